@@ -1,0 +1,86 @@
+"""Noise without structure: N is a full matrix."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lusee_bayes.checks import (
+    InputError,
+    is_traced,
+    require_finite,
+    require_float64,
+    require_shape,
+)
+from lusee_bayes.covariance.base import Covariance, Factor, checked_cholesky, solve_lower
+
+# |N - N^T| of a matrix that was meant to be symmetric is rounding, relative to its largest entry
+SYMMETRY_TOLERANCE = 1e-12
+
+
+def _as_columns(x: Float[Array, "data *columns"]) -> Float[Array, "data all_columns"]:
+    return x.reshape(x.shape[0], -1)
+
+
+class CholeskyFactor(Factor):
+    """L lower triangular."""
+
+    lower: Float[Array, "data data"]
+
+    def whiten(self, x):
+        return solve_lower(self.lower, _as_columns(x), transpose=False).reshape(x.shape)
+
+    def whiten_transpose(self, x):
+        return solve_lower(self.lower, _as_columns(x), transpose=True).reshape(x.shape)
+
+    def colour(self, z):
+        return jnp.tril(self.lower) @ z
+
+    def log_det(self):
+        return 2.0 * jnp.log(jnp.diagonal(self.lower)).sum()
+
+
+class DenseCovariance(Covariance):
+    """N = ``matrix``, in K^2. InputError unless it is square, finite and symmetric.
+
+    ``name`` says in error messages which term this is.
+    """
+
+    matrix: Float[Array, "data data"]
+    name: str = "the dense covariance"
+
+    def __check_init__(self):
+        require_float64(self.name, self.matrix)
+        require_shape(self.name, self.matrix, (self.matrix.shape[0],) * 2)
+        require_finite(self.name, self.matrix)
+        if not is_traced(self.matrix):
+            largest = float(jnp.abs(self.matrix).max())
+            asymmetry = float(jnp.abs(self.matrix - self.matrix.T).max())
+            if asymmetry > SYMMETRY_TOLERANCE * largest:
+                raise InputError(
+                    f"{self.name} is not symmetric: entries differ by up to {asymmetry:.3g} from "
+                    f"their mirror images (largest entry {largest:.3g}); give (N + N.T) / 2 if "
+                    "that is what you mean"
+                )
+
+    @property
+    def size(self) -> int:
+        return self.matrix.shape[0]
+
+    def mv(self, x):
+        return self.matrix @ x
+
+    def diagonal(self):
+        return jnp.diagonal(self.matrix)
+
+    def dense(self):
+        return self.matrix
+
+    def factor(self):
+        return CholeskyFactor(checked_cholesky(self.name, self.matrix))
+
+    def absorb(self, other):
+        return DenseCovariance(self.matrix + other.dense(), self.name)
+
+    def scaled(self, factor):
+        return DenseCovariance(factor * self.matrix, self.name)

@@ -1,0 +1,98 @@
+"""Noise that couples the products of one time but not different times: a block per time."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lusee_bayes.checks import require_finite, require_float64, require_shape
+from lusee_bayes.covariance.base import Covariance, Factor, checked_cholesky, solve_lower
+from lusee_bayes.covariance.diagonal import DiagonalCovariance
+from lusee_bayes.layout import DataLayout
+
+
+def _by_time(layout: DataLayout, x: Float[Array, "data *columns"]) -> Float[Array, "..."]:
+    """Entries of d as (times, products, columns), zero where nothing was taken."""
+    grid = layout.scatter(x)
+    return jnp.swapaxes(grid.reshape(*grid.shape[:2], -1), 0, 1)
+
+
+def _back(
+    layout: DataLayout, grid: Float[Array, "times products all_columns"], shape: tuple[int, ...]
+) -> Float[Array, "data *columns"]:
+    return layout.gather(jnp.swapaxes(grid, 0, 1)).reshape(shape)
+
+
+class TimeBlockFactor(Factor):
+    """L lower triangular within every time."""
+
+    lower: Float[Array, "times products products"]
+    layout: DataLayout
+
+    def whiten(self, x):
+        white = solve_lower(self.lower, _by_time(self.layout, x), transpose=False)
+        return _back(self.layout, white, x.shape)
+
+    def whiten_transpose(self, x):
+        white = solve_lower(self.lower, _by_time(self.layout, x), transpose=True)
+        return _back(self.layout, white, x.shape)
+
+    def colour(self, z):
+        return _back(self.layout, jnp.tril(self.lower) @ _by_time(self.layout, z), z.shape)
+
+    def log_det(self):
+        return 2.0 * jnp.log(jnp.diagonal(self.lower, axis1=1, axis2=2)).sum()
+
+
+class TimeBlockCovariance(Covariance):
+    """N with one products x products block per time, ``blocks`` in K^2.
+
+    Samples that ``layout`` leaves out have their rows and columns replaced by those of the unit
+    matrix: they then change neither solve nor determinant of the samples that are there.
+    """
+
+    blocks: Float[Array, "times products products"]
+    layout: DataLayout
+
+    def __init__(self, blocks: Float[Array, "times products products"], layout: DataLayout):
+        require_float64("the noise blocks", blocks)
+        n = layout.n_products
+        require_shape("the noise blocks", blocks, (layout.n_times, n, n))
+        require_finite("the noise blocks", blocks)
+        if layout.index is not None:
+            present = layout.present.T
+            both = present[:, :, None] & present[:, None, :]
+            unit = jnp.eye(n)[None]
+            blocks = jnp.where(both, blocks, unit)
+        self.blocks = blocks
+        self.layout = layout
+
+    @property
+    def size(self) -> int:
+        return self.layout.size
+
+    def mv(self, x):
+        return _back(self.layout, self.blocks @ _by_time(self.layout, x), x.shape)
+
+    def diagonal(self):
+        return self.layout.gather(jnp.diagonal(self.blocks, axis1=1, axis2=2).T)
+
+    def dense(self):
+        return self.mv(jnp.eye(self.size))
+
+    def factor(self):
+        lower = checked_cholesky("the noise covariance of one time", self.blocks)
+        return TimeBlockFactor(lower, self.layout)
+
+    def absorb(self, other):
+        if isinstance(other, TimeBlockCovariance):
+            # a missing sample's unit row must stay a unit row: the constructor puts it back
+            return TimeBlockCovariance(self.blocks + other.blocks, self.layout)
+        if isinstance(other, DiagonalCovariance):
+            added = self.layout.scatter(other.variance).T
+            blocks = self.blocks + added[:, :, None] * jnp.eye(self.layout.n_products)[None]
+            return TimeBlockCovariance(blocks, self.layout)
+        return None
+
+    def scaled(self, factor):
+        return TimeBlockCovariance(factor * self.blocks, self.layout)

@@ -1,0 +1,25 @@
+"""W^T W at the cost of a symmetric product.
+
+XLA has no symmetric rank-k update on the CPU: ``W.T @ W`` computes both triangles. Splitting the
+columns and forming only the blocks on and below the diagonal does 5/8 of the work.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+# measured at 5232 x 2304 on two cores: 4 blocks 0.37 s, 8 blocks 0.41 s, one product 0.48 s
+N_BLOCKS = 4
+
+
+def gram(w: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
+    """Lower triangle of W^T W; what stands above the diagonal is unspecified."""
+    columns = w.shape[1]
+    edges = np.linspace(0, columns, N_BLOCKS + 1).astype(int)
+    rows = []
+    for first, end in zip(edges[:-1], edges[1:], strict=True):
+        block = w[:, first:end].T @ w[:, :end]
+        rows.append(jnp.pad(block, ((0, 0), (0, columns - end))))
+    return jnp.concatenate(rows, axis=0)

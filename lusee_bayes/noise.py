@@ -1,0 +1,105 @@
+"""Terms of the noise covariance N that the instrument's physics gives.
+
+Radiometer noise in two forms. With T_ij(t) the visibilities of the four antennas in K, bandwidth
+df and integration time dt (times the duty cycle):
+
+    paper   sigma_k^2 = (T_ii T_jj + V_k^2) / (2 df dt), independent;
+    exact   the voltages are complex Gaussian with covariance T(t), so
+            Cov[V_ij, conj(V_kl)] = T_ik conj(T_jl) / (df dt),
+            Cov[V_ij, V_kl]       = T_il conj(T_jk) / (df dt),
+            which couples all products of one time.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lusee_bayes.checks import (
+    InputError,
+    is_traced,
+    nearest,
+    require_finite,
+    require_float64,
+    require_positive,
+    require_shape,
+)
+from lusee_bayes.covariance import Covariance, DiagonalCovariance, TimeBlockCovariance
+from lusee_bayes.layout import DataLayout
+from lusee_bayes.products import all_products, auto_indices, to_matrix
+
+RADIOMETER_FORMS = ("paper", "exact")
+
+
+def radiometer_noise(
+    visibilities: Float[Array, "products times"],
+    layout: DataLayout,
+    *,
+    bandwidth_hz: float = 1.0e6,
+    step_s: float = 7200.0,
+    form: str = "paper",
+    duty_cycle: float = 1.0,
+    factor: float = 1.0,
+) -> Covariance:
+    """Covariance of the radiometer noise around given visibilities, in K^2.
+
+    visibilities : modelled or measured V_k(t) of all products on the full time grid, in K;
+    layout : which samples are in the data; duty_cycle : the fraction of ``step_s`` spent
+    integrating; factor : multiplies the variance (10 for ten times the noise power).
+    InputError for parameters that are not positive and for autos that are not positive.
+    """
+    if form not in RADIOMETER_FORMS:
+        raise InputError(f"unknown radiometer form '{form}'; {nearest(form, RADIOMETER_FORMS)}")
+    for name, value in [("bandwidth_hz", bandwidth_hz), ("step_s", step_s), ("factor", factor)]:
+        require_positive(f"the radiometer's {name}", value)
+    require_positive("the radiometer's duty_cycle", duty_cycle)
+    if not is_traced(duty_cycle) and duty_cycle > 1.0:
+        raise InputError(f"the radiometer's duty_cycle must not exceed 1, got {duty_cycle}")
+    require_float64("the visibilities", visibilities)
+    require_shape("the visibilities", visibilities, (layout.n_products, layout.n_times))
+    require_finite("the visibilities", visibilities)
+    autos = visibilities[auto_indices(round(np.sqrt(layout.n_products)))]
+    require_positive(
+        "the antenna temperature (autos of the visibilities)",
+        autos,
+        "noise levels are taken from it; use a sky with a positive mean",
+    )
+    scale = factor / (bandwidth_hz * step_s * duty_cycle)
+    if form == "paper":
+        return DiagonalCovariance(layout.gather(paper_variance(visibilities)) * scale)
+    return TimeBlockCovariance(exact_blocks(visibilities) * scale, layout)
+
+
+def paper_variance(
+    visibilities: Float[Array, "products times"],
+) -> Float[Array, "products times"]:
+    """(T_ii T_jj + V_k^2) / 2, in K^2: divide by df dt."""
+    n = round(np.sqrt(visibilities.shape[0]))
+    autos = visibilities[auto_indices(n)]
+    products = all_products(n)
+    t_ii = autos[np.array([p.i for p in products])]
+    t_jj = autos[np.array([p.j for p in products])]
+    return (t_ii * t_jj + visibilities**2) / 2.0
+
+
+@eqx.filter_jit
+def exact_blocks(
+    visibilities: Float[Array, "products times"],
+) -> Float[Array, "times products products"]:
+    """Covariance of all real products at every time, in K^2: divide by df dt.
+
+    A product is Re(c V_ij) with c = 1 or -i, so
+    Cov[k, l] = Re( c_k conj(c_l) E[dV dV'*] + c_k c_l E[dV dV'] ) / 2.
+    """
+    n = round(np.sqrt(visibilities.shape[0]))
+    products = all_products(n)
+    i = np.array([p.i for p in products])
+    j = np.array([p.j for p in products])
+    part = jnp.asarray([1.0 + 0j if p.part == "R" else -1j for p in products])
+    t = jnp.moveaxis(to_matrix(visibilities), 2, 0)
+    hermitian = t[:, i[:, None], i[None]] * t[:, j[:, None], j[None]].conj()
+    pseudo = t[:, i[:, None], j[None]] * t[:, j[:, None], i[None]].conj()
+    weights = (part[:, None] * part[None].conj())[None], (part[:, None] * part[None])[None]
+    return (weights[0] * hermitian + weights[1] * pseudo).real / 2.0

@@ -1,0 +1,210 @@
+"""Where, when and with which turntable angles the sky was observed.
+
+Frames: Galactic (of the sky), MCMF (fixed to the Moon, from lunarsky), topocentric (x East,
+y North, z up). All orientations come from lunarsky's own coordinate transformation at every time;
+nothing here assumes that the Moon turns about a fixed axis.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import astropy.units as u
+import erfa
+import numpy as np
+from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_body_barycentric
+from astropy.time import Time
+from jaxtyping import Bool, Float, Int
+from lunarsky import MCMF
+
+from lusee_bayes.checks import InputError
+
+CYCLE_DAYS = 27.321661
+EPHEMERIS_YEARS = (1900, 2050)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One stretch of data taken at one turntable angle.
+
+    ``cycles``: its length in sidereal months of 27.321661 days. ``turntable_deg``: positive turns
+    the antennas from East towards North. ``night_only``: keep the samples with the Sun below the
+    horizon.
+    """
+
+    cycles: float = 1.0
+    turntable_deg: float = 0.0
+    night_only: bool = False
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The samples of one or more runs at one site.
+
+    times : (times,) UTC, one for every sample, runs one after the other
+    run : (times,) which run each sample belongs to, 0, 1, ... without going back
+    turntable_deg : (runs,) turntable angle of each run
+    step_s : integration time of one sample, in seconds
+    """
+
+    lon_deg: float
+    lat_deg: float
+    times: Time
+    run: Int[np.ndarray, " times"]
+    turntable_deg: tuple[float, ...]
+    step_s: float
+
+    def __post_init__(self):
+        if not -90.0 <= self.lat_deg <= 90.0:
+            raise InputError(f"lat_deg must lie in -90..90, got {self.lat_deg}")
+        if not self.step_s > 0.0:
+            raise InputError(f"step_s must be positive, got {self.step_s}")
+        if self.times.shape != self.run.shape or self.times.ndim != 1 or not self.times.size:
+            raise InputError(
+                f"times {self.times.shape} and run {self.run.shape} must be two lists of the "
+                "same length, with at least one sample"
+            )
+        steps = np.diff(self.run)
+        if (
+            self.run[0] != 0
+            or self.run[-1] != len(self.turntable_deg) - 1
+            or not ((steps == 0) | (steps == 1)).all()
+        ):
+            raise InputError(
+                f"run must count 0, 1, ... up to {len(self.turntable_deg) - 1} (one number for "
+                "each turntable angle) without going back"
+            )
+        require_ephemeris(self.times)
+
+    @classmethod
+    def from_runs(
+        cls,
+        runs: list[Run] | tuple[Run, ...] = (Run(),),
+        *,
+        start: str = "2027-01-15T00:00:00",
+        step_s: float = 7200.0,
+        lon_deg: float = 182.258,
+        lat_deg: float = -23.814,
+    ) -> Observation:
+        """Runs that follow one another from ``start`` (UTC, ISO); defaults as in the paper.
+
+        A run of c cycles holds floor(c cycle / step_s) samples, start + k step_s; the next begins
+        c cycles later. InputError for a bad date, step or length, or if no sample is left.
+        """
+        if not step_s > 0.0:
+            raise InputError(f"step_s must be positive, got {step_s}")
+        try:
+            t0 = Time(start, scale="utc")
+        except ValueError as error:
+            raise InputError(
+                f"start '{start}' is not a date; write it as 2027-01-15T00:00:00"
+            ) from error
+        elapsed, offsets, numbers = 0.0, [], []
+        for number, run in enumerate(runs):
+            length = run.cycles * CYCLE_DAYS * 86400.0
+            n = int(length // step_s)
+            if n < 1:
+                raise InputError(
+                    f"run {number} of {run.cycles} cycles holds no sample of {step_s} s; "
+                    "lengthen it or shorten step_s"
+                )
+            offsets.append(elapsed + step_s * np.arange(n))
+            numbers.append(np.full(n, number))
+            elapsed += length
+        seconds, run_of = np.concatenate(offsets), np.concatenate(numbers)
+        last = t0.jd + seconds[-1] / 86400.0
+        require_ephemeris(Time([t0.jd, last], format="jd", scale="utc"))
+        with warnings.catch_warnings():  # leap seconds of the coming years are not announced yet
+            warnings.simplefilter("ignore", erfa.ErfaWarning)
+            times = t0 + seconds * u.s
+        observation = cls(
+            lon_deg, lat_deg, times, run_of, tuple(r.turntable_deg for r in runs), step_s
+        )
+        night_runs = np.array([r.night_only for r in runs])
+        if not night_runs.any():
+            return observation
+        keep = ~night_runs[run_of] | (observation.sun_altitude_deg() < 0.0)
+        empty = [i for i in range(len(runs)) if not keep[run_of == i].any()]
+        if empty:
+            raise InputError(
+                f"run {empty[0]} holds no lunar night; lengthen it, move its start or drop "
+                "night_only"
+            )
+        return observation.select(keep)
+
+    def select(self, keep: Bool[np.ndarray, " times"]) -> Observation:
+        """The same observation with only the samples where ``keep`` is True."""
+        return Observation(
+            self.lon_deg,
+            self.lat_deg,
+            self.times[keep],
+            self.run[keep],
+            self.turntable_deg,
+            self.step_s,
+        )
+
+    @property
+    def n_times(self) -> int:
+        """Number of samples over all runs."""
+        return len(self.run)
+
+    @property
+    def n_runs(self) -> int:
+        """Number of runs."""
+        return len(self.turntable_deg)
+
+    @property
+    def hours(self) -> Float[np.ndarray, " times"]:
+        """Hours since the first sample."""
+        return (self.times.tdb - self.times[0].tdb).to_value(u.hour)
+
+    def mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
+        """Rotation at every time that takes Galactic unit vectors to MCMF ones."""
+        return mcmf_from_galactic(self.times)
+
+    def topocentric_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
+        """Rotation from MCMF to the site's East, North, up axes (its rows)."""
+        lon, lat = np.radians(self.lon_deg), np.radians(self.lat_deg)
+        up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+        east = np.array([-np.sin(lon), np.cos(lon), 0.0])
+        return np.array([east, np.cross(up, east), up])
+
+    def zenith_galactic(self) -> Float[np.ndarray, "times 3"]:
+        """Unit vector of the zenith in Galactic coordinates at every time."""
+        return self.topocentric_from_mcmf()[2] @ self.mcmf_from_galactic()
+
+    def sun_altitude_deg(self) -> Float[np.ndarray, " times"]:
+        """Altitude of the Sun's centre above the horizon, geometric, in degrees."""
+        sun = get_body_barycentric("sun", self.times, ephemeris="builtin")
+        moon = get_body_barycentric("moon", self.times, ephemeris="builtin")
+        direction = (sun - moon).xyz.to_value(u.km)
+        galactic = ICRS(CartesianRepresentation(direction)).transform_to(Galactic())
+        vector = galactic.cartesian.xyz.value
+        vector = vector / np.linalg.norm(vector, axis=0)
+        height = np.einsum("ti,it->t", self.zenith_galactic(), vector)
+        return np.degrees(np.arcsin(height))
+
+
+def require_ephemeris(times: Time) -> None:
+    """InputError unless all times lie within lunarsky's lunar orientation kernel."""
+    first, last = (Time(f"{year}-01-01", scale="tdb") for year in EPHEMERIS_YEARS)
+    jd = times.jd
+    outside = ~((jd >= first.jd) & (jd <= last.jd))
+    if outside.any():
+        at = Time(jd[outside][0], format="jd").isot[:19]
+        raise InputError(
+            f"sample times run outside the ephemeris ({EPHEMERIS_YEARS[0]}-{EPHEMERIS_YEARS[1]}): "
+            f"{at}; give a start inside it"
+        )
+
+
+def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:
+    """Rotations, shape (times, 3, 3), that take Galactic unit vectors to MCMF ones.
+
+    The three Galactic axes go through lunarsky's ICRS -> MCMF transformation in one call.
+    """
+    axes = Galactic(CartesianRepresentation(np.eye(3)[:, :, None])).transform_to(ICRS())
+    icrs = ICRS(CartesianRepresentation(axes.cartesian.xyz.value))
+    turned = icrs.transform_to(MCMF(obstime=times))
+    return np.moveaxis(turned.cartesian.xyz.value, 2, 0)

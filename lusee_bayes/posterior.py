@@ -1,0 +1,107 @@
+"""The posterior over sky maps: mean, covariance, standard deviations, draws."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lusee_bayes.covariance.base import solve_lower
+from lusee_bayes.prior import Prior
+
+# directions handled at once when standard deviations of many of them are asked for
+CHUNK = 2048
+
+
+class Posterior(eqx.Module):
+    """N(mean, C) over the sky's unknowns m = G u, in K.
+
+    white_mean : (white,) mean of u; lower : L with Lambda = L L^T the precision of u, or of
+    v = Q^T u where ``basis`` Q (white, rank) is given (u outside Q's span keeps its prior).
+    log_evidence : ln p(d); refinement : last correction of the mean in standard deviations.
+    """
+
+    prior: Prior
+    white_mean: Float[Array, " white"]
+    lower: Float[Array, "rank rank"]
+    basis: Float[Array, "white rank"] | None
+    log_evidence: Float[Array, ""]
+    refinement: Float[Array, ""]
+
+    @property
+    def mean(self) -> Float[Array, " unknowns"]:
+        """Posterior mean of m (for harmonics: Galactic, real packed), in K."""
+        return self.prior.colour(self.white_mean)
+
+    def std(self) -> Float[Array, " unknowns"]:
+        """Posterior standard deviation of every unknown, in K."""
+        return self.std_of(jnp.eye(self.prior.size))
+
+    def std_of(self, directions: Float[Array, "n unknowns"]) -> Float[Array, " n"]:
+        """Standard deviation of linear combinations of m.
+
+        With rows of ``harmonics.pixel_matrix`` as directions: per pixel, in K.
+        """
+        parts = [
+            _std_of(self, jnp.asarray(directions[i : i + CHUNK]))
+            for i in range(0, directions.shape[0], CHUNK)
+        ]
+        return jnp.concatenate(parts)
+
+    def covariance(self) -> Float[Array, "unknowns unknowns"]:
+        """C as a matrix, in K^2."""
+        return _covariance(self)
+
+    def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
+        """A draw of m, shape (unknowns,); with ``n``, that many, shape (n, unknowns)."""
+        z = jax.random.normal(key, (1 if n is None else n, self.prior.rank), dtype=jnp.float64)
+        draws = _colour(self, z)
+        return draws[0] if n is None else draws
+
+    def prior_fraction(self) -> Float[Array, " unknowns"]:
+        """Share of each unknown's variance that is left from the prior: diag(C) / diag(S).
+
+        1 where the data say nothing, 0 where the prior does not matter; 0 also where the prior
+        variance itself is zero.
+        """
+        prior = self.prior.variance()
+        return jnp.where(prior > 0, self.std() ** 2 / jnp.where(prior > 0, prior, 1.0), 0.0)
+
+    def information_bits(self) -> Float[Array, ""]:
+        """Information about the sky gained from the data: ln|Lambda| / 2 in bits."""
+        return jnp.log(jnp.diagonal(self.lower)).sum() / np.log(2.0)
+
+
+@eqx.filter_jit
+def _std_of(posterior: Posterior, directions: Float[Array, "n unknowns"]) -> Float[Array, " n"]:
+    white = posterior.prior.colour_columns(directions)
+    inside = white if posterior.basis is None else white @ posterior.basis
+    half = solve_lower(posterior.lower, inside.T, transpose=False)
+    variance = (half**2).sum(0)
+    if posterior.basis is not None:
+        outside = white - inside @ posterior.basis.T
+        variance = variance + (outside**2).sum(1)
+    return jnp.sqrt(variance)
+
+
+@eqx.filter_jit
+def _covariance(posterior: Posterior) -> Float[Array, "unknowns unknowns"]:
+    rank = posterior.prior.rank
+    root = jnp.eye(rank) if posterior.basis is None else posterior.basis.T
+    half = solve_lower(posterior.lower, root, transpose=False)
+    white = half.T @ half
+    if posterior.basis is not None:
+        white = white + jnp.eye(rank) - posterior.basis @ posterior.basis.T
+    return posterior.prior.colour(posterior.prior.colour(white).T)
+
+
+@eqx.filter_jit
+def _colour(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array, "n unknowns"]:
+    """mean + G (L^-T z), or with a basis: z outside its span, L^-T Q^T z inside."""
+    inside = z if posterior.basis is None else z @ posterior.basis
+    drawn = solve_lower(posterior.lower, inside.T, transpose=True).T
+    if posterior.basis is not None:
+        drawn = z + (drawn - inside) @ posterior.basis.T
+    return posterior.prior.colour(drawn + posterior.white_mean[None])

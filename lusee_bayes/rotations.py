@@ -1,0 +1,125 @@
+"""Rotations of real spherical harmonics: orthogonal matrices, block-diagonal in ell.
+
+D(g) turns a field: (D(g) f)(n) = f(g^-1 n), so D(g h) = D(g) D(h). For the rotation vector w
+(axis times angle) D = exp(w . K), with K_x, K_y, K_z the real antisymmetric generators, that is
+-i times the angular momentum operators in the basis of :mod:`lusee_bayes.harmonics`. K_z couples
+only m with -m, K_x and K_y only |m| with |m| +- 1.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation as SpatialRotation
+
+from lusee_bayes.harmonics import mode_numbers, n_modes
+
+
+@lru_cache(maxsize=256)
+def generators(ell: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """K_x, K_y, K_z within one ell, each of shape (2 ell + 1, 2 ell + 1), rows m = -ell..ell."""
+    m = np.arange(-ell, ell + 1)
+    raising = np.diag(np.sqrt(ell * (ell + 1.0) - m[:-1] * (m[:-1] + 1.0)), k=-1)
+    j_x, j_y, j_z = (raising + raising.T) / 2, (raising - raising.T) / 2j, np.diag(m + 0.0)
+    # real = U complex for the complete set m = -ell..ell of a real field
+    to_real = np.zeros((2 * ell + 1, 2 * ell + 1), dtype=complex)
+    for order in range(-ell, ell + 1):
+        row, plus, minus = order + ell, abs(order) + ell, -abs(order) + ell
+        sign = (-1.0) ** order
+        if order == 0:
+            to_real[row, row] = 1.0
+        elif order > 0:
+            to_real[row, [plus, minus]] = np.array([1.0, sign]) / np.sqrt(2.0)
+        else:
+            to_real[row, [plus, minus]] = np.array([-1j, 1j * sign]) / np.sqrt(2.0)
+    return tuple(np.real(to_real @ (-1j * j) @ to_real.conj().T) for j in (j_x, j_y, j_z))
+
+
+class Rotation(eqx.Module):
+    """An orthogonal matrix on packed modes, one block for each ell = 0..lmax."""
+
+    blocks: tuple[Float[Array, "_ _"], ...]
+
+    @classmethod
+    def from_matrix(cls, matrix: Float[np.ndarray, "3 3"], lmax: int) -> Rotation:
+        """D(g) for the proper rotation ``matrix`` that takes vectors n to g n."""
+        w = SpatialRotation.from_matrix(np.asarray(matrix)).as_rotvec()
+        blocks = []
+        for ell in range(lmax + 1):
+            k_x, k_y, k_z = generators(ell)
+            blocks.append(jnp.asarray(expm(w[0] * k_x + w[1] * k_y + w[2] * k_z)))
+        return cls(tuple(blocks))
+
+    @property
+    def T(self) -> Rotation:
+        """The inverse rotation."""
+        return Rotation(tuple(b.T for b in self.blocks))
+
+    def __call__(self, modes: Float[Array, "*batch modes"]) -> Float[Array, "*batch modes"]:
+        """Turn the field(s) with these coefficients (last axis)."""
+        turned = []
+        for ell, block in enumerate(self.blocks):
+            turned.append(modes[..., ell**2 : (ell + 1) ** 2] @ block.T)
+        return jnp.concatenate(turned, axis=-1)
+
+
+def turn_about_z(
+    modes: Float[Array, "*batch modes"], angle: float | Float[Array, ""]
+) -> Float[Array, "*batch modes"]:
+    """D for a turn by ``angle`` (radians, positive from x towards y) about z; differentiable."""
+    lmax = round(np.sqrt(modes.shape[-1])) - 1
+    ell, m = mode_numbers(lmax)
+    mirrored = modes[..., ell * (ell + 1) - m]
+    turns = jnp.asarray(m, dtype=jnp.float64) * angle
+    cosine, sine = jnp.cos(turns), jnp.sin(turns)
+    shape = (1,) * (modes.ndim - 1) + (-1,)
+    return modes * cosine.reshape(shape) + mirrored * sine.reshape(shape)
+
+
+@lru_cache(maxsize=16)
+def _horizontal_generators(lmax: int) -> tuple[np.ndarray, np.ndarray]:
+    """K_x and K_y over all packed modes as gather tables: two columns and weights per row.
+
+    A row (ell, m) has entries only in columns (ell, +-(|m| +- 1)), two of them non-zero.
+    """
+    columns = np.zeros((2, n_modes(lmax), 2), dtype=int)
+    weights = np.zeros((2, n_modes(lmax), 2))
+    for ell in range(lmax + 1):
+        for axis, k in enumerate(generators(ell)[:2]):
+            order = np.argsort(-np.abs(k), axis=1, kind="stable")[:, :2]
+            rows = slice(ell**2, (ell + 1) ** 2)
+            width = order.shape[1]
+            columns[axis, rows, :width] = ell**2 + order
+            weights[axis, rows, :width] = np.take_along_axis(k, order, axis=1)
+    return columns, weights
+
+
+def apply_generator(modes: Float[Array, "*batch modes"], axis: int) -> Float[Array, "*batch modes"]:
+    """K_x (axis 0) or K_y (axis 1) times packed modes, in time proportional to their number."""
+    columns, weights = _horizontal_generators(round(np.sqrt(modes.shape[-1])) - 1)
+    shape = (1,) * (modes.ndim - 1) + (-1,)
+    first, second = (jnp.asarray(weights[axis, :, i]).reshape(shape) for i in (0, 1))
+    return first * modes[..., columns[axis, :, 0]] + second * modes[..., columns[axis, :, 1]]
+
+
+def tilts(modes: Float[Array, "*batch modes"], order: int) -> list[Float[Array, "*batch modes"]]:
+    """Taylor terms of exp(ex K_x + ey K_y): W_ab = K_x W_(a-1)b + K_y W_a(b-1), W_00 = modes.
+
+    In the order of :func:`tilt_powers`, with exp(ex K_x + ey K_y) f = sum ex^a ey^b / (a+b)! W_ab.
+    """
+    terms = {(0, 0): modes}
+    for a, b in tilt_powers(order)[1:]:
+        left = apply_generator(terms[a - 1, b], 0) if a else 0.0
+        right = apply_generator(terms[a, b - 1], 1) if b else 0.0
+        terms[a, b] = left + right
+    return list(terms.values())
+
+
+def tilt_powers(order: int) -> list[tuple[int, int]]:
+    """Powers (a, b) of (ex, ey) up to total degree ``order``, lowest degree first."""
+    return [(n - b, b) for n in range(order + 1) for b in range(n + 1)]
