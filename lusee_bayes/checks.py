@@ -13,6 +13,8 @@ from typing import Any
 import jax
 import numpy as np
 
+AnyArray = jax.Array | np.ndarray
+
 
 class InputError(ValueError):
     """Something a user supplied cannot be used. The message says what, where and what to do."""

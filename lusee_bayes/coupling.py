@@ -31,8 +31,8 @@ from lusee_bayes.rotations import tilts, turn_about_z
 class CouplingMatrix(eqx.Module):
     """A, of shape (data, modes): the beams of an observation, in Galactic coordinates.
 
-    ``A @ sky`` and ``A.transpose_mv(data)`` use the structure; :meth:`rows` and :meth:`dense` give the
-    numbers. Differentiable in the beams.
+    ``A @ sky`` and ``A.transpose_mv(data)`` use the structure; :meth:`rows` and :meth:`dense` give
+    the numbers. Differentiable in the beams.
     """
 
     body_beams: Float[Array, "runs products powers modes"]

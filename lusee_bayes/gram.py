@@ -6,6 +6,8 @@ columns and forming only the blocks on and below the diagonal does 5/8 of the wo
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -19,7 +21,7 @@ def gram(w: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
     columns = w.shape[1]
     edges = np.linspace(0, columns, N_BLOCKS + 1).astype(int)
     rows = []
-    for first, end in zip(edges[:-1], edges[1:], strict=True):
+    for first, end in pairwise(edges):
         block = w[:, first:end].T @ w[:, :end]
         rows.append(jnp.pad(block, ((0, 0), (0, columns - end))))
     return jnp.concatenate(rows, axis=0)

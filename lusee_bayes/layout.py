@@ -66,12 +66,12 @@ class DataLayout(eqx.Module):
             return np.arange(self.size)
         return np.asarray(self.index)
 
-    def gather(self, grid: Float[Array, "products times *rest"]) -> Float[Array, "data *rest"]:
+    def gather(self, grid: Float[Array, "products times *rest"]) -> Float[Array, data * rest]:
         """The entries of d (and of any trailing axes) out of a full grid."""
         flat = grid.reshape(self.n_products * self.n_times, *grid.shape[2:])
         return flat if self.index is None else flat[self.index]
 
-    def scatter(self, data: Float[Array, "data *rest"]) -> Float[Array, "products times *rest"]:
+    def scatter(self, data: Float[Array, data * rest]) -> Float[Array, "products times *rest"]:
         """Put the entries of d back onto the full grid, zero where nothing was taken."""
         rest = data.shape[1:]
         if self.index is None:

@@ -153,7 +153,8 @@ def _factorise_checked(model: LinearGaussian, form: str) -> Solver:
     if not bool(jnp.isfinite(solver.lower).all()):
         model.noise.factor()  # outside jit: raises and names the term that is not positive
         raise InputError(
-            "Lambda = 1 + W^T W could not be factorised; check the coupling matrix for extreme values"
+            "Lambda = 1 + W^T W could not be factorised; check the coupling matrix for extreme "
+            "values"
         )
     return solver
 

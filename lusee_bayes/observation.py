@@ -8,6 +8,8 @@ nothing here assumes that the Moon turns about a fixed axis.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import astropy.units as u
@@ -95,7 +97,8 @@ class Observation:
         if not step_s > 0.0:
             raise InputError(f"step_s must be positive, got {step_s}")
         try:
-            t0 = Time(start, scale="utc")
+            with unannounced_leap_seconds():
+                t0 = Time(start, scale="utc")
         except ValueError as error:
             raise InputError(
                 f"start '{start}' is not a date; write it as 2027-01-15T00:00:00"
@@ -114,9 +117,8 @@ class Observation:
             elapsed += length
         seconds, run_of = np.concatenate(offsets), np.concatenate(numbers)
         last = t0.jd + seconds[-1] / 86400.0
-        require_ephemeris(Time([t0.jd, last], format="jd", scale="utc"))
-        with warnings.catch_warnings():  # leap seconds of the coming years are not announced yet
-            warnings.simplefilter("ignore", erfa.ErfaWarning)
+        with unannounced_leap_seconds():
+            require_ephemeris(Time([t0.jd, last], format="jd", scale="utc"))
             times = t0 + seconds * u.s
         observation = cls(
             lon_deg, lat_deg, times, run_of, tuple(r.turntable_deg for r in runs), step_s
@@ -134,13 +136,17 @@ class Observation:
         return observation.select(keep)
 
     def select(self, keep: Bool[np.ndarray, " times"]) -> Observation:
-        """The same observation with only the samples where ``keep`` is True."""
+        """The same observation with only the samples where ``keep`` is True.
+
+        Runs that keep no sample are gone. InputError if nothing is left.
+        """
+        runs, renumbered = np.unique(self.run[keep], return_inverse=True)
         return Observation(
             self.lon_deg,
             self.lat_deg,
             self.times[keep],
-            self.run[keep],
-            self.turntable_deg,
+            renumbered,
+            tuple(self.turntable_deg[run] for run in runs),
             self.step_s,
         )
 
@@ -184,6 +190,14 @@ class Observation:
         vector = vector / np.linalg.norm(vector, axis=0)
         height = np.einsum("ti,it->t", self.zenith_galactic(), vector)
         return np.degrees(np.arcsin(height))
+
+
+@contextmanager
+def unannounced_leap_seconds() -> Iterator[None]:
+    """UTC of coming years may still get leap seconds: ERFA warns, and there is nothing to do."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
+        yield
 
 
 def require_ephemeris(times: Time) -> None:

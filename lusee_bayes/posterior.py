@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from lusee_bayes.checks import AnyArray
 from lusee_bayes.covariance.base import solve_lower
 from lusee_bayes.prior import Prior
 
@@ -39,7 +40,7 @@ class Posterior(eqx.Module):
         """Posterior standard deviation of every unknown, in K."""
         return self.std_of(jnp.eye(self.prior.size))
 
-    def std_of(self, directions: Float[Array, "n unknowns"]) -> Float[Array, " n"]:
+    def std_of(self, directions: Float[AnyArray, "n unknowns"]) -> Float[Array, " n"]:
         """Standard deviation of linear combinations of m.
 
         With rows of ``harmonics.pixel_matrix`` as directions: per pixel, in K.
@@ -54,7 +55,7 @@ class Posterior(eqx.Module):
         """C as a matrix, in K^2."""
         return _covariance(self)
 
-    def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
+    def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, ...]:
         """A draw of m, shape (unknowns,); with ``n``, that many, shape (n, unknowns)."""
         z = jax.random.normal(key, (1 if n is None else n, self.prior.rank), dtype=jnp.float64)
         draws = _colour(self, z)

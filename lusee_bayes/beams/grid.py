@@ -63,7 +63,7 @@ class HemisphereGrid(eqx.Module):
             raise InputError(
                 f"{self.n_phi} azimuths cannot resolve lmax = {lmax}; give more than {2 * lmax}"
             )
-        ell, m = mode_numbers(lmax)
+        _, m = mode_numbers(lmax)
         fourier = jnp.fft.rfft(f, axis=-1)[..., : lmax + 1] * (2.0 * np.pi / self.n_phi)
         parts = jnp.concatenate(
             [

@@ -31,7 +31,7 @@ PORT_AZIMUTHS_DEG = (90.0, 0.0, -90.0, 180.0)
 CURRENT_NODES = 16
 
 
-def _array(x) -> Float[Array, "..."]:
+def _array(x) -> Float[Array, ...]:
     return jnp.asarray(x, dtype=jnp.float64)
 
 
@@ -55,7 +55,7 @@ class Monopoles(eqx.Module):
 
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         """Field patterns at one frequency, phase centre at the feed, common to all arms."""
-        if not 0.0 < frequency_mhz:
+        if not frequency_mhz > 0.0:
             raise InputError(f"frequency_mhz must be positive, got {frequency_mhz}")
         k = wavenumber(frequency_mhz)
         cos, sin = jnp.cos(grid.theta)[None, :, None], jnp.sin(grid.theta)[None, :, None]

@@ -18,7 +18,7 @@ from lusee_bayes.covariance.base import Covariance, Factor, checked_cholesky, so
 SYMMETRY_TOLERANCE = 1e-12
 
 
-def _as_columns(x: Float[Array, "data *columns"]) -> Float[Array, "data all_columns"]:
+def _as_columns(x: Float[Array, data * columns]) -> Float[Array, "data all_columns"]:
     return x.reshape(x.shape[0], -1)
 
 

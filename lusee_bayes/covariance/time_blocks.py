@@ -11,7 +11,7 @@ from lusee_bayes.covariance.diagonal import DiagonalCovariance
 from lusee_bayes.layout import DataLayout
 
 
-def _by_time(layout: DataLayout, x: Float[Array, "data *columns"]) -> Float[Array, "..."]:
+def _by_time(layout: DataLayout, x: Float[Array, data * columns]) -> Float[Array, ...]:
     """Entries of d as (times, products, columns), zero where nothing was taken."""
     grid = layout.scatter(x)
     return jnp.swapaxes(grid.reshape(*grid.shape[:2], -1), 0, 1)
@@ -19,7 +19,7 @@ def _by_time(layout: DataLayout, x: Float[Array, "data *columns"]) -> Float[Arra
 
 def _back(
     layout: DataLayout, grid: Float[Array, "times products all_columns"], shape: tuple[int, ...]
-) -> Float[Array, "data *columns"]:
+) -> Float[Array, data * columns]:
     return layout.gather(jnp.swapaxes(grid, 0, 1)).reshape(shape)
 
 

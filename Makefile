@@ -1,0 +1,37 @@
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# numbers that must not depend on the machine's locale or on a display
+export MPLBACKEND := agg
+
+.PHONY: map test long lint bench clean
+
+# a posterior map of the embedded sky at 25 MHz, in output/fiducial
+map: $(VENV)/installed
+	$(BIN)/lusee-bayes map fiducial
+
+test: $(VENV)/installed-dev
+	$(BIN)/python -m pytest -n 2
+
+long: $(VENV)/installed-dev
+	$(BIN)/python -m pytest -m long
+
+lint: $(VENV)/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+
+bench: $(VENV)/installed
+	$(BIN)/python benchmarks/pipeline.py
+
+clean:
+	rm -rf $(VENV) output
+
+$(VENV)/installed: pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --editable .
+	touch $@
+
+$(VENV)/installed-dev: pyproject.toml $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	touch $@

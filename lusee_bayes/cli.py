@@ -1,0 +1,49 @@
+"""The command line: parsing, error messages and exit codes. The work is in ``commands``.
+
+Exit codes: 0 success, 2 bad input (one sentence on standard error), 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from cyclopts import App, CycloptsError
+from rich.console import Console
+
+from lusee_bayes.checks import InputError
+from lusee_bayes.version import __version__
+
+app = App(
+    name="lusee-bayes",
+    version=__version__,
+    suppress_keyboard_interrupt=False,
+    help="Bayesian maps of the low-frequency sky from LuSEE-Night's visibilities.",
+)
+# named by path: each is imported when called, so that --help and completion answer at once
+for _name, _help in {
+    "simulate": "Simulate the visibilities of a scenario.",
+    "map": "Make a posterior map of a scenario, or of given data.",
+    "info": "Say what is in a file.",
+}.items():
+    app.command(f"lusee_bayes.commands:{_name}_command", name=_name, help=_help)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    errors = Console(stderr=True, soft_wrap=True, highlight=False)
+    try:
+        app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+    except InputError as error:
+        errors.print(f"lusee-bayes: {error}", markup=False)
+        return 2
+    except CycloptsError as error:
+        errors.print(f"lusee-bayes: {' '.join(str(error).split())}", markup=False)
+        return 2
+    except KeyboardInterrupt:
+        errors.print("lusee-bayes: interrupted; earlier results are as they were")
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

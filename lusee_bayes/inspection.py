@@ -1,0 +1,89 @@
+"""Recognising files and saying what is in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import healpy
+import numpy as np
+import xarray as xr
+
+from lusee_bayes import results, visibilities
+from lusee_bayes.checks import InputError
+from lusee_bayes.sky import read_map
+
+
+def describe(path: str | Path) -> str:
+    """A few lines on a file of visibilities, a posterior, or a sky map (FITS or HDF5).
+
+    InputError if it is missing or none of these.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"no file at '{path}'")
+    kind = _netcdf_format(path)
+    if kind == visibilities.FORMAT:
+        return _describe_visibilities(path)
+    if kind == results.FORMAT:
+        return _describe_posterior(path)
+    return _describe_map(path)
+
+
+def _netcdf_format(path: Path) -> str | None:
+    if not h5py.is_hdf5(path):
+        return None
+    with h5py.File(path) as file:
+        kind = file.attrs.get("format")
+    return kind.decode() if isinstance(kind, bytes) else kind
+
+
+def _describe_visibilities(path: Path) -> str:
+    data = visibilities.read_visibilities(path)
+    observation = data.observation
+    grid = data.grid()
+    autos = grid[[k for k, label in enumerate(data.labels) if label[0] == label[1]]]
+    return "\n".join(
+        [
+            f"{path}: visibilities at {data.frequency_mhz:g} MHz",
+            f"  {data.layout.n_products} products ({data.labels[0]} ... {data.labels[-1]}), "
+            f"{data.layout.n_times} times of {observation.step_s:g} s, {data.n_missing} samples "
+            "missing",
+            f"  {observation.times[0].isot} to {observation.times[-1].isot} UTC, "
+            f"{observation.n_runs} run(s) at turntable {observation.turntable_deg} degrees",
+            f"  site: longitude {observation.lon_deg}, latitude {observation.lat_deg} degrees",
+            f"  autos {np.nanmin(autos):.4g} to {np.nanmax(autos):.4g} K",
+            f"  true sky {'included' if data.truth is not None else 'not known'}",
+        ]
+    )
+
+
+def _describe_posterior(path: Path) -> str:
+    with xr.open_dataset(path, engine="h5netcdf") as posterior:
+        mean, std = posterior["mean"].values, posterior["std"].values
+        attrs = posterior.attrs
+        extra = [name for name in ("truth", "draws", "covariance") if name in posterior]
+        draws = posterior.sizes.get("draw", 0)
+    constrained = int((std < 0.5 * posterior["prior_std"].values).sum())
+    return "\n".join(
+        [
+            f"{path}: posterior over {mean.size} modes (lmax {attrs['lmax']}) at "
+            f"{float(attrs['frequency_mhz']):g} MHz, {attrs['frame']}",
+            f"  mean temperature {mean[0] / np.sqrt(4 * np.pi):.6g} K +- "
+            f"{std[0] / np.sqrt(4 * np.pi):.3g} K",
+            f"  {constrained} modes known to better than half their prior width",
+            f"  also holds: {', '.join(extra) or 'nothing else'}"
+            + (f" ({draws} draws)" if draws else ""),
+            f"  versions: {attrs['versions']}",
+        ]
+    )
+
+
+def _describe_map(path: Path) -> str:
+    pixels = read_map(path)
+    return "\n".join(
+        [
+            f"{path}: HEALPix sky map, NSIDE {healpy.npix2nside(pixels.size)}, RING, Galactic",
+            f"  mean {pixels.mean():.6g} K, from {pixels.min():.4g} to {pixels.max():.4g} K",
+        ]
+    )

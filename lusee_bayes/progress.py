@@ -1,0 +1,39 @@
+"""What is being done, for whom it may concern: stages with their times."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from rich.console import Console
+
+
+@dataclass
+class Stages:
+    """Names and times the stages of a run; ``console`` None keeps silent."""
+
+    console: Console | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Run a block as the stage ``name``: a spinner while it runs, its time when done."""
+        start = time.perf_counter()
+        if self.console is None:
+            yield
+        else:
+            with self.console.status(f"{name} ..."):
+                yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+        if self.console is not None:
+            self.console.print(f"  {name:<28} {self.seconds[name]:7.2f} s", highlight=False)
+
+
+def peak_memory_gb() -> float:
+    """Largest resident size of this process so far, in GB (10^9 bytes)."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e9 if sys.platform == "darwin" else peak * 1024 / 1e9

@@ -1,0 +1,245 @@
+"""What a map run leaves behind: files that others can open, written whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+
+import healpy
+import jax
+import numpy as np
+import xarray as xr
+from jaxtyping import Float, Shaped
+
+from lusee_bayes.checks import AnyArray, InputError
+from lusee_bayes.experiment import Experiment
+from lusee_bayes.harmonics import mode_numbers, modes_to_map, pixel_matrix, power_spectrum
+from lusee_bayes.linear_gaussian import LinearGaussian
+from lusee_bayes.metrics import (
+    correlation,
+    effective_resolution_deg,
+    ell_cross,
+    expected_chi2,
+    highest_altitude,
+    prior_fraction_per_ell,
+    signal_to_noise,
+    whitened_residuals,
+)
+from lusee_bayes.posterior import Posterior
+from lusee_bayes.progress import Stages, peak_memory_gb
+from lusee_bayes.version import __version__
+from lusee_bayes.visibilities import Visibilities
+
+FORMAT = "lusee_bayes posterior 1"
+
+
+@dataclass(frozen=True)
+class MapResult:
+    """A posterior map with everything needed to judge it.
+
+    pixel_std : (pixels,) posterior standard deviation of HEALPix RING pixels, in K;
+    highest_altitude : (pixels,) sin of the highest altitude each reached; seconds : per stage.
+    """
+
+    experiment: Experiment
+    data: Visibilities
+    model: LinearGaussian
+    posterior: Posterior
+    std: Float[np.ndarray, " modes"]
+    pixel_std: Float[np.ndarray, " pixels"]
+    highest_altitude: Float[np.ndarray, " pixels"]
+    chi2: float
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def from_experiment(
+        cls, experiment: Experiment, data: Visibilities, stages: Stages | None = None
+    ) -> MapResult:
+        """Condition the experiment's model on ``data`` and work out the uncertainties."""
+        stages = stages or Stages()
+        with stages("posterior"):
+            model = experiment.model(data)
+            posterior = jax.block_until_ready(model.condition(data.data))
+        nside = experiment.scenario.map_nside
+        with stages("standard deviations"):
+            std = np.asarray(posterior.std())
+            pixel_std = np.asarray(posterior.std_of(pixel_matrix(nside, experiment.scenario.lmax)))
+            residuals = np.asarray(whitened_residuals(model, posterior, data.data))
+        return cls(
+            experiment=experiment,
+            data=data,
+            model=model,
+            posterior=posterior,
+            std=std,
+            pixel_std=pixel_std,
+            highest_altitude=highest_altitude(data.observation, nside),
+            chi2=float(residuals @ residuals),
+            seconds=stages.seconds,
+        )
+
+    @property
+    def nside(self) -> int:
+        """NSIDE of the maps."""
+        return self.experiment.scenario.map_nside
+
+    @property
+    def truth(self) -> Float[AnyArray, " modes"] | None:
+        """The sky behind simulated data; None for real data."""
+        return self.data.truth
+
+    def mean_map(self) -> Float[np.ndarray, " pixels"]:
+        """Posterior mean in K, HEALPix RING, Galactic."""
+        return modes_to_map(self.posterior.mean, self.nside)
+
+    def truth_map(self) -> Float[np.ndarray, " pixels"] | None:
+        """The true sky up to lmax in K, where it is known."""
+        return None if self.truth is None else modes_to_map(self.truth, self.nside)
+
+    def spectra(self) -> dict[str, Shaped[np.ndarray, " ells"]]:
+        """Columns of spectra.csv; rho, snr and cl_truth only where the truth is known."""
+        mean = np.asarray(self.posterior.mean)
+        columns = {"ell": np.arange(self.experiment.scenario.lmax + 1)}
+        if self.truth is not None:
+            columns["rho"] = correlation(mean, self.truth)
+            columns["snr"] = signal_to_noise(mean, self.truth)
+        columns["cl_prior"] = np.asarray(self.experiment.prior.spectrum)
+        columns["cl_mean"] = power_spectrum(mean)
+        if self.truth is not None:
+            columns["cl_truth"] = power_spectrum(self.truth)
+        columns["cl_posterior_variance"] = power_spectrum(self.std)
+        columns["prior_fraction"] = prior_fraction_per_ell(self.posterior)
+        return columns
+
+    def summary(self) -> dict[str, object]:
+        """Figures of summary.json; null where a truth would be needed and is not known."""
+        spectra = self.spectra()
+        return {
+            "frequency_mhz": self.experiment.scenario.frequency_mhz,
+            "ell_cross": ell_cross(spectra["snr"]) if "snr" in spectra else None,
+            "effective_resolution_deg": effective_resolution_deg(spectra["prior_fraction"]),
+            "log_evidence": float(self.posterior.log_evidence),
+            "information_bits": float(self.posterior.information_bits()),
+            "chi2": self.chi2,
+            "chi2_expected": expected_chi2(self.posterior, self.model.n_data),
+            "n_data": self.model.n_data,
+            "n_missing": self.data.n_missing,
+            "n_modes": self.model.prior.size,
+            "mean_refinement_sigma": float(self.posterior.refinement),
+            "never_observed_fraction": float((self.highest_altitude < 0).mean()),
+            "seconds": {name: round(s, 3) for name, s in self.seconds.items()},
+            "peak_memory_gb": round(peak_memory_gb(), 3),
+            "versions": versions(),
+        }
+
+    def to_dataset(self, n_draws: int = 0, covariance: bool = False) -> xr.Dataset:
+        """posterior.nc: on dim ``mode`` with coords ``ell``, ``m``; all in K (K^2)."""
+        scenario = self.experiment.scenario
+        ell, m = mode_numbers(scenario.lmax)
+        variables = {
+            "mean": ("mode", np.asarray(self.posterior.mean)),
+            "std": ("mode", self.std),
+            "prior_std": ("mode", np.sqrt(np.asarray(self.model.prior.variance()))),
+        }
+        if self.truth is not None:
+            variables["truth"] = ("mode", np.asarray(self.truth))
+        if n_draws:
+            key = jax.random.fold_in(jax.random.key(scenario.seed), 1)
+            variables["draws"] = (("draw", "mode"), np.asarray(self.posterior.sample(key, n_draws)))
+        variables = {name: (*value, {"units": "K"}) for name, value in variables.items()}
+        if covariance:
+            matrix = np.asarray(self.posterior.covariance())
+            variables["covariance"] = (("mode", "mode_2"), matrix, {"units": "K2"})
+        return xr.Dataset(
+            variables,
+            coords={"ell": ("mode", ell), "m": ("mode", m)},
+            attrs={
+                "format": FORMAT,
+                "frequency_mhz": scenario.frequency_mhz,
+                "lmax": scenario.lmax,
+                "frame": "galactic",
+                "basis": "real orthonormal spherical harmonics, index ell^2 + ell + m",
+                "versions": json.dumps(versions()),
+                "scenario": scenario.to_yaml(),
+            },
+        )
+
+    def write(self, folder: str | Path, n_draws: int = 0, covariance: bool = False) -> list[Path]:
+        """Write all files but the figures into ``folder``; see :func:`staged`."""
+        with staged(folder) as stage:
+            self.to_dataset(n_draws, covariance).to_netcdf(
+                stage / "posterior.nc", engine="h5netcdf"
+            )
+            for name, pixels in self.maps().items():
+                self._write_fits(stage / f"{name}.fits", name, pixels)
+            with (stage / "spectra.csv").open("w", newline="") as file:
+                writer = csv.writer(file)
+                columns = self.spectra()
+                writer.writerow(columns)
+                writer.writerows(zip(*(c.tolist() for c in columns.values()), strict=True))
+            (stage / "scenario.yaml").write_text(self.experiment.scenario.to_yaml())
+            (stage / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n")
+            written = sorted(p.name for p in stage.iterdir())
+        return [Path(folder) / name for name in written]
+
+    def maps(self) -> dict[str, Float[np.ndarray, " pixels"]]:
+        """The maps by name, in K: mean, std and, where the truth is known, truth and residual."""
+        mean, truth = self.mean_map(), self.truth_map()
+        maps = {"mean": mean, "std": self.pixel_std}
+        if truth is not None:
+            maps |= {"truth": truth, "residual": mean - truth}
+        return maps
+
+    def _write_fits(self, path: Path, name: str, pixels: Float[np.ndarray, " pixels"]) -> None:
+        scenario = self.experiment.scenario
+        healpy.write_map(
+            path,
+            pixels,
+            coord="G",
+            column_names=[name.upper()],
+            column_units="K",
+            dtype=np.float64,
+            extra_header=[
+                ("FREQ", scenario.frequency_mhz, "frequency in MHz"),
+                ("LMAX", scenario.lmax, "highest ell of the map"),
+                ("CREATOR", f"lusee_bayes {__version__}"),
+            ],
+        )
+
+
+def versions() -> dict[str, str]:
+    """Versions of the package and of what its numbers depend on."""
+    others = ("jax", "numpy", "scipy", "healpy", "astropy", "lunarsky")
+    return {"lusee_bayes": __version__, **{name: metadata.version(name) for name in others}}
+
+
+@contextmanager
+def staged(folder: str | Path) -> Iterator[Path]:
+    """A scratch folder inside ``folder`` whose files replace the old ones only when all are done.
+
+    If anything fails or is interrupted before that, the previous files stay as they were.
+    """
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"'{folder}' is a file; give a folder for the results")
+    folder.mkdir(parents=True, exist_ok=True)
+    stage = Path(tempfile.mkdtemp(prefix=".partial-", dir=folder))
+    try:
+        yield stage
+        for item in sorted(stage.iterdir()):
+            target = folder / item.name
+            if item.is_dir():
+                target.mkdir(exist_ok=True)
+                for inner in sorted(item.iterdir()):
+                    os.replace(inner, target / inner.name)
+            else:
+                os.replace(item, target)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
