@@ -76,7 +76,10 @@ class CouplingMatrix(eqx.Module):
         return len(self.pointing.pole_from_galactic.blocks) - 1
 
     def __matmul__(self, sky: Float[Array, " modes"]) -> Float[Array, " data"]:
-        """A a: the visibilities, in K, of a sky with Galactic coefficients ``sky`` in K."""
+        """A a: the visibilities, in K, of a sky with Galactic coefficients ``sky`` in K.
+
+        The values of ``sky`` are not looked at: NaN comes out as NaN.
+        """
         require_float64("the sky", sky)
         require_shape("the sky", sky, (self.shape[1],))
         return _forward(self, sky)
@@ -93,6 +96,12 @@ class CouplingMatrix(eqx.Module):
         """Rows of A for chosen product and time numbers, flagged or not."""
         product, time = np.asarray(product), np.asarray(time)
         require_shape("time", time, product.shape)
+        for name, numbers, limit in [
+            ("product", product, self.layout.n_products),
+            ("time", time, self.layout.n_times),
+        ]:
+            if ((numbers < 0) | (numbers >= limit)).any():
+                raise InputError(f"{name} numbers must lie in 0..{limit - 1}, got {numbers}")
         rows = jnp.zeros((len(product), self.shape[1]))
         for run, span in self.pointing.runs():
             here = np.flatnonzero((time >= span.start) & (time < span.stop))

@@ -20,7 +20,7 @@ from astropy.time import Time
 from jaxtyping import Bool, Float, Int
 from lunarsky import MCMF
 
-from lusee_bayes.checks import InputError
+from lusee_bayes.checks import InputError, require_finite, require_positive
 
 CYCLE_DAYS = 27.321661
 EPHEMERIS_YEARS = (1900, 2050)
@@ -60,8 +60,8 @@ class Observation:
     def __post_init__(self):
         if not -90.0 <= self.lat_deg <= 90.0:
             raise InputError(f"lat_deg must lie in -90..90, got {self.lat_deg}")
-        if not self.step_s > 0.0:
-            raise InputError(f"step_s must be positive, got {self.step_s}")
+        require_positive("step_s", self.step_s)
+        require_finite("lon_deg and turntable_deg", np.array([self.lon_deg, *self.turntable_deg]))
         if self.times.shape != self.run.shape or self.times.ndim != 1 or not self.times.size:
             raise InputError(
                 f"times {self.times.shape} and run {self.run.shape} must be two lists of the "
@@ -94,8 +94,9 @@ class Observation:
         A run of c cycles holds floor(c cycle / step_s) samples, start + k step_s; the next begins
         c cycles later. InputError for a bad date, step or length, or if no sample is left.
         """
-        if not step_s > 0.0:
-            raise InputError(f"step_s must be positive, got {step_s}")
+        require_positive("step_s", step_s)
+        if not runs:
+            raise InputError("an observation needs at least one run, got none")
         try:
             with unannounced_leap_seconds():
                 t0 = Time(start, scale="utc")
@@ -105,6 +106,7 @@ class Observation:
             ) from error
         elapsed, offsets, numbers = 0.0, [], []
         for number, run in enumerate(runs):
+            require_positive(f"the length in cycles of run {number}", run.cycles)
             length = run.cycles * CYCLE_DAYS * 86400.0
             n = int(length // step_s)
             if n < 1:
@@ -163,7 +165,9 @@ class Observation:
     @property
     def hours(self) -> Float[np.ndarray, " times"]:
         """Hours since the first sample."""
-        return (self.times.tdb - self.times[0].tdb).to_value(u.hour)
+        with unannounced_leap_seconds():
+            tdb = self.times.tdb
+        return (tdb - tdb[0]).to_value(u.hour)
 
     def mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
         """Rotation at every time that takes Galactic unit vectors to MCMF ones."""
@@ -182,8 +186,9 @@ class Observation:
 
     def sun_altitude_deg(self) -> Float[np.ndarray, " times"]:
         """Altitude of the Sun's centre above the horizon, geometric, in degrees."""
-        sun = get_body_barycentric("sun", self.times, ephemeris="builtin")
-        moon = get_body_barycentric("moon", self.times, ephemeris="builtin")
+        with unannounced_leap_seconds():
+            sun = get_body_barycentric("sun", self.times, ephemeris="builtin")
+            moon = get_body_barycentric("moon", self.times, ephemeris="builtin")
         direction = (sun - moon).xyz.to_value(u.km)
         galactic = ICRS(CartesianRepresentation(direction)).transform_to(Galactic())
         vector = galactic.cartesian.xyz.value
@@ -220,5 +225,6 @@ def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:
     """
     axes = Galactic(CartesianRepresentation(np.eye(3)[:, :, None])).transform_to(ICRS())
     icrs = ICRS(CartesianRepresentation(axes.cartesian.xyz.value))
-    turned = icrs.transform_to(MCMF(obstime=times))
+    with unannounced_leap_seconds():
+        turned = icrs.transform_to(MCMF(obstime=times))
     return np.moveaxis(turned.cartesian.xyz.value, 2, 0)

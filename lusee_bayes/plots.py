@@ -68,7 +68,10 @@ def _orthographic(axes: Axes, grid: HemisphereGrid, pattern: Complex[np.ndarray,
     power = np.abs(pattern)
     phi = np.append(grid.phi, 2 * np.pi)
     closed = np.concatenate([power, power[:, :1]], axis=1) / power.max()
-    x, y = (np.outer(np.sin(grid.theta), f(phi)) for f in (np.cos, np.sin))
+    # the grid has no node at the zenith itself: every azimuth of the first ring meets there
+    closed = np.concatenate([np.full((1, closed.shape[1]), closed[0].mean()), closed])
+    theta = np.append(0.0, grid.theta)
+    x, y = (np.outer(np.sin(theta), f(phi)) for f in (np.cos, np.sin))
     image = axes.pcolormesh(
         x, y, closed, cmap=SEQUENTIAL, vmin=0, vmax=1, shading="gouraud", rasterized=True
     )

@@ -19,11 +19,14 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation as SpatialRotation
 
+from lusee_bayes.checks import InputError
 from lusee_bayes.observation import Observation
 from lusee_bayes.rotations import Rotation, tilt_powers
 
-# bound on a mode's relative error at lmax; at 25 MHz this is 3e-6 of the radiometer noise
+# bound on the relative error of a mode at lmax, and the least order whatever lmax: the bright low
+# modes then leave at most 4e-5 of the radiometer noise of a sample, over one cycle or three
 TILT_TOLERANCE = 1e-5
+LEAST_ORDER = 2
 
 
 class Pointing(eqx.Module):
@@ -49,6 +52,8 @@ class Pointing(eqx.Module):
         ``order`` of the tilt expansion; None picks the lowest one that is exact for every
         purpose, 0 pretends that the axis is fixed at its mean.
         """
+        if order is not None and order < 0:
+            raise InputError(f"the order of the tilt expansion must be 0, 1, ..., got {order}")
         mcmf = observation.mcmf_from_galactic()
         pole_frame = mean_pole_frame(mcmf)
         azimuth, tilt = split(mcmf @ pole_frame.T)
@@ -109,10 +114,10 @@ def split(
 
 
 def sufficient_order(tilt: Float[np.ndarray, "times 2"], lmax: int) -> int:
-    """Lowest order n with (lmax |tilt|)^(n+1) / (n+1)! below TILT_TOLERANCE."""
+    """Lowest order n >= LEAST_ORDER with (lmax |tilt|)^(n+1) / (n+1)! below TILT_TOLERANCE."""
     size = lmax * float(np.hypot(tilt[:, 0], tilt[:, 1]).max())
     order, neglected = 0, size
     while neglected > TILT_TOLERANCE:
         order += 1
         neglected *= size / (order + 1)
-    return order
+    return max(order, LEAST_ORDER)

@@ -14,30 +14,48 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.linalg import expm
-from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.harmonics import mode_numbers, n_modes
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=512)
 def generators(ell: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """K_x, K_y, K_z within one ell, each of shape (2 ell + 1, 2 ell + 1), rows m = -ell..ell."""
+    """K_x, K_y, K_z within one ell, each of shape (2 ell + 1, 2 ell + 1), rows m = -ell..ell.
+
+    From (J_+ a)_m = alpha_m a_(m-1), (J_- a)_m = alpha_(m+1) a_(m+1), with
+    alpha_m = sqrt((ell + m)(ell - m + 1)), written for c_m = sqrt(2) Re a_m, s_m = sqrt(2) Im a_m.
+    """
+    k_x, k_y, k_z = np.zeros((3, 2 * ell + 1, 2 * ell + 1))
+    m = np.arange(1, ell + 1)
+    cosine, sine = ell + m, ell - m
+    k_z[cosine, sine], k_z[sine, cosine] = m, -m
+    # how m - 1 enters row m; with a_0 real its coefficient has no sqrt(2) to share
+    lowering = np.sqrt((ell + m) * (ell - m + 1.0)) / 2
+    lowering[:1] *= np.sqrt(2.0)
+    k_y[cosine, cosine - 1] = -lowering
+    k_y[sine[1:], sine[1:] + 1] = -lowering[1:]
+    k_x[cosine[1:], sine[1:] + 1] = lowering[1:]
+    k_x[sine, cosine - 1] = -lowering
+    return k_x - k_x.T, k_y - k_y.T, k_z
+
+
+@lru_cache(maxsize=512)
+def _eigen_y(ell: int) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues (exact integers) and vectors of the Hermitian i K_y within one ell."""
+    values, vectors = np.linalg.eigh(1j * generators(ell)[1])
+    return np.rint(values), vectors
+
+
+def _block_y(ell: int, angle: float) -> np.ndarray:
+    """exp(angle K_y) within one ell."""
+    values, vectors = _eigen_y(ell)
+    return np.real((vectors * np.exp(-1j * angle * values)) @ vectors.conj().T)
+
+
+def _block_z(ell: int, angle: float) -> np.ndarray:
+    """exp(angle K_z) within one ell."""
     m = np.arange(-ell, ell + 1)
-    raising = np.diag(np.sqrt(ell * (ell + 1.0) - m[:-1] * (m[:-1] + 1.0)), k=-1)
-    j_x, j_y, j_z = (raising + raising.T) / 2, (raising - raising.T) / 2j, np.diag(m + 0.0)
-    # real = U complex for the complete set m = -ell..ell of a real field
-    to_real = np.zeros((2 * ell + 1, 2 * ell + 1), dtype=complex)
-    for order in range(-ell, ell + 1):
-        row, plus, minus = order + ell, abs(order) + ell, -abs(order) + ell
-        sign = (-1.0) ** order
-        if order == 0:
-            to_real[row, row] = 1.0
-        elif order > 0:
-            to_real[row, [plus, minus]] = np.array([1.0, sign]) / np.sqrt(2.0)
-        else:
-            to_real[row, [plus, minus]] = np.array([-1j, 1j * sign]) / np.sqrt(2.0)
-    return tuple(np.real(to_real @ (-1j * j) @ to_real.conj().T) for j in (j_x, j_y, j_z))
+    return np.diag(np.cos(m * angle)) + np.fliplr(np.diag(np.sin(m * angle)))
 
 
 class Rotation(eqx.Module):
@@ -48,12 +66,12 @@ class Rotation(eqx.Module):
     @classmethod
     def from_matrix(cls, matrix: Float[np.ndarray, "3 3"], lmax: int) -> Rotation:
         """D(g) for the proper rotation ``matrix`` that takes vectors n to g n."""
-        w = SpatialRotation.from_matrix(np.asarray(matrix)).as_rotvec()
-        blocks = []
-        for ell in range(lmax + 1):
-            k_x, k_y, k_z = generators(ell)
-            blocks.append(jnp.asarray(expm(w[0] * k_x + w[1] * k_y + w[2] * k_z)))
-        return cls(tuple(blocks))
+        first, tilt, last = euler_zyz(np.asarray(matrix))
+        blocks = [
+            _block_z(ell, first) @ _block_y(ell, tilt) @ _block_z(ell, last)
+            for ell in range(lmax + 1)
+        ]
+        return cls(tuple(jnp.asarray(block) for block in blocks))
 
     @property
     def T(self) -> Rotation:
@@ -66,6 +84,16 @@ class Rotation(eqx.Module):
         for ell, block in enumerate(self.blocks):
             turned.append(modes[..., ell**2 : (ell + 1) ** 2] @ block.T)
         return jnp.concatenate(turned, axis=-1)
+
+
+def euler_zyz(matrix: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
+    """Angles with matrix = R_z(first) R_y(tilt) R_z(last), exact also for a tilt of 0 or pi."""
+    tilt = np.arctan2(np.hypot(matrix[0, 2], matrix[1, 2]), matrix[2, 2])
+    first = np.arctan2(matrix[1, 2], matrix[0, 2])
+    # what is left after undoing the first turn and the tilt; its first column's y and x
+    sideways = np.array([-np.sin(first), np.cos(first), 0.0])
+    along = np.array([np.cos(tilt) * np.cos(first), np.cos(tilt) * np.sin(first), -np.sin(tilt)])
+    return first, tilt, np.arctan2(sideways @ matrix[:, 0], along @ matrix[:, 0])
 
 
 def turn_about_z(

@@ -17,9 +17,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 DATA = Path(
-    os.environ.get(
-        "LUSEE_BAYES_TEST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"
-    )
+    os.environ.get("LUSEE_BAYES_TEST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")
 )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import h5py
 import healpy as hp
 import numpy as np
@@ -11,7 +13,6 @@ from scipy.integrate import quad
 from lusee_bayes.checks import InputError
 from lusee_bayes.sky import free_free, galaxy
 from lusee_bayes.sky.sources import BRIGHT_SOURCES
-import itertools
 
 NSIDE = 64
 

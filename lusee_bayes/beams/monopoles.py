@@ -22,7 +22,7 @@ from lusee_bayes.beams.fields import AntennaFields, phasor, wavenumber
 from lusee_bayes.beams.grid import HemisphereGrid
 from lusee_bayes.beams.product_beams import ProductBeams, product_beams
 from lusee_bayes.beams.regolith import Regolith
-from lusee_bayes.checks import InputError, require_positive
+from lusee_bayes.checks import require_finite, require_positive
 
 # ports 0, 1, 2, 3 point North, East, South, West; phi counts from East towards North
 PORT_AZIMUTHS_DEG = (90.0, 0.0, -90.0, 180.0)
@@ -50,13 +50,14 @@ class Monopoles(eqx.Module):
     azimuths_deg: Float[Array, " antennas"] = eqx.field(default=PORT_AZIMUTHS_DEG, converter=_array)
 
     def __check_init__(self):
+        require_finite("zenith_angle_deg", self.zenith_angle_deg)
+        require_finite("azimuths_deg", self.azimuths_deg)
         require_positive("length_m", self.length_m)
         require_positive("height_m", self.height_m)
 
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         """Field patterns at one frequency, phase centre at the feed, common to all arms."""
-        if not frequency_mhz > 0.0:
-            raise InputError(f"frequency_mhz must be positive, got {frequency_mhz}")
+        require_positive("frequency_mhz", frequency_mhz)
         k = wavenumber(frequency_mhz)
         cos, sin = jnp.cos(grid.theta)[None, :, None], jnp.sin(grid.theta)[None, :, None]
         tilt = jnp.radians(self.zenith_angle_deg)

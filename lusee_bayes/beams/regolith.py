@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from lusee_bayes.beams.fields import wavenumber
-from lusee_bayes.checks import require_positive
+from lusee_bayes.checks import InputError, is_traced, require_positive
 
 N_LAYERS = 8
 DEPTH_M = 100.0
@@ -35,6 +35,8 @@ class Regolith(eqx.Module):
     def __check_init__(self):
         require_positive("surface_permittivity", self.surface_permittivity)
         require_positive("deep_permittivity", self.deep_permittivity)
+        if not is_traced(self.loss_tangent) and not self.loss_tangent >= 0:
+            raise InputError(f"loss_tangent must not be negative, got {self.loss_tangent}")
 
     def permittivities(self) -> Complex[Array, " layers"]:
         """Complex relative permittivity of each layer from the top down."""

@@ -1,0 +1,95 @@
+"""Draw the documentation's figures and print its tables.
+
+Run from the repository's root: python docs/make_figures.py [ULSA folder]
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+import lusee_bayes as lb
+from lusee_bayes.experiment import build_beams
+from lusee_bayes.harmonics import modes_to_map, power_spectrum
+from lusee_bayes.metrics import ell_cross, signal_to_noise
+from lusee_bayes.plots import BLUE, ORANGE, mollweide
+from lusee_bayes.sky.galaxy import galaxy_map
+
+HERE = Path(__file__).parent / "figures"
+
+
+def fixed_axis() -> None:
+    """What it costs to let the Moon turn about a fixed axis: visibilities and the map."""
+    scenario = lb.load_scenario("fiducial")
+    experiment = lb.Experiment.from_scenario(scenario)
+    beams, observation = build_beams(scenario), experiment.observation
+    exact = lb.CouplingMatrix.build(beams, lb.Pointing.of(observation, scenario.lmax, order=6))
+    noise, data = experiment.noise(), experiment.simulate()
+    sigma = np.sqrt(np.asarray(noise.diagonal()))
+    truth = exact @ experiment.sky.modes
+    model = experiment.model()
+    reference = signal_to_noise(model.condition(data.data).mean, experiment.sky.modes)
+    print("| axis | rms [sigma] | worst [sigma] | first ell with SNR < 1 |")
+    print("| --- | --- | --- | --- |")
+    lines = {}
+    for order, name in enumerate(["fixed at its mean", "wanders, first order", "second order"]):
+        coupling = lb.CouplingMatrix.build(
+            beams, lb.Pointing.of(observation, scenario.lmax, order=order)
+        )
+        error = np.abs((coupling @ experiment.sky.modes - truth) / sigma)
+        posterior = lb.LinearGaussian(coupling, model.prior, noise).condition(data.data)
+        snr = signal_to_noise(posterior.mean, experiment.sky.modes)
+        lines[name] = snr
+        print(
+            f"| {name} | {np.sqrt(np.mean(error**2)):.2g} | {error.max():.2g} | {ell_cross(snr)} |"
+        )
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    ell = np.arange(1, len(reference))
+    axes.semilogy(ell, reference[1:], color=BLUE, label="wandering axis (exact)")
+    axes.semilogy(ell, lines["fixed at its mean"][1:], color=ORANGE, ls="--", label="fixed axis")
+    axes.axhline(1.0, color="grey", lw=0.8, ls=":")
+    axes.set(xlabel=r"multipole $\ell$", ylabel=r"$\mathrm{SNR}_\ell$", xlim=(1, ell[-1]))
+    axes.set_title("The same data, two assumptions about the Moon's axis")
+    axes.legend(frameon=False)
+    figure.savefig(HERE / "fixed_axis.png", dpi=90)
+
+
+def embedded_sky(ulsa: Path | None) -> None:
+    """The embedded Galaxy at 1, 3 and 10 MHz, beside ULSA where its maps are at hand."""
+    figure = Figure(figsize=(10, 8.5), layout="constrained")
+    for row, frequency in enumerate((1.0, 3.0, 10.0)):
+        ours = galaxy_map(frequency)
+        pairs = [("embedded", ours)]
+        if ulsa is not None:
+            path = ulsa / f"exp{frequency}MHz_sky_map_with_absorption.hdf5"
+            sky = lb.sky_from_file(path, frequency, 95)
+            pairs.append(("ULSA (Cong et al. 2021)", modes_to_map(sky.modes, 64)))
+        norm = LogNorm(*np.percentile(ours, [1, 99.5]))
+        for column, (name, pixels) in enumerate(pairs):
+            axes = figure.add_subplot(3, 2, 2 * row + column + 1, projection="mollweide")
+            image = mollweide(axes, pixels, norm=norm)
+            axes.set_title(f"{name}, {frequency:g} MHz")
+            figure.colorbar(image, ax=axes, label="K", shrink=0.8)
+    figure.savefig(HERE / "embedded_sky.png", dpi=80)
+    if ulsa is not None:
+        print("| MHz | mean / ULSA's | C_ell / ULSA's, ell = 1..30 |\n| --- | --- | --- |")
+        for frequency in (1.0, 3.0, 10.0):
+            path = ulsa / f"exp{frequency}MHz_sky_map_with_absorption.hdf5"
+            theirs = lb.sky_from_file(path, frequency).modes
+            ours = lb.galaxy_sky(frequency, sources=()).modes
+            ratio = (power_spectrum(ours) / power_spectrum(theirs))[1:31]
+            print(
+                f"| {frequency:g} | {float(ours[0] / theirs[0]):.3f} "
+                f"| {ratio.min():.2f} to {ratio.max():.2f} |"
+            )
+
+
+if __name__ == "__main__":
+    HERE.mkdir(exist_ok=True)
+    embedded_sky(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+    fixed_axis()

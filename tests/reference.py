@@ -1,0 +1,128 @@
+"""Slow, obvious physics, written without the package: what its fast code must agree with.
+
+Nothing here imports lusee_bayes. Harmonics come from scipy one (ell, m) at a time, directions from
+lunarsky's LunarTopo frame, reflection from 2 x 2 characteristic matrices, antenna currents from
+vectors in space. Frames and conventions: topocentric x East, y North, z up; theta from the zenith,
+phi from East towards North; packed real modes at ell^2 + ell + m; time convention exp(+i w t).
+"""
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import ICRS, Galactic
+from lunarsky import LunarTopo, MoonLocation
+from scipy.special import sph_harm_y
+
+SPEED_OF_LIGHT = 299792458.0
+
+
+def real_harmonics(theta, phi, lmax):
+    """Orthonormal real harmonics, (points, modes), from scipy's complex ones."""
+    columns = []
+    for ell in range(lmax + 1):
+        for m in range(-ell, ell + 1):
+            y = sph_harm_y(ell, abs(m), theta, phi)
+            if m == 0:
+                columns.append(y.real)
+            elif m > 0:
+                columns.append(np.sqrt(2.0) * y.real)
+            else:
+                columns.append(-np.sqrt(2.0) * y.imag)
+    return np.stack(columns, axis=-1)
+
+
+def hemisphere(n_theta, n_phi):
+    """theta, phi and solid angle of directions that cover the hemisphere above the horizon."""
+    x, w = np.polynomial.legendre.leggauss(n_theta)
+    theta = np.arccos((x + 1.0) / 2.0)
+    phi = 2.0 * np.pi * (np.arange(n_phi) + 0.5) / n_phi
+    theta, phi = (a.ravel() for a in np.meshgrid(theta, phi, indexing="ij"))
+    return theta, phi, np.repeat(w / 2.0, n_phi) * 2.0 * np.pi / n_phi
+
+
+def galactic_directions(theta, phi, time, lon_deg, lat_deg):
+    """Galactic colatitude and longitude of topocentric directions at one time."""
+    site = MoonLocation.from_selenodetic(lon=lon_deg, lat=lat_deg)
+    here = LunarTopo(
+        az=(np.pi / 2 - phi) * u.rad, alt=(np.pi / 2 - theta) * u.rad, obstime=time, location=site
+    )
+    there = here.transform_to(ICRS()).transform_to(Galactic())
+    return np.pi / 2 - there.b.rad, there.l.rad
+
+
+def visibilities(response, grid, sky, time, *, lon_deg, lat_deg, turntable_deg=0.0):
+    """sum over directions of response x sky x solid angle, for each product (first axis).
+
+    ``response``, (products, points), belongs to the antennas at turntable angle zero, at the
+    directions of ``grid`` (theta, phi, solid angle); turning the antennas moves those directions.
+    """
+    theta, phi, solid_angle = grid
+    turned = phi + np.radians(turntable_deg)
+    directions = galactic_directions(theta, turned, time, lon_deg, lat_deg)
+    lmax = round(np.sqrt(len(sky))) - 1
+    temperature = real_harmonics(*directions, lmax) @ sky
+    return response @ (temperature * solid_angle)
+
+
+def layered_reflection(permittivities, thickness_m, cos_theta, frequency_mhz):
+    """(s, p) of a stack by characteristic matrices of tangential E and H (Born & Wolf 1.6.2).
+
+    ``permittivities``: of the layers from the top, the last without end; all others are
+    ``thickness_m`` thick. s is the ratio of the reflected to the incident tangential E, p that of
+    the tangential H.
+    """
+    k = 2.0e6 * np.pi * frequency_mhz / SPEED_OF_LIGHT
+    ratios = []
+    for polarisation in "sp":
+
+        def admittance(eps, polarisation=polarisation):
+            q = np.sqrt(complex(eps - (1.0 - cos_theta**2)))
+            q = -q if q.imag > 0 else q  # decays downwards under exp(+i w t)
+            return q, q if polarisation == "s" else q / eps
+
+        matrix = np.eye(2, dtype=complex)
+        for eps in permittivities[:-1]:
+            q, y = admittance(eps)
+            delta = k * q * thickness_m
+            matrix = matrix @ np.array(
+                [
+                    [np.cos(delta), 1j * np.sin(delta) / y],
+                    [1j * y * np.sin(delta), np.cos(delta)],
+                ]
+            )
+        _, y0 = admittance(1.0)
+        _, y_end = admittance(permittivities[-1])
+        u_top, v_top = matrix @ np.array([1.0, y_end])
+        ratios.append((y0 * u_top - v_top) / (y0 * u_top + v_top))
+    return tuple(ratios)
+
+
+def arm_response(
+    theta, phi, *, frequency_mhz, length, arm, height=0.0, reflection=(0.0, 0.0), steps=4001
+):
+    """E_theta, E_phi of one arm (unit vector) by Simpson's rule along it, in one direction.
+
+    A plane wave comes from n with its electric field along e; its mirror image in the ground at
+    z = -height comes from n' with the field e' that the reflection (s, p) leaves.
+    """
+    k = 2.0e6 * np.pi * frequency_mhz / SPEED_OF_LIGHT
+    s = np.linspace(0.0, length, steps)
+    simpson = np.ones(steps)
+    simpson[1:-1:2], simpson[2:-1:2] = 4.0, 2.0
+    simpson *= (s[1] - s[0]) / 3.0
+    current = np.sin(k * (length - s)) * simpson
+    sin_t, cos_t, sin_p, cos_p = np.sin(theta), np.cos(theta), np.sin(phi), np.cos(phi)
+    n = np.array([sin_t * cos_p, sin_t * sin_p, cos_t])
+    mirrored = n * np.array([1.0, 1.0, -1.0])
+    e_theta = np.array([cos_t * cos_p, cos_t * sin_p, -sin_t])
+    e_phi = np.array([-sin_p, cos_p, 0.0])
+    r_s, r_p = reflection
+    # H of the theta wave is horizontal and scales by p; E = H x (direction of travel)
+    reflected_theta = -r_p * e_theta * np.array([1.0, 1.0, -1.0])
+    reflected_phi = r_s * e_phi
+    detour = np.exp(-2j * k * height * cos_t)
+    answers = []
+    for direct, reflected in ((e_theta, reflected_theta), (e_phi, reflected_phi)):
+        wave = (arm @ direct) * np.exp(1j * k * s * (arm @ n))
+        echo = (arm @ reflected) * np.exp(1j * k * s * (arm @ mirrored)) * detour
+        answers.append(np.sum(current * (wave + echo)))
+    return tuple(answers)

@@ -1,0 +1,129 @@
+"""What a posterior reports about itself, against the textbook covariance."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference_linear import assert_draws_follow, posterior, random_covariance
+
+from lusee_bayes import posterior as posterior_module
+from lusee_bayes.covariance import DenseCovariance
+from lusee_bayes.linear_gaussian import FORMS, LinearGaussian
+from lusee_bayes.prior import HarmonicPrior, PixelPrior
+
+SPECTRUM = np.array([4.0, 1.0, 0.5, 0.25])
+PER_MODE = np.repeat(SPECTRUM, [1, 3, 5, 7])
+SIZES = [30, 9]  # more and fewer data than the 16 modes
+# numbers of order one, condition below 1e4: 1e4 x 16 x eps
+TOL = 1e-10
+
+
+def conditioned(n_data, form, prior=None, blind=False):
+    """(posterior, the naive one); ``blind``: the last ell is not seen by the data at all."""
+    rng = np.random.default_rng(n_data)
+    a = rng.normal(size=(n_data, 16))
+    if blind:
+        a[:, 9:] = 0.0
+    n, d = random_covariance(rng, n_data), rng.normal(size=n_data)
+    prior = HarmonicPrior(jnp.asarray(SPECTRUM)) if prior is None else prior
+    a = jnp.asarray(a)
+    a = prior.coupling(a) if isinstance(prior, PixelPrior) else a
+    model = LinearGaussian(a, prior, DenseCovariance(jnp.asarray(n)))
+    return model.condition(jnp.asarray(d), form), posterior(a, prior.covariance(), n, d)
+
+
+cases = pytest.mark.parametrize(("n_data", "form"), [(n, f) for n in SIZES for f in FORMS])
+
+
+@cases
+def test_covariance_and_standard_deviations(n_data, form):
+    post, expected = conditioned(n_data, form)
+    covariance = np.asarray(post.covariance())
+    np.testing.assert_allclose(covariance, expected.covariance, atol=TOL)
+    np.testing.assert_allclose(covariance, covariance.T, atol=1e-15)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+    np.testing.assert_allclose(post.std(), expected.std, rtol=TOL)
+    np.testing.assert_allclose(post.mean, expected.mean, atol=TOL)
+
+
+@cases
+def test_std_of_any_direction(n_data, form):
+    post, expected = conditioned(n_data, form)
+    directions = np.random.default_rng(0).normal(size=(23, 16))
+    variance = np.einsum("ni,ij,nj->n", directions, expected.covariance, directions)
+    np.testing.assert_allclose(post.std_of(jnp.asarray(directions)), np.sqrt(variance), rtol=TOL)
+
+
+def test_std_of_does_not_depend_on_the_chunks(monkeypatch):
+    post, _ = conditioned(30, "map")
+    directions = jnp.asarray(np.random.default_rng(0).normal(size=(23, 16)))
+    whole = np.asarray(post.std_of(directions))
+    monkeypatch.setattr(posterior_module, "CHUNK", 5)  # 4 chunks of 5 and one of 3
+    np.testing.assert_allclose(post.std_of(directions), whole, rtol=1e-14)
+
+
+@cases
+def test_draws_have_the_posteriors_mean_and_covariance(n_data, form):
+    """Every entry; a sqrt(2) in the random term would be off by 100 sigma."""
+    post, expected = conditioned(n_data, form)
+    draws = post.sample(jax.random.key(n_data), 20_000)
+    assert draws.shape == (20_000, 16)
+    assert_draws_follow(draws, expected.mean, expected.covariance)
+    assert post.sample(jax.random.key(0)).shape == (16,)
+
+
+def test_the_draw_test_notices_sqrt_two():
+    post, expected = conditioned(30, "map")
+    draws = np.asarray(post.sample(jax.random.key(0), 20_000))
+    narrow = expected.mean + (draws - expected.mean) / np.sqrt(2)
+    with pytest.raises(AssertionError, match="sample covariance off"):
+        assert_draws_follow(narrow, expected.mean, expected.covariance)
+    with pytest.raises(AssertionError, match="sample mean off"):
+        assert_draws_follow(draws + 0.1 * expected.std, expected.mean, expected.covariance)
+
+
+def test_draws_in_pixels():
+    """More unknowns than normals behind them: the covariance has rank 16 of 48."""
+    prior = PixelPrior(jnp.asarray(SPECTRUM), 2)
+    for form in FORMS:
+        post, expected = conditioned(9, form, prior)
+        draws = post.sample(jax.random.key(5), 20_000)
+        assert_draws_follow(draws, expected.mean, expected.covariance)
+
+
+@cases
+def test_prior_fraction(n_data, form):
+    post, expected = conditioned(n_data, form)
+    got = np.asarray(post.prior_fraction())
+    np.testing.assert_allclose(got, expected.std**2 / PER_MODE, rtol=TOL)
+    assert ((got > 0) & (got < 1)).all()
+
+
+@cases
+def test_modes_that_the_data_do_not_see_keep_their_prior(n_data, form):
+    post, expected = conditioned(n_data, form, blind=True)
+    fraction = np.asarray(post.prior_fraction())
+    np.testing.assert_allclose(fraction[9:], 1.0, rtol=1e-14)
+    assert (fraction[:9] < 1).all()
+    np.testing.assert_allclose(np.asarray(post.mean)[9:], 0.0, atol=1e-14)
+    draws = post.sample(jax.random.key(2), 20_000)
+    assert_draws_follow(draws, expected.mean, expected.covariance)
+
+
+@cases
+def test_information_is_the_shrinkage_of_the_covariance(n_data, form):
+    """log2 of the ratio of the volumes, sqrt(|S| / |C|): the mutual information in bits."""
+    post, expected = conditioned(n_data, form)
+    bits = 0.5 * (np.log2(PER_MODE).sum() - np.linalg.slogdet(expected.covariance)[1] / np.log(2))
+    assert float(post.information_bits()) == pytest.approx(bits, rel=TOL)
+
+
+def test_information_of_one_number():
+    """Variance 3 known with a noise of variance 1: 1/2 log2(1 + 3) = 1 bit."""
+    noise = DenseCovariance(jnp.array([[1.0]]))
+    model = LinearGaussian(jnp.array([[1.0]]), HarmonicPrior(jnp.array([3.0])), noise)
+    for form in FORMS:
+        post = model.condition(jnp.array([0.3]), form)
+        assert float(post.information_bits()) == pytest.approx(1.0, rel=1e-15)
