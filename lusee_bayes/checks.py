@@ -43,7 +43,7 @@ def require_shape(name: str, array: Any, shape: tuple[int | None, ...]) -> None:
         s is None or s == g for s, g in zip(shape, got, strict=True)
     )
     if not fits:
-        expected = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
+        expected = str(shape).replace("None", "any")
         raise InputError(f"{name} has shape {got}, expected {expected}")
 
 
@@ -74,6 +74,24 @@ def require_positive(name: str, array: Any, hint: str = "") -> None:
     if bad.any():
         detail = f"got {values}" if values.ndim == 0 else f"fails at {_first_offenders(bad)}"
         raise InputError(f"{name} must be positive, {detail}" + (f"; {hint}" if hint else ""))
+
+
+# |N - N^T| of a matrix that was meant to be symmetric is rounding, relative to its largest entry
+SYMMETRY_TOLERANCE = 1e-12
+
+
+def require_symmetric(name: str, matrices: Any) -> None:
+    """Refuse a matrix, or a stack of them, that differs from its transpose."""
+    if is_traced(matrices):
+        return
+    values = np.asarray(matrices)
+    largest = float(np.abs(values).max())
+    asymmetry = float(np.abs(values - np.swapaxes(values, -1, -2)).max())
+    if asymmetry > SYMMETRY_TOLERANCE * largest:
+        raise InputError(
+            f"{name} is not symmetric: entries differ by up to {asymmetry:.3g} from their mirror "
+            f"images (largest entry {largest:.3g}); give (N + N.T) / 2 if that is what you mean"
+        )
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

@@ -43,7 +43,7 @@ def simulate_command(
     quiet
         Print nothing but errors.
     """
-    console = Console(quiet=quiet)
+    console = Console(quiet=quiet, soft_wrap=True)
     resolved = load_scenario(scenario, set_ or [])
     stages = Stages(console)
     experiment = Experiment.from_scenario(resolved, stages=stages)
@@ -88,7 +88,7 @@ def map_command(
     quiet
         Print nothing but errors.
     """
-    console = Console(quiet=quiet)
+    console = Console(quiet=quiet, soft_wrap=True)
     resolved = load_scenario(scenario, set_ or [])
     folder = output or Path("output") / Path(scenario).stem
     stages = Stages(console)
@@ -144,4 +144,4 @@ def info_command(file: Path) -> None:
 
     Example: lusee-bayes info output/fiducial/posterior.nc
     """
-    Console().print(describe(file), highlight=False, markup=False)
+    Console(soft_wrap=True).print(describe(file), highlight=False, markup=False)

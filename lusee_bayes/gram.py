@@ -17,11 +17,12 @@ N_BLOCKS = 4
 
 
 def gram(w: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
-    """Lower triangle of W^T W; what stands above the diagonal is unspecified."""
+    """W^T W, symmetric to the last bit."""
     columns = w.shape[1]
     edges = np.linspace(0, columns, N_BLOCKS + 1).astype(int)
     rows = []
     for first, end in pairwise(edges):
         block = w[:, first:end].T @ w[:, :end]
         rows.append(jnp.pad(block, ((0, 0), (0, columns - end))))
-    return jnp.concatenate(rows, axis=0)
+    lower = jnp.tril(jnp.concatenate(rows, axis=0))
+    return lower + jnp.tril(lower, -1).T

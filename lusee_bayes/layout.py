@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lusee_bayes.checks import InputError
+from lusee_bayes.checks import InputError, is_traced
 
 
 class DataLayout(eqx.Module):
@@ -66,6 +66,21 @@ class DataLayout(eqx.Module):
             return np.arange(self.size)
         return np.asarray(self.index)
 
+    def require_same(self, other: DataLayout) -> None:
+        """InputError unless ``other`` holds the same samples (where both are known)."""
+        same = (self.n_products, self.n_times, self.size) == (
+            other.n_products,
+            other.n_times,
+            other.size,
+        )
+        if same and self.index is not None and other.index is not None:
+            same = is_traced(self.index, other.index) or np.array_equal(self.index, other.index)
+        if not same:
+            raise InputError(
+                f"two layouts of {self.size} and {other.size} data hold different samples; build "
+                "both terms for the same observation and flags"
+            )
+
     def gather(self, grid: Float[Array, "products times *rest"]) -> Float[Array, data * rest]:
         """The entries of d (and of any trailing axes) out of a full grid."""
         flat = grid.reshape(self.n_products * self.n_times, *grid.shape[2:])
@@ -78,3 +93,16 @@ class DataLayout(eqx.Module):
             return data.reshape(self.n_products, self.n_times, *rest)
         flat = jnp.zeros((self.n_products * self.n_times, *rest), dtype=data.dtype)
         return flat.at[self.index].set(data).reshape(self.n_products, self.n_times, *rest)
+
+    def by_time(
+        self, data: Float[Array, data * columns]
+    ) -> Float[Array, "times products all_columns"]:
+        """Entries of d with the products of one time together, zero where nothing was taken."""
+        grid = self.scatter(data)
+        return jnp.swapaxes(grid.reshape(*grid.shape[:2], -1), 0, 1)
+
+    def from_times(
+        self, grid: Float[Array, "times products all_columns"], shape: tuple[int, ...]
+    ) -> Float[Array, data * columns]:
+        """Inverse of :meth:`by_time`, into an array of ``shape``."""
+        return self.gather(jnp.swapaxes(grid, 0, 1)).reshape(shape)

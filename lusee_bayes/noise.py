@@ -30,6 +30,8 @@ from lusee_bayes.covariance import Covariance, DiagonalCovariance, TimeBlockCova
 from lusee_bayes.layout import DataLayout
 from lusee_bayes.products import all_products, auto_indices, to_matrix
 
+Scalar = float | int | Float[Array, ""]
+
 RADIOMETER_FORMS = ("paper", "exact")
 
 
@@ -37,11 +39,11 @@ def radiometer_noise(
     visibilities: Float[Array, "products times"],
     layout: DataLayout,
     *,
-    bandwidth_hz: float = 1.0e6,
-    step_s: float = 7200.0,
+    bandwidth_hz: Scalar = 1.0e6,
+    step_s: Scalar = 7200.0,
     form: str = "paper",
-    duty_cycle: float = 1.0,
-    factor: float = 1.0,
+    duty_cycle: Scalar = 1.0,
+    factor: Scalar = 1.0,
 ) -> Covariance:
     """Covariance of the radiometer noise around given visibilities, in K^2.
 

@@ -100,8 +100,9 @@ def mollweide(
 
     ``highest_altitude``: draws a dashed line round the region that never rose.
     """
-    lon = np.linspace(180.0, -180.0, 721)
-    lat = np.linspace(-90.0, 90.0, 361)
+    # a degree between nodes, shaded smoothly: no finer than the eye needs, four times faster
+    lon = np.linspace(180.0, -180.0, 361)
+    lat = np.linspace(-90.0, 90.0, 181)
     grid_lon, grid_lat = np.meshgrid(lon, lat)
 
     def at(values):

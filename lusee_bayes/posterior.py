@@ -8,12 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lusee_bayes.checks import AnyArray
+from lusee_bayes.checks import AnyArray, InputError, is_traced
 from lusee_bayes.covariance.base import solve_lower
 from lusee_bayes.prior import Prior
 
 # directions handled at once when standard deviations of many of them are asked for
 CHUNK = 2048
+
+# largest relative error of standard deviations that is accepted
+PRECISION = 1e-3
 
 
 class Posterior(eqx.Module):
@@ -37,8 +40,19 @@ class Posterior(eqx.Module):
         return self.prior.colour(self.white_mean)
 
     def std(self) -> Float[Array, " unknowns"]:
-        """Posterior standard deviation of every unknown, in K."""
-        return self.std_of(jnp.eye(self.prior.size))
+        """Posterior standard deviation of every unknown, in K.
+
+        InputError if rounding in the map-space form makes one of them wrong by more than 1e-3.
+        """
+        white, rounding = _white_std(self)
+        if not is_traced(rounding) and float(rounding) > PRECISION:
+            raise InputError(
+                f"standard deviations of the map-space form would be wrong by {rounding:.1g} of "
+                f"themselves (accepted: {PRECISION:g}): the data are too precise for the normal "
+                "equations; use form='data'"
+            )
+        scale = self.prior.diagonal_root()
+        return self.std_of(jnp.eye(self.prior.size)) if scale is None else scale * white
 
     def std_of(self, directions: Float[AnyArray, "n unknowns"]) -> Float[Array, " n"]:
         """Standard deviation of linear combinations of m.
@@ -76,8 +90,29 @@ class Posterior(eqx.Module):
 
 
 @eqx.filter_jit
-def _std_of(posterior: Posterior, directions: Float[Array, "n unknowns"]) -> Float[Array, " n"]:
-    white = posterior.prior.colour_columns(directions)
+def _white_std(posterior: Posterior) -> tuple[Float[Array, " white"], Float[Array, ""]]:
+    """Standard deviations of u, and the relative error that rounding of Lambda makes in them.
+
+    Lambda_jj (Lambda^-1)_jj, the inflation of a mode's variance by all others, is the condition
+    number that counts: rescaling modes does not change it. Times eps it predicts the difference
+    between the two forms to within a factor 1.5 (fiducial: 1e-6).
+    """
+    white = _std_of(posterior, None)
+    if posterior.basis is not None:
+        return white, jnp.zeros(())
+    inflation = (jnp.tril(posterior.lower) ** 2).sum(1) * white**2
+    return white, np.finfo(np.float64).eps * inflation.max()
+
+
+@eqx.filter_jit
+def _std_of(
+    posterior: Posterior, directions: Float[Array, "n unknowns"] | None
+) -> Float[Array, " n"]:
+    """Of given directions of m, or (None) of every component of u."""
+    if directions is None:
+        white = jnp.eye(posterior.prior.rank)
+    else:
+        white = posterior.prior.colour_columns(directions)
     inside = white if posterior.basis is None else white @ posterior.basis
     half = solve_lower(posterior.lower, inside.T, transpose=False)
     variance = (half**2).sum(0)

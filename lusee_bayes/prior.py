@@ -40,6 +40,10 @@ class Prior(eqx.Module):
         """A G: the columns of A in units of the prior."""
 
     @abstractmethod
+    def diagonal_root(self) -> Float[Array, " unknowns"] | None:
+        """The diagonal of G if G is diagonal, else None."""
+
+    @abstractmethod
     def variance(self) -> Float[Array, " unknowns"]:
         """Diagonal of S, in K^2."""
 
@@ -57,8 +61,11 @@ class Prior(eqx.Module):
 def _require_spectrum(spectrum: Float[Array, " ells"]) -> None:
     require_float64("the prior spectrum", spectrum)
     require_finite("the prior spectrum", spectrum)
-    if not is_traced(spectrum) and bool((spectrum < 0).any()):
-        ell = int(jnp.argmax(spectrum < 0))
+    if is_traced(spectrum):
+        return
+    negative = np.asarray(spectrum) < 0
+    if negative.any():
+        ell = int(np.argmax(negative))
         raise InputError(
             f"the prior spectrum is negative at ell = {ell}: C_ell = {float(spectrum[ell]):.3g}; "
             "a variance cannot be"
@@ -84,14 +91,17 @@ class HarmonicPrior(Prior):
     def rank(self) -> int:
         return self.size
 
-    def _sigma(self) -> Float[Array, " modes"]:
-        return jnp.sqrt(per_mode(self.spectrum))
+    def diagonal_root(self):
+        # the derivative of sqrt at an ell without power is zero here, not infinite
+        power = self.spectrum > 0
+        root = jnp.sqrt(jnp.where(power, self.spectrum, 1.0))
+        return per_mode(jnp.where(power, root, 0.0))
 
     def colour(self, u):
-        return u * self._sigma().reshape(*(1,) * (u.ndim - 1), -1)
+        return u * self.diagonal_root().reshape(*(1,) * (u.ndim - 1), -1)
 
     def colour_columns(self, a):
-        return a * self._sigma()[None]
+        return a * self.diagonal_root()[None]
 
     def variance(self):
         return per_mode(self.spectrum)
@@ -131,6 +141,9 @@ class PixelPrior(Prior):
 
     def colour_columns(self, a):
         return HarmonicPrior(self.spectrum).colour_columns(a @ self.synthesis)
+
+    def diagonal_root(self):
+        return None
 
     def variance(self):
         return self.synthesis**2 @ per_mode(self.spectrum)

@@ -109,9 +109,10 @@ def test_more_data_than_modes(long_run, noise, form):
     assert_calibrated(long_run.standardised(n, n, form))
 
 
-@pytest.mark.parametrize("noise", ["exact", "diagonal+dense"])
-@pytest.mark.parametrize("form", FORMS)
-def test_fewer_data_than_modes(short_run, noise, form):
+@pytest.mark.parametrize(
+    ("form", "noise"), [("map", "exact"), ("data", "exact"), ("data", "diagonal+dense")]
+)
+def test_fewer_data_than_modes(short_run, form, noise):
     n = short_run.noise[noise]
     assert_calibrated(short_run.standardised(n, n, form))
 

@@ -259,7 +259,7 @@ def test_bad_input_is_refused(coupling):
         CouplingMatrix.build(random_beams(0, lmax=5), pointing)
     with pytest.raises(InputError, match="the data layout has 4 products x 7 times"):
         CouplingMatrix.build(random_beams(0), pointing, DataLayout(4, 7))
-    with pytest.raises(InputError, match=r"the sky has shape \(80,\), expected \(81\)"):
+    with pytest.raises(InputError, match=r"the sky has shape \(80,\), expected \(81,\)"):
         coupling @ jnp.zeros(80)
     with pytest.raises(InputError, match=r"the data has shape \(3,\)"):
         coupling.transpose_mv(jnp.zeros(3))

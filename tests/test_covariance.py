@@ -254,7 +254,6 @@ def test_sizes_must_match_in_a_sum():
 # --- known problems of the package: remove the mark when they are mended --------------------------
 
 
-@pytest.mark.xfail(reason="TimeBlockCovariance.absorb takes its own layout for both terms")
 def test_blocks_with_other_flags_are_refused():
     other = FLAGS[:, ::-1]  # as many samples, but not the same ones
     a, b = _terms(FLAGS)[1][1], _terms(other)[1][1]
@@ -262,21 +261,18 @@ def test_blocks_with_other_flags_are_refused():
         a + b
 
 
-@pytest.mark.xfail(reason="mv uses the whole block, the factor its lower triangle: no check")
 def test_asymmetric_blocks_are_refused():
     blocks = jnp.tile(jnp.eye(3)[None], (2, 1, 1)).at[1, 0, 2].set(0.1)
     with pytest.raises(InputError, match="not symmetric"):
         TimeBlockCovariance(blocks, DataLayout(3, 2))
 
 
-@pytest.mark.xfail(reason="the check converts traced values of a concrete matrix to float")
 def test_a_dense_term_can_be_built_inside_jit_from_known_numbers():
     matrix = jnp.asarray(random_covariance(np.random.default_rng(0), 3))
     got = jax.jit(lambda x: DenseCovariance(matrix).solve(x))(jnp.ones(3))
     close(got, np.linalg.solve(np.asarray(matrix), np.ones(3)))
 
 
-@pytest.mark.xfail(reason="DenseCovariance.name is a leaf of the pytree, not static")
 def test_a_dense_term_is_a_pytree_of_arrays():
     cov = DenseCovariance(jnp.eye(3))
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cov))

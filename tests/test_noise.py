@@ -204,7 +204,6 @@ def test_bad_visibilities_are_refused():
 # --- known problems of the package: remove the mark when they are mended --------------------------
 
 
-@pytest.mark.xfail(reason="factor and duty_cycle are annotated float: a sampled one is refused")
 @pytest.mark.parametrize("form", ["paper", "exact"])
 def test_slopes_with_respect_to_the_noise_factor_flow(form):
     slope = jax.grad(lambda f: noise(form, factor=f).log_det())(jnp.asarray(2.0))

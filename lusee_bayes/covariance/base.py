@@ -75,7 +75,7 @@ class Covariance(eqx.Module):
 
     @abstractmethod
     def scaled(self, factor: float | Float[Array, ""]) -> Covariance:
-        """``factor * N``, for a positive factor."""
+        """``factor * N``; the factor must be positive (checked when it is factorised)."""
 
     def solve(self, x: Float[Array, data * columns]) -> Float[Array, data * columns]:
         """N^-1 x."""

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lusee_bayes.checks import (
-    InputError,
-    is_traced,
     require_finite,
     require_float64,
     require_shape,
+    require_symmetric,
 )
 from lusee_bayes.covariance.base import Covariance, Factor, checked_cholesky, solve_lower
-
-# |N - N^T| of a matrix that was meant to be symmetric is rounding, relative to its largest entry
-SYMMETRY_TOLERANCE = 1e-12
 
 
 def _as_columns(x: Float[Array, data * columns]) -> Float[Array, "data all_columns"]:
@@ -47,21 +44,13 @@ class DenseCovariance(Covariance):
     """
 
     matrix: Float[Array, "data data"]
-    name: str = "the dense covariance"
+    name: str = eqx.field(static=True, default="the dense covariance")
 
     def __check_init__(self):
         require_float64(self.name, self.matrix)
         require_shape(self.name, self.matrix, (self.matrix.shape[0],) * 2)
         require_finite(self.name, self.matrix)
-        if not is_traced(self.matrix):
-            largest = float(jnp.abs(self.matrix).max())
-            asymmetry = float(jnp.abs(self.matrix - self.matrix.T).max())
-            if asymmetry > SYMMETRY_TOLERANCE * largest:
-                raise InputError(
-                    f"{self.name} is not symmetric: entries differ by up to {asymmetry:.3g} from "
-                    f"their mirror images (largest entry {largest:.3g}); give (N + N.T) / 2 if "
-                    "that is what you mean"
-                )
+        require_symmetric(self.name, self.matrix)
 
     @property
     def size(self) -> int:

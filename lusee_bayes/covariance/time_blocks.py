@@ -5,22 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lusee_bayes.checks import require_finite, require_float64, require_shape
+from lusee_bayes.checks import require_finite, require_float64, require_shape, require_symmetric
 from lusee_bayes.covariance.base import Covariance, Factor, checked_cholesky, solve_lower
 from lusee_bayes.covariance.diagonal import DiagonalCovariance
 from lusee_bayes.layout import DataLayout
-
-
-def _by_time(layout: DataLayout, x: Float[Array, data * columns]) -> Float[Array, ...]:
-    """Entries of d as (times, products, columns), zero where nothing was taken."""
-    grid = layout.scatter(x)
-    return jnp.swapaxes(grid.reshape(*grid.shape[:2], -1), 0, 1)
-
-
-def _back(
-    layout: DataLayout, grid: Float[Array, "times products all_columns"], shape: tuple[int, ...]
-) -> Float[Array, data * columns]:
-    return layout.gather(jnp.swapaxes(grid, 0, 1)).reshape(shape)
 
 
 class TimeBlockFactor(Factor):
@@ -30,15 +18,15 @@ class TimeBlockFactor(Factor):
     layout: DataLayout
 
     def whiten(self, x):
-        white = solve_lower(self.lower, _by_time(self.layout, x), transpose=False)
-        return _back(self.layout, white, x.shape)
+        white = solve_lower(self.lower, self.layout.by_time(x), transpose=False)
+        return self.layout.from_times(white, x.shape)
 
     def whiten_transpose(self, x):
-        white = solve_lower(self.lower, _by_time(self.layout, x), transpose=True)
-        return _back(self.layout, white, x.shape)
+        white = solve_lower(self.lower, self.layout.by_time(x), transpose=True)
+        return self.layout.from_times(white, x.shape)
 
     def colour(self, z):
-        return _back(self.layout, jnp.tril(self.lower) @ _by_time(self.layout, z), z.shape)
+        return self.layout.from_times(jnp.tril(self.lower) @ self.layout.by_time(z), z.shape)
 
     def log_det(self):
         return 2.0 * jnp.log(jnp.diagonal(self.lower, axis1=1, axis2=2)).sum()
@@ -58,12 +46,13 @@ class TimeBlockCovariance(Covariance):
         require_float64("the noise blocks", blocks)
         n = layout.n_products
         require_shape("the noise blocks", blocks, (layout.n_times, n, n))
-        require_finite("the noise blocks", blocks)
         if layout.index is not None:
             present = layout.present.T
             both = present[:, :, None] & present[:, None, :]
             unit = jnp.eye(n)[None]
             blocks = jnp.where(both, blocks, unit)
+        require_finite("the noise blocks", blocks)
+        require_symmetric("the noise covariance of one time", blocks)
         self.blocks = blocks
         self.layout = layout
 
@@ -72,7 +61,7 @@ class TimeBlockCovariance(Covariance):
         return self.layout.size
 
     def mv(self, x):
-        return _back(self.layout, self.blocks @ _by_time(self.layout, x), x.shape)
+        return self.layout.from_times(self.blocks @ self.layout.by_time(x), x.shape)
 
     def diagonal(self):
         return self.layout.gather(jnp.diagonal(self.blocks, axis1=1, axis2=2).T)
@@ -86,6 +75,7 @@ class TimeBlockCovariance(Covariance):
 
     def absorb(self, other):
         if isinstance(other, TimeBlockCovariance):
+            self.layout.require_same(other.layout)
             # a missing sample's unit row must stay a unit row: the constructor puts it back
             return TimeBlockCovariance(self.blocks + other.blocks, self.layout)
         if isinstance(other, DiagonalCovariance):

@@ -1,0 +1,242 @@
+"""Noise with a memory: blocks couple the products of times up to some distance apart.
+
+The matrix is banded once the products of one time are put together. Its Cholesky factor fills only
+the band, so that factorising costs O(times x bandwidth^2). Several times are gathered into one
+block row, large enough for matrix products to run at full speed and small enough to follow the
+band's edge.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lusee_bayes.checks import (
+    InputError,
+    is_traced,
+    require_finite,
+    require_float64,
+    require_shape,
+    require_symmetric,
+)
+from lusee_bayes.covariance.base import Covariance, Factor, solve_lower
+from lusee_bayes.covariance.diagonal import DiagonalCovariance
+from lusee_bayes.covariance.time_blocks import TimeBlockCovariance
+from lusee_bayes.layout import DataLayout
+
+# rows of a block: measured at 16 products and a band of 43 times, whitening 5232 x 2304 on two
+# cores takes 0.28 s with 112 or 176 rows, 0.30 s with 352, 0.37 s with 704
+ROWS = 176
+
+
+class TimeBandedFactor(Factor):
+    """L in block rows: ``left`` the blocks before the diagonal, ``inverse`` those on it, inverted.
+
+    ``steps``: times in one block row. The last row is padded with rows of the unit matrix.
+    """
+
+    left: Float[Array, "blocks rows window"]
+    diagonal: Float[Array, "blocks rows rows"]
+    inverse: Float[Array, "blocks rows rows"]
+    layout: DataLayout
+
+    def _blocks(self, x: Float[Array, data * columns]) -> Float[Array, "blocks rows all_columns"]:
+        n, rows = self.diagonal.shape[:2]
+        flat = self.layout.by_time(x)
+        flat = flat.reshape(flat.shape[0] * flat.shape[1], -1)
+        flat = jnp.pad(flat, ((0, n * rows - flat.shape[0]), (0, 0)))
+        return flat.reshape(n, rows, -1)
+
+    def _data(self, blocks: Array, shape: tuple[int, ...]) -> Float[Array, data * columns]:
+        flat = blocks.reshape(-1, blocks.shape[-1])
+        n_times, n_products = self.layout.n_times, self.layout.n_products
+        grid = flat[: n_times * n_products].reshape(n_times, n_products, -1)
+        return self.layout.from_times(grid, shape)
+
+    def _window(self, columns: int) -> Float[Array, "window columns"]:
+        return jnp.zeros((self.left.shape[2], columns))
+
+    def whiten(self, x):
+        blocks, rows = self._blocks(x), self.diagonal.shape[1]
+
+        def step(window, row):
+            left, inverse, block = row
+            solved = inverse @ (block - left @ window)
+            return jnp.concatenate([window[rows:], solved]), solved
+
+        start = self._window(blocks.shape[-1])
+        _, solved = jax.lax.scan(step, start, (self.left, self.inverse, blocks))
+        return self._data(solved, x.shape)
+
+    def whiten_transpose(self, x):
+        blocks, rows = self._blocks(x), self.diagonal.shape[1]
+
+        def step(pending, row):
+            left, inverse, block = row
+            solved = inverse.T @ (block - pending[-rows:])
+            pending = jnp.concatenate([jnp.zeros((rows, block.shape[-1])), pending[:-rows]])
+            return pending + left.T @ solved, solved
+
+        start = self._window(blocks.shape[-1])
+        _, solved = jax.lax.scan(step, start, (self.left, self.inverse, blocks), reverse=True)
+        return self._data(solved, x.shape)
+
+    def colour(self, z):
+        blocks, rows = self._blocks(z), self.diagonal.shape[1]
+
+        def step(window, row):
+            left, diagonal, block = row
+            return jnp.concatenate([window[rows:], block]), diagonal @ block + left @ window
+
+        start = self._window(blocks.shape[-1])
+        _, coloured = jax.lax.scan(step, start, (self.left, self.diagonal, blocks))
+        return self._data(coloured, z.shape)
+
+    def log_det(self):
+        return 2.0 * jnp.log(jnp.diagonal(self.diagonal, axis1=1, axis2=2)).sum()
+
+
+class TimeBandedCovariance(Covariance):
+    """N with blocks N(t, t - w) for w = 0..width, zero beyond; all in K^2.
+
+    ``band``: (times, width + 1, products, products), band[t, w] the block of rows t and columns
+    t - w; blocks that would begin before the first time are ignored. Samples that ``layout`` leaves
+    out have their rows and columns replaced by those of the unit matrix.
+    """
+
+    band: Float[Array, "times widths products products"]
+    layout: DataLayout
+    name: str = eqx.field(static=True, default="the time-banded covariance")
+
+    def __init__(
+        self,
+        band: Float[Array, "times widths products products"],
+        layout: DataLayout,
+        name: str = "the time-banded covariance",
+    ):
+        require_float64(name, band)
+        n = layout.n_products
+        require_shape(name, band, (layout.n_times, None, n, n))
+        band = _mask(band, layout)
+        require_finite(name, band)
+        require_symmetric(f"{name} within one time", band[:, 0])
+        self.band = band
+        self.layout = layout
+        self.name = name
+
+    @property
+    def size(self) -> int:
+        return self.layout.size
+
+    @property
+    def width(self) -> int:
+        """Furthest distance in samples at which two times are coupled."""
+        return self.band.shape[1] - 1
+
+    def mv(self, x):
+        grid = self.layout.by_time(x)
+
+        def add(w, total):
+            block = jax.lax.dynamic_index_in_dim(self.band, w, 1, keepdims=False)
+            earlier = block @ jnp.roll(grid, w, axis=0)  # band[t, w] is zero where t < w
+            later = jnp.roll(jnp.swapaxes(block, 1, 2) @ grid, -w, axis=0)
+            return total + earlier + jnp.where(w > 0, 1.0, 0.0) * later
+
+        total = jax.lax.fori_loop(0, self.band.shape[1], add, jnp.zeros_like(grid))
+        return self.layout.from_times(total, x.shape)
+
+    def diagonal(self):
+        return self.layout.gather(jnp.diagonal(self.band[:, 0], axis1=1, axis2=2).T)
+
+    def dense(self):
+        return self.mv(jnp.eye(self.size))
+
+    def factor(self):
+        left, diagonal = _cholesky(*_block_rows(self.band))
+        if not is_traced(diagonal) and not bool(jnp.isfinite(diagonal).all()):
+            lowest = float(jnp.linalg.eigvalsh(self.dense()).min())
+            raise InputError(
+                f"{self.name} is not positive definite: its lowest eigenvalue is {lowest:.3g} "
+                f"(largest entry {float(jnp.abs(self.band).max()):.3g}); add the radiometer noise "
+                "or check the term's amplitude"
+            )
+        unit = jnp.broadcast_to(jnp.eye(diagonal.shape[1]), diagonal.shape)
+        inverse = solve_lower(diagonal, unit, transpose=False)
+        return TimeBandedFactor(left, diagonal, inverse, self.layout)
+
+    def absorb(self, other):
+        if isinstance(other, TimeBandedCovariance | TimeBlockCovariance):
+            self.layout.require_same(other.layout)
+        if isinstance(other, TimeBandedCovariance):
+            wide, narrow = sorted((self.band, other.band), key=lambda b: -b.shape[1])
+            extra = wide.shape[1] - narrow.shape[1]
+            narrow = jnp.pad(narrow, ((0, 0), (0, extra), (0, 0), (0, 0)))
+            return TimeBandedCovariance(wide + narrow, self.layout, self.name)
+        if isinstance(other, DiagonalCovariance):
+            other = TimeBlockCovariance(jnp.zeros_like(self.band[:, 0]), self.layout).absorb(other)
+        if isinstance(other, TimeBlockCovariance):
+            band = self.band.at[:, 0].add(other.blocks)
+            return TimeBandedCovariance(band, self.layout, self.name)
+        return None
+
+    def scaled(self, factor):
+        return TimeBandedCovariance(factor * self.band, self.layout, self.name)
+
+
+def _mask(band: Array, layout: DataLayout) -> Array:
+    """Zero what lies before the first time and at missing samples; units on their diagonal."""
+    n_times, widths = band.shape[:2]
+    inside = np.arange(n_times)[:, None] >= np.arange(widths)[None]
+    if layout.index is None and inside.all():
+        return band
+    present = layout.present.T
+    earlier = np.maximum(np.arange(n_times)[:, None] - np.arange(widths)[None], 0)
+    both = present[:, None, :, None] & present[earlier][:, :, None, :]
+    band = jnp.where(both & jnp.asarray(inside)[:, :, None, None], band, 0.0)
+    unit = jnp.eye(layout.n_products)[None] * (~present)[:, :, None].astype(band.dtype)
+    return band.at[:, 0].add(unit)
+
+
+def _block_rows(band: Array) -> tuple[Array, Array]:
+    """Gather the band into block rows: (blocks, rows, window) before the diagonal, and on it."""
+    n_times, widths, products, _ = band.shape
+    steps = max(1, ROWS // products)
+    before = max(1, -(-(widths - 1) // steps))  # block columns that the band reaches back
+    n = -(-n_times // steps)
+    padded = jnp.pad(band, ((0, n * steps - n_times), (0, 0), (0, 0), (0, 0)))
+    padding = jnp.asarray(np.arange(n * steps) >= n_times, dtype=band.dtype)
+    padded = padded.at[:, 0].add(padding[:, None, None] * jnp.eye(products)[None])
+    row, column = np.arange(steps)[:, None], np.arange((before + 1) * steps)[None]
+    distance = row + before * steps - column
+    valid = jnp.asarray((distance >= 0) & (distance < widths))
+    index = np.clip(distance, 0, widths - 1)
+    grouped = padded.reshape(n, steps, widths, products, products)
+    blocks = grouped[:, row, index]  # (n, steps, columns, products, products)
+    blocks = jnp.where(valid[None, :, :, None, None], blocks, 0.0)
+    blocks = jnp.swapaxes(blocks, 2, 3).reshape(n, steps * products, -1)
+    split = before * steps * products
+    return blocks[:, :, :split], blocks[:, :, split:]
+
+
+@eqx.filter_jit
+def _cholesky(left: Array, diagonal: Array) -> tuple[Array, Array]:
+    """Block rows of L from those of N.
+
+    Row i of L before the diagonal solves  L_i W^T = N_i,  with W the part of L that the band still
+    reaches: the lower triangle of the last block rows.
+    """
+    rows, window = left.shape[1:]
+
+    def step(reach, row):
+        before, on = row
+        solved = solve_lower(reach, before.T, transpose=False).T
+        lower = jax.lax.linalg.cholesky(on - solved @ solved.T, symmetrize_input=False)
+        shifted = jnp.zeros_like(reach).at[:-rows, :-rows].set(reach[rows:, rows:])
+        new = jnp.concatenate([solved[:, rows:], jnp.tril(lower)], axis=1)
+        return shifted.at[-rows:].set(new), (solved, jnp.tril(lower))
+
+    _, factor = jax.lax.scan(step, jnp.eye(window), (left, diagonal))
+    return factor
