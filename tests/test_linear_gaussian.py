@@ -23,10 +23,11 @@ from lusee_bayes.checks import InputError
 from lusee_bayes.coupling import CouplingMatrix
 from lusee_bayes.covariance import DenseCovariance, DiagonalCovariance, TimeBlockCovariance
 from lusee_bayes.layout import DataLayout
-from lusee_bayes.linear_gaussian import CONVERGENCE, FORMS, LinearGaussian
+from lusee_bayes.linear_gaussian import LinearGaussian
 from lusee_bayes.noise import radiometer_noise
 from lusee_bayes.observation import Observation, Run
 from lusee_bayes.prior import HarmonicPrior
+from lusee_bayes.solver import CONVERGENCE, FORMS
 
 LMAX, N_MODES = 3, 16
 SPECTRUM = np.array([4.0, 1.0, 0.5, 0.25])
