@@ -81,12 +81,12 @@ class DataLayout(eqx.Module):
                 "both terms for the same observation and flags"
             )
 
-    def gather(self, grid: Float[Array, "products times *rest"]) -> Float[Array, data * rest]:
+    def gather(self, grid: Float[Array, "products times *rest"]) -> Float[Array, "data *rest"]:
         """The entries of d (and of any trailing axes) out of a full grid."""
         flat = grid.reshape(self.n_products * self.n_times, *grid.shape[2:])
         return flat if self.index is None else flat[self.index]
 
-    def scatter(self, data: Float[Array, data * rest]) -> Float[Array, "products times *rest"]:
+    def scatter(self, data: Float[Array, "data *rest"]) -> Float[Array, "products times *rest"]:
         """Put the entries of d back onto the full grid, zero where nothing was taken."""
         rest = data.shape[1:]
         if self.index is None:
@@ -95,7 +95,7 @@ class DataLayout(eqx.Module):
         return flat.at[self.index].set(data).reshape(self.n_products, self.n_times, *rest)
 
     def by_time(
-        self, data: Float[Array, data * columns]
+        self, data: Float[Array, "data *columns"]
     ) -> Float[Array, "times products all_columns"]:
         """Entries of d with the products of one time together, zero where nothing was taken."""
         grid = self.scatter(data)
@@ -103,6 +103,6 @@ class DataLayout(eqx.Module):
 
     def from_times(
         self, grid: Float[Array, "times products all_columns"], shape: tuple[int, ...]
-    ) -> Float[Array, data * columns]:
+    ) -> Float[Array, "data *columns"]:
         """Inverse of :meth:`by_time`, into an array of ``shape``."""
         return self.gather(jnp.swapaxes(grid, 0, 1)).reshape(shape)

@@ -109,8 +109,8 @@ def mollweide(
         return healpy.get_interp_val(values, grid_lon, grid_lat, lonlat=True)
 
     x, y = np.radians(-grid_lon), np.radians(grid_lat)
-    colours = colormaps[cmap].copy()
-    colours.set_bad(colours(0.0))  # negative temperatures have no logarithm: the darkest colour
+    # negative temperatures have no logarithm: they take the darkest colour
+    colours = colormaps[cmap].with_extremes(bad=colormaps[cmap](0.0))
     image = axes.pcolormesh(
         x, y, at(pixels), cmap=colours, norm=norm, shading="gouraud", rasterized=True
     )

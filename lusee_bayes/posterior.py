@@ -69,7 +69,7 @@ class Posterior(eqx.Module):
         """C as a matrix, in K^2."""
         return _covariance(self)
 
-    def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, ...]:
+    def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
         """A draw of m, shape (unknowns,); with ``n``, that many, shape (n, unknowns)."""
         z = jax.random.normal(key, (1 if n is None else n, self.prior.rank), dtype=jnp.float64)
         draws = _colour(self, z)
@@ -83,6 +83,15 @@ class Posterior(eqx.Module):
         """
         prior = self.prior.variance()
         return jnp.where(prior > 0, self.std() ** 2 / jnp.where(prior > 0, prior, 1.0), 0.0)
+
+    def rms_shift_from(self, other: Posterior) -> Float[Array, ""]:
+        """Distance of the two means, rms over modes, in standard deviations of this posterior."""
+        shift = self.white_mean - other.white_mean
+        inside = shift if self.basis is None else self.basis.T @ shift
+        squared = ((inside @ jnp.tril(self.lower)) ** 2).sum()
+        if self.basis is not None:
+            squared = squared + ((shift - self.basis @ inside) ** 2).sum()
+        return jnp.sqrt(squared / shift.shape[0])
 
     def information_bits(self) -> Float[Array, ""]:
         """Information about the sky gained from the data: ln|Lambda| / 2 in bits."""

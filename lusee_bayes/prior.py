@@ -52,7 +52,7 @@ class Prior(eqx.Module):
         root = self.colour(jnp.eye(self.rank))
         return root.T @ root
 
-    def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, ...]:
+    def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
         """A sky drawn from the prior, shape (unknowns,); with ``n``, shape (n, unknowns)."""
         shape = (self.rank,) if n is None else (n, self.rank)
         return self.colour(jax.random.normal(key, shape, dtype=jnp.float64))

@@ -52,7 +52,7 @@ def auto_indices(n_antennas: int = N_ANTENNAS) -> np.ndarray:
     return np.array([k for k, p in enumerate(all_products(n_antennas)) if p.i == p.j])
 
 
-def to_real(matrix: Complex[Array, "antennas antennas *rest"]) -> Float[Array, products * rest]:
+def to_real(matrix: Complex[Array, "antennas antennas *rest"]) -> Float[Array, "products *rest"]:
     """Products of a Hermitian matrix V_ij (first two axes) in luseepy's order."""
     products = all_products(matrix.shape[0])
     picked = matrix[np.array([p.i for p in products]), np.array([p.j for p in products])]
@@ -62,7 +62,7 @@ def to_real(matrix: Complex[Array, "antennas antennas *rest"]) -> Float[Array, p
 
 
 def to_matrix(
-    products: Float[Array, products * rest],
+    products: Float[Array, "products *rest"],
 ) -> Complex[Array, "antennas antennas *rest"]:
     """The Hermitian matrix V_ij that has these real products; inverse of :func:`to_real`."""
     n = round(np.sqrt(products.shape[0]))

@@ -57,6 +57,7 @@ class MapResult:
     pixel_std: Float[np.ndarray, " pixels"]
     highest_altitude: Float[np.ndarray, " pixels"]
     chi2: float
+    rounds: int = 1
     seconds: dict[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -66,8 +67,8 @@ class MapResult:
         """Condition the experiment's model on ``data`` and work out the uncertainties."""
         stages = stages or Stages()
         with stages("posterior"):
-            model = experiment.model(data)
-            posterior = jax.block_until_ready(model.condition(data.data))
+            model, posterior, rounds = experiment.infer(data)
+            jax.block_until_ready(posterior.white_mean)
         nside = experiment.scenario.map_nside
         with stages("standard deviations"):
             std = np.asarray(posterior.std())
@@ -82,6 +83,7 @@ class MapResult:
             pixel_std=pixel_std,
             highest_altitude=highest_altitude(data.observation, nside),
             chi2=float(residuals @ residuals),
+            rounds=rounds,
             seconds=stages.seconds,
         )
 
@@ -132,6 +134,8 @@ class MapResult:
             "n_data": self.model.n_data,
             "n_missing": self.data.n_missing,
             "n_modes": self.model.prior.size,
+            "rounds": self.rounds,
+            "beam_rms_difference": self.experiment.beam_rms_difference(),
             "mean_refinement_sigma": float(self.posterior.refinement),
             "never_observed_fraction": float((self.highest_altitude < 0).mean()),
             "seconds": {name: round(s, 3) for name, s in self.seconds.items()},

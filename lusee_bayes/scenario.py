@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from lusee_bayes.checks import InputError, nearest
 
@@ -96,10 +96,46 @@ class RadiometerSection(Section):
     temperature: Literal["model", "measured"] = "model"
 
 
+Treatment = Literal["marginalised", "ignored"]
+
+
+class GainSection(Section):
+    """Gain drifts in the data; ``marginalised`` puts their covariance into N, ``ignored`` not.
+
+    ``visibilities``: the d that the covariance is built around. ``posterior`` starts from the
+    measured ones and repeats with the map's prediction until the map stops moving.
+    """
+
+    sigma: Positive = 0.01
+    correlation_h: Positive = 10.0
+    treatment: Treatment = "marginalised"
+    visibilities: Literal["model", "measured", "posterior"] = "model"
+
+
+class BeamErrorSection(Section):
+    """Beams that differ from the model's in the data; marginalised in N or ignored.
+
+    ``shift_mhz``: the data are taken with the beams of frequency + shift. ``parameters``: standard
+    deviations of parameters of the embedded antennas, whose errors are drawn with the seed.
+    """
+
+    shift_mhz: float | None = None
+    parameters: dict[str, Positive] = {}
+    treatment: Treatment = "marginalised"
+
+    @model_validator(mode="after")
+    def _one_direction(self) -> BeamErrorSection:
+        if (self.shift_mhz is None) == (not self.parameters):
+            raise ValueError("give either shift_mhz or parameters")
+        return self
+
+
 class NoiseSection(Section):
-    """The terms of N."""
+    """The terms of N; a term that is left out is neither in the data nor in N."""
 
     radiometer: RadiometerSection = RadiometerSection()
+    gain: GainSection | None = None
+    beam: BeamErrorSection | None = None
 
 
 class Scenario(Section):

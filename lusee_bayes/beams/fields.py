@@ -19,7 +19,7 @@ def wavenumber(frequency_mhz: float | Float[Array, ""]) -> float | Float[Array, 
     return 2.0e6 * np.pi * frequency_mhz / SPEED_OF_LIGHT
 
 
-def phasor(angle: Float[Array, ...]) -> Complex[Array, ...]:
+def phasor(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
     """exp(i angle)."""
     return jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
 

@@ -31,7 +31,7 @@ PORT_AZIMUTHS_DEG = (90.0, 0.0, -90.0, 180.0)
 CURRENT_NODES = 16
 
 
-def _array(x) -> Float[Array, ...]:
+def _array(x) -> Float[Array, "..."]:
     return jnp.asarray(x, dtype=jnp.float64)
 
 

@@ -22,25 +22,29 @@ from lusee_bayes.checks import InputError, is_traced
 
 
 class Factor(eqx.Module):
-    """A square root L of a covariance: N = L L^T. L need not be triangular."""
+    """A square root L of a covariance: N = L L^T.
+
+    L need not be triangular, and the order of whitened entries is the factor's own: only L z of
+    independent normals z, and products of whitened vectors with each other, mean anything.
+    """
 
     @abstractmethod
-    def whiten(self, x: Float[Array, data * columns]) -> Float[Array, data * columns]:
+    def whiten(self, x: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:
         """L^-1 x, for a vector or for every column of a matrix."""
 
     @abstractmethod
-    def whiten_transpose(self, x: Float[Array, data * columns]) -> Float[Array, data * columns]:
+    def whiten_transpose(self, x: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:
         """L^-T x."""
 
     @abstractmethod
-    def colour(self, z: Float[Array, data * columns]) -> Float[Array, data * columns]:
+    def colour(self, z: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:
         """L z: turns independent unit normals into draws of N(0, N)."""
 
     @abstractmethod
     def log_det(self) -> Float[Array, ""]:
         """ln |N|."""
 
-    def solve(self, x: Float[Array, data * columns]) -> Float[Array, data * columns]:
+    def solve(self, x: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:
         """N^-1 x."""
         return self.whiten_transpose(self.whiten(x))
 
@@ -54,7 +58,7 @@ class Covariance(eqx.Module):
         """Number of data."""
 
     @abstractmethod
-    def mv(self, x: Float[Array, data * columns]) -> Float[Array, data * columns]:
+    def mv(self, x: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:
         """N x, for a vector or for every column of a matrix."""
 
     @abstractmethod
@@ -77,7 +81,7 @@ class Covariance(eqx.Module):
     def scaled(self, factor: float | Float[Array, ""]) -> Covariance:
         """``factor * N``; the factor must be positive (checked when it is factorised)."""
 
-    def solve(self, x: Float[Array, data * columns]) -> Float[Array, data * columns]:
+    def solve(self, x: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:
         """N^-1 x."""
         return self.factor().solve(x)
 
@@ -85,7 +89,7 @@ class Covariance(eqx.Module):
         """ln |N|."""
         return self.factor().log_det()
 
-    def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, ...]:
+    def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
         """A draw of N(0, N), shape (data,); with ``n``, that many draws, shape (n, data)."""
         z = jax.random.normal(key, (self.size, 1 if n is None else n), dtype=jnp.float64)
         draws = self.factor().colour(z).T

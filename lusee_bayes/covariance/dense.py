@@ -15,7 +15,7 @@ from lusee_bayes.checks import (
 from lusee_bayes.covariance.base import Covariance, Factor, checked_cholesky, solve_lower
 
 
-def _as_columns(x: Float[Array, data * columns]) -> Float[Array, "data all_columns"]:
+def _as_columns(x: Float[Array, "data *columns"]) -> Float[Array, "data all_columns"]:
     return x.reshape(x.shape[0], -1)
 
 

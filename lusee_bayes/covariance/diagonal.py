@@ -9,7 +9,7 @@ from lusee_bayes.checks import require_float64, require_positive, require_shape
 from lusee_bayes.covariance.base import Covariance, Factor
 
 
-def _down(vector: Float[Array, " data"], x: Float[Array, data * columns]) -> Float[Array, ...]:
+def _down(vector: Float[Array, " data"], x: Float[Array, "data *columns"]) -> Float[Array, "..."]:
     """The vector shaped to multiply the rows of x."""
     return vector.reshape(-1, *(1,) * (x.ndim - 1))
 

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from lusee_bayes.checks import (
     InputError,
@@ -35,7 +35,8 @@ ROWS = 176
 class TimeBandedFactor(Factor):
     """L in block rows: ``left`` the blocks before the diagonal, ``inverse`` those on it, inverted.
 
-    ``steps``: times in one block row. The last row is padded with rows of the unit matrix.
+    The last block row is padded with rows of the unit matrix. Whitened entries are in order of
+    time, which spares a transposition of every matrix that is whitened.
     """
 
     left: Float[Array, "blocks rows window"]
@@ -43,24 +44,44 @@ class TimeBandedFactor(Factor):
     inverse: Float[Array, "blocks rows rows"]
     layout: DataLayout
 
-    def _blocks(self, x: Float[Array, data * columns]) -> Float[Array, "blocks rows all_columns"]:
+    def _pad(self, flat: Float[Array, "entries columns"]) -> Float[Array, "blocks rows columns"]:
         n, rows = self.diagonal.shape[:2]
-        flat = self.layout.by_time(x)
-        flat = flat.reshape(flat.shape[0] * flat.shape[1], -1)
         flat = jnp.pad(flat, ((0, n * rows - flat.shape[0]), (0, 0)))
         return flat.reshape(n, rows, -1)
 
-    def _data(self, blocks: Array, shape: tuple[int, ...]) -> Float[Array, data * columns]:
+    def _from_data(self, x: Float[Array, "data *columns"]) -> Float[Array, "blocks rows last"]:
+        grid = self.layout.by_time(x)
+        return self._pad(grid.reshape(grid.shape[0] * grid.shape[1], -1))
+
+    def _to_data(self, blocks: Array, shape: tuple[int, ...]) -> Float[Array, "data *columns"]:
         flat = blocks.reshape(-1, blocks.shape[-1])
         n_times, n_products = self.layout.n_times, self.layout.n_products
         grid = flat[: n_times * n_products].reshape(n_times, n_products, -1)
         return self.layout.from_times(grid, shape)
 
+    def _in_time_order(self) -> Int[Array, " data"] | None:
+        """Positions of the samples that are there, counted with products running fastest."""
+        if self.layout.index is None:
+            return None
+        return jnp.flatnonzero(self.layout.present.T.ravel(), size=self.layout.size)
+
+    def _from_white(self, z: Float[Array, "data *columns"]) -> Float[Array, "blocks rows last"]:
+        flat, where = z.reshape(z.shape[0], -1), self._in_time_order()
+        if where is not None:
+            n = self.layout.n_times * self.layout.n_products
+            flat = jnp.zeros((n, flat.shape[1])).at[where].set(flat)
+        return self._pad(flat)
+
+    def _to_white(self, blocks: Array, shape: tuple[int, ...]) -> Float[Array, "data *columns"]:
+        flat, where = blocks.reshape(-1, blocks.shape[-1]), self._in_time_order()
+        n = self.layout.n_times * self.layout.n_products
+        return (flat[:n] if where is None else flat[where]).reshape(shape)
+
     def _window(self, columns: int) -> Float[Array, "window columns"]:
         return jnp.zeros((self.left.shape[2], columns))
 
     def whiten(self, x):
-        blocks, rows = self._blocks(x), self.diagonal.shape[1]
+        blocks, rows = self._from_data(x), self.diagonal.shape[1]
 
         def step(window, row):
             left, inverse, block = row
@@ -69,10 +90,10 @@ class TimeBandedFactor(Factor):
 
         start = self._window(blocks.shape[-1])
         _, solved = jax.lax.scan(step, start, (self.left, self.inverse, blocks))
-        return self._data(solved, x.shape)
+        return self._to_white(solved, x.shape)
 
     def whiten_transpose(self, x):
-        blocks, rows = self._blocks(x), self.diagonal.shape[1]
+        blocks, rows = self._from_white(x), self.diagonal.shape[1]
 
         def step(pending, row):
             left, inverse, block = row
@@ -82,10 +103,10 @@ class TimeBandedFactor(Factor):
 
         start = self._window(blocks.shape[-1])
         _, solved = jax.lax.scan(step, start, (self.left, self.inverse, blocks), reverse=True)
-        return self._data(solved, x.shape)
+        return self._to_data(solved, x.shape)
 
     def colour(self, z):
-        blocks, rows = self._blocks(z), self.diagonal.shape[1]
+        blocks, rows = self._from_white(z), self.diagonal.shape[1]
 
         def step(window, row):
             left, diagonal, block = row
@@ -93,7 +114,7 @@ class TimeBandedFactor(Factor):
 
         start = self._window(blocks.shape[-1])
         _, coloured = jax.lax.scan(step, start, (self.left, self.diagonal, blocks))
-        return self._data(coloured, z.shape)
+        return self._to_data(coloured, z.shape)
 
     def log_det(self):
         return 2.0 * jnp.log(jnp.diagonal(self.diagonal, axis1=1, axis2=2)).sum()

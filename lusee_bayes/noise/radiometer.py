@@ -1,6 +1,6 @@
-"""Terms of the noise covariance N that the instrument's physics gives.
+"""Radiometer noise, in two forms.
 
-Radiometer noise in two forms. With T_ij(t) the visibilities of the four antennas in K, bandwidth
+With T_ij(t) the visibilities of the four antennas in K, bandwidth
 df and integration time dt (times the duty cycle):
 
     paper   sigma_k^2 = (T_ii T_jj + V_k^2) / (2 df dt), independent;

@@ -1,0 +1,26 @@
+"""The terms of N: what the instrument adds to the sky's visibilities, as covariances."""
+
+from lusee_bayes.noise.beam_error import (
+    beam_error_noise,
+    derivative,
+    difference,
+    moved,
+    rms_difference,
+)
+from lusee_bayes.noise.gain_drift import GainDrift, with_gains
+from lusee_bayes.noise.radiometer import exact_blocks, paper_variance, radiometer_noise
+from lusee_bayes.noise.templates import template_noise
+
+__all__ = [
+    "GainDrift",
+    "beam_error_noise",
+    "derivative",
+    "difference",
+    "exact_blocks",
+    "moved",
+    "paper_variance",
+    "radiometer_noise",
+    "rms_difference",
+    "template_noise",
+    "with_gains",
+]

@@ -1,0 +1,143 @@
+"""Gains that drift: per-antenna Gaussian processes g_i(t) that multiply the visibilities.
+
+    V_ij -> (1 + g_i)(1 + g_j) V_ij,    <g_i(t) g_j(t')> = delta_ij C_g(t, t'),
+    C_g = sigma_g^2 exp(-(t - t')^2 / (2 sigma_t^2))
+
+Marginalised over g, the error is a noise term with (paper, appendix A)
+
+    Cov(e_ij(t), e_kl(t')) = d_ij(t) d_kl(t') C_g [ (dik + dil + djk + djl)
+                                                    + C_g (dik djl + dil djk) ]
+
+and with the mean sigma_g^2 d_ii in the autos. The quadratic part is not negligible: at sigma_g =
+0.01 it is 1e-4 of the signal, ten times the radiometer noise.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lusee_bayes.checks import require_finite, require_float64, require_positive, require_shape
+from lusee_bayes.covariance import TimeBandedCovariance
+from lusee_bayes.layout import DataLayout
+from lusee_bayes.products import Product, all_products
+
+# C_g is dropped where it is below double precision, relative to sigma_g^2: exp(-x^2 / 2) = eps
+REACH = float(np.sqrt(-2.0 * np.log(np.finfo(np.float64).eps)))
+
+
+def _scalar(x) -> Float[Array, ""]:
+    return jnp.asarray(x, dtype=jnp.float64)
+
+
+class GainDrift(eqx.Module):
+    """Gain drifts of standard deviation ``sigma`` and correlation time ``correlation_h`` (hours).
+
+    The same for all antennas, independent between them. Both are differentiable where the band of
+    the covariance does not have to be worked out from them.
+    """
+
+    sigma: Float[Array, ""] = eqx.field(converter=_scalar)
+    correlation_h: Float[Array, ""] = eqx.field(default=10.0, converter=_scalar)
+
+    def __check_init__(self):
+        require_positive("the gain drift's sigma", self.sigma)
+        require_positive("the gain drift's correlation time in hours", self.correlation_h)
+
+    def kernel(self, lag_h: Float[Array, "..."]) -> Float[Array, "..."]:
+        """C_g at lags in hours."""
+        return self.sigma**2 * jnp.exp(-((lag_h / self.correlation_h) ** 2) / 2.0)
+
+    def width(self, hours: Float[np.ndarray, " times"]) -> int:
+        """How many samples apart two times can be and still be correlated."""
+        reach = REACH * float(self.correlation_h)
+        first = np.searchsorted(hours, np.asarray(hours) - reach)
+        return int((np.arange(len(hours)) - first).max())
+
+    def covariance(
+        self,
+        visibilities: Float[Array, "products times"],
+        hours: Float[np.ndarray, " times"],
+        layout: DataLayout,
+        width: int | None = None,
+    ) -> TimeBandedCovariance:
+        """The noise term of the drifts, around given visibilities d, in K^2.
+
+        visibilities : d_k(t) of all products on the full time grid, in K; hours : (times,) sample
+        times, growing; width : of the band in samples, by default as far as C_g reaches.
+        Semidefinite: add the radiometer noise before solving with it.
+        """
+        require_float64("the visibilities", visibilities)
+        require_shape("the visibilities", visibilities, (layout.n_products, layout.n_times))
+        require_finite("the visibilities", visibilities)
+        width = self.width(hours) if width is None else width
+        earlier = np.arange(layout.n_times)[:, None] - np.arange(width + 1)[None]
+        lag = np.asarray(hours)[:, None] - np.asarray(hours)[np.maximum(earlier, 0)]
+        kernel = jnp.where(jnp.asarray(earlier >= 0), self.kernel(jnp.asarray(lag)), 0.0)
+        linear, quadratic = shared_antennas(layout.n_products)
+        band = _band(
+            visibilities, kernel, jnp.asarray(earlier), jnp.asarray(linear), jnp.asarray(quadratic)
+        )
+        return TimeBandedCovariance(band, layout, "the gain-drift covariance")
+
+    def mean_response(self, n_products: int) -> Float[Array, " products"]:
+        """Factor by which each product is larger on average: 1 + sigma_g^2 for autos, else 1."""
+        products = all_products(round(np.sqrt(n_products)))
+        auto = jnp.asarray([1.0 if p.i == p.j else 0.0 for p in products])
+        return 1.0 + self.sigma**2 * auto
+
+    def sample(
+        self, key: PRNGKeyArray, hours: Float[np.ndarray, " times"], n_antennas: int = 4
+    ) -> Float[Array, "antennas times"]:
+        """Draw g_i(t) with exactly this covariance.
+
+        White noise on a grid of sigma_t / 4, convolved with a Gaussian of width sigma_t / sqrt(2);
+        the sum over such a grid equals the integral to exp(-16 pi^2).
+        """
+        spacing = float(self.correlation_h) / 4.0
+        hours = np.asarray(hours)
+        margin = REACH * float(self.correlation_h)
+        grid = np.arange(hours.min() - margin, hours.max() + margin, spacing)
+        lag = (hours[:, None] - grid[None]) / float(self.correlation_h)
+        shape = np.sqrt(spacing / float(self.correlation_h) * np.sqrt(2.0 / np.pi))
+        white = jax.random.normal(key, (n_antennas, len(grid)), dtype=jnp.float64)
+        return self.sigma * shape * white @ jnp.asarray(np.exp(-(lag**2)).T)
+
+
+def with_gains(
+    visibilities: Float[Array, "products times"], gains: Float[Array, "antennas times"]
+) -> Float[Array, "products times"]:
+    """(1 + g_i)(1 + g_j) V_ij, exactly, for every product."""
+    products = all_products(gains.shape[0])
+    i, j = np.array([p.i for p in products]), np.array([p.j for p in products])
+    return (1.0 + gains[i]) * (1.0 + gains[j]) * visibilities
+
+
+def shared_antennas(n_products: int) -> tuple[np.ndarray, np.ndarray]:
+    """(dik + dil + djk + djl) and (dik djl + dil djk) for every pair of products."""
+    products = all_products(round(np.sqrt(n_products)))
+
+    def linear(p: Product, q: Product) -> int:
+        return (p.i == q.i) + (p.i == q.j) + (p.j == q.i) + (p.j == q.j)
+
+    def quadratic(p: Product, q: Product) -> int:
+        return (p.i == q.i) * (p.j == q.j) + (p.i == q.j) * (p.j == q.i)
+
+    return tuple(
+        np.array([[float(f(p, q)) for q in products] for p in products])
+        for f in (linear, quadratic)
+    )
+
+
+@eqx.filter_jit
+def _band(
+    visibilities: Array, kernel: Array, earlier: Array, linear: Array, quadratic: Array
+) -> Float[Array, "times widths products products"]:
+    later = visibilities.T
+    before = later[jnp.maximum(earlier, 0)]  # (times, widths, products)
+    weight = kernel[:, :, None, None]
+    pattern = linear[None, None] + weight * quadratic[None, None]
+    return later[:, None, :, None] * before[:, :, None, :] * weight * pattern
