@@ -23,6 +23,7 @@ lint: $(VENV)/installed-dev
 
 bench: $(VENV)/installed
 	$(BIN)/python benchmarks/pipeline.py
+	$(BIN)/python benchmarks/structured_noise.py
 
 clean:
 	rm -rf $(VENV) output

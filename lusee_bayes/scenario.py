@@ -176,9 +176,16 @@ def load_scenario(source: str | Path, overrides: list[str] | tuple[str, ...] = (
 
     InputError with one sentence for a missing file, bad YAML, an unknown key or a bad value.
     """
-    tree = _read_yaml(source)
+    scenario = _validate(_read_yaml(source), source)
+    if not overrides:
+        return scenario
+    tree = scenario.model_dump(mode="json")  # defaults included, so that any entry can be set
     for override in overrides:
         _apply(tree, override)
+    return _validate(tree, source)
+
+
+def _validate(tree: dict[str, Any], source: str | Path) -> Scenario:
     try:
         return Scenario.model_validate(tree)
     except ValidationError as error:

@@ -40,6 +40,12 @@ def test_overrides_reach_into_sections_that_the_file_leaves_out(tmp_path):
     assert scenario.nside is None
 
 
+def test_every_entry_of_a_short_file_can_be_set():
+    scenario = load_scenario("gain_1e-2", ["observation.runs.0.cycles=0.5", "noise.gain.sigma=0.1"])
+    assert scenario.observation.runs[0].cycles == 0.5
+    assert scenario.noise.gain.sigma == 0.1
+
+
 def test_scientific_notation_without_a_sign_is_a_number(tmp_path):
     # YAML 1.1 reads 1e6 as text; users write it all the same
     path = tmp_path / "x.yaml"
