@@ -19,7 +19,7 @@ from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpotrf
 
 import lusee_bayes as lb
-from lusee_bayes.experiment import build_beams, build_observation
+from lusee_bayes.building import build_beams, build_observation
 from lusee_bayes.progress import peak_memory_gb
 
 

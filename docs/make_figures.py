@@ -13,7 +13,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 import lusee_bayes as lb
-from lusee_bayes.experiment import build_beams
+from lusee_bayes.building import build_beams
 from lusee_bayes.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.metrics import ell_cross, signal_to_noise
 from lusee_bayes.plots import BLUE, ORANGE, mollweide

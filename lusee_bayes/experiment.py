@@ -8,13 +8,19 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from lusee_bayes.beams import Monopoles, ProductBeams, Regolith, monopole_beams
+from lusee_bayes.beams import ProductBeams, monopole_beams
+from lusee_bayes.building import (
+    build_beams,
+    build_gain_drift,
+    build_monopoles,
+    build_observation,
+    build_sky,
+)
 from lusee_bayes.checks import InputError
 from lusee_bayes.coupling import CouplingMatrix
 from lusee_bayes.covariance import Covariance
 from lusee_bayes.linear_gaussian import LinearGaussian
 from lusee_bayes.noise import (
-    GainDrift,
     beam_error_noise,
     derivative,
     difference,
@@ -23,13 +29,13 @@ from lusee_bayes.noise import (
     rms_difference,
     with_gains,
 )
-from lusee_bayes.observation import Observation, Run
+from lusee_bayes.observation import Observation
 from lusee_bayes.pointing import Pointing
 from lusee_bayes.posterior import Posterior
 from lusee_bayes.prior import HarmonicPrior
 from lusee_bayes.progress import Stages
 from lusee_bayes.scenario import Scenario
-from lusee_bayes.sky import BRIGHT_SOURCES, Sky, galaxy_sky, sky_from_file
+from lusee_bayes.sky import Sky
 from lusee_bayes.visibilities import Visibilities
 
 # what the scenario's seed is folded with for each kind of draw; the radiometer takes it as it is
@@ -226,12 +232,6 @@ class Experiment:
         )
 
 
-def build_gain_drift(scenario: Scenario) -> GainDrift | None:
-    """The gain drifts of the scenario, or None."""
-    gain = scenario.noise.gain
-    return None if gain is None else GainDrift(gain.sigma, gain.correlation_h)
-
-
 def measured_visibilities(
     data: Visibilities, model: Float[Array, "products times"]
 ) -> Float[Array, "products times"]:
@@ -249,47 +249,3 @@ def measured_visibilities(
             "measured there; use noise.radiometer.temperature=model"
         )
     return jax.numpy.where(complete[None], data.layout.scatter(data.data), model)
-
-
-def build_observation(scenario: Scenario) -> Observation:
-    """Site, times and turntable angles."""
-    section = scenario.observation
-    return Observation.from_runs(
-        tuple(Run(r.cycles, r.turntable_deg, r.night_only) for r in section.runs),
-        start=section.start,
-        step_s=section.step_s,
-        lon_deg=section.lon_deg,
-        lat_deg=section.lat_deg,
-    )
-
-
-def build_monopoles(scenario: Scenario) -> Monopoles:
-    """The embedded antennas with the scenario's parameters."""
-    beam = scenario.beam
-    return Monopoles(
-        regolith=Regolith(beam.surface_permittivity, beam.deep_permittivity, beam.loss_tangent),
-        length_m=beam.length_m,
-        zenith_angle_deg=beam.zenith_angle_deg,
-        height_m=beam.height_m,
-    )
-
-
-def build_beams(scenario: Scenario) -> ProductBeams:
-    """Beams of all products at the scenario's frequency."""
-    return monopole_beams(scenario.frequency_mhz, scenario.lmax, build_monopoles(scenario))
-
-
-def build_sky(scenario: Scenario) -> Sky:
-    """The scenario's sky up to lmax."""
-    section = scenario.sky
-    if section.file is None:
-        sources = BRIGHT_SOURCES if section.sources else ()
-        return galaxy_sky(scenario.frequency_mhz, scenario.lmax, seed=section.seed, sources=sources)
-    return sky_from_file(
-        section.file,
-        scenario.frequency_mhz,
-        scenario.lmax,
-        dataset=section.dataset,
-        file_frequency_mhz=section.file_frequency_mhz,
-        spectral_index=section.spectral_index,
-    )

@@ -13,7 +13,7 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import LogLocator
 
 from lusee_bayes.beams import HemisphereGrid, stokes_beam
-from lusee_bayes.experiment import build_monopoles
+from lusee_bayes.building import build_monopoles
 from lusee_bayes.metrics import ell_cross
 from lusee_bayes.results import MapResult
 from lusee_bayes.scenario import Scenario

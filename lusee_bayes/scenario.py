@@ -15,6 +15,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from lusee_bayes.checks import InputError, nearest
+from lusee_bayes.overrides import apply_override
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -181,7 +182,7 @@ def load_scenario(source: str | Path, overrides: list[str] | tuple[str, ...] = (
         return scenario
     tree = scenario.model_dump(mode="json")  # defaults included, so that any entry can be set
     for override in overrides:
-        _apply(tree, override)
+        apply_override(tree, override)
     return _validate(tree, source)
 
 
@@ -213,41 +214,6 @@ def _read_yaml(source: str | Path) -> dict[str, Any]:
     return tree
 
 
-def _apply(tree: dict[str, Any], override: str) -> None:
-    """Set one entry; list entries by number, as in observation.runs.0.cycles=2."""
-    key, separator, text = override.partition("=")
-    if not separator or not key:
-        raise InputError(f"--set takes key.path=value, got '{override}'")
-    *parents, last = key.split(".")
-    node: Any = tree
-    for parent in parents:
-        node = _step(node, parent, override)
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InputError(f"--set {override}: the value is not valid YAML") from error
-    if isinstance(node, list):
-        node[_position(node, last, override)] = value
-    else:
-        node[last] = value
-
-
-def _step(node: Any, key: str, override: str) -> Any:
-    if isinstance(node, list):
-        return node[_position(node, key, override)]
-    if node.get(key) is None:
-        node[key] = {}
-    if not isinstance(node[key], dict | list):
-        raise InputError(f"--set {override}: '{key}' holds a value, not a section")
-    return node[key]
-
-
-def _position(node: list[Any], key: str, override: str) -> int:
-    if not key.isdigit() or int(key) >= len(node):
-        raise InputError(f"--set {override}: '{key}' is not one of the entries 0..{len(node) - 1}")
-    return int(key)
-
-
 def _section_at(location: tuple[int | str, ...]) -> type[BaseModel] | None:
     """The section that a key of a validation error belongs to."""
     model: Any = Scenario
@@ -273,5 +239,6 @@ def _one_sentence(error: ValidationError, source: str) -> str:
         known = list(section.model_fields) if section else []
         return f"{source}: unknown key '{where}'; {nearest(str(first['loc'][-1]), known)}"
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    expected = first["msg"][0].lower() + first["msg"][1:]
+    expected = first["msg"].removeprefix("Value error, ")
+    expected = expected[0].lower() + expected[1:]
     return f"{source}: {where} is {first['input']!r}, but {expected}{more}"

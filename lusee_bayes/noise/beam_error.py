@@ -8,6 +8,8 @@ parameter of the embedded beam times its standard deviation.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -44,9 +46,7 @@ def derivative(
     parameter: str, frequency_mhz: float, lmax: int, monopoles: Monopoles
 ) -> ProductBeams:
     """d beams / d parameter of the embedded antennas (one of ``PARAMETERS``), by forward mode."""
-    if parameter not in PARAMETERS:
-        raise InputError(f"unknown beam parameter '{parameter}'; {nearest(parameter, PARAMETERS)}")
-    where = PARAMETERS[parameter]
+    where = _where(parameter)
 
     def modes(value: Float[Array, ""]) -> Float[Array, "products modes"]:
         moved = eqx.tree_at(where, monopoles, value)
@@ -57,10 +57,17 @@ def derivative(
     return ProductBeams(slope, float(frequency_mhz))
 
 
+def _where(parameter: str) -> Callable[[Monopoles], Float[Array, ""]]:
+    """How to find a parameter in the antennas; InputError naming the nearest for unknown ones."""
+    if parameter not in PARAMETERS:
+        raise InputError(f"unknown beam parameter '{parameter}'; {nearest(parameter, PARAMETERS)}")
+    return PARAMETERS[parameter]
+
+
 def moved(monopoles: Monopoles, steps: dict[str, float]) -> Monopoles:
     """The antennas with parameters changed by given steps."""
     for parameter, step in steps.items():
-        where = PARAMETERS[parameter]
+        where = _where(parameter)
         monopoles = eqx.tree_at(where, monopoles, where(monopoles) + step)
     return monopoles
 
