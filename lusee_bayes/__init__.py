@@ -23,14 +23,18 @@ jax.config.update("jax_enable_x64", True)
 
 # loaded when first used: healpy, lunarsky and xarray take seconds together
 _HOMES = {
+    "CorrelatedNormal": "sites",
     "CouplingMatrix": "coupling",
     "Covariance": "covariance",
     "DenseCovariance": "covariance",
     "DiagonalCovariance": "covariance",
     "Experiment": "experiment",
+    "GainDrift": "noise",
     "HarmonicPrior": "prior",
+    "LowRankCovariance": "covariance",
     "LinearGaussian": "linear_gaussian",
     "MapResult": "results",
+    "Marginal": "sites",
     "Monopoles": "beams",
     "Observation": "observation",
     "PixelPrior": "prior",
@@ -41,6 +45,8 @@ _HOMES = {
     "Run": "observation",
     "Scenario": "scenario",
     "Sky": "sky",
+    "SkyPrior": "sites",
+    "TimeBandedCovariance": "covariance",
     "TimeBlockCovariance": "covariance",
     "Visibilities": "visibilities",
     "galaxy_sky": "sky",
@@ -48,6 +54,8 @@ _HOMES = {
     "monopole_beams": "beams",
     "radiometer_noise": "noise",
     "read_visibilities": "visibilities",
+    "beam_error_noise": "noise",
+    "template_noise": "noise",
     "sky_from_file": "sky",
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import healpy
 import jax.numpy as jnp
 import numpy as np
@@ -60,6 +61,7 @@ def effective_resolution_deg(prior_fraction: Float[np.ndarray, " ells"]) -> floa
     return 180.0 / (int(beyond[0]) + 1) if beyond.size else None
 
 
+@eqx.filter_jit
 def whitened_residuals(
     model: LinearGaussian, posterior: Posterior, data: Float[Array, " data"]
 ) -> Float[Array, " data"]:

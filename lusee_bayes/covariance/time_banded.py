@@ -177,16 +177,29 @@ class TimeBandedCovariance(Covariance):
 
     def factor(self):
         left, diagonal = _cholesky(*_block_rows(self.band))
-        if not is_traced(diagonal) and not bool(jnp.isfinite(diagonal).all()):
-            lowest = float(jnp.linalg.eigvalsh(self.dense()).min())
-            raise InputError(
-                f"{self.name} is not positive definite: its lowest eigenvalue is {lowest:.3g} "
-                f"(largest entry {float(jnp.abs(self.band).max()):.3g}); add the radiometer noise "
-                "or check the term's amplitude"
-            )
+        if not is_traced(diagonal):
+            self._require_positive(diagonal)
         unit = jnp.broadcast_to(jnp.eye(diagonal.shape[1]), diagonal.shape)
         inverse = solve_lower(diagonal, unit, transpose=False)
         return TimeBandedFactor(left, diagonal, inverse, self.layout)
+
+    def _require_positive(self, diagonal: Float[Array, "blocks rows rows"]) -> None:
+        """InputError with the lowest eigenvalue of the samples where the factorisation broke."""
+        broken = ~np.isfinite(np.asarray(diagonal)).all(axis=(1, 2))
+        if not broken.any():
+            return
+        end = (int(np.argmax(broken)) + 1) * (diagonal.shape[1] // self.layout.n_products)
+        end = min(end, self.layout.n_times)
+        start = max(0, end - 2 * self.band.shape[1])
+        part = TimeBandedCovariance(
+            self.band[start:end], DataLayout(self.layout.n_products, end - start), self.name
+        )
+        lowest = float(jnp.linalg.eigvalsh(part.dense()).min())
+        raise InputError(
+            f"{self.name} is not positive definite: its lowest eigenvalue is {lowest:.3g} between "
+            f"samples {start} and {end - 1} (largest entry {float(jnp.abs(self.band).max()):.3g}); "
+            "add the radiometer noise or check the term's amplitude"
+        )
 
     def absorb(self, other):
         if isinstance(other, TimeBandedCovariance | TimeBlockCovariance):

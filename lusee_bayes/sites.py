@@ -1,0 +1,103 @@
+"""NumPyro distributions built on the package's objects, for use at sample sites.
+
+m ~ SkyPrior(S),    d ~ CorrelatedNormal(A m, N)
+d ~ Marginal(model)                                 the same with the sky integrated out
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+from numpyro import distributions as dist
+
+from lusee_bayes.checks import InputError, is_traced
+from lusee_bayes.covariance import Covariance, Factor
+from lusee_bayes.linear_gaussian import LinearGaussian
+from lusee_bayes.prior import Prior
+
+HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
+
+
+class SkyPrior(dist.Distribution):
+    """m ~ N(0, S) for a prior whose root is diagonal, such as HarmonicPrior; event (unknowns,).
+
+    InputError for a prior without density: one over pixels (S is singular) or with C_ell = 0.
+    """
+
+    support = dist.constraints.real_vector
+    pytree_data_fields = ("prior",)
+
+    def __init__(self, prior: Prior, *, validate_args: bool | None = None):
+        scale = prior.diagonal_root()
+        if scale is None:
+            raise InputError("a prior over pixels has no density; sample harmonic coefficients")
+        if not is_traced(scale) and not bool((scale > 0).all()):
+            raise InputError("the prior spectrum is zero at some ell and has no density; drop it")
+        self.prior = prior
+        super().__init__(event_shape=(prior.size,), validate_args=validate_args)
+
+    def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+        u = jax.random.normal(key, (*sample_shape, self.prior.rank), dtype=jnp.float64)
+        return self.prior.colour(u)
+
+    def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        scale = self.prior.diagonal_root()
+        u = value / scale.reshape(*(1,) * (value.ndim - 1), -1)
+        return -0.5 * (u**2).sum(-1) - jnp.log(scale).sum() - scale.shape[0] * HALF_LOG_2PI
+
+
+class CorrelatedNormal(dist.Distribution):
+    """d ~ N(loc, N) for any covariance of the package; event (data,).
+
+    Give ``noise.factor()`` instead of the covariance where N is fixed: it is then factorised once
+    and not at every evaluation of a model.
+    """
+
+    support = dist.constraints.real_vector
+    pytree_data_fields = ("factor", "loc")
+
+    def __init__(
+        self,
+        loc: Float[Array, " data"],
+        noise: Covariance | Factor,
+        *,
+        validate_args: bool | None = None,
+    ):
+        self.loc = loc
+        self.factor = noise.factor() if isinstance(noise, Covariance) else noise
+        super().__init__(event_shape=loc.shape, validate_args=validate_args)
+
+    def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+        n = int(np.prod(sample_shape))
+        z = jax.random.normal(key, (self.loc.shape[0], n), dtype=jnp.float64)
+        draws = self.factor.colour(z).T + self.loc[None]
+        return draws.reshape(*sample_shape, -1)
+
+    def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        n = self.loc.shape[0]
+        residual = (value - self.loc.reshape(*(1,) * (value.ndim - 1), -1)).reshape(-1, n)
+        squared = (self.factor.whiten(residual.T) ** 2).sum(0).reshape(value.shape[:-1])
+        return -0.5 * (squared + self.factor.log_det()) - n * HALF_LOG_2PI
+
+
+class Marginal(dist.Distribution):
+    """d with the sky integrated out: the evidence of a linear Gaussian model; event (data,)."""
+
+    support = dist.constraints.real_vector
+    pytree_data_fields = ("model",)
+
+    def __init__(self, model: LinearGaussian, *, validate_args: bool | None = None):
+        self.model = model
+        super().__init__(event_shape=(model.n_data,), validate_args=validate_args)
+
+    def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+        keys = jax.random.split(key, int(np.prod(sample_shape)))
+        draws = jax.vmap(lambda k: self.model.sample(k)[1])(keys)
+        return draws.reshape(*sample_shape, -1)
+
+    def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        solver = self.model.factorise()
+        flat = value.reshape(-1, value.shape[-1])
+        return jax.vmap(solver.log_prob)(flat).reshape(value.shape[:-1])
