@@ -16,7 +16,7 @@ import lusee_bayes as lb
 from lusee_bayes.building import build_beams
 from lusee_bayes.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.metrics import ell_cross, signal_to_noise
-from lusee_bayes.plots import BLUE, ORANGE, mollweide
+from lusee_bayes.plots import BLUE, ORANGE, colour_bar, mollweide
 from lusee_bayes.sky.galaxy import galaxy_map
 
 HERE = Path(__file__).parent / "figures"
@@ -74,7 +74,7 @@ def embedded_sky(ulsa: Path | None) -> None:
             axes = figure.add_subplot(3, 2, 2 * row + column + 1, projection="mollweide")
             image = mollweide(axes, pixels, norm=norm)
             axes.set_title(f"{name}, {frequency:g} MHz")
-            figure.colorbar(image, ax=axes, label="K", shrink=0.8)
+            colour_bar(figure, image, axes, label="K", shrink=0.8)
     figure.savefig(HERE / "embedded_sky.png", dpi=80)
     if ulsa is not None:
         print("| MHz | mean / ULSA's | C_ell / ULSA's, ell = 1..30 |\n| --- | --- | --- |")

@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
@@ -56,14 +58,14 @@ def beams(scenario: Scenario) -> Figure:
     ]
     figure = Figure(figsize=(11, 4), layout="constrained")
     for axes, (title, pattern) in zip(figure.subplots(1, 3), panels, strict=True):
-        image = _orthographic(axes, grid, pattern)
+        image = orthographic(axes, grid, pattern)
         axes.set_title(title)
     figure.colorbar(image, ax=figure.axes, label="beam / its peak", shrink=0.8)
     figure.suptitle(f"Beams at {scenario.frequency_mhz:g} MHz, zenith at the centre")
     return figure
 
 
-def _orthographic(axes: Axes, grid: HemisphereGrid, pattern: Complex[np.ndarray, "theta phi"]):
+def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Complex[np.ndarray, "theta phi"]):
     """Draw |pattern| on the plane of the horizon: x East, y North."""
     power = np.abs(pattern)
     phi = np.append(grid.phi, 2 * np.pi)
@@ -125,6 +127,16 @@ def mollweide(
     return image
 
 
+def colour_bar(figure: Figure, image: ScalarMappable, axes: Axes, **options: object) -> Colorbar:
+    """A colour bar; on a logarithmic scale with plain numbers at 1, 2 and 5 times powers of ten."""
+    bar = figure.colorbar(image, ax=axes, **options)
+    if isinstance(image.norm, LogNorm):
+        bar.set_ticks(LogLocator(subs=(1.0, 2.0, 5.0)), minor=False)
+        bar.set_ticks([], minor=True)
+        bar.long_axis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+    return bar
+
+
 def maps(result: MapResult) -> Figure:
     """Truth, posterior mean, residual over the mean temperature, and standard deviation."""
     values = result.maps()
@@ -150,11 +162,7 @@ def maps(result: MapResult) -> Figure:
         image = mollweide(
             axes, pixels, norm=norm, cmap=cmap, highest_altitude=result.highest_altitude
         )
-        bar = figure.colorbar(image, ax=axes, label=unit, shrink=0.85, extend="both")
-        if isinstance(norm, LogNorm):
-            bar.set_ticks(LogLocator(subs=(1.0, 2.0, 5.0)), minor=False)
-            bar.set_ticks([], minor=True)
-            bar.ax.yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+        colour_bar(figure, image, axes, label=unit, shrink=0.85, extend="both")
         axes.set_title(title)
     figure.suptitle(
         f"{result.experiment.scenario.frequency_mhz:g} MHz, Galactic coordinates; "
