@@ -23,6 +23,7 @@ app = App(
 for _name, _help in {
     "simulate": "Simulate the visibilities of a scenario.",
     "map": "Make a posterior map of a scenario, or of given data.",
+    "paper": "Reproduce the figures of the reference paper and judge its claims.",
     "info": "Say what is in a file.",
 }.items():
     app.command(f"lusee_bayes.commands:{_name}_command", name=_name, help=_help)

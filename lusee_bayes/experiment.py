@@ -208,7 +208,7 @@ class Experiment:
                 return model, posterior, rounds
         raise InputError(
             f"the map still moves after {MAX_ROUNDS} rounds of rebuilding the gain term around it; "
-            "use noise.gain.visibilities=measured"
+            "use noise.gain.visibilities=model"
         )
 
     def simulate(self) -> Visibilities:
@@ -245,7 +245,8 @@ def measured_visibilities(
     if bool((some & ~complete).any()):
         first = int((some & ~complete).argmax())
         raise InputError(
-            f"time {first} lacks some of its products, so the antenna temperatures cannot be "
-            "measured there; use noise.radiometer.temperature=model"
+            f"time {first} lacks some of its products, so the noise cannot be built around what "
+            "was measured there; use noise.radiometer.temperature=model and "
+            "noise.gain.visibilities=model"
         )
     return jax.numpy.where(complete[None], data.layout.scatter(data.data), model)

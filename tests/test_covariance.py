@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import permutations, product
 
 import equinox as eqx
 import jax
@@ -16,7 +16,11 @@ from lusee_bayes.covariance import (
     Covariance,
     DenseCovariance,
     DiagonalCovariance,
+    LowRankCovariance,
+    LowRankUpdate,
+    TimeBandedCovariance,
     TimeBlockCovariance,
+    time_banded,
 )
 from lusee_bayes.layout import DataLayout
 
@@ -34,61 +38,174 @@ def close(got, expected, tol=TOL):
     np.testing.assert_allclose(got, expected, rtol=0, atol=tol * np.abs(expected).max())
 
 
-def check_covariance(cov: Covariance, dense: np.ndarray):
+@eqx.filter_jit
+def _numbers(cov: Covariance, x, xs, factor_of_cov):
+    """All that the contract compares, compiled once for every structure."""
+    factor = cov.factor()
+    unit = jnp.eye(cov.size)
+    return {
+        "dense": cov.dense(),
+        "diagonal": cov.diagonal(),
+        "log_det": (cov.log_det(), factor.log_det(), factor_of_cov.log_det()),
+        "mv": [cov.mv(v) for v in (x, xs)],
+        "solve": [f.solve(v) for f in (cov, factor, factor_of_cov) for v in (x, xs)],
+        "back": factor_of_cov.whiten(factor_of_cov.colour(xs)),
+        "root": factor_of_cov.colour(unit),
+        "inverse_root": factor_of_cov.whiten(unit),
+        "inverse_root_transpose": factor_of_cov.whiten_transpose(unit),
+        "one": [f(x) for f in (factor.colour, factor.whiten, factor.whiten_transpose)],
+        "mapped": jax.vmap(lambda v: cov.solve(v))(xs.T),
+        "scaled": (cov.scaled(2.5).dense(), cov.scaled(jnp.asarray(2.5)).solve(x)),
+        "scaled_log_dets": jax.vmap(lambda s: cov.scaled(s).log_det())(jnp.asarray([1.0, 2.5])),
+        "draws": cov.sample(jax.random.key(2), 20_000),
+        "draw": cov.sample(jax.random.key(1)),
+    }
+
+
+@eqx.filter_jit
+def _slopes(cov: Covariance, x):
+    """d ln|s N| / ds at s = 2, d(x^T N^-1 x) / dx, and d(x^T (s N)^-1 x) / ds at s = 2."""
+    two = jnp.asarray(2.0)
+    return (
+        jax.grad(lambda s: cov.scaled(s).log_det())(two),
+        jax.grad(lambda v: v @ cov.solve(v))(x),
+        jax.grad(lambda s: x @ cov.scaled(s).solve(x))(two),
+    )
+
+
+def check_covariance(
+    cov: Covariance, dense: np.ndarray, *, slopes: bool = True, eager: bool = False
+):
     """What it means to be a Covariance: everything agrees with the matrix ``dense``."""
     rng = np.random.default_rng(7)
     n = len(dense)
-    x, xs = jnp.asarray(rng.normal(size=n)), jnp.asarray(rng.normal(size=(n, 3)))
+    x, xs = rng.normal(size=n), rng.normal(size=(n, 3))
     inverse, (sign, log_det) = np.linalg.inv(dense), np.linalg.slogdet(dense)
     assert sign == 1.0
+    assert cov.size == n
+    factor = cov.factor()  # outside of jit, where values are checked
+    if eager:
+        close(cov.solve(jnp.asarray(x)), inverse @ x)
+        close(jax.jit(lambda v: cov.solve(v))(jnp.asarray(x)), inverse @ x)  # closed over
+        assert cov.sample(jax.random.key(1)).shape == (n,)
+    got = _numbers(cov, jnp.asarray(x), jnp.asarray(xs), factor)
 
     # what it is
-    assert cov.size == n
-    close(cov.dense(), dense, 1e-15)
-    assert (np.asarray(cov.dense()) == np.asarray(cov.dense()).T).all()
-    close(cov.diagonal(), np.diag(dense), 1e-15)
-    factor = cov.factor()
-    assert float(cov.log_det()) == pytest.approx(log_det, abs=TOL * n)
-    assert float(factor.log_det()) == pytest.approx(log_det, abs=TOL * n)
-    for v in (x, xs):
-        close(cov.mv(v), dense @ np.asarray(v))
-        close(cov.solve(v), inverse @ np.asarray(v))
-        close(factor.solve(v), inverse @ np.asarray(v))
-        close(factor.whiten(factor.colour(v)), v)
+    close(got["dense"], dense, 1e-15)
+    assert (np.asarray(got["dense"]) == np.asarray(got["dense"]).T).all()
+    close(got["diagonal"], np.diag(dense), 1e-15)
+    for value in got["log_det"]:
+        assert float(value) == pytest.approx(log_det, abs=TOL * n)
+    for value, v in zip(got["mv"], (x, xs), strict=True):
+        close(value, dense @ v)
+    for value, v in zip(got["solve"], 3 * (x, xs), strict=True):
+        close(value, inverse @ v)
+    close(got["mapped"], xs.T @ inverse)
 
     # the square root: L L^T = N, whiten = L^-1, whiten_transpose = L^-T
-    root = np.asarray(factor.colour(jnp.eye(n)))
+    root = np.asarray(got["root"])
     close(root @ root.T, dense)
-    close(factor.whiten(jnp.eye(n)), np.linalg.inv(root))
-    close(factor.whiten_transpose(jnp.eye(n)), np.linalg.inv(root).T)
-    close(factor.whiten_transpose(x), np.linalg.inv(root).T @ np.asarray(x))
+    close(got["inverse_root"], np.linalg.inv(root))
+    close(got["inverse_root_transpose"], np.linalg.inv(root).T)
+    close(got["back"], xs)
+    for value, matrix in zip(
+        got["one"], (root, np.linalg.inv(root), np.linalg.inv(root).T), strict=True
+    ):
+        close(value, matrix @ x)
 
     # scaled
-    close(cov.scaled(2.5).dense(), 2.5 * dense)
-    close(cov.scaled(jnp.asarray(2.5)).solve(x), inverse @ np.asarray(x) / 2.5)
-    assert float(cov.scaled(2.5).log_det()) == pytest.approx(log_det + n * np.log(2.5), abs=TOL * n)
+    close(got["scaled"][0], 2.5 * dense)
+    close(got["scaled"][1], inverse @ x / 2.5)
+    close(got["scaled_log_dets"], [log_det, log_det + n * np.log(2.5)])
 
     # draws
-    assert cov.sample(jax.random.key(1)).shape == (n,)
-    draws = cov.sample(jax.random.key(2), 20_000)
-    assert draws.shape == (20_000, n)
-    assert_draws_follow(draws, np.zeros(n), dense)
+    assert got["draw"].shape == (n,)
+    assert got["draws"].shape == (20_000, n)
+    assert_draws_follow(got["draws"], np.zeros(n), dense)
 
-    # inside transformations: closed over, as an argument, mapped, differentiated
-    close(jax.jit(lambda v: cov.solve(v))(x), inverse @ np.asarray(x))
-    close(eqx.filter_jit(lambda c, v: c.factor().whiten(v))(cov, x), factor.whiten(x))
-    close(jax.vmap(lambda v: cov.solve(v))(xs.T), np.asarray(xs).T @ inverse)
-    close(jax.vmap(lambda s: cov.scaled(s).log_det())(jnp.ones(2)), [log_det] * 2)
-    slope = jax.jit(jax.grad(lambda s: cov.scaled(s).log_det()))(jnp.asarray(2.0))
-    assert float(slope) == pytest.approx(n / 2.0, rel=TOL)
-    close(jax.grad(lambda v: v @ cov.solve(v))(x), 2.0 * inverse @ np.asarray(x))
+    if slopes:
+        check_slopes(cov, dense)
+
+
+def check_slopes(cov: Covariance, dense: np.ndarray):
+    x = np.random.default_rng(8).normal(size=len(dense))
+    of_log_det, of_vector, of_scale = _slopes(cov, jnp.asarray(x))
+    inverse = np.linalg.inv(dense)
+    assert float(of_log_det) == pytest.approx(len(dense) / 2.0, rel=TOL)
+    close(of_vector, 2.0 * inverse @ x)
+    assert float(of_scale) == pytest.approx(-x @ inverse @ x / 4.0, rel=TOL)
+
+
+@eqx.filter_jit
+def _square_root(cov: Covariance, x):
+    f, unit = cov.factor(), jnp.eye(cov.size)
+    root = f.colour(unit)
+    return cov.dense(), root, f.whiten(root), f.whiten_transpose(unit), f.solve(x), f.log_det()
+
+
+def check_square_root(cov: Covariance, dense: np.ndarray):
+    """The part of the contract that depends on how times are gathered into blocks."""
+    n = len(dense)
+    x = np.random.default_rng(1).normal(size=(n, 2))
+    same, root, unit, transpose, solved, log_det = _square_root(cov, jnp.asarray(x))
+    close(same, dense, 1e-15)
+    close(root @ root.T, dense)
+    close(unit, np.eye(n))
+    close(transpose, np.linalg.inv(np.asarray(root)).T)
+    close(solved, np.linalg.solve(dense, x))
+    assert float(log_det) == pytest.approx(np.linalg.slogdet(dense)[1], abs=TOL * n)
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    """Block rows of two times of three products, so that small matrices have several."""
+    monkeypatch.setattr(time_banded, "ROWS", 7)
+
+
+def _entries(flags):
+    """(product, time) of every datum, product by product with time running fastest."""
+    n_products, n_times = flags.shape
+    return [(k, t) for k in range(n_products) for t in range(n_times) if not flags[k, t]]
+
+
+def _banded(flags, width, seed=5):
+    """(time-banded covariance, the same matrix by hand): N = G G^T with G block banded."""
+    rng = np.random.default_rng(seed)
+    n_products, n_times = flags.shape
+    g = np.zeros((n_times, n_times, n_products, n_products))
+    for t in range(n_times):
+        for s in range(max(0, t - width), t + 1):
+            g[t, s] = rng.normal(size=(n_products, n_products)) / np.sqrt(
+                2 * n_products * (width + 1)
+            )
+        g[t, t] += np.eye(n_products)
+    full = np.einsum("arij,brkj->abik", g, g)  # blocks of rows a and columns b
+    # what lies before the first time is ignored, whatever it is
+    band = np.full((n_times, width + 1, n_products, n_products), np.nan)
+    for t in range(n_times):
+        for w in range(min(width, t) + 1):
+            band[t, w] = full[t, t - w]
+    entries = _entries(flags)
+    product_of, time_of = (np.array(x) for x in zip(*entries, strict=True))
+    by_hand = full[time_of[:, None], time_of[None], product_of[:, None], product_of[None]]
+    apart = np.abs(time_of[:, None] - time_of[None])
+    assert (by_hand[apart > width] == 0).all()
+    layout = DataLayout.from_flags(flags)
+    return TimeBandedCovariance(jnp.asarray(band), layout, "the memory"), by_hand
+
+
+def _directions(n, rank=2, seed=11):
+    """(U U^T, the same by hand, entry by entry)."""
+    u = np.random.default_rng(seed).normal(size=(n, rank))
+    by_hand = np.array([[sum(u[i] * u[j]) for j in range(n)] for i in range(n)])
+    return LowRankCovariance(jnp.asarray(u), "the templates"), by_hand
 
 
 def _terms(flags):
-    """(kind, covariance, the same matrix by hand) of every kind, for one layout."""
+    """kind: (covariance, the same matrix by hand) of every kind, for one layout."""
     rng = np.random.default_rng(3)
     layout = DataLayout.from_flags(flags)
-    entries = [(k, t) for k in range(N_PRODUCTS) for t in range(N_TIMES) if not flags[k, t]]
+    entries = _entries(flags)
     n = len(entries)
     variance = rng.uniform(0.5, 2.0, n)
     blocks = np.stack([random_covariance(rng, N_PRODUCTS) for _ in range(N_TIMES)])
@@ -97,51 +214,167 @@ def _terms(flags):
         if t == s:
             by_hand[a, b] = blocks[t, k, j]
     matrix = random_covariance(rng, n)
-    return [
-        ("diagonal", DiagonalCovariance(jnp.asarray(variance)), np.diag(variance)),
-        ("blocks", TimeBlockCovariance(jnp.asarray(blocks), layout), by_hand),
-        ("dense", DenseCovariance(jnp.asarray(matrix)), matrix),
-    ]
+    updated = rng.uniform(0.5, 2.0, n)
+    directions, outer = _directions(n)
+    return {
+        "diagonal": (DiagonalCovariance(jnp.asarray(variance)), np.diag(variance)),
+        "blocks": (TimeBlockCovariance(jnp.asarray(blocks), layout), by_hand),
+        "dense": (DenseCovariance(jnp.asarray(matrix)), matrix),
+        "banded": _banded(flags, 2),
+        "low rank": (
+            LowRankUpdate(DiagonalCovariance(jnp.asarray(updated)), directions),
+            np.diag(updated) + outer,
+        ),
+    }
 
 
-KINDS = ["diagonal", "blocks", "dense"]
+KINDS = ["diagonal", "blocks", "dense", "banded", "low rank"]
 LAYOUTS = {"complete": np.zeros_like(FLAGS), "flagged": FLAGS}
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_contract(kind, layout):
-    _, cov, dense = _terms(LAYOUTS[layout])[KINDS.index(kind)]
-    check_covariance(cov, dense)
+def test_contract(kind, layout, small_blocks):
+    check_covariance(*_terms(LAYOUTS[layout])[kind], slopes=True, eager=True)
 
 
 @pytest.mark.parametrize("second", KINDS)
 @pytest.mark.parametrize("first", KINDS)
-def test_contract_of_sums(first, second):
+def test_contract_of_sums(first, second, small_blocks):
     terms = _terms(FLAGS)
-    (_, cov_a, dense_a), (_, cov_b, dense_b) = terms[KINDS.index(first)], terms[KINDS.index(second)]
-    check_covariance(cov_a + cov_b, dense_a + dense_b)
+    (cov_a, dense_a), (cov_b, dense_b) = terms[first], terms[second]
+    check_covariance(cov_a + cov_b, dense_a + dense_b, slopes=True)
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if k != "low rank"])
+def test_contract_of_low_rank_updates(kind, small_blocks):
+    cov, dense = _terms(FLAGS)[kind]
+    directions, outer = _directions(len(dense), rank=3, seed=12)
+    check_covariance(LowRankUpdate(cov, directions), dense + outer, slopes=True)
+    for total in (cov + directions, directions + cov):
+        close(_dense(total), dense + outer)
+
+
+# blocks of two times: widths below, at and above a block, whole matrices; times no multiple of two
+@pytest.mark.parametrize(
+    ("width", "flagged"), [*((w, False) for w in (0, 1, 2, 3, 6, 9)), *((w, True) for w in (2, 5))]
+)
+def test_bands_of_every_width(width, flagged, small_blocks):
+    flags = np.zeros((3, 7), dtype=bool)
+    if flagged:
+        flags[:, [0, 3]] = flags[1, 5] = flags[2, 6] = True
+    check_square_root(*_banded(flags, width))
+
+
+# 11 and 44 times make a block row; one gap hides more than a whole block row
+@pytest.mark.parametrize(
+    ("n_products", "n_times", "width", "gap"),
+    [
+        (16, 25, 0, slice(0, 0)),
+        (16, 25, 11, slice(0, 0)),
+        (16, 27, 12, slice(9, 23)),
+        (16, 25, 40, slice(3, 4)),
+        (4, 95, 50, slice(60, 70)),
+    ],
+)
+def test_bands_at_the_blocks_own_size(n_products, n_times, width, gap):
+    flags = np.zeros((n_products, n_times), dtype=bool)
+    flags[:, gap] = True
+    check_square_root(*_banded(flags, width))
 
 
 def test_sums_keep_the_structure():
-    (_, diagonal, _), (_, blocks, _), (_, dense, _) = _terms(FLAGS)
+    diagonal, blocks, dense, banded, low_rank = (_terms(FLAGS)[kind][0] for kind in KINDS)
+    directions, _ = _directions(diagonal.size)
     assert isinstance(diagonal + diagonal, DiagonalCovariance)
     for term in (diagonal + blocks, blocks + diagonal, blocks + blocks):
         assert isinstance(term, TimeBlockCovariance)
-    for term in (dense + blocks, blocks + dense, diagonal + dense, dense + dense):
+    for term in (dense + blocks, blocks + dense, diagonal + dense, dense + dense, banded + dense):
         assert isinstance(term, DenseCovariance)
+    for other in (diagonal, blocks, banded):
+        for term in (banded + other, other + banded):
+            assert isinstance(term, TimeBandedCovariance)
+            assert term.width == 2
+        for term in (other + directions, directions + other, other + low_rank, low_rank + other):
+            assert isinstance(term, LowRankUpdate)
+            assert isinstance(term.base, type(other))
+    assert (low_rank + directions).update.root.shape[1] == 4
+    assert isinstance(directions + directions, LowRankCovariance)
+
+
+def test_bands_of_different_width_add_up(small_blocks):
+    (wide, dense_wide), (narrow, dense_narrow) = _banded(FLAGS, 3), _banded(FLAGS, 1, seed=6)
+    check_square_root(wide + narrow, dense_wide + dense_narrow)
+    close((narrow + wide).dense(), dense_wide + dense_narrow, 1e-15)
+    assert (narrow + wide).width == 3
+
+
+def test_as_many_directions_as_data_leave_no_structure():
+    cov, dense = _terms(FLAGS)["banded"]
+    for rank in (len(dense), len(dense) + 3):
+        directions, outer = _directions(len(dense), rank)
+        total = cov + directions
+        assert isinstance(total, DenseCovariance)
+        close(total.dense(), dense + outer)
+        ones = np.ones(len(dense))
+        close(total.solve(jnp.asarray(ones)), np.linalg.solve(dense + outer, ones))
+
+
+def test_low_rank_alone():
+    directions, outer = _directions(6, 2)
+    other, other_outer = _directions(6, 1, seed=13)
+    x = np.random.default_rng(0).normal(size=(6, 3))
+    for cov, dense in [
+        (directions, outer),
+        (directions + other, outer + other_outer),
+        (directions.scaled(2.5), 2.5 * outer),
+    ]:
+        assert cov.size == 6
+        close(cov.dense(), dense, 1e-15)
+        close(cov.diagonal(), np.diag(dense), 1e-15)
+        # sums of a few products
+        close(cov.mv(jnp.asarray(x)), dense @ x, 1e-14)
+        close(cov.mv(jnp.asarray(x[:, 0])), dense @ x[:, 0], 1e-14)
+    for use in (directions.factor, directions.log_det, lambda: directions.solve(jnp.ones(6))):
+        with pytest.raises(InputError, match="the templates has rank 2 .* 6 data.* add the radio"):
+            use()
+
+
+@pytest.mark.parametrize("kind", ["diagonal", "blocks", "banded", "dense"])
+def test_strong_directions_are_whitened_too(kind):
+    """U U^T of 1e8 times the base, the worst of the fiducial terms: W (N_0 + U U^T) W^T is 1.
+
+    The sum is never formed here: in float64 it would lose N_0. Along U, whitening cancels 1e4 of
+    the base's standard deviations down to 1: rounding 1e4 eps of each of some 10 operations.
+    """
+    base, dense = _terms(FLAGS)[kind]
+    directions, _ = _directions(len(dense), rank=3)
+    factor = LowRankUpdate(base, directions.scaled(1e8)).factor()
+    strong = factor.whiten(1e4 * directions.root)
+    weak = factor.whiten(jnp.asarray(np.linalg.cholesky(dense)))
+    unit = np.asarray(strong @ strong.T + weak @ weak.T)
+    np.testing.assert_allclose(unit, np.eye(len(dense)), rtol=0, atol=1e4 * 2.2e-16 * 10)
+    # ln|N_0 + s U U^T| = ln|N_0| + ln|1 + s U^T N_0^-1 U|, well conditioned in eigenvalues
+    u = np.asarray(directions.root)
+    small = np.eye(3) + 1e8 * u.T @ np.linalg.solve(dense, u)
+    expected = np.linalg.slogdet(dense)[1] + np.log(np.linalg.eigvalsh(small)).sum()
+    assert float(factor.log_det()) == pytest.approx(expected, abs=1e-10)
+
+
+_dense = eqx.filter_jit(lambda cov: cov.dense())
 
 
 def test_sums_of_three_do_not_depend_on_order():
-    terms = [cov for _, cov, _ in _terms(FLAGS)]
-    expected = sum(dense for _, _, dense in _terms(FLAGS))
-    for a, b, c in [(0, 1, 2), (2, 1, 0), (1, 2, 0)]:
-        close((terms[a] + terms[b] + terms[c]).dense(), expected)
-        close((terms[a] + (terms[b] + terms[c])).dense(), expected)
+    terms = list(_terms(FLAGS).values())
+    for triple in [(0, 1, 2), (0, 1, 3), (0, 3, 4), (1, 3, 4), (2, 3, 4)]:
+        expected = sum(terms[i][1] for i in triple)
+        for a, b, c in permutations([terms[i][0] for i in triple]):
+            close(_dense(a + b + c), expected)
+            close(_dense(a + (b + c)), expected)
 
 
 def test_flagged_samples_change_nothing_whatever_their_blocks_hold():
-    _, (_, cov, dense), _ = _terms(FLAGS)
+    cov, dense = _terms(FLAGS)["blocks"]
     junk = np.asarray(cov.blocks).copy()
     junk[FLAGS.T] = 1e6  # rows of samples that were never taken
     again = TimeBlockCovariance(jnp.asarray(junk), cov.layout)
@@ -165,7 +398,8 @@ def test_gradients_reach_the_entries():
         y = np.linalg.solve(matrix, np.asarray(x))
         return np.linalg.inv(matrix) - np.outer(y, y)
 
-    (_, diagonal, d), (_, blocks, b), (_, dense, m) = _terms(FLAGS)
+    terms = _terms(FLAGS)
+    (diagonal, d), (blocks, b), (dense, m) = (terms[k] for k in ("diagonal", "blocks", "dense"))
     close(slope(DiagonalCovariance, diagonal.variance), np.diag(expected(d)))
     close(slope(DenseCovariance, dense.matrix), expected(m))
     by_block = np.zeros((N_TIMES, N_PRODUCTS, N_PRODUCTS))
@@ -238,6 +472,44 @@ def test_indefinite_terms_are_named_with_their_lowest_eigenvalue():
             use()
 
 
+@pytest.mark.parametrize("update", [False, True])
+def test_indefinite_bands_are_named_with_their_lowest_eigenvalue(update):
+    # times 0 and 1 correlated by 1.25: eigenvalues 1 +- 1.25; the last time stands alone
+    band = jnp.zeros((3, 2, 4, 4)).at[:, 0].set(jnp.eye(4)).at[1, 1].set(1.25 * jnp.eye(4))
+    cov = TimeBandedCovariance(band, DataLayout(4, 3), "the gain term")
+    cov = LowRankUpdate(cov, LowRankCovariance(1e-3 * jnp.ones((12, 1)))) if update else cov
+    for use in (cov.factor, cov.log_det, lambda: cov.solve(jnp.ones(12))):
+        with pytest.raises(
+            InputError, match=r"the gain term is not positive definite: .* eigenvalue is -0\.25 "
+        ):
+            use()
+
+
+def test_bad_bands_are_refused():
+    layout = DataLayout(2, 3)
+    good = jnp.zeros((3, 2, 2, 2)).at[:, 0].set(jnp.eye(2))
+    for bad, message in [
+        (good.at[2, 0, 0, 1].set(0.5), "the gain term within one time is not symmetric: .* 0\\.5 "),
+        (good.at[1, 1, 0, 1].set(jnp.nan), r"the gain term holds NaN .* first at \(1, 1, 0, 1\)"),
+        (good[:2], r"the gain term has shape \(2, 2, 2, 2\), expected \(3, any, 2, 2\)"),
+        (good.astype(jnp.float32), "the gain term must be a float64 array, got .*float32"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            TimeBandedCovariance(bad, layout, "the gain term")
+    # blocks between times need not be symmetric
+    TimeBandedCovariance(good.at[1, 1, 0, 1].set(0.5), layout)
+
+
+def test_bad_directions_are_refused():
+    root = jnp.ones((4, 2))
+    for bad, message in [
+        (root.at[3, 1].set(jnp.inf), r"the beams holds NaN or infinity .*\(3, 1\)"),
+        (root.astype(jnp.float32), "the beams must be a float64 array, got .*float32"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            LowRankCovariance(bad, "the beams")
+
+
 def test_indefinite_blocks_are_refused():
     blocks = jnp.stack([jnp.eye(6), _indefinite()])
     with pytest.raises(InputError, match=r"not positive definite: .* eigenvalue is -0\.25 "):
@@ -249,6 +521,12 @@ def test_sizes_must_match_in_a_sum():
         DiagonalCovariance(jnp.ones(3)) + DiagonalCovariance(jnp.ones(4))
     with pytest.raises(InputError, match="cannot add covariances of 4 and 3 data"):
         DenseCovariance(jnp.eye(4)) + DiagonalCovariance(jnp.ones(3))
+    for kind in KINDS:
+        cov, dense = _terms(FLAGS)[kind]
+        directions, _ = _directions(len(dense) + 1)
+        for a, b in [(cov, directions), (directions, cov)]:
+            with pytest.raises(InputError, match=f"of {a.size} and {b.size} data; build both"):
+                a + b
 
 
 # --- known problems of the package: remove the mark when they are mended --------------------------
@@ -256,9 +534,10 @@ def test_sizes_must_match_in_a_sum():
 
 def test_blocks_with_other_flags_are_refused():
     other = FLAGS[:, ::-1]  # as many samples, but not the same ones
-    a, b = _terms(FLAGS)[1][1], _terms(other)[1][1]
-    with pytest.raises(InputError):
-        a + b
+    for first, second in product(["blocks", "banded"], repeat=2):
+        a, b = _terms(FLAGS)[first][0], _terms(other)[second][0]
+        with pytest.raises(InputError, match="hold different samples; build both"):
+            a + b
 
 
 def test_asymmetric_blocks_are_refused():

@@ -15,7 +15,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lusee_bayes.checks import InputError, require_finite, require_float64, require_shape
+from lusee_bayes.checks import (
+    InputError,
+    require_finite,
+    require_float64,
+    require_positive,
+    require_shape,
+)
 from lusee_bayes.covariance.base import Covariance, Factor, checked_cholesky, solve_lower
 from lusee_bayes.covariance.dense import DenseCovariance
 
@@ -60,6 +66,7 @@ class LowRankCovariance(Covariance):
         return LowRankUpdate(other, self)
 
     def scaled(self, factor):
+        require_positive("the factor of a low-rank term", factor)
         return LowRankCovariance(jnp.sqrt(factor) * self.root, self.name)
 
 

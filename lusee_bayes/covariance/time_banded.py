@@ -190,11 +190,13 @@ class TimeBandedCovariance(Covariance):
             return
         end = (int(np.argmax(broken)) + 1) * (diagonal.shape[1] // self.layout.n_products)
         end = min(end, self.layout.n_times)
-        start = max(0, end - 2 * self.band.shape[1])
-        part = TimeBandedCovariance(
-            self.band[start:end], DataLayout(self.layout.n_products, end - start), self.name
-        )
-        lowest = float(jnp.linalg.eigvalsh(part.dense()).min())
+        start, lowest = end, np.inf
+        while lowest > 0 and start > 0:  # a short stretch may be positive by itself
+            start = max(0, end - 2 * max(self.band.shape[1], end - start))
+            part = TimeBandedCovariance(
+                self.band[start:end], DataLayout(self.layout.n_products, end - start), self.name
+            )
+            lowest = float(jnp.linalg.eigvalsh(part.dense()).min())
         raise InputError(
             f"{self.name} is not positive definite: its lowest eigenvalue is {lowest:.3g} between "
             f"samples {start} and {end - 1} (largest entry {float(jnp.abs(self.band).max()):.3g}); "
@@ -267,7 +269,10 @@ def _cholesky(left: Array, diagonal: Array) -> tuple[Array, Array]:
     def step(reach, row):
         before, on = row
         solved = solve_lower(reach, before.T, transpose=False).T
-        lower = jax.lax.linalg.cholesky(on - solved @ solved.T, symmetrize_input=False)
+        # Cholesky's value needs the lower triangle only, its derivative a symmetric matrix
+        rest = jnp.tril(on - solved @ solved.T)
+        rest = rest + jnp.tril(rest, -1).T
+        lower = jax.lax.linalg.cholesky(rest, symmetrize_input=False)
         shifted = jnp.zeros_like(reach).at[:-rows, :-rows].set(reach[rows:, rows:])
         new = jnp.concatenate([solved[:, rows:], jnp.tril(lower)], axis=1)
         return shifted.at[-rows:].set(new), (solved, jnp.tril(lower))

@@ -20,7 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lusee_bayes.checks import require_finite, require_float64, require_positive, require_shape
+from lusee_bayes.checks import (
+    InputError,
+    require_finite,
+    require_float64,
+    require_positive,
+    require_shape,
+)
 from lusee_bayes.covariance import TimeBandedCovariance
 from lusee_bayes.layout import DataLayout
 from lusee_bayes.products import Product, all_products
@@ -73,6 +79,11 @@ class GainDrift(eqx.Module):
         require_float64("the visibilities", visibilities)
         require_shape("the visibilities", visibilities, (layout.n_products, layout.n_times))
         require_finite("the visibilities", visibilities)
+        require_shape("hours", hours, (layout.n_times,))
+        if not (np.diff(hours) > 0).all():
+            raise InputError(
+                "the sample times (hours) of a gain drift must grow from one to the next"
+            )
         width = self.width(hours) if width is None else width
         earlier = np.arange(layout.n_times)[:, None] - np.arange(width + 1)[None]
         lag = np.asarray(hours)[:, None] - np.asarray(hours)[np.maximum(earlier, 0)]
@@ -95,7 +106,7 @@ class GainDrift(eqx.Module):
         """Draw g_i(t) with exactly this covariance.
 
         White noise on a grid of sigma_t / 4, convolved with a Gaussian of width sigma_t / sqrt(2);
-        the sum over such a grid equals the integral to exp(-16 pi^2).
+        the sum over such a grid equals the integral to exp(-8 pi^2).
         """
         spacing = float(self.correlation_h) / 4.0
         hours = np.asarray(hours)
