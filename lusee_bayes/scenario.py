@@ -104,8 +104,8 @@ class GainSection(Section):
     """Gain drifts in the data; ``marginalised`` puts their covariance into N, ``ignored`` not.
 
     ``visibilities``: the d that the covariance is built around. ``measured`` data hold the drifts
-    themselves, which moves the map by about a standard deviation; ``posterior`` starts from them and
-    repeats with the map's prediction until the map stops moving, which mends that.
+    themselves, which moves the map by about a standard deviation; ``posterior`` starts from them
+    and repeats with the map's prediction until the map stops moving, which mends that.
     """
 
     sigma: Positive = 0.01

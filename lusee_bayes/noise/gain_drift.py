@@ -81,9 +81,7 @@ class GainDrift(eqx.Module):
         require_finite("the visibilities", visibilities)
         require_shape("hours", hours, (layout.n_times,))
         if not (np.diff(hours) > 0).all():
-            raise InputError(
-                "the sample times (hours) of a gain drift must grow from one to the next"
-            )
+            raise InputError("the sample times (hours) must grow from one to the next")
         width = self.width(hours) if width is None else width
         earlier = np.arange(layout.n_times)[:, None] - np.arange(width + 1)[None]
         lag = np.asarray(hours)[:, None] - np.asarray(hours)[np.maximum(earlier, 0)]
