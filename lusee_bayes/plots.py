@@ -12,6 +12,7 @@ from matplotlib.colorbar import Colorbar
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator
 
 from lusee_bayes.beams import HemisphereGrid, stokes_beam
@@ -117,9 +118,17 @@ def mollweide(
         x, y, at(pixels), cmap=colours, norm=norm, shading="gouraud", rasterized=True
     )
     if highest_altitude is not None and (highest_altitude < 0).any():
-        axes.contour(
-            x, y, at(highest_altitude), [0.0], colors="black", linestyles="dashed", linewidths=1.2
+        rim = axes.contour(
+            x,
+            y,
+            at(highest_altitude),
+            [0.0],
+            colors="black",
+            linestyles="dashed",
+            linewidths=1.2,
         )
+        # seen on dark maps and on light ones
+        rim.set_path_effects([withStroke(linewidth=2.4, foreground="white", alpha=0.7)])
     axes.set_xticks(np.radians([-120, -60, 0, 60, 120]), ["120°", "60°", "0°", "300°", "240°"])
     axes.set_yticks(np.radians([-60, -30, 0, 30, 60]))
     axes.tick_params(labelsize=7)
