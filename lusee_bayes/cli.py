@@ -1,6 +1,7 @@
 """The command line: parsing, error messages and exit codes. The work is in ``commands``.
 
-Exit codes: 0 success, 2 bad input (one sentence on standard error), 130 interrupted.
+Exit codes: 0 success, 1 a validation that failed, 2 bad input (one sentence on standard error), 130
+interrupted.
 """
 
 from __future__ import annotations
@@ -23,17 +24,19 @@ app = App(
 for _name, _help in {
     "simulate": "Simulate the visibilities of a scenario.",
     "map": "Make a posterior map of a scenario, or of given data.",
+    "sample": "Sample the posterior of a NumPyro program by Hamiltonian Monte Carlo.",
+    "validate": "Check the analytic posterior by HMC and by simulated data sets.",
     "paper": "Reproduce the figures of the reference paper and judge its claims.",
     "info": "Say what is in a file.",
 }.items():
-    app.command(f"lusee_bayes.commands:{_name}_command", name=_name, help=_help)
+    app.command(f"lusee_bayes.commands.{_name}:{_name}_command", name=_name, help=_help)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     errors = Console(stderr=True, soft_wrap=True, highlight=False)
     try:
-        app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+        code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except InputError as error:
         errors.print(f"lusee-bayes: {error}", markup=False)
         return 2
@@ -43,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         errors.print("lusee-bayes: interrupted; earlier results are as they were")
         return 130
-    return 0
+    return code if isinstance(code, int) else 0
 
 
 if __name__ == "__main__":

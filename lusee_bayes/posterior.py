@@ -69,10 +69,26 @@ class Posterior(eqx.Module):
         """C as a matrix, in K^2."""
         return _covariance(self)
 
+    def root(self) -> Float[Array, "unknowns white"]:
+        """R with C = R R^T: a draw is mean + R z, z ~ N(0, 1)."""
+        return _spread(self, jnp.eye(self.prior.rank)).T
+
+    def whiten(self, skies: Float[AnyArray, "n unknowns"]) -> Float[Array, "n white"]:
+        """z = R^-1 (m - mean): standard normals, if the skies are draws of this posterior.
+
+        InputError for a prior over pixels or with C_ell = 0, whose root has no inverse.
+        """
+        scale = self.prior.diagonal_root()
+        if scale is None or (not is_traced(scale) and not bool((scale > 0).all())):
+            raise InputError(
+                "only draws of harmonic coefficients with C_ell > 0 at every ell can be whitened"
+            )
+        return _whiten(self, jnp.asarray(skies))
+
     def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
         """A draw of m, shape (unknowns,); with ``n``, that many, shape (n, unknowns)."""
         z = jax.random.normal(key, (1 if n is None else n, self.prior.rank), dtype=jnp.float64)
-        draws = _colour(self, z)
+        draws = self.mean[None] + _spread(self, z)
         return draws[0] if n is None else draws
 
     def prior_fraction(self) -> Float[Array, " unknowns"]:
@@ -143,10 +159,21 @@ def _covariance(posterior: Posterior) -> Float[Array, "unknowns unknowns"]:
 
 
 @eqx.filter_jit
-def _colour(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array, "n unknowns"]:
-    """mean + G (L^-T z), or with a basis: z outside its span, L^-T Q^T z inside."""
+def _spread(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array, "n unknowns"]:
+    """R z = G (L^-T z), or with a basis: z outside its span, L^-T Q^T z inside."""
     inside = z if posterior.basis is None else z @ posterior.basis
     drawn = solve_lower(posterior.lower, inside.T, transpose=True).T
     if posterior.basis is not None:
         drawn = z + (drawn - inside) @ posterior.basis.T
-    return posterior.prior.colour(drawn + posterior.white_mean[None])
+    return posterior.prior.colour(drawn)
+
+
+@eqx.filter_jit
+def _whiten(posterior: Posterior, skies: Float[Array, "n unknowns"]) -> Float[Array, "n white"]:
+    """The inverse of :func:`_spread` about the mean."""
+    u = skies / posterior.prior.diagonal_root()[None] - posterior.white_mean[None]
+    inside = u if posterior.basis is None else u @ posterior.basis
+    white = inside @ jnp.tril(posterior.lower)
+    if posterior.basis is None:
+        return white
+    return u + (white - inside) @ posterior.basis.T

@@ -5,11 +5,19 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 
 @dataclass
@@ -28,6 +36,31 @@ class Stages:
         else:
             with self.console.status(f"{name} ..."):
                 yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+        if self.console is not None:
+            self.console.print(f"  {name:<28} {self.seconds[name]:7.2f} s", highlight=False)
+
+    @contextmanager
+    def progress(self, name: str, total: int) -> Iterator[Callable[[int, str], None]]:
+        """Run a block as a stage that counts: call what is given with (done so far, remark)."""
+        start = time.perf_counter()
+        if self.console is None:
+            yield lambda done, remark="": None
+        else:
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                TimeRemainingColumn(),
+                TextColumn("{task.fields[remark]}"),
+            )
+            with Progress(*columns, console=self.console, transient=True) as bar:
+                task = bar.add_task(name, total=total, remark="")
+                yield lambda done, remark="": bar.update(task, completed=done, remark=remark)
+        self._note(name, start)
+
+    def _note(self, name: str, start: float) -> None:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
         if self.console is not None:
             self.console.print(f"  {name:<28} {self.seconds[name]:7.2f} s", highlight=False)

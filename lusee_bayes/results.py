@@ -35,6 +35,7 @@ from lusee_bayes.metrics import (
 )
 from lusee_bayes.posterior import Posterior
 from lusee_bayes.progress import Stages, peak_memory_gb
+from lusee_bayes.scenario import Scenario
 from lusee_bayes.version import __version__
 from lusee_bayes.visibilities import Visibilities
 
@@ -182,7 +183,7 @@ class MapResult:
                 stage / "posterior.nc", engine="h5netcdf"
             )
             for name, pixels in self.maps().items():
-                self._write_fits(stage / f"{name}.fits", name, pixels)
+                write_map_fits(stage / f"{name}.fits", name, pixels, self.experiment.scenario)
             with (stage / "spectra.csv").open("w", newline="") as file:
                 writer = csv.writer(file)
                 columns = self.spectra()
@@ -201,26 +202,29 @@ class MapResult:
             maps |= {"truth": truth, "residual": mean - truth}
         return maps
 
-    def _write_fits(self, path: Path, name: str, pixels: Float[np.ndarray, " pixels"]) -> None:
-        scenario = self.experiment.scenario
-        healpy.write_map(
-            path,
-            pixels,
-            coord="G",
-            column_names=[name.upper()],
-            column_units="K",
-            dtype=np.float64,
-            extra_header=[
-                ("FREQ", scenario.frequency_mhz, "frequency in MHz"),
-                ("LMAX", scenario.lmax, "highest ell of the map"),
-                ("CREATOR", f"lusee_bayes {__version__}"),
-            ],
-        )
+
+def write_map_fits(
+    path: Path, name: str, pixels: Float[np.ndarray, " pixels"], scenario: Scenario
+) -> None:
+    """A HEALPix FITS file (RING, Galactic, K) of one map of a scenario."""
+    healpy.write_map(
+        path,
+        pixels,
+        coord="G",
+        column_names=[name.upper()],
+        column_units="K",
+        dtype=np.float64,
+        extra_header=[
+            ("FREQ", scenario.frequency_mhz, "frequency in MHz"),
+            ("LMAX", scenario.lmax, "highest ell of the map"),
+            ("CREATOR", f"lusee_bayes {__version__}"),
+        ],
+    )
 
 
 def versions() -> dict[str, str]:
     """Versions of the package and of what its numbers depend on."""
-    others = ("jax", "numpy", "scipy", "healpy", "astropy", "lunarsky")
+    others = ("jax", "numpyro", "arviz-stats", "numpy", "scipy", "healpy", "astropy", "lunarsky")
     return {"lusee_bayes": __version__, **{name: metadata.version(name) for name in others}}
 
 

@@ -1,23 +1,31 @@
-"""NumPyro distributions built on the package's objects, for use at sample sites.
+"""NumPyro pieces built on the package's objects, for use at sample sites.
 
 m ~ SkyPrior(S),    d ~ CorrelatedNormal(A m, N)
 d ~ Marginal(model)                                 the same with the sky integrated out
+handlers.reparam(config={"sky": Whitened(...)})     m sampled through z, m = mean + R z
 """
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
 from jaxtyping import Array, Float, PRNGKeyArray
 from numpyro import distributions as dist
+from numpyro.infer.reparam import Reparam
 
 from lusee_bayes.checks import InputError, is_traced
 from lusee_bayes.covariance import Covariance, Factor
 from lusee_bayes.linear_gaussian import LinearGaussian
+from lusee_bayes.posterior import Posterior
 from lusee_bayes.prior import Prior
 
 HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
+
+# the site of z is that of m with this appended
+WHITE_SUFFIX = "_white"
 
 
 class SkyPrior(dist.Distribution):
@@ -38,12 +46,17 @@ class SkyPrior(dist.Distribution):
         self.prior = prior
         super().__init__(event_shape=(prior.size,), validate_args=validate_args)
 
+    @property
+    def scale(self) -> Float[Array, " unknowns"]:
+        """Prior standard deviation of every unknown, in K."""
+        return self.prior.diagonal_root()
+
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         u = jax.random.normal(key, (*sample_shape, self.prior.rank), dtype=jnp.float64)
         return self.prior.colour(u)
 
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        scale = self.prior.diagonal_root()
+        scale = self.scale
         u = value / scale.reshape(*(1,) * (value.ndim - 1), -1)
         return -0.5 * (u**2).sum(-1) - jnp.log(scale).sum() - scale.shape[0] * HALF_LOG_2PI
 
@@ -101,3 +114,45 @@ class Marginal(dist.Distribution):
         solver = self.model.factorise()
         flat = value.reshape(-1, value.shape[-1])
         return jax.vmap(solver.log_prob)(flat).reshape(value.shape[:-1])
+
+
+class Whitening(eqx.Module):
+    """Coordinates z of the sky, m = mean + R z, in which a posterior is round.
+
+    mean : (unknowns,); root : R (unknowns, white) with R R^T the covariance; log_det : ln|det R|.
+    """
+
+    mean: Float[Array, " unknowns"]
+    root: Float[Array, "unknowns white"]
+    log_det: Float[Array, ""]
+
+    @classmethod
+    def of(cls, posterior: Posterior) -> Whitening:
+        """The coordinates in which ``posterior`` is N(0, 1). InputError as SkyPrior's."""
+        log_det = jnp.log(SkyPrior(posterior.prior).scale).sum()
+        log_det = log_det - jnp.log(jnp.diagonal(posterior.lower)).sum()
+        return cls(posterior.mean, posterior.root(), log_det)
+
+
+class Whitened(Reparam):
+    """Samples a site through z, m = mean + R z, by ``numpyro.handlers.reparam``.
+
+    The density stays the model's own: its prior at m, times |det R|. Only the coordinates are the
+    analytic posterior's; where that is wrong, sampling is slower and not wrong. z is the site
+    NAME_white, improper, so that programs are drawn from (``Predictive``) without this handler.
+    """
+
+    def __init__(self, whitening: Whitening):
+        self.whitening = whitening
+
+    def __call__(self, name, fn, obs):
+        if obs is not None:
+            raise InputError(f"the site '{name}' is observed; only latent sites can be whitened")
+        mean, root = self.whitening.mean, self.whitening.root
+        z = numpyro.sample(
+            f"{name}{WHITE_SUFFIX}",
+            dist.ImproperUniform(dist.constraints.real_vector, (), (root.shape[1],)),
+        )
+        value = mean + root @ z
+        numpyro.factor(f"{name}_density", fn.log_prob(value) + self.whitening.log_det)
+        return None, value

@@ -10,7 +10,7 @@ import numpyro
 import lusee_bayes as lb
 
 
-def model(coupling, prior, noise, data=None):
-    """``noise``: a covariance, or its factor where it is fixed."""
+def model(coupling, prior, fixed_noise, data=None):
+    """``fixed_noise``: N, factorised once (``noise.factor()``), or a covariance."""
     sky = numpyro.sample("sky", lb.SkyPrior(prior))
-    return numpyro.sample("data", lb.CorrelatedNormal(coupling @ sky, noise), obs=data)
+    numpyro.sample("data", lb.CorrelatedNormal(coupling @ sky, fixed_noise), obs=data)

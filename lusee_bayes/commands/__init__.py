@@ -1,0 +1,1 @@
+"""What each command does: scenario in, files and a few figures out."""

@@ -1,0 +1,93 @@
+"""lusee-bayes map: a posterior map of a scenario, or of given data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from rich.console import Console
+
+from lusee_bayes import plots
+from lusee_bayes.commands.options import Output, Overrides, Quiet, prepare
+from lusee_bayes.progress import Stages
+from lusee_bayes.results import MapResult, staged
+from lusee_bayes.scenario import load_scenario
+
+
+def map_command(
+    scenario: str,
+    *,
+    data: Path | None = None,
+    output: Output = None,
+    draws: int = 0,
+    covariance: Annotated[bool, Parameter(negative="")] = False,
+    set_: Overrides | None = None,
+    quiet: Quiet = False,
+) -> None:
+    """Make a posterior map of a scenario, or of given data.
+
+    Example: lusee-bayes map fiducial --set frequency_mhz=10 -o output/ten
+
+    Parameters
+    ----------
+    scenario
+        A YAML file, or the name of a scenario of the package (fiducial, ...).
+    data
+        Visibilities to map; without them the scenario's own are simulated.
+    output
+        Folder for the results; by default output/NAME.
+    draws
+        How many posterior draws to keep in posterior.nc.
+    covariance
+        Keep the posterior covariance in posterior.nc.
+    set_
+        key.path=value; overrides an entry of the scenario, as often as needed.
+    quiet
+        Print nothing but errors.
+    """
+    console = Console(quiet=quiet, soft_wrap=True)
+    resolved = load_scenario(scenario, set_ or [])
+    folder = output or Path("output") / Path(scenario).stem
+    stages = Stages(console)
+    experiment, measured = prepare(resolved, data, stages)
+    result = MapResult.from_experiment(experiment, measured, stages)
+    figures = write_figures(result, folder, stages)
+    with stages("files"):
+        files = result.write(folder, draws, covariance)
+    for path in files + figures:
+        console.print(f"  {path}", highlight=False)
+    console.print(headline(result), highlight=False)
+    console.print(f"look at {folder}/figures/maps.png", highlight=False)
+
+
+def write_figures(result: MapResult, folder: Path, stages: Stages) -> list[Path]:
+    """Draw every figure of a map run into folder/figures."""
+    drawn = {
+        "maps": lambda: plots.maps(result),
+        "data_vector": lambda: plots.data_vector(result.data),
+        "beams": lambda: plots.beams(result.experiment.scenario),
+        "fidelity": lambda: plots.fidelity(result),
+        "spectra": lambda: plots.spectra(result),
+    }
+    with stages("figures"), staged(folder) as stage:
+        (stage / "figures").mkdir()
+        for name, draw in drawn.items():
+            draw().savefig(stage / "figures" / f"{name}.png", dpi=110)
+    return [folder / "figures" / f"{name}.png" for name in drawn]
+
+
+def headline(result: MapResult) -> str:
+    """The few figures that matter, in one line."""
+    summary = result.summary()
+    parts = []
+    if result.truth is not None:
+        cross = summary["ell_cross"]
+        parts.append("SNR > 1 at every ell" if cross is None else f"SNR < 1 first at ell {cross}")
+    resolution = summary["effective_resolution_deg"]
+    if resolution is not None:
+        parts.append(f"resolution {resolution:.1f} deg")
+    parts.append(f"chi2 {summary['chi2']:.0f} (expected {summary['chi2_expected']:.0f})")
+    parts.append(f"ln evidence {summary['log_evidence']:.1f}")
+    parts.append(f"{summary['information_bits']:.0f} bits")
+    return ", ".join(parts)

@@ -1,0 +1,30 @@
+"""What commands have in common: options that mean the same everywhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from lusee_bayes.experiment import Experiment
+from lusee_bayes.progress import Stages
+from lusee_bayes.scenario import Scenario
+from lusee_bayes.visibilities import Visibilities, read_visibilities
+
+Overrides = Annotated[list[str], Parameter(name="--set", negative="")]
+Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")]
+Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
+
+
+def prepare(
+    scenario: Scenario, data: Path | None, stages: Stages
+) -> tuple[Experiment, Visibilities]:
+    """The experiment of a scenario with the data of a file, or with its own simulated ones."""
+    measured = None if data is None else read_visibilities(data)
+    experiment = Experiment.from_scenario(scenario, measured, stages)
+    if measured is None:
+        with stages("noise"):
+            measured = experiment.simulate()
+            measured.data.block_until_ready()
+    return experiment, measured

@@ -1,0 +1,127 @@
+"""Draws as an ArviZ DataTree: every group that belongs to a sampled model, on netCDF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import arviz_base
+import jax
+import numpy as np
+import xarray as xr
+from numpyro.infer import Predictive
+
+from lusee_bayes.checks import InputError
+from lusee_bayes.harmonics import lmax_of, mode_numbers
+from lusee_bayes.inference import Chains
+from lusee_bayes.linear_gaussian import LinearGaussian
+from lusee_bayes.posterior import Posterior
+from lusee_bayes.programs import Program, collapsed_skies, is_collapsed, replicated_data
+from lusee_bayes.visibilities import Visibilities
+
+FORMAT = "lusee_bayes samples 1"
+SKY = "sky"
+
+
+def to_datatree(
+    chains: Chains,
+    program: Program,
+    model: LinearGaussian,
+    posterior: Posterior,
+    data: Visibilities,
+    *,
+    seed: int = 0,
+    n_predictive: int = 100,
+    attributes: dict[str, object] | None = None,
+) -> xr.DataTree:
+    """Groups posterior, sample_stats, prior, prior and posterior predictive, data and constants.
+
+    Skies are on dims (chain, draw, mode) with coords ell and m, in K; data on (datum) with coords
+    product and time. Programs without the sky get it drawn. ``n_predictive``: draws of the prior
+    and of each predictive group. The analytic posterior of ``model`` is among the constants.
+    """
+    arguments = program.arguments(model)
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1), 3)
+    sites = dict(chains.sites)
+    collapsed = is_collapsed(program, arguments, data.data)
+    n_chains, n_draws = next(iter(sites.values())).shape[:2]
+    step = max(1, n_chains * n_draws // n_predictive)
+    # NumPyro's own code mixes types and ranks, whatever is asked of ours
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        if collapsed:
+            sites[SKY] = collapsed_skies(program, arguments, data.data, sites, keys[0])
+        prior = Predictive(program.model, num_samples=n_predictive)(keys[1], **arguments)
+        thinned = {name: values[:, ::step] for name, values in sites.items()}
+        if collapsed:
+            skies = thinned.pop(SKY)
+            replicated = replicated_data(program, arguments, data.data, thinned, skies, keys[2])
+        else:
+            again = Predictive(program.model, thinned, batch_ndims=2, return_sites=["data"])
+            replicated = np.asarray(again(keys[2], **arguments)["data"])
+    prior = {name: np.asarray(values)[None] for name, values in prior.items()}
+    constants = {
+        "prior_std": np.sqrt(np.asarray(model.prior.variance())),
+        "analytic_mean": np.asarray(posterior.mean),
+        "analytic_std": np.asarray(posterior.std()),
+    }
+    if data.truth is not None:
+        constants["truth"] = np.asarray(data.truth)
+    groups = {
+        "posterior": sites,
+        "sample_stats": chains.statistics,
+        "prior": {name: v for name, v in prior.items() if name in sites},
+        "prior_predictive": {"data": prior["data"]},
+        "posterior_predictive": {"data": replicated},
+        "observed_data": {"data": np.asarray(data.data)},
+        "constant_data": constants,
+    }
+    tree = arviz_base.from_dict(
+        groups,
+        dims={SKY: ["mode"], "data": ["datum"], **{name: ["mode"] for name in constants}},
+        attrs={"/": {"format": FORMAT, "program": program.name, **(attributes or {})}},
+    )
+    tree["posterior_predictive"] = tree["posterior_predictive"].dataset.assign_coords(
+        draw=np.arange(n_draws)[::step]
+    )
+    return _with_coordinates(tree, model, data)
+
+
+def _with_coordinates(tree: xr.DataTree, model: LinearGaussian, data: Visibilities) -> xr.DataTree:
+    """ell and m of every mode, product and time of every sample, and units."""
+    ell, m = mode_numbers(lmax_of(model.prior.size))
+    times = data.observation.times.isot
+    labels = np.asarray(data.labels)
+    mode = {"ell": ("mode", ell), "m": ("mode", m)}
+    sample = {
+        "product": ("datum", labels[data.layout.product]),
+        "time": ("datum", np.asarray(times)[data.layout.time]),
+    }
+
+    def labelled(dataset: xr.Dataset) -> xr.Dataset:
+        for dimension, coordinates in [("mode", mode), ("datum", sample)]:
+            if dimension in dataset.dims:
+                dataset = dataset.assign_coords(coordinates)
+        for name in dataset.data_vars:
+            if {"mode", "datum"} & set(dataset[name].dims):
+                dataset[name].attrs["units"] = "K"
+        return dataset
+
+    return tree.map_over_datasets(labelled)
+
+
+def write_datatree(tree: xr.DataTree, path: Path) -> None:
+    """Write every group to one netCDF file."""
+    tree.to_netcdf(path, engine="h5netcdf")
+
+
+def read_datatree(path: str | Path) -> xr.DataTree:
+    """Read what :func:`write_datatree` wrote. InputError for anything else."""
+    try:
+        tree = xr.load_datatree(path, engine="h5netcdf")
+    except (OSError, ValueError) as error:
+        raise InputError(f"'{path}' cannot be read as samples: {error}") from error
+    if tree.attrs.get("format") != FORMAT:
+        raise InputError(
+            f"'{path}' is not a file of samples: its format is '{tree.attrs.get('format')}', "
+            f"expected '{FORMAT}' (lusee-bayes sample writes one)"
+        )
+    return tree

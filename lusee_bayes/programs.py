@@ -1,0 +1,166 @@
+"""Probabilistic programs: files with a NumPyro ``model``, and what they can ask for."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+from numpyro import handlers
+
+from lusee_bayes.checks import AnyArray, InputError, nearest
+from lusee_bayes.linear_gaussian import LinearGaussian
+
+# the programs that come along: beside the package in a checkout, inside it once installed
+FOLDERS = (Path(__file__).parent / "models", Path(__file__).parents[1] / "models")
+
+# what a program's arguments may be called
+PIECES: dict[str, Callable[[LinearGaussian], Any]] = {
+    "coupling": lambda model: model.coupling,
+    "prior": lambda model: model.prior,
+    "noise": lambda model: model.noise,
+    "fixed_noise": lambda model: model.noise.factor(),
+}
+
+
+@dataclass(frozen=True)
+class Program:
+    """A NumPyro model whose arguments are among ``PIECES``, and ``data``.
+
+    Called with ``data=None`` it is the prior predictive. If it returns a LinearGaussian, it has
+    integrated the sky out; :func:`collapsed_skies` then draws it.
+    """
+
+    name: str
+    model: Callable
+    digest: str
+
+    def arguments(self, model: LinearGaussian) -> dict[str, Any]:
+        """What the program asks for, taken from ``model``; all but the data."""
+        wanted = [name for name in inspect.signature(self.model).parameters if name != "data"]
+        return {name: PIECES[name](model) for name in wanted}
+
+
+def program_names() -> list[str]:
+    """Names of the programs that come with the package."""
+    return sorted({path.stem for folder in FOLDERS for path in folder.glob("*.py")})
+
+
+def load_program(source: str | Path) -> Program:
+    """A program by its name, or by the path of its file.
+
+    InputError if there is none, if it cannot be run, or asks for something unknown.
+    """
+    path = _find(source)
+    text = path.read_bytes()
+    spec = importlib.util.spec_from_file_location(f"lusee_bayes_program_{path.stem}", path)
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except (SyntaxError, ImportError, NameError, AttributeError, TypeError, ValueError) as error:
+        raise InputError(f"the program '{path}' does not run: {error}") from error
+    model = getattr(module, "model", None)
+    if not callable(model):
+        raise InputError(
+            f"'{path}' has no function 'model'; a program is def model(..., data=None)"
+        )
+    asked = inspect.signature(model).parameters
+    if "data" not in asked:
+        raise InputError(f"model in '{path}' has no argument 'data'; the data could not enter it")
+    for name in asked:
+        if name != "data" and name not in PIECES:
+            raise InputError(
+                f"model in '{path}' asks for '{name}'; a program can have data, "
+                f"{', '.join(PIECES)} ({nearest(name, PIECES)})"
+            )
+    return Program(path.stem, model, hashlib.sha256(text).hexdigest())
+
+
+def _find(source: str | Path) -> Path:
+    if str(source) in program_names():
+        return next(f / f"{source}.py" for f in FOLDERS if (f / f"{source}.py").exists())
+    path = Path(source)
+    if path.suffix == ".py" and path.is_file():
+        return path
+    raise InputError(
+        f"no program '{source}': give the path of a Python file, or one of "
+        f"{', '.join(program_names())}"
+    )
+
+
+def is_collapsed(program: Program, arguments: dict[str, Any], data: AnyArray) -> bool:
+    """Whether the program has integrated the sky out: its model returns a LinearGaussian."""
+    found = []
+
+    def run(dynamic):
+        result = handlers.seed(program.model, 0)(**eqx.combine(dynamic, static), data=data)
+        found.append(isinstance(result, LinearGaussian))
+
+    dynamic, static = eqx.partition(arguments, eqx.is_array)
+    jax.eval_shape(run, dynamic)
+    return found[0]
+
+
+def collapsed_skies(
+    program: Program,
+    arguments: dict[str, Any],
+    data: Float[AnyArray, " data"],
+    sites: dict[str, np.ndarray],
+    key: PRNGKeyArray,
+) -> Float[np.ndarray, "chains draws modes"]:
+    """An exact draw of the sky for each draw (chains, draws, ...) of the other sites."""
+    return _map_draws(program, arguments, data, sites, None, key)
+
+
+def replicated_data(
+    program: Program,
+    arguments: dict[str, Any],
+    data: Float[AnyArray, " data"],
+    sites: dict[str, np.ndarray],
+    skies: Float[np.ndarray, "chains draws modes"],
+    key: PRNGKeyArray,
+) -> Float[np.ndarray, "chains draws data"]:
+    """Data of a collapsed program seen again: the drawn skies with new noise."""
+    return _map_draws(program, arguments, data, sites, skies, key)
+
+
+def _map_draws(program, arguments, data, sites, skies, key) -> np.ndarray:
+    shape = next(iter(sites.values())).shape[:2]
+    per_draw = jax.tree.map(
+        lambda v: jnp.asarray(v).reshape(shape[0] * shape[1], *v.shape[2:]), (sites, skies)
+    )
+    keys = jax.random.split(key, shape[0] * shape[1])
+    rows = _draw(program, arguments, jnp.asarray(data), *per_draw, keys)
+    return np.asarray(rows).reshape(*shape, -1)
+
+
+@eqx.filter_jit
+def _draw(
+    program: Program,
+    arguments: dict[str, Any],
+    data: Float[Array, " data"],
+    sites: dict[str, Array],
+    skies: Float[Array, "draws modes"] | None,
+    keys: PRNGKeyArray,
+) -> Float[Array, "draws n"]:
+    """Skies, or data where skies are given, one draw after the other."""
+
+    def one(inputs):
+        values, sky, key = inputs
+        model = handlers.substitute(handlers.seed(program.model, 0), values)
+        gaussian = model(**arguments, data=data)
+        if sky is None:
+            return gaussian.condition(data).sample(key)
+        seen = gaussian.coupling @ sky + gaussian.noise.sample(key)
+        return seen if gaussian.offset is None else seen + gaussian.offset
+
+    return jax.lax.map(one, (sites, skies, keys))

@@ -1,0 +1,245 @@
+"""A sampled scenario: draws that survive a kill, and the files that are made of them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpyro.infer.hmc import HMCState
+
+from lusee_bayes.checkpoints import Checkpoints
+from lusee_bayes.checks import InputError
+from lusee_bayes.datatree import SKY, read_datatree, to_datatree, write_datatree
+from lusee_bayes.experiment import Experiment
+from lusee_bayes.inference import Chains, Sampler, latent_sites, sample
+from lusee_bayes.linear_gaussian import LinearGaussian
+from lusee_bayes.posterior import Posterior
+from lusee_bayes.programs import Program
+from lusee_bayes.progress import Stages, peak_memory_gb
+from lusee_bayes.results import staged, versions, write_map_fits
+from lusee_bayes.sites import Whitening
+from lusee_bayes.uncertainty import (
+    INTERVAL,
+    pixel_interval,
+    pixel_mean,
+    pixel_std,
+    sky_quantities,
+    summary,
+)
+from lusee_bayes.visibilities import Visibilities
+
+SAMPLES, CHAINS = "samples.nc", "chains"
+
+# directions whose brightness every summary tells: Galactic longitude and latitude in degrees
+LANDMARKS = {
+    "Galactic centre": (0.0, 0.0),
+    "anticentre": (180.0, 0.0),
+    "north Galactic pole": (0.0, 90.0),
+    "south Galactic pole": (0.0, -90.0),
+}
+
+
+@dataclass(frozen=True)
+class SampleRun:
+    """Draws of a program given an experiment's data, with the analytic posterior beside them.
+
+    tree : the draws as an ArviZ DataTree; gradients_per_second : of all chains together while
+    drawing, None if too little was drawn in this session to tell.
+    """
+
+    experiment: Experiment
+    data: Visibilities
+    model: LinearGaussian
+    posterior: Posterior
+    tree: xr.DataTree
+    seconds: dict[str, float]
+    gradients_per_second: float | None
+
+    @property
+    def skies(self) -> np.ndarray:
+        """Draws of the sky, (chains, draws, modes), in K."""
+        return self.tree["posterior"][SKY].values
+
+    def quantities(self) -> dict[str, np.ndarray]:
+        """Draws (chains, draws) of the other sites, landmarks, powers and lowest modes."""
+        lmax = self.experiment.scenario.lmax
+        others = {
+            name: values.values
+            for name, values in self.tree["posterior"].data_vars.items()
+            if name != SKY and values.ndim == 2
+        }
+        ells = sorted({min(ell, lmax) for ell in (0, 1, 2, 5, 10, 20, 30, 40)})
+        modes = [(ell, m) for ell in range(min(lmax, 2) + 1) for m in range(-ell, ell + 1)]
+        return others | sky_quantities(self.skies, pixels=LANDMARKS, ells=ells, modes=modes)
+
+    def summary_table(self) -> pd.DataFrame:
+        """ArviZ's summary of :meth:`quantities`."""
+        return summary(self.quantities())
+
+    def maps(self) -> dict[str, np.ndarray]:
+        """Mean, standard deviation and the ends of the 90 % interval of every pixel, in K."""
+        nside = self.experiment.scenario.map_nside
+        lower, upper = pixel_interval(self.skies, nside, INTERVAL)
+        return {
+            "mean": pixel_mean(self.skies, nside),
+            "std": pixel_std(self.skies, nside),
+            "lower": lower,
+            "upper": upper,
+        }
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write samples, summary, maps and the scenario into ``folder``; see ``results.staged``."""
+        scenario = self.experiment.scenario
+        with staged(folder) as stage:
+            write_datatree(self.tree, stage / SAMPLES)
+            self.summary_table().to_csv(stage / "summary.csv", index_label="quantity")
+            for name, pixels in self.maps().items():
+                write_map_fits(stage / f"{name}.fits", name, pixels, scenario)
+            (stage / "scenario.yaml").write_text(scenario.to_yaml())
+            (stage / "sampling.json").write_text(json.dumps(self.figures(), indent=2) + "\n")
+            written = sorted(p.name for p in stage.iterdir())
+        # every draw is in the samples now
+        shutil.rmtree(Path(folder) / CHAINS, ignore_errors=True)
+        return [Path(folder) / name for name in written]
+
+    def figures(self) -> dict[str, object]:
+        """What sampling.json tells: sizes, speeds, times, memory, versions."""
+        stats = self.tree["sample_stats"]
+        chains, draws = self.skies.shape[:2]
+        return {
+            "program": self.tree.attrs["program"],
+            "chains": chains,
+            "draws": draws,
+            "divergences": int(stats["diverging"].sum()),
+            "mean_acceptance": float(stats["acceptance_rate"].mean()),
+            "step_size": [float(x) for x in stats["step_size"].values[:, -1]],
+            "mean_steps": float(stats["n_steps"].mean()),
+            "gradients_per_second": self.gradients_per_second,
+            "seconds": {name: round(s, 3) for name, s in self.seconds.items()},
+            "peak_memory_gb": round(peak_memory_gb(), 3),
+            "versions": versions(),
+        }
+
+
+def run_sampler(
+    experiment: Experiment,
+    data: Visibilities,
+    program: Program,
+    sampler: Sampler,
+    folder: str | Path,
+    *,
+    resume: bool = False,
+    stages: Stages | None = None,
+) -> SampleRun:
+    """Sample ``program`` given ``data``; draws are kept in ``folder``/chains until
+    :meth:`SampleRun.write` has put them where they belong.
+
+    ``resume``: go on with an unfinished run of the same settings, or take over a finished one.
+    InputError if ``folder`` holds an unfinished run and ``resume`` is not given.
+    """
+    stages = stages or Stages()
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"'{folder}' is a file; give a folder for the results")
+    with stages("posterior"):
+        model, posterior, _ = experiment.infer(data)
+        jax.block_until_ready(posterior.white_mean)
+    identity = {
+        "scenario": experiment.scenario.to_yaml(),
+        "data": _digest(data),
+        "program": program.name,
+        "program text": program.digest,
+        **{f"sampler's {name}": value for name, value in sampler.identity().items()},
+        "versions": versions(),
+    }
+    if resume and (finished := _finished(folder, identity, sampler)) is not None:
+        return SampleRun(experiment, data, model, posterior, finished, stages.seconds, None)
+    arguments = program.arguments(model)
+    latent = latent_sites(program.model, {**arguments, "data": data.data})
+    whitening = {SKY: Whitening.of(posterior)} if SKY in latent else {}
+    checkpoints = Checkpoints(folder / CHAINS, identity, resume=resume)
+    times = []
+    with stages.progress("sampling", sampler.warmup + sampler.draws) as update:
+
+        def report(iteration: int, state: HMCState) -> None:
+            times.append((time.perf_counter(), iteration))
+            update(iteration, _state_in_words(iteration, state, sampler))
+
+        chains = sample(
+            program.model,
+            {**arguments, "data": data.data},
+            sampler,
+            whitening,
+            checkpoints,
+            report,
+        )
+    with stages("data tree"):
+        tree = to_datatree(
+            chains,
+            program,
+            model,
+            posterior,
+            data,
+            seed=sampler.seed,
+            attributes={
+                "identity": json.dumps(identity),
+                "frequency_mhz": experiment.scenario.frequency_mhz,
+                "frame": "galactic",
+                "scenario": experiment.scenario.to_yaml(),
+            },
+        )
+    return SampleRun(
+        experiment,
+        data,
+        model,
+        posterior,
+        tree,
+        stages.seconds,
+        _speed(times, chains, sampler.warmup),
+    )
+
+
+def _digest(data: Visibilities) -> str:
+    """Tells data sets apart."""
+    content = hashlib.sha256(np.ascontiguousarray(data.data).tobytes())
+    content.update(data.layout.product.tobytes() + data.layout.time.tobytes())
+    return content.hexdigest()
+
+
+def _finished(folder: Path, identity: dict, sampler: Sampler) -> xr.DataTree | None:
+    """The samples that an earlier run of the same settings has left, if there are enough."""
+    if (folder / CHAINS).exists() or not (folder / SAMPLES).exists():
+        return None
+    tree = read_datatree(folder / SAMPLES)
+    same = json.loads(tree.attrs["identity"]) == json.loads(json.dumps(identity))
+    if not same or tree["posterior"].sizes["draw"] != sampler.draws:
+        raise InputError(
+            f"'{folder}' holds a finished run with other settings; leave out --resume to replace "
+            "it, or give another folder"
+        )
+    return tree
+
+
+def _state_in_words(iteration: int, state: HMCState, sampler: Sampler) -> str:
+    phase = "warmup" if iteration <= sampler.warmup else "draws"
+    steps, size = float(state.num_steps.mean()), float(state.adapt_state.step_size.mean())
+    return (
+        f"{phase}, {steps:.0f} steps of {size:.3f}, acceptance {state.mean_accept_prob.mean():.2f}"
+    )
+
+
+def _speed(times: list[tuple[float, int]], chains: Chains, warmup: int) -> float | None:
+    """Gradients per second between the first and the last file of draws of this session."""
+    drawn = [(at, done - warmup) for at, done in times if done > warmup]
+    if len(drawn) < 2:
+        return None
+    (start, first), (end, last) = drawn[0], drawn[-1]
+    return float(chains.statistics["n_steps"][:, first:last].sum() / (end - start))

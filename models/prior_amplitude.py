@@ -1,0 +1,22 @@
+"""How strong the sky is, and how steep its spectrum: C_ell -> A C_ell ((ell + 1) / 10)^tilt.
+
+A (``amplitude``) and ``tilt`` are sampled with the sky integrated out, the sky is then drawn given
+each of them: its uncertainty holds theirs.
+"""
+
+import jax.numpy as jnp
+import numpyro
+from numpyro import distributions as dist
+
+import lusee_bayes as lb
+
+
+def model(coupling, prior, noise, data=None):
+    """``prior``: the spectrum that A = 1 and tilt = 0 stand for."""
+    amplitude = numpyro.sample("amplitude", dist.LogNormal(0.0, 0.5))
+    tilt = numpyro.sample("tilt", dist.Normal(0.0, 0.5))
+    ell = jnp.arange(float(prior.spectrum.shape[0]))
+    spectrum = prior.spectrum * amplitude * ((ell + 1.0) / 10.0) ** tilt
+    gaussian = lb.LinearGaussian(coupling, lb.HarmonicPrior(spectrum), noise)
+    numpyro.sample("data", lb.Marginal(gaussian), obs=data)
+    return gaussian
