@@ -6,9 +6,9 @@ FALSE_ALARM`` runs, given how many draws there are and how they hang together in
 * means: the largest of the modes' deviations in units of their Monte Carlo errors;
 * variances: the same for chi^2 of each mode's sample variance, with its own effective sample size;
 * covariance: the extreme eigenvalues of the draws' covariance in the analytic posterior's
-  coordinates (the generalised eigenvalues of the two), against those of simulated Gaussian chains
-  with the spectrum in time of the real ones. Even exact draws spread widely here: independent ones
-  over (1 +- sqrt(modes / draws))^2 (Marchenko & Pastur 1967).
+  coordinates (the generalised eigenvalues of the two), against those of simulated exact chains
+  that move as far from draw to draw as the real ones. Even exact draws spread widely here:
+  independent ones over (1 +- sqrt(modes / draws))^2 (Marchenko & Pastur 1967).
 
 The sampler's own diagnostics are judged as is common (Vehtari et al. 2021; Betancourt 2016).
 """
@@ -179,29 +179,21 @@ def _eigenvalues(white: Float[np.ndarray, "chains draws modes"]) -> Float[np.nda
 def _null_eigenvalues(
     white: Float[np.ndarray, "chains draws modes"], rng: np.random.Generator
 ) -> Float[np.ndarray, "runs modes"]:
-    """Eigenvalues of Gaussian chains of unit covariance with the spectrum in time of ``white``.
+    """Eigenvalues of exact chains that turn from draw to draw as far as ``white`` does.
 
-    The spectrum is the mean over modes and chains, scaled to unit variance: the total variance of
-    the draws is not taken over from them.
+    In white coordinates a trajectory is a turn of all modes by one angle, x' = c x + s p with new
+    momenta p; c is the cosine between successive draws. Draws that turn by 180 degrees count once
+    in a covariance, though they halve the error of a mean: ESS of the means would mislead here.
     """
-    n_draws = white.shape[1]
-    power = np.zeros(n_draws // 2 + 1)
-    for chain in white:
-        power += (np.abs(np.fft.rfft(chain, axis=0)) ** 2).mean(1)
-    weights = np.full(len(power), 2.0)
-    weights[0] = 1.0
-    if n_draws % 2 == 0:
-        weights[-1] = 1.0
-    root = np.sqrt(power / ((weights * power).sum() / n_draws))
+    unit = white / np.linalg.norm(white, axis=2, keepdims=True)
+    cosine = (unit[:, 1:] * unit[:, :-1]).sum(2)
+    # not sqrt(1 - cosine^2), which rounding makes imaginary where a draw is repeated
+    sine = np.linalg.norm(unit[:, 1:] - cosine[..., None] * unit[:, :-1], axis=2)
     runs = []
     for _ in range(NULL_RUNS):
-        chains = [
-            np.fft.irfft(
-                np.fft.rfft(rng.standard_normal(chain.shape), axis=0) * root[:, None],
-                n_draws,
-                axis=0,
-            )
-            for chain in white
-        ]
-        runs.append(_eigenvalues(np.stack(chains)))
+        chains = rng.standard_normal(white.shape)
+        for t in range(1, white.shape[1]):
+            chains[:, t] *= sine[:, t - 1, None]
+            chains[:, t] += cosine[:, t - 1, None] * chains[:, t - 1]
+        runs.append(_eigenvalues(chains))
     return np.stack(runs)

@@ -155,7 +155,7 @@ def as_text(scenario: str, checks: list[Check], ranks: Ranks) -> str:
     lines += [
         "",
         "Means, variances and calibration: a true posterior fails each of them once in a thousand "
-        "runs. Eigenvalues: against simulated chains with the spectrum in time of the real ones. "
+        "runs. Eigenvalues: against simulated exact chains that move as far from draw to draw. "
         "R-hat, effective sizes, BFMI: as is common.",
         "",
         f"Coverage over {ranks.n_simulations} simulations (regions: distance from the mean; else "
