@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, PRNGKeyArray
 from numpyro import handlers
 from numpyro.infer import HMC, NUTS
 from numpyro.infer.hmc import HMCState
@@ -154,6 +155,39 @@ def sample(
     )
 
 
+def draw_within(
+    program: Callable,
+    arguments: Mapping[str, Any],
+    key: PRNGKeyArray,
+    sampler: Sampler,
+    whitening: Mapping[str, Whitening] | None = None,
+    thin: int = 1,
+) -> dict[str, Array]:
+    """Every ``thin``-th draw of one chain, (draws, ...) by site, as a part of a JAX program.
+
+    To be mapped over many data sets (``jax.vmap``), as in simulation-based calibration; nothing is
+    kept on disk. ``sampler``'s chains and seed are not looked at. Call it with NumPy's dtype
+    promotion "standard" and rank promotion allowed: NumPyro needs them.
+    """
+    run = _Run(program, dict(arguments), sampler, dict(whitening or {}))
+    kernel, inputs = run.kernel, (run.dynamic,)
+    state = kernel.init(key, sampler.warmup, None, inputs, {})
+
+    def iterate(n, state):
+        return jax.lax.fori_loop(0, n, lambda _, s: kernel.sample(s, inputs, {}), state)
+
+    def step(state, _):
+        state = iterate(thin, state)
+        return state, state.z
+
+    _, z = jax.lax.scan(step, iterate(sampler.warmup, state), None, length=sampler.draws)
+    return _without_auxiliary(jax.vmap(kernel.postprocess_fn(inputs, {}))(z))
+
+
+def _without_auxiliary(sites: dict[str, Array]) -> dict[str, Array]:
+    return {name: values for name, values in sites.items() if not name.endswith(WHITE_SUFFIX)}
+
+
 class _Run:
     """A kernel with its model's arguments, and chunks of its iterations compiled once."""
 
@@ -217,8 +251,7 @@ class _Run:
         state, rows = jax.lax.fori_loop(0, n, step, (state, rows))
         constrain = self.kernel.postprocess_fn((dynamic,), {})
         sites = jax.vmap(jax.vmap(constrain))(rows.pop("z"))
-        kept = {name: v for name, v in sites.items() if not name.endswith(WHITE_SUFFIX)}
-        return state, kept | rows
+        return state, _without_auxiliary(sites) | rows
 
     def _shared_out(self, state: HMCState) -> HMCState:
         devices = jax.devices()

@@ -20,7 +20,7 @@ CHAIN_COLOURS = (BLUE, ORANGE, "#009E73", "#000000")
 
 def uncertainty(run: SampleRun) -> Figure:
     """Mean, standard deviation and 90 % interval of the drawn maps, and how skewed it is."""
-    maps = run.maps()
+    maps = run.maps
     positive = np.percentile(maps["mean"][maps["mean"] > 0], [0.5, 99.8])
     level = maps["mean"].mean()
     width = maps["upper"] - maps["lower"]

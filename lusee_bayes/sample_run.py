@@ -7,6 +7,7 @@ import json
 import shutil
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import jax
@@ -84,6 +85,7 @@ class SampleRun:
         """ArviZ's summary of :meth:`quantities`."""
         return summary(self.quantities())
 
+    @cached_property
     def maps(self) -> dict[str, np.ndarray]:
         """Mean, standard deviation and the ends of the 90 % interval of every pixel, in K."""
         nside = self.experiment.scenario.map_nside
@@ -101,7 +103,7 @@ class SampleRun:
         with staged(folder) as stage:
             write_datatree(self.tree, stage / SAMPLES)
             self.summary_table().to_csv(stage / "summary.csv", index_label="quantity")
-            for name, pixels in self.maps().items():
+            for name, pixels in self.maps.items():
                 write_map_fits(stage / f"{name}.fits", name, pixels, scenario)
             (stage / "scenario.yaml").write_text(scenario.to_yaml())
             (stage / "sampling.json").write_text(json.dumps(self.figures(), indent=2) + "\n")

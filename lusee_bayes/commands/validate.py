@@ -156,7 +156,8 @@ def as_text(scenario: str, checks: list[Check], ranks: Ranks) -> str:
         "",
         "Means, variances and calibration: a true posterior fails each of them once in a thousand "
         "runs. Eigenvalues: against simulated exact chains that move as far from draw to draw. "
-        "R-hat, effective sizes, BFMI: as is common.",
+        "R-hat: 1.01, or what the largest of so many modes reaches by chance. Effective sizes, "
+        "BFMI: as is common.",
         "",
         f"Coverage over {ranks.n_simulations} simulations (regions: distance from the mean; else "
         "central intervals):",
