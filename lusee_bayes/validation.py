@@ -111,6 +111,7 @@ def compare(
     limit = float(stats.norm.isf(FALSE_ALARM / (2 * n_modes)))
     spread = NULL_MARGIN * null.std(0, ddof=1)
     low, high = null.mean(0)[0] - spread[0], null.mean(0)[-1] + spread[-1]
+    total = NULL_MARGIN * float(null.mean(1).std(ddof=1))
     ess_floor = float(MIN_ESS_PER_CHAIN * n_chains)
     infinite = float("inf")
     # R-hat^2 - 1 of m half chains is chi^2 with m - 1 degrees over ESS: the largest of many modes
@@ -126,6 +127,8 @@ def compare(
               "smallest generalised eigenvalue of the draws' covariance"),
         Check("covariance, largest", float(eigenvalues[-1]), 0.0, high,
               "largest generalised eigenvalue of the draws' covariance"),
+        Check("covariance, mean", float(eigenvalues.mean()), 1.0 - total, 1.0 + total,
+              "mean generalised eigenvalue: the total variance in analytic coordinates"),
         Check("R-hat", float(rhat.max()), 0.0, rhat_limit, "largest of all modes"),
         Check("bulk ESS", float(bulk.min()), ess_floor, infinite, "smallest of all modes"),
         Check("tail ESS", float(tail.min()), ess_floor, infinite, "smallest of all modes"),
