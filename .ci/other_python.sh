@@ -7,7 +7,7 @@ here=$(.venv/bin/python -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 for version in 3.13 3.12 3.11; do
   [ "$version" = "$here" ] && continue
   for python in "python$version" "$HOME"/.pyenv/versions/"$version".*/bin/python; do
-    "$python" -c 'import venv' 2>/dev/null || continue
+    "$python" -c 'import venv' >/dev/null 2>&1 || continue
     folder=.venv-$version
     [ -x "$folder/bin/python" ] || "$python" -m venv "$folder"
     "$folder/bin/python" -m pip install --quiet --editable '.[dev]'

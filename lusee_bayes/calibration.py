@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 from scipy import stats
 
 from lusee_bayes.checks import InputError
@@ -135,7 +135,7 @@ def calibrate(
 
 
 @eqx.filter_jit
-def _rank_batch(simulate, draw, quantities, keys: PRNGKeyArray) -> dict[str, Array]:
+def _rank_batch(simulate, draw, quantities, keys: Key[Array, " n"]) -> dict[str, Array]:
     """Ranks of one batch of data sets: (simulations, ...) by name."""
 
     def one(key):

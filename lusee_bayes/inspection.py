@@ -9,13 +9,13 @@ import healpy
 import numpy as np
 import xarray as xr
 
-from lusee_bayes import results, visibilities
+from lusee_bayes import datatree, results, visibilities
 from lusee_bayes.checks import InputError
 from lusee_bayes.sky import read_map
 
 
 def describe(path: str | Path) -> str:
-    """A few lines on a file of visibilities, a posterior, or a sky map (FITS or HDF5).
+    """A few lines on a file of visibilities, a posterior, samples, or a sky map (FITS or HDF5).
 
     InputError if it is missing or none of these.
     """
@@ -27,6 +27,8 @@ def describe(path: str | Path) -> str:
         return _describe_visibilities(path)
     if kind == results.FORMAT:
         return _describe_posterior(path)
+    if kind == datatree.FORMAT:
+        return _describe_samples(path)
     return _describe_map(path)
 
 
@@ -75,6 +77,22 @@ def _describe_posterior(path: Path) -> str:
             f"  also holds: {', '.join(extra) or 'nothing else'}"
             + (f" ({draws} draws)" if draws else ""),
             f"  versions: {attrs['versions']}",
+        ]
+    )
+
+
+def _describe_samples(path: Path) -> str:
+    tree = datatree.read_datatree(path)
+    posterior, statistics = tree["posterior"], tree["sample_stats"]
+    sites = ", ".join(f"{name} {v.shape[2:]}" for name, v in posterior.data_vars.items())
+    return "\n".join(
+        [
+            f"{path}: {posterior.sizes['chain']} x {posterior.sizes['draw']} draws of the program "
+            f"{tree.attrs['program']} at {float(tree.attrs['frequency_mhz']):g} MHz",
+            f"  sites: {sites}",
+            f"  {int(statistics['diverging'].sum())} divergences, "
+            f"{float(statistics['n_steps'].mean()):.1f} steps a trajectory",
+            f"  groups: {', '.join(tree.children)}",
         ]
     )
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import inspect
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray
 from numpyro import handlers
 
 from lusee_bayes.checks import AnyArray, InputError, nearest
@@ -62,12 +63,17 @@ def load_program(source: str | Path) -> Program:
     """
     path = _find(source)
     text = path.read_bytes()
-    spec = importlib.util.spec_from_file_location(f"lusee_bayes_program_{path.stem}", path)
-    module = importlib.util.module_from_spec(spec)
+    module = ModuleType(f"lusee_bayes_program_{path.stem}")
+    module.__file__ = str(path)
+    # compiled from the text that is hashed, never from a cache of an earlier one; dataclasses look
+    # their module up by name
+    sys.modules[module.__name__] = module
     try:
-        spec.loader.exec_module(module)
-    except (SyntaxError, ImportError, NameError, AttributeError, TypeError, ValueError) as error:
-        raise InputError(f"the program '{path}' does not run: {error}") from error
+        exec(compile(text, str(path), "exec"), module.__dict__)
+    except Exception as error:  # whatever a user's file may raise: it is not our failure
+        del sys.modules[module.__name__]
+        kind = type(error).__name__
+        raise InputError(f"the program '{path}' does not run: {kind}: {error}") from error
     model = getattr(module, "model", None)
     if not callable(model):
         raise InputError(
@@ -150,7 +156,7 @@ def _draw(
     data: Float[Array, " data"],
     sites: dict[str, Array],
     skies: Float[Array, "draws modes"] | None,
-    keys: PRNGKeyArray,
+    keys: Key[Array, " draws"],
 ) -> Float[Array, "draws n"]:
     """Skies, or data where skies are given, one draw after the other."""
 

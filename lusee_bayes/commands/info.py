@@ -10,7 +10,7 @@ from lusee_bayes.inspection import describe
 
 
 def info_command(file: Path) -> None:
-    """Say what is in a file: visibilities, a posterior, or a sky map.
+    """Say what is in a file: visibilities, a posterior, samples, or a sky map.
 
     Example: lusee-bayes info output/fiducial/posterior.nc
     """

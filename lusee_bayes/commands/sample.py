@@ -68,8 +68,10 @@ def sample_command(
     """
     console = Console(quiet=quiet, soft_wrap=True)
     program = load_program(model)
-    sampler = Sampler(chains=chains, warmup=warmup, draws=draws, algorithm=algorithm)
     resolved = load_scenario(scenario, set_ or [])
+    sampler = Sampler(
+        chains=chains, warmup=warmup, draws=draws, seed=resolved.seed, algorithm=algorithm
+    )
     folder = output or Path("output") / f"{Path(scenario).stem}-{program.name}"
     stages = Stages(console)
     experiment, measured = prepare(resolved, data, stages)

@@ -66,9 +66,9 @@ def validate_command(
     """
     console = Console(quiet=quiet, soft_wrap=True)
     program = load_program("sky")
-    sampler = Sampler(chains=chains, warmup=warmup, draws=draws)
     calibration.require_simulations(simulations)
     resolved = load_scenario(scenario, set_ or [])
+    sampler = Sampler(chains=chains, warmup=warmup, draws=draws, seed=resolved.seed)
     folder = output or Path("output") / f"{Path(scenario).stem}-validation"
     stages = Stages(console)
     experiment, measured = prepare(resolved, data, stages)
