@@ -11,6 +11,7 @@ import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -25,17 +26,19 @@ class Chunk:
     """What one file holds.
 
     iteration : iterations done at its end, warmup included; state : leaves of the sampler's state;
-    draws : arrays (draws of the chunk, chains, ...) by name.
+    draws : arrays (draws of the chunk, chains, ...) by name; start : iterations done before it.
     """
 
     iteration: int
     state: list[np.ndarray]
     draws: dict[str, np.ndarray]
+    start: int = 0
 
     def write(self, folder: Path) -> None:
         """Write the chunk's file, by way of a scratch file that replaces it in one step."""
         arrays = {f"state:{i:03d}": leaf for i, leaf in enumerate(self.state)}
         arrays |= {f"draws:{name}": values for name, values in self.draws.items()}
+        arrays["start:"] = np.array(self.start)
         target = folder / f"chunk-{self.iteration:08d}.npz"
         scratch = folder / f".partial-{target.name}"
         with scratch.open("wb") as file:
@@ -48,18 +51,19 @@ class Chunk:
     def read(cls, path: Path) -> Chunk:
         """InputError if the file cannot be read."""
         try:
-            with np.load(path) as arrays:
-                kinds = {"state": {}, "draws": {}}
+            with path.open("rb") as file, np.load(file) as arrays:
+                kinds = {"start": {}, "state": {}, "draws": {}}
                 for key in arrays.files:
                     kind, name = key.split(":", 1)
                     kinds[kind][name] = arrays[key]
-        except (OSError, ValueError, KeyError, EOFError) as error:
+            start = int(kinds["start"][""])
+        except (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile) as error:
             raise InputError(
                 f"the checkpoint '{path}' cannot be read ({error}); delete it to go on from the "
                 "one before"
             ) from error
         state = [kinds["state"][name] for name in sorted(kinds["state"])]
-        return cls(int(path.stem.removeprefix("chunk-")), state, kinds["draws"])
+        return cls(_iteration(path), state, kinds["draws"], start)
 
 
 class Checkpoints:
@@ -68,13 +72,19 @@ class Checkpoints:
     def __init__(self, folder: str | Path, identity: dict[str, object], *, resume: bool):
         """Open ``folder`` for a run that is told from others by ``identity`` (JSON values).
 
-        InputError if it holds an unfinished run and ``resume`` is False, or one that differs.
+        InputError if it holds an unfinished run and ``resume`` is False, or one that differs or
+        does not say which it is.
         """
         self.folder = Path(folder)
         described = json.loads(json.dumps(identity))
         marker = self.folder / IDENTITY
         if marker.exists():
-            self._require_same(json.loads(marker.read_text()), described, resume)
+            self._require_same(_read_marker(marker), described, resume)
+        elif self._paths():
+            raise InputError(
+                f"'{self.folder}' holds draws, but no {IDENTITY} that says of which run; delete "
+                "the folder"
+            )
         else:
             self.folder.mkdir(parents=True, exist_ok=True)
             scratch = self.folder / f".partial-{IDENTITY}"
@@ -84,7 +94,7 @@ class Checkpoints:
     def _require_same(self, found: dict, described: dict, resume: bool) -> None:
         if not resume:
             chunks = self._paths()
-            done = chunks[-1].stem.removeprefix("chunk-").lstrip("0") if chunks else "no"
+            done = _iteration(chunks[-1]) if chunks else "no"
             raise InputError(
                 f"'{self.folder}' holds an unfinished run ({done} iterations done); go on with "
                 "--resume, or delete the folder"
@@ -107,21 +117,48 @@ class Checkpoints:
 
     def append(self, iteration: int, state: list[AnyArray], draws: dict[str, AnyArray]) -> None:
         """Keep what was sampled since the last call."""
+        paths = self._paths()
+        start = _iteration(paths[-1]) if paths else 0
         arrays = {name: np.asarray(values) for name, values in draws.items()}
-        Chunk(iteration, [np.asarray(leaf) for leaf in state], arrays).write(self.folder)
+        Chunk(iteration, [np.asarray(leaf) for leaf in state], arrays, start).write(self.folder)
 
     def draws(self) -> dict[str, np.ndarray]:
-        """All draws so far, (chains, draws, ...) by name."""
-        chunks = [Chunk.read(path).draws for path in self._paths()]
-        kept = [c for c in chunks if c]
+        """All draws so far, (chains, draws, ...) by name. InputError if a chunk is missing."""
+        chunks = [Chunk.read(path) for path in self._paths()]
+        done = 0
+        for chunk in chunks:
+            if chunk.start != done:
+                raise InputError(
+                    f"'{self.folder}' lacks the draws of iterations {done} to {chunk.start}; "
+                    "delete the chunks behind them to go on from there"
+                )
+            done = chunk.iteration
+        kept = [chunk.draws for chunk in chunks if chunk.draws]
         return {
             name: np.concatenate([c[name] for c in kept]).swapaxes(0, 1)
             for name in (kept[0] if kept else {})
         }
 
     def remove(self) -> None:
-        """Delete the folder: its draws are kept elsewhere now."""
-        shutil.rmtree(self.folder)
+        """Delete the folder; if that is interrupted, nothing is left that would be seen."""
+        doomed = self.folder.with_name(f".{self.folder.name}-removed")
+        shutil.rmtree(doomed, ignore_errors=True)
+        os.replace(self.folder, doomed)
+        shutil.rmtree(doomed)
+
+
+def _iteration(path: Path) -> int:
+    return int(path.stem.removeprefix("chunk-"))
+
+
+def _read_marker(marker: Path) -> dict[str, object]:
+    try:
+        found = json.loads(marker.read_text())
+    except ValueError as error:
+        raise InputError(f"'{marker}' cannot be read ({error}); delete its folder") from error
+    if not isinstance(found, dict):
+        raise InputError(f"'{marker}' does not describe a run; delete its folder")
+    return found
 
 
 def _short(value: object) -> str:

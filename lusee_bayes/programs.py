@@ -82,6 +82,10 @@ def load_program(source: str | Path) -> Program:
     asked = inspect.signature(model).parameters
     if "data" not in asked:
         raise InputError(f"model in '{path}' has no argument 'data'; the data could not enter it")
+    if asked["data"].default is not None:
+        raise InputError(
+            f"model in '{path}' has no data=None; without data, data are drawn from it"
+        )
     for name in asked:
         if name != "data" and name not in PIECES:
             raise InputError(

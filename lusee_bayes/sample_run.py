@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import time
 from dataclasses import dataclass
 from functools import cached_property
@@ -63,6 +62,7 @@ class SampleRun:
     tree: xr.DataTree
     seconds: dict[str, float]
     gradients_per_second: float | None
+    checkpoints: Checkpoints | None = None
 
     @property
     def skies(self) -> np.ndarray:
@@ -109,7 +109,8 @@ class SampleRun:
             (stage / "sampling.json").write_text(json.dumps(self.figures(), indent=2) + "\n")
             written = sorted(p.name for p in stage.iterdir())
         # every draw is in the samples now
-        shutil.rmtree(Path(folder) / CHAINS, ignore_errors=True)
+        if self.checkpoints is not None:
+            self.checkpoints.remove()
         return [Path(folder) / name for name in written]
 
     def figures(self) -> dict[str, object]:
@@ -167,7 +168,7 @@ def run_sampler(
     arguments = program.arguments(model)
     latent = latent_sites(program.model, {**arguments, "data": data.data})
     whitening = {SKY: Whitening.of(posterior)} if SKY in latent else {}
-    checkpoints = Checkpoints(folder / CHAINS, identity, resume=resume)
+    kept = Checkpoints(folder / CHAINS, identity, resume=resume)
     times = []
     with stages.progress("sampling", sampler.warmup + sampler.draws) as update:
 
@@ -180,7 +181,7 @@ def run_sampler(
             {**arguments, "data": data.data},
             sampler,
             whitening,
-            checkpoints,
+            kept,
             report,
         )
     with stages("data tree"):
@@ -206,6 +207,7 @@ def run_sampler(
         tree,
         stages.seconds,
         _speed(times, chains, sampler.warmup),
+        kept,
     )
 
 

@@ -87,7 +87,7 @@ def region_brightness(
 def probability_brighter(
     skies: Float[np.ndarray, "chains draws modes"],
     first: Bool[np.ndarray, " pixels"],
-    second: Bool[np.ndarray, " pixels"],
+    second: Bool[np.ndarray, " others"],
 ) -> tuple[float, float]:
     """Probability that the first region is brighter on average than the second, and its error.
 
@@ -136,5 +136,5 @@ def summary(quantities: Mapping[str, Float[np.ndarray, "chains draws"]]) -> pd.D
 
     Mean, standard deviation, 90 % interval, bulk and tail ESS, R-hat, Monte Carlo errors.
     """
-    tree = arviz_base.from_dict({"posterior": dict(quantities)})
+    tree = arviz_base.from_dict({"posterior": dict(quantities)}, check_conventions=False)
     return arviz_stats.summary(tree, ci_prob=INTERVAL, ci_kind="eti", round_to="none")
