@@ -71,13 +71,15 @@ class Ranks:
     def coverage(self) -> dict[str, dict[float, float]]:
         """Share of truths within the 50, 68, 90 and 95 % regions, by quantity."""
         n = self.n_draws + 1
-        middle = (self.n_draws) / 2
+        middle = self.n_draws / 2
         table = {}
         for name, ranks in zip(self.names, self.ranks.T, strict=True):
             if name in self.regions:
                 inside = {p: ranks < p * n for p in LEVELS}
             else:
-                inside = {p: np.abs(ranks - middle) < p * n / 2 for p in LEVELS}
+                off = np.abs(ranks - middle)
+                # 95 of 100 ranks do not lie evenly about the middle: the outermost count half
+                inside = {p: (off < p * n / 2) + 0.5 * (off == p * n / 2) for p in LEVELS}
             table[name] = {p: float(hit.mean()) for p, hit in inside.items()}
         return table
 

@@ -143,8 +143,9 @@ class Checkpoints:
         """Delete the folder; if that is interrupted, nothing is left that would be seen."""
         doomed = self.folder.with_name(f".{self.folder.name}-removed")
         shutil.rmtree(doomed, ignore_errors=True)
-        os.replace(self.folder, doomed)
-        shutil.rmtree(doomed)
+        if self.folder.exists():
+            os.replace(self.folder, doomed)
+            shutil.rmtree(doomed)
 
 
 def _iteration(path: Path) -> int:

@@ -19,7 +19,7 @@ from lusee_bayes.programs import Program, collapsed_skies, is_collapsed, replica
 from lusee_bayes.visibilities import Visibilities
 
 FORMAT = "lusee_bayes samples 1"
-SKY = "sky"
+SKY, DATA = "sky", "data"
 
 
 def to_datatree(
@@ -77,6 +77,7 @@ def to_datatree(
     tree = arviz_base.from_dict(
         groups,
         dims={SKY: ["mode"], "data": ["datum"], **{name: ["mode"] for name in constants}},
+        check_conventions=False,  # more chains than draws is unusual, not wrong
         attrs={"/": {"format": FORMAT, "program": program.name, **(attributes or {})}},
     )
     tree["posterior_predictive"] = tree["posterior_predictive"].dataset.assign_coords(

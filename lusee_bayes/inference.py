@@ -263,14 +263,20 @@ class _Run:
 
 def latent_sites(program: Callable, arguments: dict) -> list[str]:
     """Names of the sites that a program samples and does not observe."""
-    names = []
+    return site_names(program, arguments)[0]
+
+
+def site_names(program: Callable, arguments: dict) -> tuple[list[str], list[str]]:
+    """Names of a program's latent and of its observed sites."""
+    latent, observed = [], []
 
     def run(dynamic):
         trace = handlers.trace(handlers.seed(program, 0)).get_trace(**eqx.combine(dynamic, static))
-        sampled = (site for site in trace.values() if site["type"] == "sample")
-        names.extend(site["name"] for site in sampled if not site["is_observed"])
+        for site in trace.values():
+            if site["type"] == "sample":
+                (observed if site["is_observed"] else latent).append(site["name"])
 
     dynamic, static = eqx.partition(arguments, eqx.is_array)
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         jax.eval_shape(run, dynamic)
-    return names
+    return latent, observed

@@ -44,6 +44,7 @@ class Program:
     name: str
     model: Callable
     digest: str
+    path: str = ""
 
     def arguments(self, model: LinearGaussian) -> dict[str, Any]:
         """What the program asks for, taken from ``model``; all but the data."""
@@ -92,7 +93,7 @@ def load_program(source: str | Path) -> Program:
                 f"model in '{path}' asks for '{name}'; a program can have data, "
                 f"{', '.join(PIECES)} ({nearest(name, PIECES)})"
             )
-    return Program(path.stem, model, hashlib.sha256(text).hexdigest())
+    return Program(path.stem, model, hashlib.sha256(text).hexdigest(), str(path))
 
 
 def _find(source: str | Path) -> Path:

@@ -228,6 +228,15 @@ def versions() -> dict[str, str]:
     return {"lusee_bayes": __version__, **{name: metadata.version(name) for name in others}}
 
 
+def require_folder(folder: Path) -> None:
+    """InputError if ``folder``, or what it would lie in, is a file."""
+    for place in (folder, *folder.parents):
+        if place.exists():
+            if not place.is_dir():
+                raise InputError(f"'{place}' is a file; give a folder for the results")
+            return
+
+
 @contextmanager
 def staged(folder: str | Path) -> Iterator[Path]:
     """A scratch folder inside ``folder`` whose files replace the old ones only when all are done.
@@ -235,8 +244,7 @@ def staged(folder: str | Path) -> Iterator[Path]:
     If anything fails or is interrupted before that, the previous files stay as they were.
     """
     folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"'{folder}' is a file; give a folder for the results")
+    require_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     stage = Path(tempfile.mkdtemp(prefix=".partial-", dir=folder))
     try:

@@ -17,14 +17,14 @@ from numpyro.infer.hmc import HMCState
 
 from lusee_bayes.checkpoints import Checkpoints
 from lusee_bayes.checks import InputError
-from lusee_bayes.datatree import SKY, read_datatree, to_datatree, write_datatree
+from lusee_bayes.datatree import DATA, SKY, read_datatree, to_datatree, write_datatree
 from lusee_bayes.experiment import Experiment
-from lusee_bayes.inference import Chains, Sampler, latent_sites, sample
+from lusee_bayes.inference import Chains, Sampler, sample, site_names
 from lusee_bayes.linear_gaussian import LinearGaussian
 from lusee_bayes.posterior import Posterior
-from lusee_bayes.programs import Program
+from lusee_bayes.programs import Program, is_collapsed
 from lusee_bayes.progress import Stages, peak_memory_gb
-from lusee_bayes.results import staged, versions, write_map_fits
+from lusee_bayes.results import require_folder, staged, versions, write_map_fits
 from lusee_bayes.sites import Whitening
 from lusee_bayes.uncertainty import (
     INTERVAL,
@@ -150,8 +150,7 @@ def run_sampler(
     """
     stages = stages or Stages()
     folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"'{folder}' is a file; give a folder for the results")
+    require_folder(folder)
     with stages("posterior"):
         model, posterior, _ = experiment.infer(data)
         jax.block_until_ready(posterior.white_mean)
@@ -166,7 +165,7 @@ def run_sampler(
     if resume and (finished := _finished(folder, identity, sampler)) is not None:
         return SampleRun(experiment, data, model, posterior, finished, stages.seconds, None)
     arguments = program.arguments(model)
-    latent = latent_sites(program.model, {**arguments, "data": data.data})
+    latent = _require_sampleable(program, arguments, data)
     whitening = {SKY: Whitening.of(posterior)} if SKY in latent else {}
     kept = Checkpoints(folder / CHAINS, identity, resume=resume)
     times = []
@@ -209,6 +208,22 @@ def run_sampler(
         _speed(times, chains, sampler.warmup),
         kept,
     )
+
+
+def _require_sampleable(program: Program, arguments: dict, data: Visibilities) -> list[str]:
+    """The program's latent sites. InputError if it would not end with draws of the sky."""
+    latent, observed = site_names(program.model, {**arguments, "data": data.data})
+    who = f"the program '{program.path or program.name}'"
+    if DATA not in observed:
+        raise InputError(f"{who} has no observed site 'data'; sample('data', ..., obs=data)")
+    if not latent:
+        raise InputError(f"{who} samples nothing: it has no site that is not observed")
+    if SKY not in latent and not is_collapsed(program, arguments, data.data):
+        raise InputError(
+            f"{who} has no site 'sky', and returns no LinearGaussian to draw the sky from; do one "
+            "or the other"
+        )
+    return latent
 
 
 def _digest(data: Visibilities) -> str:

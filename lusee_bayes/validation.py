@@ -80,6 +80,12 @@ class Comparison:
         return all(check.passed for check in self.checks)
 
 
+def require_draws(n: int) -> None:
+    """InputError for fewer draws of a chain than a comparison needs."""
+    if n < 100:
+        raise InputError(f"a comparison needs 100 draws of each chain, got {n}")
+
+
 def compare(
     draws: Float[np.ndarray, "chains draws modes"],
     posterior: Posterior,
@@ -93,8 +99,7 @@ def compare(
     InputError for draws of another number of modes, fewer than 100 of a chain, or not finite.
     """
     require_shape("the draws", draws, (None, None, posterior.prior.size))
-    if draws.shape[1] < 100:
-        raise InputError(f"a comparison needs 100 draws of each chain, got {draws.shape[1]}")
+    require_draws(draws.shape[1])
     if not np.isfinite(draws).all():
         raise InputError("the draws hold NaN or infinity; their chains have failed")
     n_chains, _, n_modes = draws.shape

@@ -9,6 +9,7 @@ import pytest
 from reference_linear import assert_draws_follow, posterior, random_covariance
 
 from lusee_bayes import posterior as posterior_module
+from lusee_bayes.checks import InputError
 from lusee_bayes.covariance import DenseCovariance
 from lusee_bayes.linear_gaussian import FORMS, LinearGaussian
 from lusee_bayes.prior import HarmonicPrior, PixelPrior
@@ -127,3 +128,77 @@ def test_information_of_one_number():
     for form in FORMS:
         post = model.condition(jnp.array([0.3]), form)
         assert float(post.information_bits()) == pytest.approx(1.0, rel=1e-15)
+
+
+def blind_or_not(n_data, form):
+    for blind in (False, True):
+        yield conditioned(n_data, form, blind=blind)
+
+
+@cases
+def test_the_root_times_its_transpose_is_the_covariance(n_data, form):
+    """Against the textbook covariance, too: covariance() shares its solves with the root."""
+    for post, expected in blind_or_not(n_data, form):
+        root = np.asarray(post.root())
+        assert root.shape == (16, 16)
+        np.testing.assert_allclose(root @ root.T, expected.covariance, atol=TOL)
+        np.testing.assert_allclose(root @ root.T, post.covariance(), atol=TOL)
+
+
+def test_the_root_of_a_singular_covariance():
+    """Over pixels (rank 16 of 48), and with C_1 = 0: no inverse, but draws are mean + R z."""
+    for form in FORMS:
+        post, expected = conditioned(9, form, PixelPrior(jnp.asarray(SPECTRUM), 2))
+        root = np.asarray(post.root())
+        assert root.shape == (48, 16)
+        np.testing.assert_allclose(root @ root.T, expected.covariance, atol=TOL)
+        spectrum = SPECTRUM * np.array([1.0, 0.0, 1.0, 1.0])
+        post, expected = conditioned(9, form, HarmonicPrior(jnp.asarray(spectrum)))
+        root = np.asarray(post.root())
+        assert (root[1:4] == 0).all()
+        np.testing.assert_allclose(root @ root.T, expected.covariance, atol=TOL)
+
+
+@cases
+def test_whitening_inverts_mean_plus_root_times_z(n_data, form):
+    for post, expected in blind_or_not(n_data, form):
+        z = np.random.default_rng(3).normal(size=(7, 16))
+        skies = np.asarray(post.mean) + z @ np.asarray(post.root()).T
+        np.testing.assert_allclose(post.whiten(jnp.asarray(skies)), z, atol=TOL)
+        np.testing.assert_allclose(post.whiten(skies), z, atol=TOL)  # numpy arrays, too
+        # squared lengths: the distance from the mean in the textbook covariance's metric, whose
+        # inverse loses its condition, below 1e5 with the prior's range
+        delta = skies - expected.mean
+        squared = np.einsum("ni,in->n", delta, np.linalg.solve(expected.covariance, delta.T))
+        np.testing.assert_allclose((np.asarray(post.whiten(skies)) ** 2).sum(1), squared, rtol=1e-9)
+
+
+@cases
+def test_draws_are_white_in_their_own_coordinates_and_not_in_others(n_data, form):
+    post, _ = conditioned(n_data, form)
+    white = post.whiten(post.sample(jax.random.key(4), 20_000))
+    assert_draws_follow(white, np.zeros(16), np.eye(16))
+    other, _ = conditioned(n_data, form, blind=True)
+    with pytest.raises(AssertionError, match="off by"):
+        assert_draws_follow(
+            other.whiten(post.sample(jax.random.key(4), 20_000)), np.zeros(16), np.eye(16)
+        )
+
+
+def test_whitening_in_a_traced_program():
+    """Under jit the spectrum's values are not known; the check of them must not get in the way."""
+    post, _ = conditioned(9, "data")
+    skies = post.sample(jax.random.key(6), 3)
+    traced = jax.jit(lambda posterior, x: posterior.whiten(x))(post, skies)
+    np.testing.assert_allclose(traced, post.whiten(skies), atol=TOL)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_what_has_no_inverse_is_not_whitened(form):
+    pixels, _ = conditioned(9, form, PixelPrior(jnp.asarray(SPECTRUM), 2))
+    with pytest.raises(InputError, match="C_ell > 0 at every ell"):
+        pixels.whiten(pixels.sample(jax.random.key(0), 2))
+    spectrum = jnp.asarray([4.0, 0.0, 0.5, 0.25])
+    powerless, _ = conditioned(9, form, HarmonicPrior(spectrum))
+    with pytest.raises(InputError, match="C_ell > 0 at every ell"):
+        powerless.whiten(powerless.sample(jax.random.key(0), 2))

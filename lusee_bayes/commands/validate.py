@@ -19,7 +19,7 @@ from lusee_bayes.progress import Stages
 from lusee_bayes.results import staged
 from lusee_bayes.sample_run import run_sampler
 from lusee_bayes.scenario import load_scenario
-from lusee_bayes.validation import Check, Comparison, compare
+from lusee_bayes.validation import Check, Comparison, compare, require_draws
 
 
 def validate_command(
@@ -67,6 +67,7 @@ def validate_command(
     console = Console(quiet=quiet, soft_wrap=True)
     program = load_program("sky")
     calibration.require_simulations(simulations)
+    require_draws(draws)
     resolved = load_scenario(scenario, set_ or [])
     sampler = Sampler(chains=chains, warmup=warmup, draws=draws, seed=resolved.seed)
     folder = output or Path("output") / f"{Path(scenario).stem}-validation"

@@ -8,7 +8,7 @@ parameter of the embedded beam times its standard deviation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -62,13 +62,6 @@ def _where(parameter: str) -> Callable[[Monopoles], Float[Array, ""]]:
     if parameter not in PARAMETERS:
         raise InputError(f"unknown beam parameter '{parameter}'; {nearest(parameter, PARAMETERS)}")
     return PARAMETERS[parameter]
-
-
-def placed(monopoles: Monopoles, values: Mapping[str, Array]) -> Monopoles:
-    """The antennas with parameters set to given values; differentiable in them."""
-    for parameter, value in values.items():
-        monopoles = eqx.tree_at(_where(parameter), monopoles, jnp.asarray(value, jnp.float64))
-    return monopoles
 
 
 def moved(monopoles: Monopoles, steps: dict[str, float]) -> Monopoles:
