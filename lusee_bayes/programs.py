@@ -70,7 +70,7 @@ def load_program(source: str | Path) -> Program:
     # their module up by name
     sys.modules[module.__name__] = module
     try:
-        exec(compile(text, str(path), "exec"), module.__dict__)
+        exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
     except Exception as error:  # whatever a user's file may raise: it is not our failure
         del sys.modules[module.__name__]
         kind = type(error).__name__
