@@ -516,7 +516,12 @@ def test_a_time_that_is_left_out_is_noticed_only_by_the_likelihood_of_all_data(n
 
 
 class HMCDraws(eqx.Module):
-    """Every second of 198 draws of one chain, of the program of ``models/sky.py``."""
+    """Every second of 198 draws of one chain, of the program of ``models/sky.py``.
+
+    Ranks are uneven where draws hang together, and those of NUTS do in their distance from the
+    mean. A trajectory of a quarter of a turn forgets where a round Gaussian was, at every draw that
+    is accepted; 0.3 of them are not, so every second draw hangs together by 0.3^2.
+    """
 
     model: lb.LinearGaussian
     solver: lb.solver.Solver
@@ -525,15 +530,12 @@ class HMCDraws(eqx.Module):
         program = load_program("sky")
         arguments = {**program.arguments(self.model), "data": data}
         whitening = {"sky": Whitening.of(self.solver.condition(data))}
-        sampler = Sampler(warmup=100, draws=N_DRAWS)
+        sampler = Sampler(warmup=100, draws=N_DRAWS, algorithm="hmc")
         return draw_within(program.model, arguments, key, sampler, whitening, thin=2)["sky"]
 
 
 @EVERY_NOISE
 def test_draws_by_hmc_are_calibrated(noise):
-    """Draws of a chain hang together a little, which makes ranks uneven where it is positively:
-    NUTS' trajectories turn by more than a right angle, and only every second draw is taken.
-    """
     truth = dense_model(noise)
     solver = truth.factorise()
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
@@ -545,6 +547,8 @@ def test_draws_by_hmc_are_calibrated(noise):
             seed=2,
         )
     assert ranks.passed, p_values(ranks)
-    for name, coverage in ranks.coverage().items():
-        for level, share in coverage.items():
-            assert abs(share - level) < 4 * ranks.coverage_error(level), (name, level)
+    for level in LEVELS:
+        chance = 1 - FALSE_ALARM / (len(LEVELS) * len(ranks.names))
+        least, most = stats.binom.interval(chance, ranks.n_simulations, level)
+        for name, coverage in ranks.coverage().items():
+            assert least <= coverage[level] * ranks.n_simulations <= most, (name, level)
