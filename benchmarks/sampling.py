@@ -34,7 +34,7 @@ def main() -> None:
     model, posterior, _ = experiment.infer(data)
     program = load_program("sky")
     arguments = {**program.arguments(model), "data": data.data}
-    whitening = {"sky": Whitening.of(posterior)}
+    whitening = Whitening.of(posterior)
 
     table = Table(
         title=f"{model.n_data} data, {model.prior.size} modes, 4 chains of {options.draws}"

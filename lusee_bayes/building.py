@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+import numpy as np
+from jaxtyping import Array, Float
+
 from lusee_bayes.beams import Monopoles, ProductBeams, Regolith, monopole_beams
+from lusee_bayes.checks import InputError, nearest
+from lusee_bayes.ephemeris import BODIES, body_direction
 from lusee_bayes.noise import GainDrift
 from lusee_bayes.observation import Observation, Run
-from lusee_bayes.scenario import Scenario
-from lusee_bayes.sky import BRIGHT_SOURCES, Sky, galaxy_sky, sky_from_file
+from lusee_bayes.scenario import Scenario, SourceSection
+from lusee_bayes.sky import (
+    BRIGHT_SOURCES,
+    Sky,
+    galactic_unit_vector,
+    galaxy_sky,
+    kelvin_steradian,
+    sky_from_file,
+)
+from lusee_bayes.source_response import source_response
 
 
 def build_observation(scenario: Scenario) -> Observation:
@@ -29,6 +42,7 @@ def build_monopoles(scenario: Scenario) -> Monopoles:
         length_m=beam.length_m,
         zenith_angle_deg=beam.zenith_angle_deg,
         height_m=beam.height_m,
+        turntable_offset_deg=beam.turntable_offset_deg,
     )
 
 
@@ -57,3 +71,54 @@ def build_gain_drift(scenario: Scenario) -> GainDrift | None:
     """The gain drifts of the scenario, or None."""
     gain = scenario.noise.gain
     return None if gain is None else GainDrift(gain.sigma, gain.correlation_h)
+
+
+def build_source_responses(
+    scenario: Scenario,
+    observation: Observation,
+    antennas: Monopoles,
+    frequency_mhz: float | None = None,
+) -> tuple[Float[Array, "products times"], ...]:
+    """Response to 1 K sr of each of the scenario's sources, with these antennas.
+
+    ``frequency_mhz``: of the beams, by default the scenario's.
+    """
+    frequency = scenario.frequency_mhz if frequency_mhz is None else frequency_mhz
+    return tuple(
+        source_response(
+            observation,
+            _direction(source, observation),
+            frequency,
+            antennas,
+            stokes_v=source.stokes_v,
+        )
+        for source in scenario.sources.list
+    )
+
+
+def _direction(source: SourceSection, observation: Observation) -> Float[np.ndarray, "..."]:
+    """Galactic unit vector(s) of a source: its own, the catalogue's, or the ephemeris'."""
+    if source.ra_deg is not None:
+        return galactic_unit_vector(source.ra_deg, source.dec_deg)
+    if source.name in BODIES:
+        return body_direction(source.name, observation)
+    known = {s.name: s for s in BRIGHT_SOURCES}
+    if source.name not in known:
+        raise InputError(
+            f"unknown source '{source.name}'; {nearest(source.name, [*known, *BODIES])} "
+            "(or give ra_deg and dec_deg of your own)"
+        )
+    return galactic_unit_vector(known[source.name].ra_deg, known[source.name].dec_deg)
+
+
+def source_flux(source: SourceSection, frequency_mhz: float) -> float:
+    """Mean of the prior of a source's flux, in K sr. InputError if nothing is known about it."""
+    if source.flux_jy is not None:
+        return float(kelvin_steradian(source.flux_jy, frequency_mhz))
+    for known in BRIGHT_SOURCES:
+        if known.name == source.name:
+            return float(known.kelvin_steradian(frequency_mhz))
+    raise InputError(
+        f"the source '{source.name}' is not in the catalogue, so that its flux is not known; give "
+        "flux_jy, the mean of its prior"
+    )

@@ -13,6 +13,8 @@ A with a vector never forms A, and nothing in it but the last sum grows with the
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -32,7 +34,8 @@ class CouplingMatrix(eqx.Module):
     """A, of shape (data, modes): the beams of an observation, in Galactic coordinates.
 
     ``A @ sky`` and ``A.transpose_mv(data)`` use the structure; :meth:`rows` and :meth:`dense` give
-    the numbers. Differentiable in the beams.
+    the numbers. ``response``: factors of the rows, such as gains (None: one). Differentiable in the
+    beams and the response.
     """
 
     body_beams: Float[Array, "runs products powers modes"]
@@ -40,6 +43,7 @@ class CouplingMatrix(eqx.Module):
     pointing: Pointing
     layout: DataLayout
     frequency_mhz: float = eqx.field(static=True)
+    response: Float[Array, " data"] | None = None
 
     @classmethod
     def build(
@@ -65,6 +69,23 @@ class CouplingMatrix(eqx.Module):
     def observe(cls, beams: ProductBeams, observation: Observation) -> CouplingMatrix:
         """A of a complete observation with these beams."""
         return cls.build(beams, Pointing.of(observation, beams.lmax))
+
+    def with_response(self, factors: Float[Array, " data"]) -> CouplingMatrix:
+        """The same with every row multiplied by a factor, on top of those it has."""
+        require_shape("the response", factors, (self.layout.size,))
+        factors = factors if self.response is None else self.response * factors
+        return replace(self, response=factors)
+
+    def plus(self, amplitude: Float[Array, ""], direction: CouplingMatrix) -> CouplingMatrix:
+        """A + amplitude dA, where dA (``direction``) is of the same observation."""
+        self.layout.require_same(direction.layout)
+        if direction.response is not None:
+            raise InputError("the direction of a beam error must have no response of its own")
+        return replace(
+            self,
+            body_beams=self.body_beams + amplitude * direction.body_beams,
+            by_order=self.by_order + amplitude * direction.by_order,
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -94,7 +115,7 @@ class CouplingMatrix(eqx.Module):
     def rows(
         self, product: Int[np.ndarray, " rows"], time: Int[np.ndarray, " rows"]
     ) -> Float[Array, "rows modes"]:
-        """Rows of A for chosen product and time numbers, flagged or not."""
+        """Rows of A for chosen product and time numbers, flagged or not, without the response."""
         product, time = np.asarray(product), np.asarray(time)
         require_shape("time", time, product.shape)
         for name, numbers, limit in [
@@ -152,7 +173,8 @@ def _body_beams(
 def _dense(coupling: CouplingMatrix) -> Float[Array, "data modes"]:
     blocks = [coupling._block(run, span) for run, span in coupling.pointing.runs()]
     grid = blocks[0] if len(blocks) == 1 else jnp.concatenate(blocks, axis=1)
-    return coupling.layout.gather(grid)
+    rows = coupling.layout.gather(grid)
+    return rows if coupling.response is None else rows * coupling.response[:, None]
 
 
 def _phases(pointing: Pointing, lmax: int) -> tuple[Array, Array]:
@@ -201,7 +223,8 @@ def _forward(coupling: CouplingMatrix, sky: Float[Array, " modes"]) -> Float[Arr
         c = jnp.einsum("tm,mkp->ktp", cosine[span], x_and_y[..., 0])
         s = jnp.einsum("tm,mkp->ktp", sine[span], x_and_y[..., 1])
         grids.append(jnp.einsum("tp,ktp->kt", factors[span], c + s))
-    return coupling.layout.gather(jnp.concatenate(grids, axis=1))
+    data = coupling.layout.gather(jnp.concatenate(grids, axis=1))
+    return data if coupling.response is None else data * coupling.response
 
 
 @eqx.filter_jit

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import arviz_base
 import jax
@@ -31,6 +32,8 @@ def to_datatree(
     *,
     seed: int = 0,
     n_predictive: int = 100,
+    arguments: dict[str, Any] | None = None,
+    truth: dict[str, float | np.ndarray] | None = None,
     attributes: dict[str, object] | None = None,
 ) -> xr.DataTree:
     """Groups posterior, sample_stats, prior, prior and posterior predictive, data and constants.
@@ -65,6 +68,11 @@ def to_datatree(
     }
     if data.truth is not None:
         constants["truth"] = np.asarray(data.truth)
+    dims = {SKY: ["mode"], "data": ["datum"], "gains": ["antenna", "sample"]}
+    dims |= {name: ["mode"] for name in constants}
+    for name, value in (truth or {}).items():
+        if name in sites:
+            constants[f"true_{name}"] = np.asarray(value)
     groups = {
         "posterior": sites,
         "sample_stats": chains.statistics,
@@ -76,7 +84,7 @@ def to_datatree(
     }
     tree = arviz_base.from_dict(
         groups,
-        dims={SKY: ["mode"], "data": ["datum"], **{name: ["mode"] for name in constants}},
+        dims=dims,
         check_conventions=False,  # more chains than draws is unusual, not wrong
         attrs={"/": {"format": FORMAT, "program": program.name, **(attributes or {})}},
     )

@@ -1,7 +1,8 @@
 """Hamiltonian Monte Carlo of any NumPyro program: chains side by side, draws kept as they come.
 
-Where a program samples the sky, it does so in the coordinates in which the analytic posterior is
-round (:class:`lusee_bayes.sites.Whitened`); the density is the program's own.
+Programs are sampled in coordinates in which their posterior is nearly round, if such are known
+(:class:`lusee_bayes.sites.Whitening`: the sky's analytic posterior, or :mod:`lusee_bayes.laplace`);
+the density is the program's own.
 """
 
 from __future__ import annotations
@@ -108,17 +109,16 @@ def sample(
     program: Callable,
     arguments: Mapping[str, Any],
     sampler: Sampler,
-    whitening: Mapping[str, Whitening] | None = None,
+    whitening: Whitening | None = None,
     checkpoints: Checkpoints | None = None,
     report: Callable[[int, HMCState], None] = lambda iteration, state: None,
 ) -> Chains:
     """Draw from the posterior of ``program(**arguments)``.
 
-    whitening : coordinates by site name; checkpoints : where draws are kept, and found again if
-    there are any (the same draws result); report : called with iteration and state after each
-    chunk. With several JAX devices the chains are shared out among them, if they go round.
+    whitening : coordinates of some of its sites; checkpoints : where draws are kept, and found
+    again if there are any (the same draws result); report : called with iteration and state after
+    each chunk. With several JAX devices the chains are shared out among them, if they go round.
     """
-    whitening = dict(whitening or {})
     run = _Run(program, dict(arguments), sampler, whitening)
     done, state, kept = 0, None, []
     previous = None if checkpoints is None else checkpoints.last()
@@ -160,7 +160,7 @@ def draw_within(
     arguments: Mapping[str, Any],
     key: PRNGKeyArray,
     sampler: Sampler,
-    whitening: Mapping[str, Whitening] | None = None,
+    whitening: Whitening | None = None,
     thin: int = 1,
 ) -> dict[str, Array]:
     """Every ``thin``-th draw of one chain, (draws, ...) by site, as a part of a JAX program.
@@ -169,7 +169,7 @@ def draw_within(
     kept on disk. ``sampler``'s chains and seed are not looked at. Call it with NumPy's dtype
     promotion "standard" and rank promotion allowed: NumPyro needs them.
     """
-    run = _Run(program, dict(arguments), sampler, dict(whitening or {}))
+    run = _Run(program, dict(arguments), sampler, whitening)
     kernel, inputs = run.kernel, (run.dynamic,)
     state = kernel.init(key, sampler.warmup, None, inputs, {})
 
@@ -191,26 +191,31 @@ def _without_auxiliary(sites: dict[str, Array]) -> dict[str, Array]:
 class _Run:
     """A kernel with its model's arguments, and chunks of its iterations compiled once."""
 
-    def __init__(self, program: Callable, arguments: dict, sampler: Sampler, whitening: dict):
+    def __init__(
+        self, program: Callable, arguments: dict, sampler: Sampler, whitening: Whitening | None
+    ):
         def model(whitening, arguments):
-            config = {name: Whitened(w) for name, w in whitening.items()}
+            config = {}
+            if whitening is not None:
+                config = dict.fromkeys(whitening.names, Whitened(whitening))
             with handlers.reparam(config=config):
                 return program(**arguments)
 
         latent = latent_sites(program, arguments)
-        unknown = set(whitening) - set(latent)
+        white = set() if whitening is None else set(whitening.names)
+        unknown = white - set(latent)
         if unknown:
             raise InputError(
                 f"the program has no latent site '{min(unknown)}' to whiten; it has "
                 f"{', '.join(latent)}"
             )
-        all_white = set(latent) == set(whitening)
+        all_white = set(latent) == white
         self.sampler = sampler
         # leaves of the model's arguments that are arrays are traced, the rest is structure
         self.dynamic, static = eqx.partition((whitening, arguments), eqx.is_array)
         self.kernel = sampler.kernel(
             lambda dynamic: model(*eqx.combine(dynamic, static)),
-            sum(w.root.shape[1] for w in whitening.values()) if all_white else None,
+            whitening.root.shape[1] if all_white else None,
         )
         self._advance = jax.jit(self._advance_traced)
 

@@ -64,12 +64,16 @@ class LinearGaussian(eqx.Module):
         """Number of data."""
         return self.coupling.shape[0]
 
+    def predict(self, sky: Float[Array, " unknowns"]) -> Float[Array, " data"]:
+        """What data of this sky are on average: A m + offset, in K."""
+        seen = self.coupling @ sky
+        return seen if self.offset is None else seen + self.offset
+
     def sample(self, key: PRNGKeyArray) -> tuple[Float[Array, " unknowns"], Float[Array, " data"]]:
         """A sky from the prior and a data vector of it: (m, d)."""
         sky_key, noise_key = jax.random.split(key)
         sky = self.prior.sample(sky_key)
-        data = self.coupling @ sky + self.noise.sample(noise_key)
-        return sky, data if self.offset is None else data + self.offset
+        return sky, self.predict(sky) + self.noise.sample(noise_key)
 
     def factorise(self, form: str | None = None) -> Solver:
         """Everything that does not depend on the data; use it to condition on many data vectors.

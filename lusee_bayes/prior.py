@@ -107,6 +107,36 @@ class HarmonicPrior(Prior):
         return per_mode(self.spectrum)
 
 
+class IndependentPrior(Prior):
+    """Independent unknowns of any kind: S = diag(root^2), such as sky modes and source fluxes."""
+
+    root: Float[Array, " unknowns"]
+
+    def __check_init__(self):
+        require_float64("the prior's standard deviations", self.root)
+        require_finite("the prior's standard deviations", self.root)
+
+    @property
+    def size(self) -> int:
+        return self.root.shape[0]
+
+    @property
+    def rank(self) -> int:
+        return self.size
+
+    def diagonal_root(self):
+        return self.root
+
+    def colour(self, u):
+        return u * self.root.reshape(*(1,) * (u.ndim - 1), -1)
+
+    def colour_columns(self, a):
+        return a * self.root[None]
+
+    def variance(self):
+        return self.root**2
+
+
 class PixelPrior(Prior):
     """The same isotropic sky in HEALPix RING pixels: m = Y a, S = Y diag(C_ell) Y^T.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -24,7 +24,7 @@ from lusee_bayes.linear_gaussian import LinearGaussian
 # the programs that come along: beside the package in a checkout, inside it once installed
 FOLDERS = (Path(__file__).parent / "models", Path(__file__).parents[1] / "models")
 
-# what a program's arguments may be called
+# what a program's arguments may be called: pieces of the model with all systematics in N, ...
 PIECES: dict[str, Callable[[LinearGaussian], Any]] = {
     "coupling": lambda model: model.coupling,
     "prior": lambda model: model.prior,
@@ -32,10 +32,13 @@ PIECES: dict[str, Callable[[LinearGaussian], Any]] = {
     "fixed_noise": lambda model: model.noise.factor(),
 }
 
+# ... and of the experiment: the model without those that are to be sampled, and they themselves
+EXPERIMENT_PIECES = ("gaussian", "systematics", "gain_drifts", "instrument", "sources")
+
 
 @dataclass(frozen=True)
 class Program:
-    """A NumPyro model whose arguments are among ``PIECES``, and ``data``.
+    """A NumPyro model whose arguments are ``data`` and pieces of a model or an experiment.
 
     Called with ``data=None`` it is the prior predictive. If it returns a LinearGaussian, it has
     integrated the sky out; :func:`collapsed_skies` then draws it.
@@ -46,10 +49,26 @@ class Program:
     digest: str
     path: str = ""
 
-    def arguments(self, model: LinearGaussian) -> dict[str, Any]:
-        """What the program asks for, taken from ``model``; all but the data."""
-        wanted = [name for name in inspect.signature(self.model).parameters if name != "data"]
-        return {name: PIECES[name](model) for name in wanted}
+    def arguments(
+        self, model: LinearGaussian, more: Mapping[str, Callable[[], Any]] | None = None
+    ) -> dict[str, Any]:
+        """What the program asks for, taken from ``model``; all but the data.
+
+        more : what makes the pieces of an experiment (``Experiment.pieces``), by name. InputError
+        if the program asks for one of those and it is not there.
+        """
+        found = {}
+        for name in inspect.signature(self.model).parameters:
+            if name in PIECES:
+                found[name] = PIECES[name](model)
+            elif name != "data":
+                if more is None or name not in more:
+                    raise InputError(
+                        f"the program '{self.name}' asks for '{name}', a piece of an experiment; "
+                        "give arguments() the experiment's pieces"
+                    )
+                found[name] = more[name]()
+        return found
 
 
 def program_names() -> list[str]:
@@ -88,10 +107,11 @@ def load_program(source: str | Path) -> Program:
             f"model in '{path}' has no data=None; without data, data are drawn from it"
         )
     for name in asked:
-        if name != "data" and name not in PIECES:
+        known = [*PIECES, *EXPERIMENT_PIECES]
+        if name != "data" and name not in known:
             raise InputError(
-                f"model in '{path}' asks for '{name}'; a program can have data, "
-                f"{', '.join(PIECES)} ({nearest(name, PIECES)})"
+                f"model in '{path}' asks for '{name}', which is neither data nor a piece; "
+                f"{nearest(name, known)}"
             )
     return Program(path.stem, model, hashlib.sha256(text).hexdigest(), str(path))
 
@@ -171,7 +191,6 @@ def _draw(
         gaussian = model(**arguments, data=data)
         if sky is None:
             return gaussian.condition(data).sample(key)
-        seen = gaussian.coupling @ sky + gaussian.noise.sample(key)
-        return seen if gaussian.offset is None else seen + gaussian.offset
+        return gaussian.predict(sky) + gaussian.noise.sample(key)
 
     return jax.lax.map(one, (sites, skies, keys))

@@ -20,12 +20,14 @@ from lusee_bayes.checks import InputError
 from lusee_bayes.datatree import DATA, SKY, read_datatree, to_datatree, write_datatree
 from lusee_bayes.experiment import Experiment
 from lusee_bayes.inference import Chains, Sampler, sample, site_names
+from lusee_bayes.laplace import laplace
 from lusee_bayes.linear_gaussian import LinearGaussian
 from lusee_bayes.posterior import Posterior
 from lusee_bayes.programs import Program, is_collapsed
 from lusee_bayes.progress import Stages, peak_memory_gb
 from lusee_bayes.results import require_folder, staged, versions, write_map_fits
 from lusee_bayes.sites import Whitening
+from lusee_bayes.systematics import SCALES
 from lusee_bayes.uncertainty import (
     INTERVAL,
     pixel_interval,
@@ -119,6 +121,7 @@ class SampleRun:
         chains, draws = self.skies.shape[:2]
         return {
             "program": self.tree.attrs["program"],
+            "coordinates": self.tree.attrs["coordinates"],
             "chains": chains,
             "draws": draws,
             "divergences": int(stats["diverging"].sum()),
@@ -164,9 +167,10 @@ def run_sampler(
     }
     if resume and (finished := _finished(folder, identity, sampler)) is not None:
         return SampleRun(experiment, data, model, posterior, finished, stages.seconds, None)
-    arguments = program.arguments(model)
+    arguments = program.arguments(model, experiment.pieces(data))
     latent = _require_sampleable(program, arguments, data)
-    whitening = {SKY: Whitening.of(posterior)} if SKY in latent else {}
+    with stages("coordinates"):
+        whitening = coordinates(program, arguments, data, posterior, latent)
     kept = Checkpoints(folder / CHAINS, identity, resume=resume)
     times = []
     with stages.progress("sampling", sampler.warmup + sampler.draws) as update:
@@ -191,7 +195,10 @@ def run_sampler(
             posterior,
             data,
             seed=sampler.seed,
+            arguments=arguments,
+            truth=experiment.truth(),
             attributes={
+                "coordinates": "learned in warmup" if whitening is None else "white",
                 "identity": json.dumps(identity),
                 "frequency_mhz": experiment.scenario.frequency_mhz,
                 "frame": "galactic",
@@ -208,6 +215,23 @@ def run_sampler(
         _speed(times, chains, sampler.warmup),
         kept,
     )
+
+
+def coordinates(
+    program: Program,
+    arguments: dict,
+    data: Visibilities,
+    posterior: Posterior,
+    latent: list[str],
+) -> Whitening | None:
+    """White coordinates for a program: those of the analytic posterior where it samples the sky
+    alone, else those about its mode. None if no mode is found: warmup then learns scales."""
+    if latent == [SKY]:
+        return Whitening.of(posterior)
+    start = {SKY: posterior.mean} if SKY in latent else {}
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        found = laplace(program.model, {**arguments, "data": data.data}, start, SCALES)
+    return found.whitening if bool(found.converged) else None
 
 
 def _require_sampleable(program: Program, arguments: dict, data: Visibilities) -> list[str]:

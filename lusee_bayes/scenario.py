@@ -60,6 +60,7 @@ class BeamSection(Section):
     surface_permittivity: Annotated[float, Field(ge=1)] = 3.7
     deep_permittivity: Annotated[float, Field(ge=1)] = 6.1
     loss_tangent: Annotated[float, Field(ge=0)] = 0.01
+    turntable_offset_deg: float = 0.0
 
 
 class SkySection(Section):
@@ -81,27 +82,52 @@ class SkySection(Section):
 
 
 class PriorSection(Section):
-    """C_ell of the prior: the spectrum of the scenario's sky, times ``scale``."""
+    """C_ell of the prior: the spectrum of the scenario's sky, times ``scale``.
+
+    Sampled where they are not known: ln of an amplitude and a tilt, C_ell A ((ell + 1) / 10)^tilt,
+    of prior standard deviations ``log_amplitude_std`` and ``tilt_std``; or (``band_edges``: first
+    ell of each band but the lowest) ln of one amplitude for every band, of ``log_band_std``.
+    """
 
     spectrum: Literal["sky"] = "sky"
     scale: Positive = 1.0
+    log_amplitude_std: Positive | None = None
+    tilt_std: Positive | None = None
+    band_edges: tuple[Annotated[int, Field(ge=1)], ...] = ()
+    log_band_std: Positive = 1.0
+
+    @model_validator(mode="after")
+    def _one_parameterisation(self) -> PriorSection:
+        if self.band_edges and (self.log_amplitude_std or self.tilt_std):
+            raise ValueError("give either band_edges or log_amplitude_std and tilt_std")
+        if list(self.band_edges) != sorted(set(self.band_edges)):
+            raise ValueError("band_edges must grow from one to the next")
+        return self
 
 
 class RadiometerSection(Section):
-    """Radiometer noise; ``temperature`` says whose visibilities set its level."""
+    """Radiometer noise; ``temperature`` says whose visibilities set its level.
+
+    ``log_factor_std``: prior standard deviation of ln of a further factor of the variance, where
+    the level is not known; simulated data hold one drawn from it, and it is sampled.
+    """
 
     form: Literal["paper", "exact"] = "paper"
     bandwidth_hz: Positive = 1.0e6
     duty_cycle: Annotated[float, Field(gt=0, le=1)] = 1.0
     factor: Positive = 1.0
+    log_factor_std: Positive | None = None
     temperature: Literal["model", "measured"] = "model"
 
 
-Treatment = Literal["marginalised", "ignored"]
+Treatment = Literal["marginalised", "sampled", "ignored"]
 
 
 class GainSection(Section):
-    """Gain drifts in the data; ``marginalised`` puts their covariance into N, ``ignored`` not.
+    """Gain drifts in the data: their covariance in N, or the drifts themselves ``sampled``.
+
+    ``log_sigma_std`` and ``log_correlation_std``: prior standard deviations of ln of the two where
+    they are not known; simulated data hold drawn ones, and they are sampled with the drifts.
 
     ``visibilities``: the d that the covariance is built around. ``measured`` data hold the drifts
     themselves, which moves the map by about a standard deviation; ``posterior`` starts from them
@@ -110,15 +136,28 @@ class GainSection(Section):
 
     sigma: Positive = 0.01
     correlation_h: Positive = 10.0
+    log_sigma_std: Positive | None = None
+    log_correlation_std: Annotated[float, Field(gt=0, le=1)] | None = None
     treatment: Treatment = "marginalised"
     visibilities: Literal["model", "measured", "posterior"] = "model"
 
+    @model_validator(mode="after")
+    def _scales_are_sampled(self) -> GainSection:
+        known = self.log_sigma_std is None and self.log_correlation_std is None
+        if not known and self.treatment == "marginalised":
+            raise ValueError(
+                "log_sigma_std and log_correlation_std need treatment 'sampled': a covariance "
+                "has to know its scales"
+            )
+        return self
+
 
 class BeamErrorSection(Section):
-    """Beams that differ from the model's in the data; marginalised in N or ignored.
+    """Beams that differ from the model's in the data; marginalised in N, sampled or ignored.
 
-    ``shift_mhz``: the data are taken with the beams of frequency + shift. ``parameters``: standard
-    deviations of parameters of the embedded antennas, whose errors are drawn with the seed.
+    ``shift_mhz``: the data are taken with the beams of frequency + shift; sampled is the amplitude
+    of that error. ``parameters``: prior standard deviations of parameters of the embedded antennas
+    about the values in ``beam``; the data's own are drawn with the seed.
     """
 
     shift_mhz: float | None = None
@@ -129,6 +168,45 @@ class BeamErrorSection(Section):
     def _one_direction(self) -> BeamErrorSection:
         if (self.shift_mhz is None) == (not self.parameters):
             raise ValueError("give either shift_mhz or parameters")
+        return self
+
+
+class SourceSection(Section):
+    """A point source, apart from the map: one of the catalogue, a body of the solar system, or own.
+
+    ``flux_jy`` is the mean of its prior (the catalogue's, if left out), ``relative_std`` its
+    standard deviation in units of the mean. Own sources give ``ra_deg`` and ``dec_deg`` (ICRS).
+    ``stokes_v``: circularly polarised part V / I. ``block_h``: an amplitude for each block of so
+    many hours, independently; without it one for all times.
+    """
+
+    name: str
+    flux_jy: Positive | None = None
+    relative_std: Positive = 0.5
+    ra_deg: float | None = None
+    dec_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
+    stokes_v: Annotated[float, Field(ge=-1, le=1)] = 0.0
+    block_h: Positive | None = None
+
+    @model_validator(mode="after")
+    def _both_coordinates(self) -> SourceSection:
+        if (self.ra_deg is None) != (self.dec_deg is None):
+            raise ValueError("give both ra_deg and dec_deg, or none")
+        return self
+
+
+class SourcesSection(Section):
+    """Point sources that are not part of the map: in N, sampled, or ignored."""
+
+    list: tuple[SourceSection, ...] = ()
+    treatment: Treatment = "marginalised"
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> SourcesSection:
+        names = [source.name for source in self.list]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ValueError(f"the source '{twice}' is there twice")
         return self
 
 
@@ -151,7 +229,30 @@ class Scenario(Section):
     sky: SkySection = SkySection()
     prior: PriorSection = PriorSection()
     noise: NoiseSection = NoiseSection()
+    sources: SourcesSection = SourcesSection()
     seed: Annotated[int, Field(ge=0)] = 1
+
+    @model_validator(mode="after")
+    def _sources_are_there_once(self) -> Scenario:
+        if self.sky.sources and self.sky.file is None and self.sources.list:
+            raise ValueError(
+                "the embedded sky holds the catalogue's sources already; with sources.list of "
+                "its own, set sky.sources=false"
+            )
+        return self
+
+    @property
+    def samples(self) -> bool:
+        """Whether something besides the sky is to be sampled."""
+        noise, prior = self.noise, self.prior
+        treatments = [s.treatment for s in (noise.gain, noise.beam, self.sources) if s is not None]
+        return (
+            "sampled" in treatments
+            or noise.radiometer.log_factor_std is not None
+            or prior.log_amplitude_std is not None
+            or prior.tilt_std is not None
+            or bool(prior.band_edges)
+        )
 
     @property
     def map_nside(self) -> int:

@@ -117,42 +117,75 @@ class Marginal(dist.Distribution):
 
 
 class Whitening(eqx.Module):
-    """Coordinates z of the sky, m = mean + R z, in which a posterior is round.
+    """Coordinates z of one or more sites, x = mean + R z, in which a posterior is round.
 
-    mean : (unknowns,); root : R (unknowns, white) with R R^T the covariance; log_det : ln|det R|.
+    x : the sites' values, unconstrained (numpyro's ``biject_to``), one site after the other
+    mean : (unknowns,); root : R (unknowns, white), R R^T the covariance; log_det : ln|det R|
+    sites : name and unconstrained shape of each, in the order in which the program samples them
     """
 
     mean: Float[Array, " unknowns"]
     root: Float[Array, "unknowns white"]
     log_det: Float[Array, ""]
+    sites: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
+
+    def __check_init__(self):
+        n = sum(int(np.prod(shape)) for _, shape in self.sites)
+        if not is_traced(self.mean) and self.mean.shape != (n,):
+            raise InputError(f"the sites have {n} values, the mean {self.mean.shape[0]}")
 
     @classmethod
-    def of(cls, posterior: Posterior) -> Whitening:
+    def of(cls, posterior: Posterior, site: str = "sky") -> Whitening:
         """The coordinates in which ``posterior`` is N(0, 1). InputError as SkyPrior's."""
         log_det = jnp.log(SkyPrior(posterior.prior).scale).sum()
         log_det = log_det - jnp.log(jnp.diagonal(posterior.lower)).sum()
-        return cls(posterior.mean, posterior.root(), log_det)
+        root = posterior.root()
+        return cls(posterior.mean, root, log_det, ((site, (root.shape[0],)),))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sites."""
+        return tuple(name for name, _ in self.sites)
+
+    def split(self, x: Float[Array, " unknowns"]) -> dict[str, Float[Array, "..."]]:
+        """x by site, in its shape."""
+        values, start = {}, 0
+        for name, shape in self.sites:
+            size = int(np.prod(shape))
+            values[name] = x[start : start + size].reshape(shape)
+            start += size
+        return values
 
 
 class Whitened(Reparam):
-    """Samples a site through z, m = mean + R z, by ``numpyro.handlers.reparam``.
+    """Samples sites through z, x = mean + R z, by ``numpyro.handlers.reparam``.
 
-    The density stays the model's own: its prior at m, times |det R|. Only the coordinates are the
-    analytic posterior's; where that is wrong, sampling is slower and not wrong. z is the site
-    NAME_white, improper, so that programs are drawn from (``Predictive``) without this handler.
+    The density stays the model's own: its prior at x, times |det R|. Only the coordinates are those
+    of some Gaussian; where it is not the posterior, sampling is slower and not wrong. z is the site
+    NAME_white of the first site, improper, so that programs are drawn from (``Predictive``) without
+    this handler. Several sites need one and the same object.
     """
 
     def __init__(self, whitening: Whitening):
         self.whitening = whitening
+        self._values: dict[str, Float[Array, "..."]] = {}
 
     def __call__(self, name, fn, obs):
         if obs is not None:
             raise InputError(f"the site '{name}' is observed; only latent sites can be whitened")
-        mean, root = self.whitening.mean, self.whitening.root
-        z = numpyro.sample(
-            f"{name}{WHITE_SUFFIX}",
-            dist.ImproperUniform(dist.constraints.real_vector, (), (root.shape[1],)),
-        )
-        value = mean + root @ z
-        numpyro.factor(f"{name}_density", fn.log_prob(value) + self.whitening.log_det)
+        density = 0.0
+        if name == self.whitening.names[0]:
+            z = numpyro.sample(
+                f"{name}{WHITE_SUFFIX}",
+                dist.ImproperUniform(
+                    dist.constraints.real_vector, (), (self.whitening.root.shape[1],)
+                ),
+            )
+            self._values = self.whitening.split(self.whitening.mean + self.whitening.root @ z)
+            density = self.whitening.log_det
+        x = self._values[name]
+        transform = dist.biject_to(fn.support)
+        value = transform(x)
+        density = density + transform.log_abs_det_jacobian(x, value).sum()
+        numpyro.factor(f"{name}_density", fn.log_prob(value).sum() + density)
         return None, value

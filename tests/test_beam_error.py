@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from reference import real_harmonics
 
-from lusee_bayes.beams import Monopoles, ProductBeams, Regolith, monopole_beams
+from lusee_bayes.beams import Monopoles, ProductBeams, Regolith, monopole_beams, placed
 from lusee_bayes.checks import InputError
 from lusee_bayes.coupling import CouplingMatrix
 from lusee_bayes.layout import DataLayout
-from lusee_bayes.noise import beam_error_noise, derivative, difference, moved, rms_difference
+from lusee_bayes.noise import beam_error_noise, derivative, difference, rms_difference
 from lusee_bayes.observation import Observation, Run
 from lusee_bayes.pointing import Pointing
 from lusee_bayes.prior import HarmonicPrior, PixelPrior
@@ -24,6 +24,7 @@ START = {
     "surface_permittivity": 3.7,
     "deep_permittivity": 6.1,
     "loss_tangent": 0.01,
+    "turntable_offset_deg": 0.0,
 }
 
 
@@ -35,6 +36,7 @@ def antennas(**changes) -> Monopoles:
         length_m=p["length_m"],
         zenith_angle_deg=p["zenith_angle_deg"],
         height_m=p["height_m"],
+        turntable_offset_deg=p["turntable_offset_deg"],
     )
 
 
@@ -128,9 +130,8 @@ def test_beams_that_do_not_match_are_refused(beams, shape):
             use(other, beams)
 
 
-def test_moved_antennas():
-    steps = {"length_m": 0.2, "zenith_angle_deg": -3.0, "deep_permittivity": 0.5}
-    got = moved(antennas(), steps)
+def test_placed_antennas():
+    got = placed(antennas(), {"length_m": 3.2, "zenith_angle_deg": 72.0, "deep_permittivity": 6.6})
     expected = antennas(length_m=3.2, zenith_angle_deg=72.0, deep_permittivity=6.6)
     for value, other in [
         (got.length_m, expected.length_m),
@@ -140,14 +141,27 @@ def test_moved_antennas():
         (got.regolith.deep_permittivity, expected.regolith.deep_permittivity),
         (got.regolith.loss_tangent, expected.regolith.loss_tangent),
     ]:
-        assert float(value) == pytest.approx(float(other), rel=1e-15)
-    assert float(moved(antennas(), {}).length_m) == 3.0
+        assert float(value) == float(other)
+    assert float(placed(antennas(), {}).length_m) == 3.0
+
+
+def test_a_turntable_offset_is_an_angle_of_the_turntable():
+    observation = Observation.from_runs([Run(0.05, turntable_deg=30.0)])
+    offset = monopole_beams(FREQUENCY, LMAX, antennas(turntable_offset_deg=12.5))
+    turned = Observation.from_runs([Run(0.05, turntable_deg=42.5)])
+    plain = monopole_beams(FREQUENCY, LMAX, antennas())
+    got = CouplingMatrix.observe(offset, observation).dense()
+    expected = np.asarray(CouplingMatrix.observe(plain, turned).dense())
+    # the azimuth grid is exact to rounding, wherever it begins
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+    other = CouplingMatrix.observe(plain, observation).dense()
+    assert np.abs(np.asarray(other) - expected).max() > 1e-2 * np.abs(expected).max()
 
 
 def test_unknown_parameters_name_the_nearest():
     for use in (
         lambda: derivative("lenght_m", FREQUENCY, LMAX, antennas()),
-        lambda: moved(antennas(), {"lenght_m": 0.1}),
+        lambda: placed(antennas(), {"lenght_m": 0.1}),
     ):
         with pytest.raises(
             InputError, match="unknown beam parameter 'lenght_m'; did you mean 'length_m'"

@@ -220,7 +220,7 @@ def test_fields_are_checked():
     good = short_dipole([0, 0, 1])
     with pytest.raises(InputError, match="e_theta must be a complex128 array, got complex64"):
         AntennaFields(good.e_theta.astype(jnp.complex64), good.e_phi, GRID)
-    with pytest.raises(InputError, match=r"e_theta has shape \(1, 127, 256\), expected"):
+    with pytest.raises(InputError, match=r"e_theta has shape \(1, 127, 128\), expected"):
         AntennaFields(good.e_theta[:, 1:], good.e_phi[:, 1:], GRID)
     with pytest.raises(InputError, match="give the pattern of one antenna, got 2"):
         displaced(random_fields(0, 2, GRID), np.zeros((2, 3)), 10.0)

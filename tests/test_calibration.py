@@ -529,7 +529,7 @@ class HMCDraws(eqx.Module):
     def __call__(self, key, data):
         program = load_program("sky")
         arguments = {**program.arguments(self.model), "data": data}
-        whitening = {"sky": Whitening.of(self.solver.condition(data))}
+        whitening = Whitening.of(self.solver.condition(data))
         sampler = Sampler(warmup=100, draws=N_DRAWS, algorithm="hmc")
         return draw_within(program.model, arguments, key, sampler, whitening, thin=2)["sky"]
 

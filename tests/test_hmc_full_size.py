@@ -21,7 +21,7 @@ def test_nuts_agrees_with_every_mean_every_variance_and_the_covariance(name):
         program.model,
         {**program.arguments(model), "data": data.data},
         Sampler(chains=4, draws=1000, seed=2),
-        {"sky": Whitening.of(posterior)},
+        Whitening.of(posterior),
     )
     draws = chains.sites["sky"]
     assert draws.shape == (4, 1000, 2304)

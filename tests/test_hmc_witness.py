@@ -46,7 +46,7 @@ def drawn(
     program = load_program("sky")
     arguments = {**program.arguments(model), "data": data.data}
     sampler = Sampler(draws=DRAWS, **options)
-    return sample(program.model, arguments, sampler, {"sky": Whitening.of(coordinates)})
+    return sample(program.model, arguments, sampler, Whitening.of(coordinates))
 
 
 @dataclass(frozen=True)

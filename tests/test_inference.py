@@ -67,7 +67,7 @@ def arguments_of(gaussian, data, name="sky"):
 
 def sky_chains(gaussian, data, sampler, whitening, **options):
     program = load_program("sky").model
-    return sample(program, arguments_of(gaussian, data), sampler, {"sky": whitening}, **options)
+    return sample(program, arguments_of(gaussian, data), sampler, whitening, **options)
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +199,7 @@ def test_a_sky_in_white_coordinates_beside_a_site_in_none(gaussian, data, level_
         "data": data,
     }
     sampler = Sampler(chains=4, warmup=300, draws=1500, seed=2)
-    chains = sample(noisy_sky, arguments, sampler, {"sky": whitening})
+    chains = sample(noisy_sky, arguments, sampler, whitening)
     assert set(chains.sites) == {"sky", "level", "mean_sky"}
     sky, level = chains.sites["sky"], chains.sites["level"]
     # a sum of nine numbers in another order: rounding
@@ -282,10 +282,10 @@ def test_the_number_of_draws_is_no_part_of_a_runs_identity():
 
 @pytest.mark.parametrize("site", ["data", "skies"])
 def test_a_site_to_whiten_that_the_program_does_not_sample(gaussian, data, site):
-    whitening = Whitening.of(gaussian.condition(data))
+    whitening = Whitening.of(gaussian.condition(data), site)
     arguments = arguments_of(gaussian, data)
     with pytest.raises(InputError, match=f"no latent site '{site}' to whiten; it has sky"):
-        sample(load_program("sky").model, arguments, Sampler(), {site: whitening})
+        sample(load_program("sky").model, arguments, Sampler(), whitening)
 
 
 def test_latent_sites_are_those_sampled_and_not_observed(gaussian, data):
@@ -405,7 +405,7 @@ def test_chains_within_a_program_follow_each_data_sets_posterior(gaussian):
     def one(key):
         data_key, key = jax.random.split(key)
         data = gaussian.sample(data_key)[1]
-        whitening = {"sky": Whitening.of(solver.condition(data))}
+        whitening = Whitening.of(solver.condition(data))
         arguments = pieces | {"data": data}
         return data, draw_within(program.model, arguments, key, sampler, whitening, thin=2)
 

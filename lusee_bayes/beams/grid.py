@@ -43,7 +43,7 @@ class HemisphereGrid(eqx.Module):
         echoes from deep layers then vary quickly with the angle.
         """
         n = max(lmax, 63) + 1
-        return cls.gauss_legendre(2 * n, 4 * n)
+        return cls.gauss_legendre(2 * n, 2 * n)
 
     @property
     def phi(self) -> Float[np.ndarray, " phi"]:

@@ -16,20 +16,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
-from scipy.special import roots_legendre
+from jaxtyping import Array, Complex, Float
 
 from lusee_bayes.beams.fields import AntennaFields, phasor, wavenumber
 from lusee_bayes.beams.grid import HemisphereGrid
 from lusee_bayes.beams.product_beams import ProductBeams, product_beams
 from lusee_bayes.beams.regolith import Regolith
-from lusee_bayes.checks import require_finite, require_positive
+from lusee_bayes.checks import AnyArray, require_finite, require_positive
 
 # ports 0, 1, 2, 3 point North, East, South, West; phi counts from East towards North
 PORT_AZIMUTHS_DEG = (90.0, 0.0, -90.0, 180.0)
-
-# k L <= pi at 50 MHz: 16 Gauss nodes integrate the current to rounding
-CURRENT_NODES = 16
 
 
 def _array(x) -> Float[Array, "..."]:
@@ -41,7 +37,8 @@ class Monopoles(eqx.Module):
 
     length_m : arm length; zenith_angle_deg : angle of the arms from the zenith (above 90 they
     droop); height_m : of the feed over the ground; azimuths_deg : (antennas,) where the arms
-    point, from East towards North, at turntable angle zero.
+    point, from East towards North, at turntable angle zero; turntable_offset_deg : by how much the
+    turntable is further round than it says.
     """
 
     regolith: Regolith = eqx.field(default_factory=Regolith)
@@ -49,21 +46,39 @@ class Monopoles(eqx.Module):
     zenith_angle_deg: Float[Array, ""] = eqx.field(default=75.0, converter=_array)
     height_m: Float[Array, ""] = eqx.field(default=2.0, converter=_array)
     azimuths_deg: Float[Array, " antennas"] = eqx.field(default=PORT_AZIMUTHS_DEG, converter=_array)
+    turntable_offset_deg: Float[Array, ""] = eqx.field(default=0.0, converter=_array)
 
     def __check_init__(self):
         require_finite("zenith_angle_deg", self.zenith_angle_deg)
         require_finite("azimuths_deg", self.azimuths_deg)
+        require_finite("turntable_offset_deg", self.turntable_offset_deg)
         require_positive("length_m", self.length_m)
         require_positive("height_m", self.height_m)
 
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         """Field patterns at one frequency, phase centre at the feed, common to all arms."""
         require_positive("frequency_mhz", frequency_mhz)
+        e_theta, e_phi = self.towards(frequency_mhz, grid.theta[:, None], grid.phi[None])
+        return AntennaFields(e_theta, e_phi, grid)
+
+    def towards(
+        self,
+        frequency_mhz: float | Float[Array, ""],
+        theta: Float[AnyArray, "*#directions"],
+        phi: Float[AnyArray, "*#directions"],
+    ) -> tuple[Complex[Array, "antennas *directions"], Complex[Array, "antennas *directions"]]:
+        """(E_theta, E_phi) of every arm in directions above the horizon, in radians.
+
+        theta and phi have the same number of axes and broadcast against each other; the ground is
+        worked out once for every entry of theta. Phase centre: the feed.
+        """
         k = wavenumber(frequency_mhz)
-        cos, sin = jnp.cos(grid.theta)[None, :, None], jnp.sin(grid.theta)[None, :, None]
+        cos, sin = jnp.cos(theta)[None], jnp.sin(theta)[None]
         tilt = jnp.radians(self.zenith_angle_deg)
-        azimuth = jnp.radians(self.azimuths_deg)[:, None, None]
-        relative = jnp.asarray(grid.phi)[None, None, :] - azimuth
+        azimuth = jnp.radians(self.azimuths_deg + self.turntable_offset_deg).reshape(
+            -1, *(1,) * phi.ndim
+        )
+        relative = jnp.asarray(phi)[None] - azimuth
         # the arm along the horizontal direction of the wave, across it, and up
         along, across, up = (
             jnp.sin(tilt) * jnp.cos(relative),
@@ -71,7 +86,7 @@ class Monopoles(eqx.Module):
             jnp.cos(tilt),
         )
         s, p = (
-            r[None, :, None] for r in self.regolith.reflection(np.cos(grid.theta), frequency_mhz)
+            r.reshape(cos.shape) for r in self.regolith.reflection(cos.reshape(-1), frequency_mhz)
         )
         ground = phasor(-2.0 * k * self.height_m * cos)
         direct = self._current_integral(k, along * sin + up * cos)
@@ -80,20 +95,22 @@ class Monopoles(eqx.Module):
         to_reflected = (along * cos + up * sin).astype(jnp.complex128)
         e_theta = to_theta * direct - p * to_reflected * bounced
         e_phi = across.astype(jnp.complex128) * (direct + s * bounced)
-        return AntennaFields(e_theta, e_phi, grid)
+        return e_theta, e_phi
 
-    def _current_integral(self, k: float, projection: Float[Array, "antennas theta phi"]) -> Array:
-        """int_0^L sin k(L - s) exp(i k s projection) ds."""
-        nodes, weights = roots_legendre(CURRENT_NODES)
-        at = jnp.asarray((nodes + 1.0) / 2.0)
-        current = jnp.sin(k * self.length_m * (1.0 - at)) * self.length_m * (weights / 2.0)
+    def _current_integral(
+        self, k: float | Float[Array, ""], projection: Float[Array, "antennas *directions"]
+    ) -> Complex[Array, "antennas *directions"]:
+        """int_0^L sin k(L - s) exp(i k s projection) ds.
 
-        def add(total, node):  # node by node: all at once would take 0.2 GB
-            where, weight = node
-            return total + weight * phasor(k * self.length_m * where * projection), None
-
-        start = jnp.zeros(projection.shape, dtype=jnp.complex128)
-        return jax.lax.scan(add, start, (at, current.astype(jnp.complex128)))[0]
+        = (L / 2i) [exp(i b) sinc a - exp(-i a) sinc b],  a, b = k L (1 -+ projection) / 2:
+        the sine as two exponentials, whose integrals are sincs; nothing is singular.
+        """
+        kl = k * self.length_m
+        a, b = kl * (1.0 - projection) / 2.0, kl * (1.0 + projection) / 2.0
+        sinc_a, sinc_b = jnp.sinc(a / np.pi), jnp.sinc(b / np.pi)
+        real = jnp.sin(b) * sinc_a + jnp.sin(a) * sinc_b
+        imaginary = jnp.cos(a) * sinc_b - jnp.cos(b) * sinc_a
+        return jax.lax.complex(real, imaginary) * (self.length_m / 2.0).astype(jnp.complex128)
 
 
 @eqx.filter_jit
@@ -103,11 +120,14 @@ def monopole_beams(
     monopoles: Monopoles | None = None,
     *,
     stokes: str = "I",
+    grid: HemisphereGrid | None = None,
 ) -> ProductBeams:
     """Product beams of the embedded antennas, autos integrating to one on average.
 
-    Differentiable in every leaf of ``monopoles`` (default: the paper's four arms on its ground).
+    ``grid``: by default one that is exact to rounding; fewer nodes are faster. Differentiable in
+    every leaf of ``monopoles`` (default: the paper's four arms on its ground).
     """
     monopoles = Monopoles() if monopoles is None else monopoles
-    fields = monopoles.fields(frequency_mhz, HemisphereGrid.for_lmax(lmax))
+    grid = HemisphereGrid.for_lmax(lmax) if grid is None else grid
+    fields = monopoles.fields(frequency_mhz, grid)
     return product_beams(fields, frequency_mhz, lmax, stokes=stokes)

@@ -20,6 +20,18 @@ def stokes_beam(
 ) -> Complex[Array, "antennas antennas theta phi"]:
     """Response of <s_i conj(s_j)> to one Stokes parameter of the sky, for every pair.
 
+    :func:`stokes_pairs` of the fields, on their grid.
+    """
+    return stokes_pairs(fields.e_theta, fields.e_phi, stokes)
+
+
+def stokes_pairs(
+    e_theta: Complex[Array, "antennas *directions"],
+    e_phi: Complex[Array, "antennas *directions"],
+    stokes: str = "I",
+) -> Complex[Array, "antennas antennas *directions"]:
+    """Response of <s_i conj(s_j)> to one Stokes parameter, in any set of directions.
+
     With E = E_i, F = E_j:
 
         I: (Et Ft* + Ep Fp*) / 2      Q: (Et Ft* - Ep Fp*) / 2
@@ -30,8 +42,8 @@ def stokes_beam(
     """
     if stokes not in STOKES:
         raise InputError(f"unknown Stokes parameter '{stokes}'; {nearest(stokes, STOKES)}")
-    et, ep = fields.e_theta[:, None], fields.e_phi[:, None]
-    ft, fp = fields.e_theta[None].conj(), fields.e_phi[None].conj()
+    et, ep = e_theta[:, None], e_phi[:, None]
+    ft, fp = e_theta[None].conj(), e_phi[None].conj()
     if stokes == "I":
         return (et * ft + ep * fp) / 2.0
     if stokes == "Q":

@@ -5,11 +5,10 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from lusee_bayes.beams.fields import wavenumber
-from lusee_bayes.checks import InputError, is_traced, require_positive
+from lusee_bayes.checks import AnyArray, InputError, is_traced, require_positive
 
 N_LAYERS = 8
 DEPTH_M = 100.0
@@ -47,7 +46,9 @@ class Regolith(eqx.Module):
         return jax.lax.complex(real, -real * self.loss_tangent)
 
     def reflection(
-        self, cos_theta: Float[np.ndarray, " theta"], frequency_mhz: float
+        self,
+        cos_theta: Float[AnyArray, " theta"],
+        frequency_mhz: float | Float[Array, ""],
     ) -> tuple[Complex[Array, " theta"], Complex[Array, " theta"]]:
         """Reflection coefficients (s, p) for waves arriving at zenith angle theta.
 
@@ -56,8 +57,8 @@ class Regolith(eqx.Module):
         vertical; a perfect conductor has s = -1, p = +1. Recursion over the interfaces from the
         bottom up, with Fresnel coefficients at each (Born & Wolf, section 1.6.4).
         """
-        k = wavenumber(frequency_mhz)
-        thickness = DEPTH_M / (N_LAYERS - 1)
+        thickness = wavenumber(frequency_mhz) * DEPTH_M / (N_LAYERS - 1)  # in radians of vacuum
+        thickness = jnp.asarray(thickness, dtype=jnp.complex128)
         cosine = jnp.asarray(cos_theta, dtype=jnp.complex128)
         sin2 = 1.0 - cosine**2
         eps = [jnp.ones((), dtype=jnp.complex128), *self.permittivities()]
@@ -71,7 +72,7 @@ class Regolith(eqx.Module):
             if upper == N_LAYERS - 1:  # nothing comes back from below the last interface
                 s, p = fresnel_s, fresnel_p
                 continue
-            delay = jnp.exp(-2j * k * q1 * thickness)
+            delay = jnp.exp(-2j * thickness * q1)
             s = (fresnel_s + s * delay) / (1.0 + fresnel_s * s * delay)
             p = (fresnel_p + p * delay) / (1.0 + fresnel_p * p * delay)
         return s, p

@@ -23,7 +23,7 @@ Resume = Annotated[bool, Parameter(negative="")]
 def sample_command(
     scenario: str,
     *,
-    model: str = "sky",
+    model: str | None = None,
     data: Path | None = None,
     output: Output = None,
     resume: Resume = False,
@@ -46,7 +46,8 @@ def sample_command(
         A YAML file, or the name of a scenario of the package (fiducial, ...).
     model
         The program: a Python file with a function model, or one of the package by its name (sky,
-        sky_marginal, prior_amplitude).
+        sky_marginal, gains, instrument, ...). By default systematics, where the scenario says that
+        something is to be sampled, else sky.
     data
         Visibilities to use; without them the scenario's own are simulated.
     output
@@ -67,8 +68,8 @@ def sample_command(
         Print nothing but errors.
     """
     console = Console(quiet=quiet, soft_wrap=True)
-    program = load_program(model)
     resolved = load_scenario(scenario, set_ or [])
+    program = load_program(model or ("systematics" if resolved.samples else "sky"))
     sampler = Sampler(
         chains=chains, warmup=warmup, draws=draws, seed=resolved.seed, algorithm=algorithm
     )

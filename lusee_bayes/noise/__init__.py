@@ -4,10 +4,9 @@ from lusee_bayes.noise.beam_error import (
     beam_error_noise,
     derivative,
     difference,
-    moved,
     rms_difference,
 )
-from lusee_bayes.noise.gain_drift import GainDrift, with_gains
+from lusee_bayes.noise.gain_drift import GainDrift, white_grid, with_gains
 from lusee_bayes.noise.radiometer import exact_blocks, paper_variance, radiometer_noise
 from lusee_bayes.noise.templates import template_noise
 
@@ -17,10 +16,10 @@ __all__ = [
     "derivative",
     "difference",
     "exact_blocks",
-    "moved",
     "paper_variance",
     "radiometer_noise",
     "rms_difference",
     "template_noise",
+    "white_grid",
     "with_gains",
 ]

@@ -8,27 +8,15 @@ parameter of the embedded beam times its standard deviation.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lusee_bayes.beams import Monopoles, ProductBeams, monopole_beams
-from lusee_bayes.checks import InputError, nearest, require_shape
+from lusee_bayes.beams import Monopoles, ProductBeams, monopole_beams, parameter, placed
+from lusee_bayes.checks import require_shape
 from lusee_bayes.coupling import CouplingMatrix
 from lusee_bayes.covariance import LowRankCovariance
 from lusee_bayes.prior import Prior
-
-PARAMETERS = {
-    "length_m": lambda m: m.length_m,
-    "zenith_angle_deg": lambda m: m.zenith_angle_deg,
-    "height_m": lambda m: m.height_m,
-    "surface_permittivity": lambda m: m.regolith.surface_permittivity,
-    "deep_permittivity": lambda m: m.regolith.deep_permittivity,
-    "loss_tangent": lambda m: m.regolith.loss_tangent,
-}
 
 
 def beam_error_noise(direction: CouplingMatrix, prior: Prior) -> LowRankCovariance:
@@ -42,34 +30,18 @@ def difference(true: ProductBeams, model: ProductBeams) -> ProductBeams:
     return ProductBeams(true.modes - model.modes, model.frequency_mhz)
 
 
-def derivative(
-    parameter: str, frequency_mhz: float, lmax: int, monopoles: Monopoles
-) -> ProductBeams:
-    """d beams / d parameter of the embedded antennas (one of ``PARAMETERS``), by forward mode."""
-    where = _where(parameter)
+def derivative(name: str, frequency_mhz: float, lmax: int, monopoles: Monopoles) -> ProductBeams:
+    """d beams / d (a parameter of the embedded antennas), by forward mode.
+
+    ``name``: one of ``beams.PARAMETERS``; InputError naming the nearest for others.
+    """
 
     def modes(value: Float[Array, ""]) -> Float[Array, "products modes"]:
-        moved = eqx.tree_at(where, monopoles, value)
-        return monopole_beams(frequency_mhz, lmax, moved).modes
+        return monopole_beams(frequency_mhz, lmax, placed(monopoles, {name: value})).modes
 
-    value = where(monopoles)
+    value = parameter(name).where(monopoles)
     _, slope = jax.jvp(modes, (value,), (jnp.ones_like(value),))
     return ProductBeams(slope, float(frequency_mhz))
-
-
-def _where(parameter: str) -> Callable[[Monopoles], Float[Array, ""]]:
-    """How to find a parameter in the antennas; InputError naming the nearest for unknown ones."""
-    if parameter not in PARAMETERS:
-        raise InputError(f"unknown beam parameter '{parameter}'; {nearest(parameter, PARAMETERS)}")
-    return PARAMETERS[parameter]
-
-
-def moved(monopoles: Monopoles, steps: dict[str, float]) -> Monopoles:
-    """The antennas with parameters changed by given steps."""
-    for parameter, step in steps.items():
-        where = _where(parameter)
-        monopoles = eqx.tree_at(where, monopoles, where(monopoles) + step)
-    return monopoles
 
 
 def rms_difference(true: ProductBeams, model: ProductBeams) -> float:

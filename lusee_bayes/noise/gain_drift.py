@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from lusee_bayes.checks import (
+    AnyArray,
     InputError,
     require_finite,
     require_float64,
@@ -101,19 +102,45 @@ class GainDrift(eqx.Module):
     def sample(
         self, key: PRNGKeyArray, hours: Float[np.ndarray, " times"], n_antennas: int = 4
     ) -> Float[Array, "antennas times"]:
-        """Draw g_i(t) with exactly this covariance.
-
-        White noise on a grid of sigma_t / 4, convolved with a Gaussian of width sigma_t / sqrt(2);
-        the sum over such a grid equals the integral to exp(-8 pi^2).
-        """
-        spacing = float(self.correlation_h) / 4.0
-        hours = np.asarray(hours)
-        margin = REACH * float(self.correlation_h)
-        grid = np.arange(hours.min() - margin, hours.max() + margin, spacing)
-        lag = (hours[:, None] - grid[None]) / float(self.correlation_h)
-        shape = np.sqrt(spacing / float(self.correlation_h) * np.sqrt(2.0 / np.pi))
+        """Draw g_i(t) with exactly this covariance."""
+        grid = white_grid(hours, float(self.correlation_h))
         white = jax.random.normal(key, (n_antennas, len(grid)), dtype=jnp.float64)
-        return self.sigma * shape * white @ jnp.asarray(np.exp(-(lag**2)).T)
+        return self.history(white, hours, grid)
+
+    def history(
+        self,
+        white: Float[Array, "antennas grid"],
+        hours: Float[np.ndarray, " times"],
+        grid: Float[AnyArray, " grid"],
+    ) -> Float[Array, "antennas times"]:
+        """g_i(t) made of white noise on an even grid of times (:func:`white_grid`), in hours.
+
+        The noise is convolved with a Gaussian of width sigma_t / sqrt(2); a sum over a spacing of
+        sigma_t / 3 or less equals the integral to exp(-9 pi^2 / 2). Differentiable in all.
+        """
+        spacing = (grid[1] - grid[0]) / self.correlation_h
+        lag = jnp.asarray(hours)[None] - jnp.asarray(grid)[:, None]
+        shape = jnp.sqrt(spacing * np.sqrt(2.0 / np.pi))
+        return self.sigma * shape * white @ jnp.exp(-((lag / self.correlation_h) ** 2))
+
+
+def white_grid(
+    hours: Float[np.ndarray, " times"],
+    shortest_h: float,
+    longest_h: float | None = None,
+    *,
+    per_correlation: float = 4.0,
+    margin: float = REACH,
+) -> Float[np.ndarray, " grid"]:
+    """Times whose white noise makes gains with correlation times from shortest to longest.
+
+    ``per_correlation`` of them in each shortest correlation time, from ``margin`` longest ones
+    before the first sample to as many behind the last.
+    """
+    longest_h = shortest_h if longest_h is None else longest_h
+    hours = np.asarray(hours)
+    first, end = hours.min() - margin * longest_h, hours.max() + margin * longest_h
+    return np.arange(first, end, shortest_h / per_correlation)
 
 
 def with_gains(

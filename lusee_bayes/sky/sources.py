@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from astropy.coordinates import SkyCoord
+from jaxtyping import Float
 
 from lusee_bayes.checks import InputError
 
@@ -71,8 +72,21 @@ class PointSource:
 
     def kelvin_steradian(self, frequency_mhz: float | np.ndarray) -> float | np.ndarray:
         """Brightness temperature integrated over the source, K sr: S c^2 / (2 k nu^2)."""
-        nu = np.asarray(frequency_mhz, dtype=np.float64) * 1e6
-        return self.flux_jy(frequency_mhz) * JANSKY * (LIGHT_SPEED / nu) ** 2 / (2.0 * BOLTZMANN)
+        return kelvin_steradian(self.flux_jy(frequency_mhz), frequency_mhz)
+
+
+def kelvin_steradian(
+    flux_jy: float | np.ndarray, frequency_mhz: float | np.ndarray
+) -> float | np.ndarray:
+    """Flux density in Jy as brightness temperature times solid angle: S c^2 / (2 k nu^2)."""
+    nu = np.asarray(frequency_mhz, dtype=np.float64) * 1e6
+    return flux_jy * JANSKY * (LIGHT_SPEED / nu) ** 2 / (2.0 * BOLTZMANN)
+
+
+def galactic_unit_vector(ra_deg: float, dec_deg: float) -> Float[np.ndarray, "3"]:
+    """Galactic unit vector of a position in ICRS (J2000), in degrees."""
+    position = SkyCoord(ra_deg, dec_deg, unit="deg", frame="icrs").galactic
+    return np.asarray(position.cartesian.xyz.value, dtype=np.float64)
 
 
 # Positions: NED and SIMBAD. Polynomials and their lower ends: Perley & Butler 2017 (ApJS 230, 7),

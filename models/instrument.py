@@ -1,0 +1,27 @@
+"""The ground, the antennas and the map from one run: the sky is integrated out for every beam.
+
+Change the names and priors to those of your own question; ``instrument.coupling`` takes every
+parameter of ``lusee_bayes.beams.PARAMETERS``.
+"""
+
+import numpyro
+from numpyro import distributions as dist
+
+import lusee_bayes as lb
+
+
+def model(instrument, gaussian, data=None):
+    """``gaussian``: S and N; its A is replaced by that of the sampled antennas."""
+    values = {
+        "surface_permittivity": dist.Uniform(2.5, 5.0),
+        "deep_permittivity": dist.Uniform(5.0, 8.0),
+        "loss_tangent": dist.LogUniform(1e-3, 1e-1),
+        "zenith_angle_deg": dist.Normal(instrument.value("zenith_angle_deg"), 2.0),
+    }
+    values = {name: numpyro.sample(name, prior) for name, prior in values.items()}
+    level = numpyro.sample("noise_level", dist.LogNormal(0.0, 0.5))
+    gaussian = lb.LinearGaussian(
+        instrument.coupling(values), gaussian.prior, gaussian.noise.scaled(level)
+    )
+    numpyro.sample("data", lb.Marginal(gaussian), obs=data)
+    return gaussian
