@@ -266,6 +266,17 @@ class Experiment:
         """N of :meth:`model`: radiometer noise and every systematic that is not ignored."""
         return self.model(data).noise
 
+    def with_fluxes(self, data: Visibilities | None = None) -> LinearGaussian:
+        """:meth:`model`, but with the sources' fluxes among the unknowns, behind the sky's.
+
+        InputError if the scenario has no sources.
+        """
+        model, sources = self.base(data), self.sources()
+        for _, systematic in self.systematics(data):
+            if not isinstance(systematic, PointSources):
+                model = systematic.marginalised(model)
+        return sources.joint(model)
+
     def unsolved(
         self, data: Visibilities | None = None
     ) -> tuple[LinearGaussian, tuple[Systematic, ...]]:

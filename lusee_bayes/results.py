@@ -16,6 +16,7 @@ from pathlib import Path
 import healpy
 import jax
 import numpy as np
+import pandas as pd
 import xarray as xr
 from jaxtyping import Float, Shaped
 
@@ -36,6 +37,7 @@ from lusee_bayes.metrics import (
 from lusee_bayes.posterior import Posterior
 from lusee_bayes.progress import Stages, peak_memory_gb
 from lusee_bayes.scenario import Scenario
+from lusee_bayes.sky import kelvin_steradian
 from lusee_bayes.version import __version__
 from lusee_bayes.visibilities import Visibilities
 
@@ -46,6 +48,7 @@ FORMAT = "lusee_bayes posterior 1"
 class MapResult:
     """A posterior map with everything needed to judge it.
 
+    fluxes : of the point sources beside the map, one row each (:func:`flux_table`), if any;
     pixel_std : (pixels,) posterior standard deviation of HEALPix RING pixels, in K;
     highest_altitude : (pixels,) sin of the highest altitude each reached; seconds : per stage.
     """
@@ -59,6 +62,7 @@ class MapResult:
     highest_altitude: Float[np.ndarray, " pixels"]
     chi2: float
     rounds: int = 1
+    fluxes: pd.DataFrame | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -75,6 +79,10 @@ class MapResult:
             std = np.asarray(posterior.std())
             pixel_std = np.asarray(posterior.std_of(pixel_matrix(nside, experiment.scenario.lmax)))
             residuals = np.asarray(whitened_residuals(model, posterior, data.data))
+        fluxes = None
+        if experiment.responses and experiment.scenario.sources.treatment != "ignored":
+            with stages("fluxes"):
+                fluxes = flux_table(experiment, data)
         return cls(
             experiment=experiment,
             data=data,
@@ -85,6 +93,7 @@ class MapResult:
             highest_altitude=highest_altitude(data.observation, nside),
             chi2=float(residuals @ residuals),
             rounds=rounds,
+            fluxes=fluxes,
             seconds=stages.seconds,
         )
 
@@ -189,6 +198,8 @@ class MapResult:
                 columns = self.spectra()
                 writer.writerow(columns)
                 writer.writerows(zip(*(c.tolist() for c in columns.values()), strict=True))
+            if self.fluxes is not None:
+                self.fluxes.to_csv(stage / "sources.csv", index=False)
             (stage / "scenario.yaml").write_text(self.experiment.scenario.to_yaml())
             (stage / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n")
             written = sorted(p.name for p in stage.iterdir())
@@ -201,6 +212,38 @@ class MapResult:
         if truth is not None:
             maps |= {"truth": truth, "residual": mean - truth}
         return maps
+
+
+def flux_table(experiment: Experiment, data: Visibilities) -> pd.DataFrame:
+    """Posterior of every source's flux in Jy and in K sr, with its prior and, if known, its truth.
+
+    ``above_horizon``: whether it is ever up; if not, its flux is known from the prior only.
+    """
+    sources = experiment.sources()
+    posterior = experiment.with_fluxes(data).condition(data.data)
+    n = sources.mean().shape[0]
+    mean = np.asarray(sources.mean() + posterior.mean[-n:])
+    std = np.asarray(posterior.std())[-n:]
+    jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
+    truth = experiment.truth() if data.truth is not None else {}
+    rows, at = [], 0
+    for source in sources.sources:
+        true = np.broadcast_to(truth.get(source.site, np.nan), source.n_blocks)
+        for block, up in enumerate(source.seen()):
+            row = {
+                "source": source.name,
+                "block": block,
+                "above_horizon": bool(up),
+                "flux_jy": mean[at] * jansky,
+                "std_jy": std[at] * jansky,
+                "flux_k_sr": mean[at],
+                "std_k_sr": std[at],
+                "prior_jy": source.mean * jansky,
+                "prior_std_jy": source.std * jansky,
+            }
+            rows.append(row if data.truth is None else row | {"true_jy": true[block] * jansky})
+            at += 1
+    return pd.DataFrame(rows)
 
 
 def write_map_fits(

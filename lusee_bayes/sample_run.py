@@ -121,7 +121,6 @@ class SampleRun:
         chains, draws = self.skies.shape[:2]
         return {
             "program": self.tree.attrs["program"],
-            "coordinates": self.tree.attrs["coordinates"],
             "chains": chains,
             "draws": draws,
             "divergences": int(stats["diverging"].sum()),

@@ -76,6 +76,12 @@ class Solver(eqx.Module):
         """ln p(d); the same errors as :meth:`condition`."""
         return self._solve(data)[1]
 
+    def half(self) -> Float[Array, "rank data"]:
+        """L_Lambda^-1 W^T (in the data form of W's part in its span): H with
+        (A S A^T + N)^-1 = L^-T (1 - H^T H) L^-1."""
+        inside = self.whitened if self.basis is None else self.whitened @ self.basis
+        return solve_lower(self.lower, inside.T, transpose=False)
+
     def _solve(self, data: Float[AnyArray, " data"]) -> tuple[Array, Array, Array]:
         require_float64("the data", data)
         require_shape("the data", data, (self.whitened.shape[0],))

@@ -303,7 +303,10 @@ def test_shipped_scenarios_are_what_their_names_say():
             ["noise.gain.treatment=marginalized"],
             "'marginalized', but .*'marginalised', 'sampled' or 'ignored'",
         ),
-        ([SHIFT, "noise.beam.treatment=ignore"], "'ignore', but .*'marginalised', 'sampled' or 'ignored'"),
+        (
+            [SHIFT, "noise.beam.treatment=ignore"],
+            "'ignore', but .*'marginalised', 'sampled' or 'ignored'",
+        ),
         (["noise.gain.visibilities=modle"], "'modle', but .*'model', 'measured' or 'posterior'"),
         ([SHIFT, PARAMETERS], "give either shift_mhz or parameters"),
         (["noise.beam.treatment=ignored"], "give either shift_mhz or parameters"),

@@ -9,6 +9,7 @@ from cyclopts import Parameter
 from rich.console import Console
 
 from lusee_bayes import plots
+from lusee_bayes.checks import InputError
 from lusee_bayes.commands.options import Output, Overrides, Quiet, prepare
 from lusee_bayes.progress import Stages
 from lusee_bayes.results import MapResult, staged
@@ -48,6 +49,11 @@ def map_command(
     """
     console = Console(quiet=quiet, soft_wrap=True)
     resolved = load_scenario(scenario, set_ or [])
+    if resolved.samples:
+        raise InputError(
+            "the scenario says that something is to be sampled, and a map can only marginalise; "
+            f"use: lusee-bayes sample {scenario}"
+        )
     folder = output or Path("output") / Path(scenario).stem
     stages = Stages(console)
     experiment, measured = prepare(resolved, data, stages)
@@ -58,6 +64,8 @@ def map_command(
     for path in files + figures:
         console.print(f"  {path}", highlight=False)
     console.print(headline(result), highlight=False)
+    for line in flux_lines(result):
+        console.print(line, highlight=False)
     console.print(f"look at {folder}/figures/maps.png", highlight=False)
 
 
@@ -91,3 +99,17 @@ def headline(result: MapResult) -> str:
     parts.append(f"ln evidence {summary['log_evidence']:.1f}")
     parts.append(f"{summary['information_bits']:.0f} bits")
     return ", ".join(parts)
+
+
+def flux_lines(result: MapResult) -> list[str]:
+    """One line for every source, or block of it."""
+    if result.fluxes is None:
+        return []
+    lines = []
+    for row in result.fluxes.to_dict("records"):
+        name = row["source"] if row["block"] == 0 else f"{row['source']} ({row['block']})"
+        text = f"{name}: {row['flux_jy']:.4g} +- {row['std_jy']:.2g} Jy"
+        if not row["above_horizon"]:
+            text += ", the prior's: it is never above the horizon"
+        lines.append(text)
+    return lines

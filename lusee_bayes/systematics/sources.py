@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
 from lusee_bayes.checks import require_finite, require_positive, require_shape
+from lusee_bayes.coupling import CouplingMatrix
 from lusee_bayes.covariance import LowRankCovariance
 from lusee_bayes.linear_gaussian import LinearGaussian
 from lusee_bayes.prior import IndependentPrior
@@ -92,8 +93,11 @@ class PointSources(Systematic):
         ``condition`` gives the posterior of both; the last unknowns are the fluxes minus their
         prior means, in K sr.
         """
-        columns = self.columns()
-        dense = model.coupling.dense() if hasattr(model.coupling, "dense") else model.coupling
+        columns, dense = self.columns(), model.coupling
+        if isinstance(model.coupling, CouplingMatrix):
+            dense = model.coupling.dense()
+            if model.coupling.response is not None:
+                columns = columns * model.coupling.response[:, None]
         prior = IndependentPrior(jnp.concatenate([model.prior.diagonal_root(), self.std()]))
         both = replace(model, coupling=jnp.concatenate([dense, columns], axis=1), prior=prior)
         return _brighter(both, columns @ self.mean())
