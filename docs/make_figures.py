@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from matplotlib.colors import LogNorm
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 import lusee_bayes as lb
@@ -17,7 +17,10 @@ from lusee_bayes.building import build_beams
 from lusee_bayes.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.metrics import ell_cross, signal_to_noise
 from lusee_bayes.plots import BLUE, ORANGE, colour_bar, mollweide
+from lusee_bayes.results import MapResult
+from lusee_bayes.sky import BRIGHT_SOURCES
 from lusee_bayes.sky.galaxy import galaxy_map
+from lusee_bayes.sky.sky import source_modes
 
 HERE = Path(__file__).parent / "figures"
 
@@ -89,7 +92,59 @@ def embedded_sky(ulsa: Path | None) -> None:
             )
 
 
+def point_sources() -> None:
+    """The catalogue's sources in the data: fitted beside the map, or left to the map."""
+    listed = ", ".join(f"{{name: {source.name}}}" for source in BRIGHT_SOURCES)
+    figure = Figure(figsize=(9, 6.5), layout="constrained")
+    residuals, lines = {}, {}
+    for treatment in ("marginalised", "ignored"):
+        overrides = [f"sources.list=[{listed}]", f"sources.treatment={treatment}"]
+        experiment = lb.Experiment.from_scenario(lb.load_scenario("fiducial", overrides))
+        data = experiment.simulate()
+        result = MapResult.from_experiment(experiment, data)
+        mean, truth = result.posterior.mean, experiment.sky.modes
+        lines[treatment] = signal_to_noise(mean, truth)
+        residuals[treatment] = modes_to_map(mean - truth, 64)
+        if result.fluxes is not None:
+            print(result.fluxes.to_string(float_format="{:.4g}".format))
+    # what the map of the second row is meant to show: the sky with its sources, as far as ell goes
+    with_sources = truth
+    for source in BRIGHT_SOURCES:
+        flux = experiment.truth()[f"flux_{source.name.replace(' ', '_')}"]
+        unit = source_modes(source, 25.0, 47) / source.kelvin_steradian(25.0)
+        with_sources = with_sources + flux * unit
+    lines["ignored, truth with sources"] = signal_to_noise(mean, with_sources)
+    largest = np.percentile(np.abs(residuals["marginalised"]), 99)
+    for column, (treatment, title) in enumerate(
+        [("marginalised", "fitted beside the map"), ("ignored", "left to the map")]
+    ):
+        axes = figure.add_subplot(2, 2, column + 1, projection="mollweide")
+        image = mollweide(
+            axes, residuals[treatment], norm=Normalize(-largest, largest), cmap="RdBu_r"
+        )
+        axes.set_title(f"posterior mean - diffuse sky, sources {title}")
+        colour_bar(figure, image, axes, label="K", shrink=0.8)
+    axes = figure.add_subplot(2, 1, 2)
+    ell = np.arange(1, 48)
+    for name, label, style in [
+        ("marginalised", "sources fitted", {"color": BLUE}),
+        ("ignored", "left to the map, against the diffuse sky", {"color": ORANGE, "ls": "--"}),
+        (
+            "ignored, truth with sources",
+            "left to the map, against the sky with sources",
+            {"color": "grey", "ls": "-."},
+        ),
+    ]:
+        axes.semilogy(ell, lines[name][1:], label=label, **style)
+        print(name, ell_cross(lines[name]), lines[name][[5, 10, 15, 20]])
+    axes.axhline(1.0, color="grey", lw=0.8, ls=":")
+    axes.set(xlabel=r"multipole $\ell$", ylabel=r"$\mathrm{SNR}_\ell$", xlim=(1, 47))
+    axes.legend(frameon=False)
+    figure.savefig(HERE / "sources.png", dpi=90)
+
+
 if __name__ == "__main__":
     HERE.mkdir(exist_ok=True)
+    point_sources()
     embedded_sky(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
     fixed_axis()

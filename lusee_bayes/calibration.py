@@ -112,6 +112,7 @@ def calibrate(
     n_simulations: int = 500,
     seed: int = 0,
     batch: int = BATCH,
+    one_by_one: bool = False,
     regions: Sequence[str] = (),
     report: Callable[[int], None] = lambda done: None,
 ) -> Ranks:
@@ -125,7 +126,7 @@ def calibrate(
     keys = jax.random.split(jax.random.key(seed), n_simulations)
     parts = []
     for start in range(0, n_simulations, batch):
-        ranks = _rank_batch(simulate, draw, quantities, keys[start : start + batch])
+        ranks = _rank_batch(simulate, draw, quantities, keys[start : start + batch], one_by_one)
         parts.append(jax.tree.map(np.asarray, ranks))
         report(min(start + batch, n_simulations))
     names, columns = [], []
@@ -137,7 +138,9 @@ def calibrate(
 
 
 @eqx.filter_jit
-def _rank_batch(simulate, draw, quantities, keys: Key[Array, " n"]) -> dict[str, Array]:
+def _rank_batch(
+    simulate, draw, quantities, keys: Key[Array, " n"], one_by_one: bool
+) -> dict[str, Array]:
     """Ranks of one batch of data sets: (simulations, ...) by name."""
 
     def one(key):
@@ -147,7 +150,7 @@ def _rank_batch(simulate, draw, quantities, keys: Key[Array, " n"]) -> dict[str,
         below = jax.tree.map(lambda q, t: (q < t[None]).sum(0), drawn, quantities(truth, data))
         return {name: jnp.atleast_1d(rank) for name, rank in below.items()}
 
-    return jax.vmap(one)(keys)
+    return jax.lax.map(one, keys) if one_by_one else jax.vmap(one)(keys)
 
 
 def calibrate_sky(

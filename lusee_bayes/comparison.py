@@ -7,6 +7,7 @@ smoothed importance sampling turns into the expected log density of data left ou
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -130,10 +131,12 @@ def with_log_likelihood(
 ) -> xr.DataTree:
     """The tree with a group log_likelihood (chain, draw, datum), of ``most`` draws at most.
 
-    The posterior of the tree that is returned has these draws only.
+    One of each chain is kept at least. The posterior of the tree that is returned has these draws
+    only.
     """
     posterior = tree["posterior"].dataset
-    step = max(1, -(-posterior.sizes["chain"] * posterior.sizes["draw"] // most))
+    each = max(1, most // posterior.sizes["chain"])
+    step = -(-posterior.sizes["draw"] // each)
     few = posterior.isel(draw=slice(None, None, step))
     data = tree["observed_data"]["data"].values
     sites = {str(name): value.values for name, value in few.data_vars.items()}
@@ -151,4 +154,7 @@ def compare(trees: Mapping[str, xr.DataTree]) -> pd.DataFrame:
     trees : by name, from :func:`with_log_likelihood`, all of the same data. Programs that sample
     the sky predict given the sky, collapsed ones without it: do not compare one with the other.
     """
-    return arviz_stats.compare(dict(trees))
+    with warnings.catch_warnings():
+        # of how ArviZ calls pandas
+        warnings.filterwarnings("ignore", message="The inplace keyword in")
+        return arviz_stats.compare(dict(trees))

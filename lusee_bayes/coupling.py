@@ -62,8 +62,20 @@ class CouplingMatrix(eqx.Module):
                 f"the data layout has {layout.n_products} products x {layout.n_times} times, "
                 f"beams and pointing have {beams.n_products} x {pointing.n_times}"
             )
-        body = _body_beams(beams.modes, pointing)
-        return cls(body, _by_order(body, beams.lmax), pointing, layout, beams.frequency_mhz)
+        return cls.of_modes(beams.modes, pointing, layout, beams.frequency_mhz)
+
+    @classmethod
+    def of_modes(
+        cls,
+        modes: Float[Array, "beams modes"],
+        pointing: Pointing,
+        layout: DataLayout,
+        frequency_mhz: float = 0.0,
+    ) -> CouplingMatrix:
+        """A of any number of beams, given by their coefficients; nothing is checked."""
+        body = _body_beams(modes, pointing)
+        lmax = len(pointing.pole_from_galactic.blocks) - 1
+        return cls(body, _by_order(body, lmax), pointing, layout, frequency_mhz)
 
     @classmethod
     def observe(cls, beams: ProductBeams, observation: Observation) -> CouplingMatrix:

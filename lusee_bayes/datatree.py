@@ -40,9 +40,10 @@ def to_datatree(
 
     Skies are on dims (chain, draw, mode) with coords ell and m, in K; data on (datum) with coords
     product and time. Programs without the sky get it drawn. ``n_predictive``: draws of the prior
-    and of each predictive group. The analytic posterior of ``model`` is among the constants.
+    and of each predictive group. The analytic posterior of ``model`` is among the constants,
+    and the ``truth`` of other sites as true_NAME. ``arguments``: the program's, if not ``model``'s.
     """
-    arguments = program.arguments(model)
+    arguments = program.arguments(model) if arguments is None else arguments
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1), 3)
     sites = dict(chains.sites)
     collapsed = is_collapsed(program, arguments, data.data)

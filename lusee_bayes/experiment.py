@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from typing import Any
 
 import jax
@@ -179,7 +179,7 @@ class Experiment:
             found.append(("sampled", PowerSpectrum(prior.log_amplitude_std, prior.tilt_std)))
         beam = noise.beam
         if beam is not None and beam.treatment == "sampled" and beam.parameters:
-            found.append(("sampled", self.instrument_parameters()))
+            found.append(("sampled", InstrumentParameters.about(self.prepared, beam.parameters)))
         elif beam is not None and beam.treatment != "ignored":
             for direction in self.beam_directions():
                 error = BeamError(self.instrument.coupling_of(direction))
@@ -190,12 +190,10 @@ class Experiment:
             found.append((noise.gain.treatment, self.gain_drifts(data, around)))
         return found
 
-    def instrument_parameters(self) -> InstrumentParameters:
-        """The antennas' parameters that are not known. InputError if there are none."""
-        beam = self.scenario.noise.beam
-        if beam is None or not beam.parameters:
-            raise InputError("the scenario has no noise.beam.parameters that could be sampled")
-        return InstrumentParameters.about(self.instrument, beam.parameters)
+    @cached_property
+    def prepared(self) -> Instrument:
+        """The instrument, prepared for A to be made of many beams."""
+        return self.instrument.prepared()
 
     def gain_drifts(
         self,
@@ -266,13 +264,17 @@ class Experiment:
         """N of :meth:`model`: radiometer noise and every systematic that is not ignored."""
         return self.model(data).noise
 
-    def with_fluxes(self, data: Visibilities | None = None) -> LinearGaussian:
+    def with_fluxes(
+        self,
+        data: Visibilities | None = None,
+        around: Float[Array, "products times"] | None = None,
+    ) -> LinearGaussian:
         """:meth:`model`, but with the sources' fluxes among the unknowns, behind the sky's.
 
         InputError if the scenario has no sources.
         """
         model, sources = self.base(data), self.sources()
-        for _, systematic in self.systematics(data):
+        for _, systematic in self.systematics(data, around):
             if not isinstance(systematic, PointSources):
                 model = systematic.marginalised(model)
         return sources.joint(model)
@@ -293,6 +295,8 @@ class Experiment:
                 rest.append(Marginalised(systematic))
             else:
                 model = systematic.marginalised(model)
+        if rest and not any(systematic.changes_coupling for systematic in rest):
+            model = replace(model, coupling=model.coupling.dense())
         return model, tuple(rest)
 
     def pieces(self, data: Visibilities) -> dict[str, Callable[[], Any]]:
@@ -318,7 +322,7 @@ class Experiment:
             "gaussian": lambda: unsolved()[0],
             "systematics": lambda: unsolved()[1],
             "gain_drifts": free(GainDrifts, lambda: self.gain_drifts(data)),
-            "instrument": free(BeamError, lambda: self.instrument),
+            "instrument": free(BeamError, lambda: self.prepared),
             "sources": free(PointSources, self.sources),
         }
 
@@ -351,7 +355,7 @@ class Experiment:
             truth["noise_level"] = float(prior.sample(jax.random.fold_in(key, LEVEL_DRAW)))
         beam = self.scenario.noise.beam
         if beam is not None and beam.parameters:
-            priors = self.instrument_parameters().priors()
+            priors = InstrumentParameters.about(self.instrument, beam.parameters).priors()
             keys = jax.random.split(jax.random.fold_in(key, BEAM_DRAW), len(priors))
             for (name, prior), k in zip(priors.items(), keys, strict=True):
                 truth[name] = float(prior.sample(k))
@@ -408,11 +412,8 @@ class Experiment:
         gain = self.scenario.noise.gain
         if gain is None or gain.treatment == "ignored" or gain.visibilities != "posterior":
             return model, posterior, 1
-        complete = CouplingMatrix.build(self.beams, self.pointing)
-        sources = self.signal - complete.layout.scatter(complete @ self.sky.modes)
         for rounds in range(2, MAX_ROUNDS + 1):
-            predicted = complete.layout.scatter(complete @ posterior.mean) + sources
-            model = self.model(data, predicted)
+            model = self.model(data, self.prediction(posterior))
             previous, posterior = posterior, model.condition(data.data)
             if float(posterior.rms_shift_from(previous)) < SETTLED:
                 return model, posterior, rounds
@@ -420,6 +421,12 @@ class Experiment:
             f"the map still moves after {MAX_ROUNDS} rounds of rebuilding the gain term around it; "
             "use noise.gain.visibilities=model"
         )
+
+    def prediction(self, posterior: Posterior) -> Float[Array, "products times"]:
+        """Visibilities of the mean map, with the sources' mean fluxes, at every time; in K."""
+        complete = CouplingMatrix.build(self.beams, self.pointing)
+        difference_of_skies = posterior.mean - self.sky.modes
+        return self.signal + complete.layout.scatter(complete @ difference_of_skies)
 
     def simulate(self) -> Visibilities:
         """Visibilities of the scenario's sky with every draw from its seed."""

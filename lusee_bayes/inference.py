@@ -23,7 +23,7 @@ from numpyro.infer.hmc import HMCState
 
 from lusee_bayes.checkpoints import Checkpoints
 from lusee_bayes.checks import AnyArray, InputError, nearest
-from lusee_bayes.sites import WHITE_SUFFIX, Whitened, Whitening
+from lusee_bayes.sites import WHITE_SUFFIX, CorrelatedNormal, Whitened, Whitening
 
 ALGORITHMS = ("nuts", "hmc")
 
@@ -217,13 +217,23 @@ class _Run:
             lambda dynamic: model(*eqx.combine(dynamic, static)),
             whitening.root.shape[1] if all_white else None,
         )
+        # batches of matrices are slow to factorise; several devices would stand idle, though
+        self.one_by_one = len(jax.devices()) == 1 and not predicts(program, arguments)
         self._advance = jax.jit(self._advance_traced)
 
     def start(self) -> HMCState:
         """The first state of every chain."""
         keys = jax.random.split(jax.random.PRNGKey(self.sampler.seed), self.sampler.chains)
-        state = self.kernel.init(keys, self.sampler.warmup, None, (self.dynamic,), {})
-        return self._shared_out(state)
+        if not self.one_by_one:
+            state = self.kernel.init(keys, self.sampler.warmup, None, (self.dynamic,), {})
+            return self._shared_out(state)
+
+        def first(keys, dynamic):
+            return jax.lax.map(
+                lambda key: self.kernel.init(key, self.sampler.warmup, None, (dynamic,), {}), keys
+            )
+
+        return jax.jit(first)(keys, self.dynamic)
 
     def restore(self, like: HMCState, leaves: list[np.ndarray]) -> HMCState:
         """The state whose leaves these are; ``like``: any state of this run."""
@@ -248,9 +258,14 @@ class _Run:
             lambda x: jnp.zeros((CHUNK, *x.shape), x.dtype), jax.eval_shape(collect, state)
         )
 
+        def sample(state):
+            if self.one_by_one:
+                return jax.lax.map(lambda s: self.kernel.sample(s, (dynamic,), {}), state)
+            return self.kernel.sample(state, (dynamic,), {})
+
         def step(i, carry):
             state, rows = carry
-            state = self.kernel.sample(state, (dynamic,), {})
+            state = sample(state)
             return state, jax.tree.map(lambda r, x: r.at[i].set(x), rows, collect(state))
 
         state, rows = jax.lax.fori_loop(0, n, step, (state, rows))
@@ -266,6 +281,12 @@ class _Run:
         return jax.device_put(state, NamedSharding(mesh, PartitionSpec("chain")))
 
 
+def predicts(program: Callable, arguments: dict) -> bool:
+    """Whether a program has a site CorrelatedNormal for data: it samples all that they depend on,
+    and its density costs products only."""
+    return any(isinstance(site["fn"], CorrelatedNormal) for site in _sites(program, arguments))
+
+
 def latent_sites(program: Callable, arguments: dict) -> list[str]:
     """Names of the sites that a program samples and does not observe."""
     return site_names(program, arguments)[0]
@@ -274,14 +295,20 @@ def latent_sites(program: Callable, arguments: dict) -> list[str]:
 def site_names(program: Callable, arguments: dict) -> tuple[list[str], list[str]]:
     """Names of a program's latent and of its observed sites."""
     latent, observed = [], []
+    for site in _sites(program, arguments):
+        (observed if site["is_observed"] else latent).append(site["name"])
+    return latent, observed
+
+
+def _sites(program: Callable, arguments: dict) -> list[dict]:
+    """The sample sites of a program, without running it."""
+    found = []
 
     def run(dynamic):
         trace = handlers.trace(handlers.seed(program, 0)).get_trace(**eqx.combine(dynamic, static))
-        for site in trace.values():
-            if site["type"] == "sample":
-                (observed if site["is_observed"] else latent).append(site["name"])
+        found.extend(site for site in trace.values() if site["type"] == "sample")
 
     dynamic, static = eqx.partition(arguments, eqx.is_array)
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         jax.eval_shape(run, dynamic)
-    return latent, observed
+    return found

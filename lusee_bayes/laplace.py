@@ -108,10 +108,13 @@ def laplace(
 
 def _trace(program: Callable, arguments: dict, start: Mapping[str, Array]) -> dict:
     """One run of the program at the start."""
-    model = handlers.seed(program, jax.random.PRNGKey(0))
-    model = handlers.substitute(model, data=dict(start))
     median = init_to_median(num_samples=31)
-    return handlers.trace(handlers.substitute(model, substitute_fn=median)).get_trace(**arguments)
+
+    def place(site):
+        return start[site["name"]] if site["name"] in start else median(site)
+
+    model = handlers.seed(program, jax.random.PRNGKey(0))
+    return handlers.trace(handlers.substitute(model, substitute_fn=place)).get_trace(**arguments)
 
 
 def _prior_scale(latent: dict) -> Float[Array, " n"]:

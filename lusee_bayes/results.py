@@ -82,7 +82,7 @@ class MapResult:
         fluxes = None
         if experiment.responses and experiment.scenario.sources.treatment != "ignored":
             with stages("fluxes"):
-                fluxes = flux_table(experiment, data)
+                fluxes = flux_table(experiment, data, posterior)
         return cls(
             experiment=experiment,
             data=data,
@@ -214,13 +214,16 @@ class MapResult:
         return maps
 
 
-def flux_table(experiment: Experiment, data: Visibilities) -> pd.DataFrame:
+def flux_table(experiment: Experiment, data: Visibilities, posterior: Posterior) -> pd.DataFrame:
     """Posterior of every source's flux in Jy and in K sr, with its prior and, if known, its truth.
 
+    ``posterior``: of the map, around which the gain term is built where the scenario says so.
     ``above_horizon``: whether it is ever up; if not, its flux is known from the prior only.
     """
-    sources = experiment.sources()
-    posterior = experiment.with_fluxes(data).condition(data.data)
+    sources, gain = experiment.sources(), experiment.scenario.noise.gain
+    settled = gain is not None and gain.visibilities == "posterior"
+    around = experiment.prediction(posterior) if settled else None
+    posterior = experiment.with_fluxes(data, around).condition(data.data)
     n = sources.mean().shape[0]
     mean = np.asarray(sources.mean() + posterior.mean[-n:])
     std = np.asarray(posterior.std())[-n:]

@@ -343,4 +343,6 @@ def _one_sentence(error: ValidationError, source: str) -> str:
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     expected = first["msg"].removeprefix("Value error, ")
     expected = expected[0].lower() + expected[1:]
+    if first["type"] == "value_error" and isinstance(first["input"], (dict, BaseModel)):
+        return f"{source}: {where}: {expected}{more}" if where else f"{source}: {expected}{more}"
     return f"{source}: {where} is {first['input']!r}, but {expected}{more}"

@@ -182,15 +182,18 @@ def _solve(solver: Solver, data: Float[Array, " data"]) -> tuple[Array, Array, A
     frozen = jax.lax.stop_gradient(live)
 
     def unfinished(state):
-        _, moved, count = state
-        return (count < 1) | ((moved > 1e-3 * CONVERGENCE) & (count < MAX_REFINEMENTS))
+        _, moved, before, count = state
+        # what is left may be rounding, which no refinement makes smaller
+        settled = (moved < CONVERGENCE) & (moved > 0.5 * before)
+        more = (moved > 1e-3 * CONVERGENCE) & ~settled & (count < MAX_REFINEMENTS)
+        return (count < 1) | more
 
     def refine(state):
         u, moved = _newton(*frozen, state[0])
-        return u, moved, state[2] + 1
+        return u, moved, state[1], state[3] + 1
 
     first, _ = _newton(*frozen, jnp.zeros(solver.whitened.shape[1]))
-    u, moved, _ = jax.lax.while_loop(unfinished, refine, (first, jnp.inf, 0))
+    u, moved, _, _ = jax.lax.while_loop(unfinished, refine, (first, jnp.inf, jnp.inf, 0))
     fixed = (solver.whitened, *frozen[1:3], white)
     u, _ = _newton(*fixed, jax.lax.stop_gradient(u))
     misfit = white - solver.whitened @ u

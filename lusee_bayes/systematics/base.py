@@ -26,6 +26,11 @@ class Systematic(eqx.Module):
         """Whether it has so many unknowns that the sky has to be sampled together with them."""
         return False
 
+    @property
+    def changes_coupling(self) -> bool:
+        """Whether A depends on it: if not, A is made dense once and for all."""
+        return True
+
     @abstractmethod
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """The model with it integrated out, as a term of N (and of the mean)."""

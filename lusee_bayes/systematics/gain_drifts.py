@@ -11,6 +11,7 @@ import numpyro
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
+from lusee_bayes.coupling import CouplingMatrix
 from lusee_bayes.layout import DataLayout
 from lusee_bayes.linear_gaussian import LinearGaussian
 from lusee_bayes.noise import GainDrift, white_grid, with_gains
@@ -136,4 +137,6 @@ class GainDrifts(Systematic):
 
 def _multiplied(model: LinearGaussian, response: Float[Array, " data"]) -> LinearGaussian:
     offset = None if model.offset is None else model.offset * response
-    return replace(model, coupling=model.coupling.with_response(response), offset=offset)
+    if isinstance(model.coupling, CouplingMatrix):
+        return replace(model, coupling=model.coupling.with_response(response), offset=offset)
+    return replace(model, coupling=model.coupling * response[:, None], offset=offset)

@@ -19,18 +19,21 @@ from lusee_bayes.beams import (
     parameter,
     placed,
 )
+from lusee_bayes.checks import InputError
 from lusee_bayes.coupling import CouplingMatrix
 from lusee_bayes.layout import DataLayout
 from lusee_bayes.linear_gaussian import LinearGaussian
 from lusee_bayes.noise import beam_error_noise, derivative
 from lusee_bayes.pointing import Pointing
 from lusee_bayes.systematics.base import Systematic, normal_within
+from lusee_bayes.turns import Turns
 
 
 class Instrument(eqx.Module):
     """Everything that A is made of, for antennas whose parameters are yet to be chosen.
 
-    grid : on which beams are worked out, by default one that is exact to rounding
+    grid : on which beams are worked out, by default one that is exact to rounding; turns : the
+    orientations, prepared for A to be made of many beams (:meth:`prepared`)
     """
 
     monopoles: Monopoles
@@ -39,6 +42,11 @@ class Instrument(eqx.Module):
     frequency_mhz: float = eqx.field(static=True)
     lmax: int = eqx.field(static=True)
     grid: HemisphereGrid | None = None
+    turns: Turns | None = None
+
+    def prepared(self) -> Instrument:
+        """The same with its orientations worked out, for :meth:`dense`."""
+        return replace(self, turns=Turns.of(self.pointing, self.layout))
 
     def value(self, name: str) -> Float[Array, ""]:
         """The present value of a parameter; InputError naming the nearest for unknown ones."""
@@ -52,6 +60,12 @@ class Instrument(eqx.Module):
     def coupling(self, values: Mapping[str, Float[Array, ""]] | None = None) -> CouplingMatrix:
         """A with these values of parameters; differentiable in them."""
         return self.coupling_of(self.beams(values))
+
+    def dense(self, values: Mapping[str, Float[Array, ""]]) -> Float[Array, "data modes"]:
+        """A as a matrix with these values of parameters, of a :meth:`prepared` instrument."""
+        if self.turns is None:
+            raise InputError("prepare the instrument first: instrument = instrument.prepared()")
+        return self.turns.coupling(self.beams(values))
 
     def coupling_of(self, beams: ProductBeams) -> CouplingMatrix:
         """A, or dA, of given beams."""
@@ -97,9 +111,9 @@ class InstrumentParameters(Systematic):
         return replace(model, noise=noise)
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
-        """One site for each parameter, of its name."""
+        """One site for each parameter, of its name; the instrument has to be prepared."""
         values = {name: numpyro.sample(name, prior) for name, prior in self.priors().items()}
-        return replace(model, coupling=self.instrument.coupling(values))
+        return replace(model, coupling=self.instrument.dense(values))
 
 
 class BeamError(Systematic):

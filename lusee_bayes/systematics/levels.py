@@ -28,6 +28,10 @@ class NoiseLevel(Systematic):
 
     log_std: float = eqx.field(static=True)
 
+    @property
+    def changes_coupling(self) -> bool:
+        return False
+
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """The model as it is."""
         return model
@@ -47,6 +51,10 @@ class PowerSpectrum(Systematic):
 
     log_amplitude_std: float | None = eqx.field(static=True, default=None)
     tilt_std: float | None = eqx.field(static=True, default=None)
+
+    @property
+    def changes_coupling(self) -> bool:
+        return False
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """The model as it is."""
@@ -74,6 +82,10 @@ class SpectrumBands(Systematic):
 
     edges: tuple[int, ...] = eqx.field(static=True)
     log_std: float = eqx.field(static=True, default=1.0)
+
+    @property
+    def changes_coupling(self) -> bool:
+        return False
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """The model as it is."""

@@ -57,6 +57,10 @@ class PointSources(Systematic):
 
     sources: tuple[Source, ...]
 
+    @property
+    def changes_coupling(self) -> bool:
+        return False
+
     def columns(self) -> Float[Array, "data amplitudes"]:
         """Responses of all sources and blocks side by side, in K per K sr."""
         return jnp.concatenate([source.columns for source in self.sources], axis=1)
