@@ -1,6 +1,7 @@
 """Draw the documentation's figures and print its tables.
 
 Run from the repository's root: python docs/make_figures.py [ULSA folder]
+The figure of the regolith needs the draws of: lusee-bayes sample regolith --draws 200 --warmup 40
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from matplotlib.figure import Figure
 
 import lusee_bayes as lb
 from lusee_bayes.building import build_beams
+from lusee_bayes.datatree import read_datatree
 from lusee_bayes.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.metrics import ell_cross, signal_to_noise
 from lusee_bayes.plots import BLUE, ORANGE, colour_bar, mollweide
@@ -21,6 +23,7 @@ from lusee_bayes.results import MapResult
 from lusee_bayes.sky import BRIGHT_SOURCES
 from lusee_bayes.sky.galaxy import galaxy_map
 from lusee_bayes.sky.sky import source_modes
+from lusee_bayes.uncertainty import summary
 
 HERE = Path(__file__).parent / "figures"
 
@@ -143,8 +146,66 @@ def point_sources() -> None:
     figure.savefig(HERE / "sources.png", dpi=90)
 
 
+def regolith(folder: Path) -> None:
+    """Ground, tilt, noise level and map from one data set, and what a wrong ground does to the map.
+
+    ``folder``: written by ``lusee-bayes sample regolith``.
+    """
+    experiment = lb.Experiment.from_scenario(lb.load_scenario("regolith"))
+    data, true = experiment.simulate(), experiment.truth()
+    tree = read_datatree(folder / "samples.nc")
+    draws = {name: tree["posterior"][name].values for name in true}
+    table = summary(draws)
+    print(table)
+    for name, value in true.items():
+        low, high = np.quantile(draws[name], [0.025, 0.975])
+        print(f"| {name} | {value:.6g} | {low:.6g} to {high:.6g} | {low < value < high} |")
+    base, sky = experiment.base(), experiment.sky.modes
+    ground = {name: true[name] for name in ("surface_permittivity", "zenith_angle_deg")}
+    wrong = ground | {"surface_permittivity": experiment.scenario.beam.surface_permittivity}
+
+    def fixed(values):
+        model = lb.LinearGaussian(experiment.prepared.dense(values), base.prior, base.noise)
+        return signal_to_noise(model.condition(data.data).mean, sky)
+
+    mean = tree["posterior"]["sky"].values.mean((0, 1))
+    lines = {
+        "inferred with the map": (signal_to_noise(mean, sky), {"color": BLUE}),
+        "fixed at the truth": (fixed(ground), {"color": "grey", "ls": ":", "lw": 2.5}),
+        f"permittivity fixed at {wrong['surface_permittivity']:g}": (
+            fixed(wrong),
+            {"color": ORANGE, "ls": "--"},
+        ),
+    }
+    figure = Figure(figsize=(9.5, 6), layout="constrained")
+    top, bottom = figure.subfigures(2, 1, height_ratios=(1, 1.3))
+    labels = {
+        "noise_level": "noise variance / radiometer's",
+        "surface_permittivity": "surface permittivity",
+        "zenith_angle_deg": "angle of the arms from the zenith [deg]",
+    }
+    for axes, (name, label) in zip(top.subplots(1, 3), labels.items(), strict=True):
+        axes.hist(draws[name].ravel(), bins=25, color=BLUE, alpha=0.7)
+        axes.axvline(true[name], color="black", lw=1.2)
+        axes.set(xlabel=label, yticks=[])
+        axes.locator_params(axis="x", nbins=4)
+        axes.ticklabel_format(axis="x", useOffset=False)
+    top.suptitle("posterior; black: the truth")
+    axes = bottom.subplots()
+    ell = np.arange(1, len(mean) ** 0.5)
+    for label, (snr, style) in lines.items():
+        axes.semilogy(ell, snr[1:], label=label, **style)
+        print(label, ell_cross(snr), snr[[1, 5, 10, 15, 20]])
+    axes.axhline(1.0, color="grey", lw=0.8, ls=":")
+    axes.set(xlabel=r"multipole $\ell$", ylabel=r"$\mathrm{SNR}_\ell$", xlim=(1, ell[-1]))
+    axes.legend(frameon=False)
+    figure.savefig(HERE / "regolith.png", dpi=90)
+
+
 if __name__ == "__main__":
     HERE.mkdir(exist_ok=True)
+    if Path("output/regolith").is_dir():
+        regolith(Path("output/regolith"))
     point_sources()
     embedded_sky(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
     fixed_axis()

@@ -34,6 +34,8 @@ HALVINGS = 20
 DIFFERENCE = 0.1
 # what is tried at first, in standard deviations of the prior
 FIRST = 1e-3
+# draws of the prior that are looked at for every further start
+CANDIDATES = 12
 # columns of the Jacobian at once: more would take more memory than time they save
 COLUMNS = 64
 # with more unknowns than this, the exact Hessian is out of reach
@@ -72,12 +74,15 @@ def laplace(
     arguments: Mapping[str, Any],
     start: Mapping[str, Array] | None = None,
     hold: Sequence[str] = (),
+    starts: int = 1,
 ) -> Laplace:
     """The Gaussian about the mode of ``program(**arguments)``; a part of a JAX program.
 
     start : values of sites to begin from, by default the medians of their priors; hold : sites that
     stay there, such as the standard deviation of thousands of others: where both are sampled, the
-    joint mode lies far from where the posterior is. Call it with
+    joint mode lies far from where the posterior is. ``starts``: how many places to climb from, the
+    first and the likeliest of some draws of the prior, where there may be more than one mode; the
+    one with the most weight is taken. Call it with
     NumPy's dtype promotion "standard" and rank promotion allowed: NumPyro needs them.
     """
     arguments = dict(arguments)
@@ -103,7 +108,34 @@ def laplace(
         )
     held = [np.full(value.size, name in hold) for name, value in unconstrained.items()]
     free = jnp.asarray(~np.concatenate(held), dtype=jnp.float64)
-    return _climb(problem, first, free, FIRST * _prior_scale(latent))
+    scale = FIRST * _prior_scale(latent)
+    if starts == 1:
+        return _climb(problem, first, free, scale)
+    drawn = _drawn(program, arguments, [name for name, _ in sites], CANDIDATES * (starts - 1))
+    heights = jax.lax.map(problem.potential, drawn)
+    best = jnp.argsort(jnp.where(jnp.isnan(heights), jnp.inf, heights))[: starts - 1]
+    places = jnp.concatenate([first[None], drawn[best]])
+    found = jax.lax.map(lambda x: _climb(problem, x, free, scale), places)
+    weight = jnp.where(found.converged, found.log_evidence, -jnp.inf)
+    return jax.tree.map(lambda leaf: leaf[jnp.argmax(weight)], found)
+
+
+def _drawn(
+    program: Callable, arguments: dict, names: list[str], n: int
+) -> Float[Array, "draws unknowns"]:
+    """Unconstrained values of sites, drawn from the prior."""
+
+    def one(key):
+        trace = handlers.trace(handlers.seed(program, key)).get_trace(**arguments)
+        values = [
+            dist.biject_to(trace[name]["fn"].support).inv(
+                jnp.asarray(trace[name]["value"], dtype=jnp.float64)
+            )
+            for name in names
+        ]
+        return jnp.concatenate([value.reshape(-1) for value in values])
+
+    return jax.lax.map(one, jax.random.split(jax.random.PRNGKey(1), n))
 
 
 def _trace(program: Callable, arguments: dict, start: Mapping[str, Array]) -> dict:

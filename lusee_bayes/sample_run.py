@@ -40,6 +40,9 @@ from lusee_bayes.visibilities import Visibilities
 
 SAMPLES, CHAINS = "samples.nc", "chains"
 
+# where the mode of a collapsed program is looked for
+STARTS = 4
+
 # directions whose brightness every summary tells: Galactic longitude and latitude in degrees
 LANDMARKS = {
     "Galactic centre": (0.0, 0.0),
@@ -229,7 +232,9 @@ def coordinates(
         return Whitening.of(posterior)
     start = {SKY: posterior.mean} if SKY in latent else {}
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        found = laplace(program.model, {**arguments, "data": data.data}, start, SCALES)
+        arguments = {**arguments, "data": data.data}
+        starts = 1 if SKY in latent else STARTS
+        found = laplace(program.model, arguments, start, SCALES, starts)
     return found.whitening if bool(found.converged) else None
 
 
