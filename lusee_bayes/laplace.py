@@ -50,12 +50,12 @@ class Laplace(eqx.Module):
     """
 
     whitening: Whitening
-    log_evidence: Float[Array, ""]
-    moved: Float[Array, ""]
-    steps: Int[Array, ""]
+    log_evidence: Float[Array, "..."]
+    moved: Float[Array, "..."]
+    steps: Int[Array, "..."]
 
     @property
-    def converged(self) -> Bool[Array, ""]:
+    def converged(self) -> Bool[Array, "..."]:
         """Whether the mode was found."""
         return self.moved < SETTLED
 

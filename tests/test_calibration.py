@@ -376,6 +376,7 @@ def test_what_is_ranked_of_a_sky():
     assert float(got["log likelihood"]) == pytest.approx(expected, rel=1e-10)
 
 
+@pytest.mark.long
 def test_fewer_data_than_modes_with_an_offset():
     ranks = calibrate_sky(random_model(True), random_model(True))
     assert ranks.passed, p_values(ranks)
@@ -430,7 +431,7 @@ class Quantities(eqx.Module):
         }
 
 
-@pytest.mark.parametrize("scale", [np.sqrt(2), np.sqrt(0.5)])
+@pytest.mark.parametrize("scale", [np.sqrt(2), pytest.param(np.sqrt(0.5), marks=pytest.mark.long)])
 def test_a_random_term_off_by_sqrt_2_is_noticed(scale):
     truth = dense_model("exact")
     solver = truth.factorise()
@@ -503,6 +504,7 @@ class WithoutTime(eqx.Module):
         }
 
 
+@pytest.mark.long
 @EVERY_NOISE
 def test_a_time_that_is_left_out_is_noticed_only_by_the_likelihood_of_all_data(noise):
     """A posterior given 15 of 16 data is calibrated, too; but not the one that was asked for."""
@@ -534,6 +536,7 @@ class HMCDraws(eqx.Module):
         return draw_within(program.model, arguments, key, sampler, whitening, thin=2)["sky"]
 
 
+@pytest.mark.long
 @EVERY_NOISE
 def test_draws_by_hmc_are_calibrated(noise):
     truth = dense_model(noise)

@@ -35,7 +35,7 @@ NOISES = {
 # a chain or two of each structure of N is run every time, the others by make long
 EVERY_NOISE = pytest.mark.parametrize(
     "noise",
-    ["exact", "gain", *(pytest.param(n, marks=pytest.mark.long) for n in ("paper", "beam"))],
+    ["exact", *(pytest.param(n, marks=pytest.mark.long) for n in ("gain", "paper", "beam"))],
 )
 LMAX, N_MODES, DRAWS, TIME = 6, 49, 2000, 2
 

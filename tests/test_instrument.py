@@ -117,6 +117,7 @@ def test_sites_of_the_antennas_parameters(instrument, base):
     assert got == pytest.approx(expected, rel=1e-10)
 
 
+@pytest.mark.long
 def test_marginalised_parameters_are_derivatives_of_a(instrument, base):
     """Central differences: h^2 f''' = 1e-8 of the slope, and rounding / h = 1e-11."""
     got = InstrumentParameters.about(instrument, STDS).marginalised(base)

@@ -238,6 +238,7 @@ def matrices(e: Experiment):
     )
 
 
+@pytest.mark.long
 def test_all_that_a_scenario_samples():
     """d ~ N(T f, (A + b dA) S (A + b dA)^T + level N_0), for values far from the medians."""
     e = experiment(*ALL)

@@ -95,6 +95,7 @@ def test_a_real_run_at_tiny_size(tmp_path):
         assert float(row["chi2_expected"]) > 0
 
 
+@pytest.mark.long
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path, computed, monkeypatch):
     compute = paper.compute_case
     uninterrupted = paper.run_cases(tmp_path / "whole", first_four(), QUIET)

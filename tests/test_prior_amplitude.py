@@ -339,6 +339,7 @@ def of_no_data(lmax, n_data, noise) -> Case:
 QUICK = (of_no_data(1, 12, 15.0), Sampler(warmup=100, draws=N_DRAWS, algorithm="hmc"), 2, 200, 100)
 
 
+@pytest.mark.long
 def test_calibrated_over_200_data_sets():
     found = ranks(*QUICK)
     assert found.passed, p_values(found)

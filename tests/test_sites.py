@@ -100,6 +100,7 @@ def test_handlers_and_predictive(gaussian):
     assert drawn["data"].shape == (7, N_DATA)
 
 
+@pytest.mark.long
 def test_nuts_finds_the_analytic_posterior(gaussian):
     _, data = gaussian.sample(jax.random.key(5))
     posterior = gaussian.condition(data)
@@ -119,6 +120,7 @@ def test_nuts_finds_the_analytic_posterior(gaussian):
     assert int(mcmc.get_extra_fields()["diverging"].sum()) == 0
 
 
+@pytest.mark.long
 def test_the_marginal_program_finds_the_noise_level(gaussian):
     """Against the density of the noise level on a grid, normalised by the trapezoidal rule."""
     _, data = gaussian.sample(jax.random.key(7))
@@ -346,7 +348,7 @@ def test_wrong_coordinates_slow_the_chains_down_and_leave_the_posterior_right(ga
     wrong = Whitening.of(other.condition(1.0 + arguments["data"]))
     # coordinates that differ by standard deviations, or the test would say nothing
     assert np.abs((wrong.mean - posterior.mean) / posterior.std()).max() > 1.0
-    chains = sample(program("sky"), arguments, Sampler(chains=2, draws=1000), {"sky": wrong})
+    chains = sample(program("sky"), arguments, Sampler(chains=2, draws=1000), wrong)
     draws = chains.sites["sky"].reshape(-1, 9)
     white = np.asarray(posterior.whiten(draws))
     # at least a fifth of the 2000 draws count

@@ -83,6 +83,7 @@ def test_below_the_horizon_they_are_exactly_zero():
     assert higher / lower == pytest.approx(100.0, rel=0.02)
 
 
+@pytest.mark.long
 def test_gradients_are_finite_and_right_with_sources_below_the_horizon():
     directions = np.array([[0.6, 0.0, 0.8], [0.0, 0.0, 1.0], [0.0, 0.6, -0.8], [0.0, -1.0, 0.0]])
     weights = jnp.asarray(np.random.default_rng(1).standard_normal((16, 4)))
@@ -125,7 +126,7 @@ def test_the_frequency_may_be_traced():
 # --- polarisation
 
 
-@pytest.mark.parametrize("stokes_v", [1.0, -1.0])
+@pytest.mark.parametrize("stokes_v", [1.0, pytest.param(-1.0, marks=pytest.mark.long)])
 def test_a_circular_wave_is_the_square_of_its_voltages(stokes_v):
     theta, phi = np.array([0.2, 0.9, 1.4]), np.array([0.3, 2.0, -1.0])
     m = Monopoles()
