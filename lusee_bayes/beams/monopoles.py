@@ -120,14 +120,16 @@ def monopole_beams(
     monopoles: Monopoles | None = None,
     *,
     stokes: str = "I",
-    grid: HemisphereGrid | None = None,
+    nodes: tuple[int, int] | None = None,
 ) -> ProductBeams:
     """Product beams of the embedded antennas, autos integrating to one on average.
 
-    ``grid``: by default one that is exact to rounding; fewer nodes are faster. Differentiable in
-    every leaf of ``monopoles`` (default: the paper's four arms on its ground).
+    ``nodes``: of the grid in theta and phi, by default enough to be exact to rounding; fewer are
+    faster. Differentiable in every leaf of ``monopoles`` (default: the paper's four arms on its
+    ground).
     """
     monopoles = Monopoles() if monopoles is None else monopoles
-    grid = HemisphereGrid.for_lmax(lmax) if grid is None else grid
+    exact = HemisphereGrid.for_lmax
+    grid = exact(lmax) if nodes is None else HemisphereGrid.gauss_legendre(*nodes)
     fields = monopoles.fields(frequency_mhz, grid)
     return product_beams(fields, frequency_mhz, lmax, stokes=stokes)

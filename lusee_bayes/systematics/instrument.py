@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
 from lusee_bayes.beams import (
-    HemisphereGrid,
     Monopoles,
     ProductBeams,
     monopole_beams,
@@ -32,7 +31,7 @@ from lusee_bayes.turns import Turns
 class Instrument(eqx.Module):
     """Everything that A is made of, for antennas whose parameters are yet to be chosen.
 
-    grid : on which beams are worked out, by default one that is exact to rounding; turns : the
+    nodes : of the grid on which beams are worked out (``monopole_beams``); turns : the
     orientations, prepared for A to be made of many beams (:meth:`prepared`)
     """
 
@@ -41,7 +40,7 @@ class Instrument(eqx.Module):
     layout: DataLayout
     frequency_mhz: float = eqx.field(static=True)
     lmax: int = eqx.field(static=True)
-    grid: HemisphereGrid | None = None
+    nodes: tuple[int, int] | None = eqx.field(static=True, default=None)
     turns: Turns | None = None
 
     def prepared(self) -> Instrument:
@@ -55,7 +54,7 @@ class Instrument(eqx.Module):
     def beams(self, values: Mapping[str, Float[Array, ""]] | None = None) -> ProductBeams:
         """The beams with these values of parameters (see ``beams.PARAMETERS``)."""
         antennas = placed(self.monopoles, values or {})
-        return monopole_beams(self.frequency_mhz, self.lmax, antennas, grid=self.grid)
+        return monopole_beams(self.frequency_mhz, self.lmax, antennas, nodes=self.nodes)
 
     def coupling(self, values: Mapping[str, Float[Array, ""]] | None = None) -> CouplingMatrix:
         """A with these values of parameters; differentiable in them."""
