@@ -98,7 +98,8 @@ def embedded_sky(ulsa: Path | None) -> None:
 def point_sources() -> None:
     """The catalogue's sources in the data: fitted beside the map, or left to the map."""
     listed = ", ".join(f"{{name: {source.name}}}" for source in BRIGHT_SOURCES)
-    figure = Figure(figsize=(9, 6.5), layout="constrained")
+    figure = Figure(figsize=(9, 7.5), layout="constrained")
+    top, bottom = figure.subfigures(2, 1, height_ratios=(1.1, 1))
     residuals, lines = {}, {}
     for treatment in ("marginalised", "ignored"):
         overrides = [f"sources.list=[{listed}]", f"sources.treatment={treatment}"]
@@ -121,13 +122,20 @@ def point_sources() -> None:
     for column, (treatment, title) in enumerate(
         [("marginalised", "fitted beside the map"), ("ignored", "left to the map")]
     ):
-        axes = figure.add_subplot(2, 2, column + 1, projection="mollweide")
+        axes = top.add_subplot(1, 2, column + 1, projection="mollweide")
         image = mollweide(
             axes, residuals[treatment], norm=Normalize(-largest, largest), cmap="RdBu_r"
         )
-        axes.set_title(f"posterior mean - diffuse sky, sources {title}")
-        colour_bar(figure, image, axes, label="K", shrink=0.8)
-    axes = figure.add_subplot(2, 1, 2)
+        axes.set_title(f"sources {title}")
+        top.colorbar(
+            image,
+            ax=axes,
+            orientation="horizontal",
+            shrink=0.7,
+            label="posterior mean - diffuse sky [K]",
+            ticks=[-15000, 0, 15000],
+        )
+    axes = bottom.subplots()
     ell = np.arange(1, 48)
     for name, label, style in [
         ("marginalised", "sources fitted", {"color": BLUE}),
