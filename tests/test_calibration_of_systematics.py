@@ -6,7 +6,6 @@ draws from the posterior by Hamiltonian Monte Carlo about the mode found for eac
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 
 import equinox as eqx
@@ -28,10 +27,6 @@ LEVELS_UNKNOWN = (
     "noise.radiometer.log_factor_std=0.5",
     "prior.log_amplitude_std=0.5",
     "prior.tilt_std=0.5",
-)
-GROUND = (
-    "noise.beam={parameters: {surface_permittivity: 0.3, loss_tangent: 0.002, "
-    "zenith_angle_deg: 2.0}, treatment: sampled}",
 )
 SOURCES = (
     "sources.treatment=sampled",
@@ -71,11 +66,10 @@ class Draws(eqx.Module):
     program: object = eqx.field(static=True)
     arguments: dict
     sampler: Sampler = eqx.field(static=True)
-    starts: int = eqx.field(static=True, default=1)
 
     def __call__(self, key, data):
         arguments = {**self.arguments, "data": data}
-        about = laplace(self.program.model, arguments, starts=self.starts)
+        about = laplace(self.program.model, arguments)
         return draw_within(self.program.model, arguments, key, self.sampler, about.whitening)
 
 
@@ -88,13 +82,13 @@ class Sites(eqx.Module):
         return {name: unknowns[name] for name in self.names}
 
 
-def ranks_of(program, arguments, names, *, n=100, starts=1, seed=1) -> Ranks:
+def ranks_of(program, arguments, names, *, n=100, seed=1) -> Ranks:
     """One data set after the other: in a batch, each would wait for the slowest."""
     sampler = Sampler(warmup=60, draws=N_DRAWS, algorithm="hmc")
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         return calibrate(
             Truth(program, arguments),
-            Draws(program, arguments, sampler, starts),
+            Draws(program, arguments, sampler),
             Sites(tuple(names)),
             n_simulations=n,
             seed=seed,
@@ -124,14 +118,3 @@ def test_fluxes_of_sources_at_rest_and_of_jupiter():
     program, arguments = pieces("systematics", *MONTH, *SOURCES)
     names = [f"flux_{name}" for name in ("Cas_A", "Cyg_A", "For_A", "Jupiter")]
     assert_calibrated(ranks_of(program, arguments, names))
-
-
-@pytest.mark.long
-def test_permittivity_loss_tangent_and_tilt():
-    """On a coarse grid of directions: the same beams make the data, so that it does not matter."""
-    program, arguments = pieces("systematics", *TINY, *GROUND)
-    ground = arguments["systematics"][0]
-    coarse = replace(ground, instrument=replace(ground.instrument, nodes=(24, 32)))
-    arguments = {**arguments, "systematics": (coarse,)}
-    names = ["surface_permittivity", "loss_tangent", "zenith_angle_deg"]
-    assert_calibrated(ranks_of(program, arguments, names, starts=3))

@@ -483,7 +483,7 @@ DEVICES_SCRIPT = """
         assert seen == {{2}}, seen
     np.savez(out / "chains.npz", **chains.sites, **chains.statistics)
     assert t.TINY.chains == 3
-    alone = t.inference._Run(t.bent, {{"y": t.jnp.asarray(1.5)}}, t.TINY, {{}})
+    alone = t.inference._Run(t.bent, {{"y": t.jnp.asarray(1.5)}}, t.TINY, None)
     with jax.numpy_rank_promotion("allow"):
         assert len(jax.tree.leaves(alone.start().z)[0].sharding.device_set) == 1
 """
