@@ -18,9 +18,9 @@ from rich.console import Console
 from rich.table import Table
 
 import lusee_bayes as lb
+from lusee_bayes.coordinates import Whitening
 from lusee_bayes.inference import ALGORITHMS, Sampler, sample
 from lusee_bayes.programs import load_program
-from lusee_bayes.sites import Whitening
 
 
 def main() -> None:

@@ -17,10 +17,11 @@ from lusee_bayes.inference import Chains
 from lusee_bayes.linear_gaussian import LinearGaussian
 from lusee_bayes.posterior import Posterior
 from lusee_bayes.programs import Program, collapsed_skies, is_collapsed, replicated_data
+from lusee_bayes.sites import SKY
 from lusee_bayes.visibilities import Visibilities
 
 FORMAT = "lusee_bayes samples 1"
-SKY, DATA = "sky", "data"
+DATA = "data"
 
 
 def to_datatree(

@@ -1,8 +1,8 @@
 """Hamiltonian Monte Carlo of any NumPyro program: chains side by side, draws kept as they come.
 
 Programs are sampled in coordinates in which their posterior is nearly round, if such are known
-(:class:`lusee_bayes.sites.Whitening`: the sky's analytic posterior, or :mod:`lusee_bayes.laplace`);
-the density is the program's own.
+(:mod:`lusee_bayes.coordinates`: those of the sky's analytic posterior, or of
+:mod:`lusee_bayes.laplace`); the density is the program's own.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from numpyro.infer.hmc import HMCState
 
 from lusee_bayes.checkpoints import Checkpoints
 from lusee_bayes.checks import AnyArray, InputError, nearest
-from lusee_bayes.sites import WHITE_SUFFIX, CorrelatedNormal, Whitened, Whitening
+from lusee_bayes.coordinates import WHITE_SUFFIX, Whitened, Whitening
+from lusee_bayes.sites import CorrelatedNormal
 
 ALGORITHMS = ("nuts", "hmc")
 

@@ -22,7 +22,8 @@ from numpyro.infer import init_to_median
 from numpyro.infer.util import potential_energy
 
 from lusee_bayes.checks import InputError, is_traced
-from lusee_bayes.sites import HALF_LOG_2PI, CorrelatedNormal, Whitening
+from lusee_bayes.coordinates import Chart, Whitening
+from lusee_bayes.sites import HALF_LOG_2PI, CorrelatedNormal
 
 # the mode is found when a step is shorter than this, rms in standard deviations: near enough for
 # coordinates, and longer than what rounding of a log evidence makes (1e-7, or 5e-4 of one)
@@ -75,6 +76,7 @@ def laplace(
     start: Mapping[str, Array] | None = None,
     hold: Sequence[str] = (),
     starts: int = 1,
+    chart: Chart | None = None,
 ) -> Laplace:
     """The Gaussian about the mode of ``program(**arguments)``; a part of a JAX program.
 
@@ -82,8 +84,8 @@ def laplace(
     stay there, such as the standard deviation of thousands of others: where both are sampled, the
     joint mode lies far from where the posterior is. ``starts``: how many places to climb from, the
     first and the likeliest of some draws of the prior, where there may be more than one mode; the
-    one with the most weight is taken. Call it with
-    NumPy's dtype promotion "standard" and rank promotion allowed: NumPyro needs them.
+    one with the most weight is taken. ``chart``: coordinates in which ridges are straight. Call it
+    with NumPy's dtype promotion "standard" and rank promotion allowed: NumPyro needs them.
     """
     arguments = dict(arguments)
     trace = _trace(program, arguments, start or {})
@@ -97,9 +99,9 @@ def laplace(
         for name, site in latent.items()
     }
     sites = tuple((name, value.shape) for name, value in unconstrained.items())
-    first = jnp.concatenate([value.reshape(-1) for value in unconstrained.values()])
-    n = first.shape[0]
-    shapes = Whitening(jnp.zeros(n), jnp.zeros((n, 0)), jnp.zeros(()), sites)
+    n = sum(value.size for value in unconstrained.values())
+    shapes = Whitening(jnp.zeros(n), jnp.zeros((n, 0)), jnp.zeros(()), sites, chart)
+    first = shapes.from_values(unconstrained)
     problem = _Problem(program, arguments, shapes, _predicts(trace))
     if not problem.predicts and n > MOST_FOR_HESSIAN:
         raise InputError(
@@ -111,7 +113,7 @@ def laplace(
     scale = FIRST * _prior_scale(latent)
     if starts == 1:
         return _climb(problem, first, free, scale)
-    drawn = _drawn(program, arguments, [name for name, _ in sites], CANDIDATES * (starts - 1))
+    drawn = _drawn(program, arguments, shapes, CANDIDATES * (starts - 1))
     heights = jax.lax.map(problem.potential, drawn)
     best = jnp.argsort(jnp.where(jnp.isnan(heights), jnp.inf, heights))[: starts - 1]
     places = jnp.concatenate([first[None], drawn[best]])
@@ -121,19 +123,19 @@ def laplace(
 
 
 def _drawn(
-    program: Callable, arguments: dict, names: list[str], n: int
+    program: Callable, arguments: dict, shapes: Whitening, n: int
 ) -> Float[Array, "draws unknowns"]:
-    """Unconstrained values of sites, drawn from the prior."""
+    """Coordinates of sites drawn from the prior."""
 
     def one(key):
         trace = handlers.trace(handlers.seed(program, key)).get_trace(**arguments)
-        values = [
-            dist.biject_to(trace[name]["fn"].support).inv(
+        values = {
+            name: dist.biject_to(trace[name]["fn"].support).inv(
                 jnp.asarray(trace[name]["value"], dtype=jnp.float64)
             )
-            for name in names
-        ]
-        return jnp.concatenate([value.reshape(-1) for value in values])
+            for name in shapes.names
+        }
+        return shapes.from_values(values)
 
     return jax.lax.map(one, jax.random.split(jax.random.PRNGKey(1), n))
 
@@ -173,17 +175,16 @@ class _Problem(eqx.Module):
     predicts: bool = eqx.field(static=True)
 
     def potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
-        return potential_energy(self.program, (), self.arguments, self.shapes.split(x))
+        values, log_det = self.shapes.to_values(x)
+        return potential_energy(self.program, (), self.arguments, values) - log_det
 
     def residual(self, x: Float[Array, " n"]) -> Float[Array, " data"]:
         """L^-1 (d - f(x)) of all sites that predict."""
-        values = {}
-        for name, value in self.shapes.split(x).items():
-            values[name] = (value, name)
+        values, _ = self.shapes.to_values(x)
 
         def place(site):
             if site["name"] in values:
-                return dist.biject_to(site["fn"].support)(values[site["name"]][0])
+                return dist.biject_to(site["fn"].support)(values[site["name"]])
             return None
 
         model = handlers.substitute(handlers.seed(self.program, 0), substitute_fn=place)
@@ -217,17 +218,37 @@ class _Problem(eqx.Module):
         columns = jax.lax.map(
             lambda e: jax.jvp(self.residual, (x,), (e,))[1], unit, batch_size=COLUMNS
         )
-        # every site's prior is a product over its values
-        _, diagonal = jax.jvp(jax.grad(prior), (x,), (jnp.ones_like(x),))
-        return self.slope(x), columns @ columns.T + jnp.diag(jnp.abs(diagonal))
+        if self.shapes.chart is None:
+            # every site's prior is a product over its values
+            _, diagonal = jax.jvp(jax.grad(prior), (x,), (jnp.ones_like(x),))
+            return self.slope(x), columns @ columns.T + jnp.diag(jnp.abs(diagonal))
+        prior_curvature = jax.lax.map(
+            lambda e: jax.jvp(jax.grad(prior), (x,), (e,))[1], unit, batch_size=COLUMNS
+        )
+        return self.slope(x), columns @ columns.T + 0.5 * (prior_curvature + prior_curvature.T)
 
 
-def _factor(curvature: Float[Array, "n n"], predicts: bool) -> tuple[Array, Array]:
-    """(R, eigenvalue signs) with R R^T the inverse of the curvature's absolute value."""
-    if predicts:
-        lower = jnp.linalg.cholesky(curvature)
-        unit = jnp.eye(curvature.shape[0])
-        return jax.scipy.linalg.solve_triangular(lower, unit, lower=True).T, jnp.asarray(True)
+def _apart(curvature: Float[Array, "n n"], free: Float[Array, " n"]) -> Float[Array, "n n"]:
+    """What is held has nothing but a curvature of its own: its true one may not be positive."""
+    held = (1.0 - free) * jnp.abs(jnp.diagonal(curvature))
+    return curvature * free[:, None] * free[None] + jnp.diag(held)
+
+
+def _factor(curvature: Float[Array, "n n"], problem: _Problem) -> tuple[Array, Array]:
+    """(R, whether all curvature is positive), R R^T the inverse of its absolute value."""
+    if not problem.predicts:
+        return _of_any_sign(curvature)
+    lower = jnp.linalg.cholesky(curvature)
+    unit = jnp.eye(curvature.shape[0])
+    root = jax.scipy.linalg.solve_triangular(lower, unit, lower=True).T
+    if problem.shapes.chart is None:
+        return root, jnp.asarray(True)
+    # a prior in curved coordinates need not curve upwards everywhere
+    positive = jnp.isfinite(root).all()
+    return jax.lax.cond(positive, lambda: (root, positive), lambda: _of_any_sign(curvature))
+
+
+def _of_any_sign(curvature: Float[Array, "n n"]) -> tuple[Array, Array]:
     # in units of its own diagonal, since parameters come in any
     scale = 1.0 / jnp.sqrt(jnp.abs(jnp.diagonal(curvature)))
     values, vectors = jnp.linalg.eigh(curvature * scale[:, None] * scale[None])
@@ -252,8 +273,8 @@ def _climb(
         """White gradient at x, the coordinates' root, and whether all curvature is positive."""
         gradient, curvature = problem.gradient_and_curvature(x, scale)
         gradient = gradient * free
-        curvature = curvature * free[:, None] * free[None] + jnp.diag(1.0 - free)
-        root, positive = _factor(curvature, problem.predicts)
+        curvature = _apart(curvature, free)
+        root, positive = _factor(curvature, problem)
         narrow = 1.0 / jnp.sqrt(jnp.abs(jnp.diagonal(curvature)))
         return root.T @ gradient, root, positive, jnp.minimum(narrow, scale)
 
@@ -288,8 +309,8 @@ def _climb(
 
     start = (first, problem.potential(first), *look(first, scale), jnp.asarray(0))
     x, value, white, _, positive, scale, n = jax.lax.while_loop(going, step, start)
-    root, _ = _factor(problem.gradient_and_curvature(x, scale)[1], problem.predicts)
+    root, _ = _factor(_apart(problem.gradient_and_curvature(x, scale)[1], free), problem)
     log_det = jnp.linalg.slogdet(root)[1]
-    whitening = Whitening(x, root, log_det, problem.shapes.sites)
+    whitening = Whitening(x, root, log_det, problem.shapes.sites, problem.shapes.chart)
     log_evidence = -value + log_det + x.shape[0] * HALF_LOG_2PI
     return Laplace(whitening, log_evidence, length_of(white, positive), n)

@@ -17,7 +17,8 @@ from numpyro.infer.hmc import HMCState
 
 from lusee_bayes.checkpoints import Checkpoints
 from lusee_bayes.checks import InputError
-from lusee_bayes.datatree import DATA, SKY, read_datatree, to_datatree, write_datatree
+from lusee_bayes.coordinates import Chart, Whitening
+from lusee_bayes.datatree import DATA, read_datatree, to_datatree, write_datatree
 from lusee_bayes.experiment import Experiment
 from lusee_bayes.inference import Chains, Sampler, sample, site_names
 from lusee_bayes.laplace import laplace
@@ -26,8 +27,8 @@ from lusee_bayes.posterior import Posterior
 from lusee_bayes.programs import Program, is_collapsed
 from lusee_bayes.progress import Stages, peak_memory_gb
 from lusee_bayes.results import require_folder, staged, versions, write_map_fits
-from lusee_bayes.sites import Whitening
-from lusee_bayes.systematics import SCALES
+from lusee_bayes.sites import SKY
+from lusee_bayes.systematics import SCALES, Systematic
 from lusee_bayes.uncertainty import (
     INTERVAL,
     pixel_interval,
@@ -234,8 +235,21 @@ def coordinates(
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         arguments = {**arguments, "data": data.data}
         starts = 1 if SKY in latent else STARTS
-        found = laplace(program.model, arguments, start, SCALES, starts)
+        chart = _chart(arguments, latent)
+        found = laplace(program.model, arguments, start, SCALES, starts, chart)
     return found.whitening if bool(found.converged) else None
+
+
+def _chart(arguments: dict, latent: list[str]) -> Chart | None:
+    """The curved coordinates that a systematic among a program's arguments knows."""
+    gaussian = arguments.get("gaussian")
+    for piece in arguments.values():
+        for systematic in piece if isinstance(piece, tuple) else (piece,):
+            if gaussian is not None and isinstance(systematic, Systematic):
+                chart = systematic.chart(gaussian)
+                if chart is not None and set(chart.names) <= set(latent):
+                    return chart
+    return None
 
 
 def _require_sampleable(program: Program, arguments: dict, data: Visibilities) -> list[str]:

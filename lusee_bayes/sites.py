@@ -2,30 +2,25 @@
 
 m ~ SkyPrior(S),    d ~ CorrelatedNormal(A m, N)
 d ~ Marginal(model)                                 the same with the sky integrated out
-handlers.reparam(config={"sky": Whitened(...)})     m sampled through z, m = mean + R z
 """
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro
 from jaxtyping import Array, Float, PRNGKeyArray
 from numpyro import distributions as dist
-from numpyro.infer.reparam import Reparam
 
 from lusee_bayes.checks import InputError, is_traced
 from lusee_bayes.covariance import Covariance, Factor
 from lusee_bayes.linear_gaussian import LinearGaussian
-from lusee_bayes.posterior import Posterior
 from lusee_bayes.prior import Prior
 
-HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
+# where programs sample the sky
+SKY = "sky"
 
-# the site of z is that of m with this appended
-WHITE_SUFFIX = "_white"
+HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
 
 
 class SkyPrior(dist.Distribution):
@@ -143,78 +138,3 @@ class Marginal(dist.Distribution):
         inner = white - half.T @ (half @ white)
         diagonal = (root**2).sum(0) - ((half @ root) ** 2).sum(0)
         return _leave_one_out(solver.factor.whiten_transpose(inner), diagonal)
-
-
-class Whitening(eqx.Module):
-    """Coordinates z of one or more sites, x = mean + R z, in which a posterior is round.
-
-    x : the sites' values, unconstrained (numpyro's ``biject_to``), one site after the other
-    mean : (unknowns,); root : R (unknowns, white), R R^T the covariance; log_det : ln|det R|
-    sites : name and unconstrained shape of each, in the order in which the program samples them
-    """
-
-    mean: Float[Array, " unknowns"]
-    root: Float[Array, "unknowns white"]
-    log_det: Float[Array, ""]
-    sites: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
-
-    def __check_init__(self):
-        n = sum(int(np.prod(shape)) for _, shape in self.sites)
-        if not is_traced(self.mean) and self.mean.shape != (n,):
-            raise InputError(f"the sites have {n} values, the mean {self.mean.shape[0]}")
-
-    @classmethod
-    def of(cls, posterior: Posterior, site: str = "sky") -> Whitening:
-        """The coordinates in which ``posterior`` is N(0, 1). InputError as SkyPrior's."""
-        log_det = jnp.log(SkyPrior(posterior.prior).scale).sum()
-        log_det = log_det - jnp.log(jnp.diagonal(posterior.lower)).sum()
-        root = posterior.root()
-        return cls(posterior.mean, root, log_det, ((site, (root.shape[0],)),))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the sites."""
-        return tuple(name for name, _ in self.sites)
-
-    def split(self, x: Float[Array, " unknowns"]) -> dict[str, Float[Array, "..."]]:
-        """x by site, in its shape."""
-        values, start = {}, 0
-        for name, shape in self.sites:
-            size = int(np.prod(shape))
-            values[name] = x[start : start + size].reshape(shape)
-            start += size
-        return values
-
-
-class Whitened(Reparam):
-    """Samples sites through z, x = mean + R z, by ``numpyro.handlers.reparam``.
-
-    The density stays the model's own: its prior at x, times |det R|. Only the coordinates are those
-    of some Gaussian; where it is not the posterior, sampling is slower and not wrong. z is the site
-    NAME_white of the first site, improper, so that programs are drawn from (``Predictive``) without
-    this handler. Several sites need one and the same object.
-    """
-
-    def __init__(self, whitening: Whitening):
-        self.whitening = whitening
-        self._values: dict[str, Float[Array, "..."]] = {}
-
-    def __call__(self, name, fn, obs):
-        if obs is not None:
-            raise InputError(f"the site '{name}' is observed; only latent sites can be whitened")
-        density = 0.0
-        if name == self.whitening.names[0]:
-            z = numpyro.sample(
-                f"{name}{WHITE_SUFFIX}",
-                dist.ImproperUniform(
-                    dist.constraints.real_vector, (), (self.whitening.root.shape[1],)
-                ),
-            )
-            self._values = self.whitening.split(self.whitening.mean + self.whitening.root @ z)
-            density = self.whitening.log_det
-        x = self._values[name]
-        transform = dist.biject_to(fn.support)
-        value = transform(x)
-        density = density + transform.log_abs_det_jacobian(x, value).sum()
-        numpyro.factor(f"{name}_density", fn.log_prob(value).sum() + density)
-        return None, value

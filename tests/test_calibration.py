@@ -27,12 +27,12 @@ from lusee_bayes.calibration import (
     calibrate,
     calibrate_sky,
 )
+from lusee_bayes.coordinates import Whitening
 from lusee_bayes.experiment import Experiment
 from lusee_bayes.harmonics import mode_numbers
 from lusee_bayes.inference import Sampler, draw_within
 from lusee_bayes.layout import DataLayout
 from lusee_bayes.programs import load_program
-from lusee_bayes.sites import Whitening
 
 SMALL = ("lmax=6", "observation.runs.0.cycles=0.02")
 NOISES = {

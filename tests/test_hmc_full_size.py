@@ -4,9 +4,9 @@ import equinox as eqx
 import pytest
 
 import lusee_bayes as lb
+from lusee_bayes.coordinates import Whitening
 from lusee_bayes.inference import Sampler, sample
 from lusee_bayes.programs import load_program
-from lusee_bayes.sites import Whitening
 from lusee_bayes.validation import compare
 
 

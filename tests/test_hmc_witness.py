@@ -17,12 +17,12 @@ import pytest
 from jaxtyping import Array, Float
 
 import lusee_bayes as lb
+from lusee_bayes.coordinates import Whitening
 from lusee_bayes.experiment import Experiment
 from lusee_bayes.harmonics import mode_numbers
 from lusee_bayes.inference import Chains, Sampler, sample
 from lusee_bayes.posterior import Posterior
 from lusee_bayes.programs import load_program
-from lusee_bayes.sites import Whitening
 from lusee_bayes.validation import Comparison, compare
 from lusee_bayes.visibilities import Visibilities
 

@@ -24,9 +24,9 @@ import lusee_bayes as lb
 from lusee_bayes import inference
 from lusee_bayes.checkpoints import Checkpoints
 from lusee_bayes.checks import InputError
+from lusee_bayes.coordinates import Whitening
 from lusee_bayes.inference import CHUNK, STATISTICS, Sampler, draw_within, latent_sites, sample
 from lusee_bayes.programs import load_program
-from lusee_bayes.sites import Whitening
 
 ROOT = Path(lb.__file__).resolve().parents[1]
 TESTS = Path(__file__).parent

@@ -18,10 +18,10 @@ from reference_linear import z_of
 from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
+from lusee_bayes.coordinates import Whitened, Whitening
 from lusee_bayes.inference import Sampler, sample
 from lusee_bayes.linear_gaussian import FORMS
 from lusee_bayes.programs import load_program
-from lusee_bayes.sites import Whitened, Whitening
 
 LMAX = 2
 N_DATA = 30

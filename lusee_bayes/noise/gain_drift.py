@@ -110,7 +110,7 @@ class GainDrift(eqx.Module):
     def history(
         self,
         white: Float[Array, "antennas grid"],
-        hours: Float[np.ndarray, " times"],
+        hours: Float[AnyArray, " times"],
         grid: Float[AnyArray, " grid"],
     ) -> Float[Array, "antennas times"]:
         """g_i(t) made of white noise on an even grid of times (:func:`white_grid`), in hours.

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
 from lusee_bayes.checks import InputError, require_positive
+from lusee_bayes.coordinates import Chart
 from lusee_bayes.linear_gaussian import LinearGaussian
 
 
@@ -30,6 +31,13 @@ class Systematic(eqx.Module):
     def changes_coupling(self) -> bool:
         """Whether A depends on it: if not, A is made dense once and for all."""
         return True
+
+    def chart(self, model: LinearGaussian) -> Chart | None:
+        """Coordinates of its sites, and of the sky's, in which ridges are straight, if it has any.
+
+        ``model``: what :meth:`sampled` is applied to.
+        """
+        return None
 
     @abstractmethod
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:

@@ -11,16 +11,21 @@ import numpyro
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
+from lusee_bayes.coordinates import Chart
 from lusee_bayes.coupling import CouplingMatrix
 from lusee_bayes.layout import DataLayout
 from lusee_bayes.linear_gaussian import LinearGaussian
 from lusee_bayes.noise import GainDrift, white_grid, with_gains
+from lusee_bayes.sites import SKY
 from lusee_bayes.systematics.base import Systematic, uncertain_scale
 
 # how far, in standard deviations of ln, a correlation time that is not known can be off, and by
 # which factor where a program of its own says how it is not known
 CORRELATION_REACH, FACTOR = 3.0, 2.0
-# the sites of the two
+# the mean of four antennas' drifts is then above -1 by ten standard deviations
+STRONGEST = 0.2
+# the sites of the drifts' white noise, and of the two
+GAIN_NOISE = "gain_noise"
 SCALES = ("gain_sigma", "gain_log_correlation")
 # white noise that makes drifts: three times per correlation time are exact to exp(-9 pi^2 / 2),
 # and beyond six correlation times it enters with exp(-36)
@@ -108,15 +113,36 @@ class GainDrifts(Systematic):
     def histories(self, drift: GainDrift) -> Float[Array, "antennas times"]:
         """g_i(t), made of the site ``gain_noise`` (antennas, grid); kept as ``gains``."""
         normal = dist.Normal(jnp.zeros((self.n_antennas, len(self.grid))), 1.0).to_event(2)
-        gains = drift.history(
-            numpyro.sample("gain_noise", normal), np.asarray(self.hours), self.grid
-        )
+        gains = drift.history(numpyro.sample(GAIN_NOISE, normal), np.asarray(self.hours), self.grid)
         return numpyro.deterministic("gains", gains)
 
     def response(self, gains: Float[Array, "antennas times"]) -> Float[Array, " data"]:
         """(1 + g_i)(1 + g_j) of every datum."""
         ones = jnp.ones((self.layout.n_products, self.layout.n_times))
         return self.layout.gather(with_gains(ones, gains))
+
+    def chart(self, model: LinearGaussian) -> GainCoordinates | None:
+        """Coordinates in which what sky, gains and scales can exchange lies on straight lines.
+
+        None for drifts so strong that their mean could be -1, which the coordinates leave out.
+        """
+        sigma = float(self.drift.sigma)
+        if sigma * np.exp(3.0 * (self.log_sigma_std or 0.0)) > STRONGEST:
+            return None
+        noise = self.layout.scatter(model.noise.diagonal())
+        floor = float(noise.sum() / (self.around**2).sum())
+        reach = None
+        if self.log_correlation_std is not None:
+            reach = CORRELATION_REACH * self.log_correlation_std
+        return GainCoordinates(
+            self.drift,
+            jnp.asarray(self.hours),
+            self.grid,
+            self.n_antennas,
+            floor,
+            self.log_sigma_std is not None,
+            reach,
+        )
 
     def marginalised(self, model: LinearGaussian, drift: GainDrift | None = None) -> LinearGaussian:
         """N with the drifts' covariance, and the autos' mean response.
@@ -140,3 +166,86 @@ def _multiplied(model: LinearGaussian, response: Float[Array, " data"]) -> Linea
     if isinstance(model.coupling, CouplingMatrix):
         return replace(model, coupling=model.coupling.with_response(response), offset=offset)
     return replace(model, coupling=model.coupling * response[:, None], offset=offset)
+
+
+class GainCoordinates(Chart):
+    """Takes out of gains and sky what the data do not tell apart.
+
+    (1 + g_i)(1 + g_j) A m stays the same if all 1 + g grow by exp(k) and m shrinks by its square.
+    The data say nothing of k and nearly everything of the rest, so that the posterior is a thin
+    sheet along k, curved in g and m. With exp(k) - 1 the mean of g, the coordinates are k,
+    exp(-k) (1 + g) and exp(2 k) m, along which it is straight. Likewise where the drifts' strength
+    and correlation time are sites: the gains at the samples, far better known than their scales,
+    stay as they are when those change; what is lost in the noise does not.
+
+    drift : whose white noise the coordinates are; floor : variance of the noise in gains;
+    sigma_is_site, log_correlation_reach : which scales are sites (the latter within +- reach)
+    """
+
+    drift: GainDrift
+    hours: Float[Array, " times"]
+    grid: Float[Array, " grid"]
+    n_antennas: int = eqx.field(static=True)
+    floor: float = eqx.field(static=True)
+    sigma_is_site: bool = eqx.field(static=True)
+    log_correlation_reach: float | None = eqx.field(static=True)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        sites = [self.sigma_is_site, self.log_correlation_reach is not None]
+        return (SKY, GAIN_NOISE, *(n for n, used in zip(SCALES, sites, strict=True) if used))
+
+    def to_values(self, x):
+        values, noise, log_det = dict(x), x[GAIN_NOISE], jnp.zeros(())
+        mean, constant = self._shared()
+        scale = (mean * noise).sum()
+        noise = jnp.exp(scale) * (noise + (1.0 - scale) * constant) - constant
+        values[SKY] = x[SKY] * jnp.exp(-2.0 * scale)
+        log_det = (noise.size - 2 * x[SKY].size) * scale
+        if len(self.names) > 2:
+            before, after = self._shapes(x)
+            own, mixed = self._covariances(before, after)
+            noise = noise + jnp.linalg.solve(own, (noise @ (before - after)).T).T @ after.T
+            change = jnp.linalg.slogdet(mixed)[1] - jnp.linalg.slogdet(own)[1]
+            log_det = log_det + self.n_antennas * change
+        return values | {GAIN_NOISE: noise}, log_det
+
+    def from_values(self, values):
+        x, noise = dict(values), values[GAIN_NOISE]
+        if len(self.names) > 2:
+            before, after = self._shapes(values)
+            _, mixed = self._covariances(before, after)
+            noise = noise - jnp.linalg.solve(mixed, (noise @ (before - after)).T).T @ after.T
+        mean, constant = self._shared()
+        scale = jnp.log1p((mean * noise).sum())
+        x[GAIN_NOISE] = (noise + constant) * jnp.exp(-scale) - (1.0 - scale) * constant
+        x[SKY] = values[SKY] * jnp.exp(2.0 * scale)
+        return x
+
+    def _shared(self) -> tuple[Float[Array, "1 grid"], Float[Array, "1 grid"]]:
+        """What makes the mean gain of white noise, and white noise whose gains are all one."""
+        mean = self._shape(self.drift).mean(1)[None] / self.n_antennas
+        # the same at all times: then so are the gains, the grid being wide enough
+        return mean, jnp.ones_like(mean) / (self.n_antennas * mean.sum())
+
+    def _shape(self, drift: GainDrift) -> Float[Array, "grid times"]:
+        """Gains for unit white noise."""
+        return drift.history(jnp.eye(self.grid.shape[0]), self.hours, self.grid)
+
+    def _shapes(self, values) -> tuple[Array, Array]:
+        """:meth:`_shape` of the drift, and with the scales at these values."""
+        sigma, correlation_h = self.drift.sigma, self.drift.correlation_h
+        if self.sigma_is_site:
+            sigma = jnp.exp(values[SCALES[0]])
+        if (reach := self.log_correlation_reach) is not None:
+            within = dist.biject_to(dist.constraints.interval(-reach, reach))
+            correlation_h = correlation_h * jnp.exp(within(values[SCALES[1]]))
+        return self._shape(self.drift), self._shape(GainDrift(sigma, correlation_h))
+
+    def _covariances(self, before: Array, after: Array) -> tuple[Array, Array]:
+        """Of the gains afterwards, and between before and afterwards; floor added to both.
+
+        Both are those of Gaussian kernels, so that neither is ever singular.
+        """
+        floor = self.floor * jnp.eye(after.shape[1])
+        return after.T @ after + floor, before.T @ after + floor
