@@ -69,10 +69,11 @@ class Draws(eqx.Module):
     program: object = eqx.field(static=True)
     arguments: dict
     sampler: Sampler = eqx.field(static=True)
+    starts: int = eqx.field(static=True, default=1)
 
     def __call__(self, key, data):
         arguments = {**self.arguments, "data": data}
-        about = laplace(self.program.model, arguments)
+        about = laplace(self.program.model, arguments, starts=self.starts)
         return draw_within(self.program.model, arguments, key, self.sampler, about.whitening)
 
 
@@ -128,6 +129,21 @@ def test_fluxes_of_sources_at_rest_and_of_jupiter():
     program, arguments = pieces("systematics", *MONTH, *SOURCES)
     names = tuple(f"flux_{name}" for name in ("Cas_A", "Cyg_A", "For_A", "Jupiter"))
     assert_calibrated(ranks_of(program, arguments, Sites(names)))
+
+
+@pytest.mark.long
+def test_permittivity_loss_tangent_and_tilt():
+    """On a coarse grid (4e-4 of the beams), of truth and posterior alike: a gradient in 2 ms."""
+    parameters = "surface_permittivity: 0.1, loss_tangent: 0.002, zenith_angle_deg: 1.0"
+    treatment = f"noise.beam={{treatment: sampled, parameters: {{{parameters}}}}}"
+    program, arguments = pieces("systematics", *TINY, treatment)
+    (antennas,) = arguments["systematics"]
+    coarse = replace(antennas, instrument=replace(antennas.instrument, nodes=(12, 16)))
+    arguments = {**arguments, "systematics": (coarse,)}
+    sampler = Sampler(warmup=40, draws=N_DRAWS, algorithm="hmc")
+    draws = Draws(program, arguments, sampler, starts=3)
+    found = ranks_of(program, arguments, Sites(tuple(antennas.stds)), draws=draws)
+    assert_calibrated(found)
 
 
 # --- gain drifts ------------------------------------------------------------------------------
