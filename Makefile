@@ -10,8 +10,9 @@ export MPLBACKEND := agg
 map: $(VENV)/installed
 	$(BIN)/lusee-bayes map fiducial
 
+# a file's tests stay in one process: they share fixtures and compiled functions
 test: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 long: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m long

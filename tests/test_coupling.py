@@ -212,7 +212,7 @@ def test_a_uniform_sky_of_one_kelvin_gives_autos_of_one_kelvin():
     np.testing.assert_allclose(v[auto_indices()], 1.0, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("cycles", "lmax"), [(1, 47), (3, 12)])
+@pytest.mark.parametrize(("cycles", "lmax"), [pytest.param(1, 47, marks=pytest.mark.long), (3, 12)])
 def test_the_moons_axis_is_not_fixed(cycles, lmax):
     """Orders of the tilt expansion in units of the fiducial radiometer noise (DESIGN 5)."""
     o = Observation.from_runs([Run(1.0)] * cycles, step_s=20000.0)

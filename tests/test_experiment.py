@@ -6,11 +6,12 @@ import pytest
 
 from lusee_bayes.checks import InputError
 from lusee_bayes.covariance import DiagonalCovariance
-from lusee_bayes.experiment import Experiment, measured_visibilities
+from lusee_bayes.experiment import Experiment
 from lusee_bayes.layout import DataLayout
 from lusee_bayes.linear_gaussian import LinearGaussian
 from lusee_bayes.results import MapResult
 from lusee_bayes.scenario import load_scenario
+from lusee_bayes.scene import measured_visibilities
 from lusee_bayes.visibilities import Visibilities
 
 SMALL = ["lmax=8", "observation.runs.0.cycles=0.2", "sky.sources=false"]

@@ -428,6 +428,7 @@ def test_chains_within_a_program_follow_each_data_sets_posterior(gaussian):
         assert np.abs(t).max() < 1.2 * z_of(t.size)
 
 
+@pytest.mark.long
 def test_thinning_keeps_every_nth_draw():
     sampler = Sampler(warmup=20, draws=12, algorithm="hmc")
     promotion, ranks = in_numpyros_types()

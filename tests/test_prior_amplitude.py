@@ -349,10 +349,10 @@ def test_calibrated_over_200_data_sets():
 @pytest.mark.parametrize(
     ("wrong", "witness"),
     [
-        ({"base_factor": 2.0}, "prior"),
-        ({"noise_factor": 2.0}, "log likelihood"),
+        pytest.param({"base_factor": 2.0}, "prior", marks=pytest.mark.long),
+        pytest.param({"noise_factor": 2.0}, "log likelihood", marks=pytest.mark.long),
         ({"noise_factor": 0.5}, "log likelihood"),
-        ({"shift": 17}, "prior"),
+        pytest.param({"shift": 17}, "prior", marks=pytest.mark.long),
     ],
 )
 def test_calibration_notices_what_is_wrong(wrong, witness):

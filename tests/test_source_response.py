@@ -40,6 +40,7 @@ def observation(turntable=(0.0, 35.0, -110.0), step_s=86400.0, cycles=0.35):
 # --- the beams in chosen directions
 
 
+@pytest.mark.long
 def test_at_the_nodes_of_a_grid_they_are_its_product_patterns():
     monopoles = Monopoles(height_m=1.3)
     grid = HemisphereGrid.for_lmax(47)
@@ -157,6 +158,7 @@ def test_the_sense_of_v():
     assert abs(got["01R"]) < 1e-15
 
 
+@pytest.mark.long
 def test_autos_and_circular_waves():
     theta, phi = np.arccos(np.linspace(0.05, 1.0, 15)), np.linspace(0.0, 6.0, 15)
     autos = [labels().index(name) for name in ("00R", "11R", "22R", "33R")]
@@ -218,6 +220,7 @@ def around(n0, g, reach, n_radius, n_angle):
     return n.reshape(-1, 3), np.repeat(kernel * ring, n_angle)
 
 
+@pytest.mark.long
 def test_a_smoothed_source_agrees_with_the_coupling_matrix():
     sigma, lmax = np.radians(9.0), 47
     o = observation(step_s=2 * 86400.0)

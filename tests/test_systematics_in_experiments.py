@@ -61,7 +61,14 @@ def chi2_per_mode(posterior, truth) -> float:
 # --- marginalised or ignored ------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("term", [GAIN, SHIFT, PARAMETERS])
+@pytest.mark.parametrize(
+    "term",
+    [
+        pytest.param(GAIN, marks=pytest.mark.long),
+        SHIFT,
+        pytest.param(PARAMETERS, marks=pytest.mark.long),
+    ],
+)
 def test_marginalising_saves_the_map(term):
     """chi^2 of 49 modes scatters by 0.2; a sky with the prior's own spectrum stays below 2."""
     section = ".".join(term.split(".")[:2])

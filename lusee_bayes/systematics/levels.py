@@ -19,7 +19,19 @@ from lusee_bayes.systematics.base import Systematic, uncertain_scale
 PIVOT = 10.0
 
 
-class NoiseLevel(Systematic):
+class _Level(Systematic):
+    """Something that has no Gaussian term: marginalised, it stays at its median."""
+
+    @property
+    def changes_coupling(self) -> bool:
+        return False
+
+    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
+        """The model as it is."""
+        return model
+
+
+class NoiseLevel(_Level):
     """A factor of the variance of all noise that the model holds so far.
 
     log_std : prior standard deviation of ln of the factor, whose median is one. There is no
@@ -28,21 +40,13 @@ class NoiseLevel(Systematic):
 
     log_std: float = eqx.field(static=True)
 
-    @property
-    def changes_coupling(self) -> bool:
-        return False
-
-    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
-        """The model as it is."""
-        return model
-
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """The site ``noise_level``, a ratio of variances."""
         level = numpyro.sample("noise_level", uncertain_scale(1.0, self.log_std))
         return replace(model, noise=model.noise.scaled(level))
 
 
-class PowerSpectrum(Systematic):
+class PowerSpectrum(_Level):
     """The sky's prior spectrum up to an amplitude and a tilt: C_ell A ((ell + 1) / 10)^tilt.
 
     log_amplitude_std, tilt_std : prior standard deviations of ln A and of the tilt; None: known.
@@ -51,14 +55,6 @@ class PowerSpectrum(Systematic):
 
     log_amplitude_std: float | None = eqx.field(static=True, default=None)
     tilt_std: float | None = eqx.field(static=True, default=None)
-
-    @property
-    def changes_coupling(self) -> bool:
-        return False
-
-    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
-        """The model as it is."""
-        return model
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """The sites ``amplitude`` and ``tilt``, those of them that are not known."""
@@ -73,7 +69,7 @@ class PowerSpectrum(Systematic):
         return replace(model, prior=HarmonicPrior(spectrum))
 
 
-class SpectrumBands(Systematic):
+class SpectrumBands(_Level):
     """The sky's prior spectrum up to a factor for each band of ells.
 
     edges : first ell of every band but the lowest, growing; log_std : prior standard deviation of
@@ -82,14 +78,6 @@ class SpectrumBands(Systematic):
 
     edges: tuple[int, ...] = eqx.field(static=True)
     log_std: float = eqx.field(static=True, default=1.0)
-
-    @property
-    def changes_coupling(self) -> bool:
-        return False
-
-    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
-        """The model as it is."""
-        return model
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """The site ``band_power`` (bands,): factors of C_ell, lowest ells first."""
