@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Array, Float
 
-from lusee_bayes.beams import Monopoles, ProductBeams, Regolith, monopole_beams
+from lusee_bayes.beams import Monopoles, ProductBeams, Regolith, monopole_beams, read_beam
 from lusee_bayes.checks import InputError, nearest
 from lusee_bayes.ephemeris import BODIES, body_direction
 from lusee_bayes.noise import GainDrift
@@ -46,9 +46,22 @@ def build_monopoles(scenario: Scenario) -> Monopoles:
     )
 
 
-def build_beams(scenario: Scenario) -> ProductBeams:
-    """Beams of all products at the scenario's frequency."""
-    return monopole_beams(scenario.frequency_mhz, scenario.lmax, build_monopoles(scenario))
+def build_beams(
+    scenario: Scenario, frequency_mhz: float | None = None, file: str | None = None
+) -> ProductBeams:
+    """Beams of all products, of the embedded antennas or of a file.
+
+    ``frequency_mhz``, ``file``: of other beams than the scenario's.
+    """
+    frequency = scenario.frequency_mhz if frequency_mhz is None else frequency_mhz
+    beam = scenario.beam
+    file = beam.file if file is None else file
+    if file is None:
+        return monopole_beams(frequency, scenario.lmax, build_monopoles(scenario))
+    rotations = tuple(angle + beam.turntable_offset_deg for angle in beam.rotations_deg)
+    return read_beam(file).beams(
+        frequency, scenario.lmax, taper=beam.taper, rotations_deg=rotations
+    )
 
 
 def build_sky(scenario: Scenario) -> Sky:

@@ -20,6 +20,7 @@ from lusee_bayes.simulation import Simulation
 from lusee_bayes.systematics import (
     BeamError,
     GainDrifts,
+    Instrument,
     InstrumentParameters,
     Marginalised,
     NoiseLevel,
@@ -75,7 +76,7 @@ class Experiment(Simulation):
         beam = self.scenario.noise.beam
         if beam is None:
             return []
-        if beam.shift_mhz is not None:
+        if not beam.parameters:
             return [difference(self.true_beams(), self.beams)]
         frequency, lmax = self.scenario.frequency_mhz, self.scenario.lmax
         directions = []
@@ -141,6 +142,15 @@ class Experiment(Simulation):
             model = replace(model, coupling=model.coupling.dense())
         return model, tuple(rest)
 
+    def embedded(self) -> Instrument:
+        """The embedded antennas, prepared. InputError where the beams are those of a file."""
+        if self.scenario.beam.file is not None:
+            raise InputError(
+                "the program asks for the embedded antennas, which beam.file replaces; leave out "
+                "beam.file"
+            )
+        return self.prepared
+
     def pieces(self, data: Visibilities) -> dict[str, Callable[[], Any]]:
         """What makes the pieces of this experiment that programs can ask for, by name.
 
@@ -164,7 +174,7 @@ class Experiment(Simulation):
             "gaussian": lambda: unsolved()[0],
             "systematics": lambda: unsolved()[1],
             "gain_drifts": free(GainDrifts, lambda: self.gain_drifts(data)),
-            "instrument": free(BeamError, lambda: self.prepared),
+            "instrument": free(BeamError, self.embedded),
             "sources": free(PointSources, self.sources),
         }
 

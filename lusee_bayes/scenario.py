@@ -50,8 +50,24 @@ class ObservationSection(Section):
         return value.isoformat() if isinstance(value, date) else value
 
 
+# what only the embedded antennas have
+EMBEDDED = (
+    "length_m",
+    "zenith_angle_deg",
+    "height_m",
+    "surface_permittivity",
+    "deep_permittivity",
+    "loss_tangent",
+)
+
+
 class BeamSection(Section):
-    """The embedded monopoles and the ground under them."""
+    """The embedded monopoles and the ground under them, or the pattern of ``file``.
+
+    ``file``: a scalar beam of luseepy, put up once for each of ``rotations_deg`` (from East towards
+    North, on top of ``turntable_offset_deg``); ``taper`` fades it out towards the horizon as
+    luseepy does.
+    """
 
     model: Literal["monopole"] = "monopole"
     length_m: Positive = 3.0
@@ -61,6 +77,17 @@ class BeamSection(Section):
     deep_permittivity: Annotated[float, Field(ge=1)] = 6.1
     loss_tangent: Annotated[float, Field(ge=0)] = 0.01
     turntable_offset_deg: float = 0.0
+    file: str | None = None
+    taper: bool = True
+    rotations_deg: Annotated[tuple[float, ...], Field(min_length=1)] = (0.0, 90.0, 180.0, 270.0)
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> BeamSection:
+        for name in EMBEDDED:
+            default = type(self).model_fields[name].default
+            if self.file is not None and getattr(self, name) != default:
+                raise ValueError(f"{name} is a parameter of the embedded antennas, not of a file")
+        return self
 
 
 class SkySection(Section):
@@ -155,19 +182,21 @@ class GainSection(Section):
 class BeamErrorSection(Section):
     """Beams that differ from the model's in the data; marginalised in N, sampled or ignored.
 
-    ``shift_mhz``: the data are taken with the beams of frequency + shift; sampled is the amplitude
-    of that error. ``parameters``: prior standard deviations of parameters of the embedded antennas
-    about the values in ``beam``; the data's own are drawn with the seed.
+    ``shift_mhz``: the data are taken with the beams of frequency + shift, ``file``: with those of
+    another file; sampled is the amplitude of that error. ``parameters``: prior standard deviations
+    of parameters of the embedded antennas about the values in ``beam``; the data's own are drawn
+    with the seed.
     """
 
     shift_mhz: float | None = None
+    file: str | None = None
     parameters: dict[str, Positive] = {}
     treatment: Treatment = "marginalised"
 
     @model_validator(mode="after")
     def _one_direction(self) -> BeamErrorSection:
-        if (self.shift_mhz is None) == (not self.parameters):
-            raise ValueError("give either shift_mhz or parameters")
+        if (self.shift_mhz is not None) + (self.file is not None) + bool(self.parameters) != 1:
+            raise ValueError("give either shift_mhz, file or parameters")
         return self
 
 
@@ -238,6 +267,22 @@ class Scenario(Section):
             raise ValueError(
                 "the embedded sky holds the catalogue's sources already; with sources.list of "
                 "its own, set sky.sources=false"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _files_have_no_parameters(self) -> Scenario:
+        error = self.noise.beam
+        if self.beam.file is not None and error is not None and error.parameters:
+            raise ValueError(
+                "noise.beam.parameters are those of the embedded antennas, which beam.file "
+                "replaces; use noise.beam.shift_mhz or noise.beam.file"
+            )
+        from_file = self.beam.file is not None or (error is not None and error.file is not None)
+        if from_file and self.sources.list:
+            raise ValueError(
+                "sources.list needs the exact beams of the embedded antennas; leave out beam.file "
+                "and noise.beam.file, or the sources"
             )
         return self
 

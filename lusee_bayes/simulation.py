@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from numpyro import handlers
 
 from lusee_bayes.beams import Monopoles, ProductBeams, monopole_beams, placed
-from lusee_bayes.building import build_source_responses
+from lusee_bayes.building import build_beams, build_source_responses
 from lusee_bayes.coupling import CouplingMatrix
 from lusee_bayes.noise import GainDrift, rms_difference, with_gains
 from lusee_bayes.scene import Scene
@@ -70,10 +70,13 @@ class Simulation(Scene):
 
     def true_beams(self) -> ProductBeams:
         """The beams that simulated data are taken with."""
-        if self.scenario.noise.beam is None:
+        beam = self.scenario.noise.beam
+        if beam is None:
             return self.beams
         frequency, antennas = self.true_antennas()
-        return monopole_beams(frequency, self.scenario.lmax, antennas)
+        if beam.parameters:
+            return monopole_beams(frequency, self.scenario.lmax, antennas)
+        return build_beams(self.scenario, frequency, beam.file)
 
     def beam_rms_difference(self) -> float | None:
         """RMS difference of the true beams and the model's, over the model's; None if the same."""

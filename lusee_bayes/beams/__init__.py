@@ -2,6 +2,7 @@
 
 from lusee_bayes.beams.directions import beams_towards
 from lusee_bayes.beams.fields import AntennaFields, displaced
+from lusee_bayes.beams.files import BeamFile, read_beam
 from lusee_bayes.beams.grid import HemisphereGrid
 from lusee_bayes.beams.monopoles import Monopoles, monopole_beams
 from lusee_bayes.beams.parameters import PARAMETERS, parameter, placed
@@ -11,6 +12,7 @@ from lusee_bayes.beams.regolith import Regolith
 __all__ = [
     "PARAMETERS",
     "AntennaFields",
+    "BeamFile",
     "HemisphereGrid",
     "Monopoles",
     "ProductBeams",
@@ -21,5 +23,6 @@ __all__ = [
     "parameter",
     "placed",
     "product_beams",
+    "read_beam",
     "stokes_beam",
 ]
