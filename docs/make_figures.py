@@ -1,7 +1,8 @@
 """Draw the documentation's figures and print its tables.
 
 Run from the repository's root: python docs/make_figures.py [ULSA folder]
-The figure of the regolith needs the draws of: lusee-bayes sample regolith --draws 200 --warmup 40
+The figure of the regolith needs the draws of
+    lusee-bayes sample regolith --draws 320 --warmup 80 -o output/regolith
 """
 
 from __future__ import annotations

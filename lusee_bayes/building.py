@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Array, Float
 
-from lusee_bayes.beams import Monopoles, ProductBeams, Regolith, monopole_beams, read_beam
+from lusee_bayes.beams import (
+    AntennaFields,
+    HemisphereGrid,
+    Monopoles,
+    ProductBeams,
+    Regolith,
+    monopole_beams,
+    read_beam,
+)
 from lusee_bayes.checks import InputError, nearest
 from lusee_bayes.ephemeris import BODIES, body_direction
 from lusee_bayes.noise import GainDrift
@@ -54,14 +64,27 @@ def build_beams(
     ``frequency_mhz``, ``file``: of other beams than the scenario's.
     """
     frequency = scenario.frequency_mhz if frequency_mhz is None else frequency_mhz
-    beam = scenario.beam
-    file = beam.file if file is None else file
+    file = scenario.beam.file if file is None else file
     if file is None:
         return monopole_beams(frequency, scenario.lmax, build_monopoles(scenario))
+    beam = read_beam(file)
+    grid = beam.rectangle_grid if scenario.beam.quadrature == "rectangle" else None
+    return beam.beams(frequency, scenario.lmax, grid=grid, **_placement(scenario))
+
+
+def build_fields(scenario: Scenario, grid: HemisphereGrid) -> AntennaFields:
+    """Fields of the antennas at the scenario's frequency, embedded or of a file."""
+    if scenario.beam.file is None:
+        return build_monopoles(scenario).fields(scenario.frequency_mhz, grid)
+    beam = read_beam(scenario.beam.file)
+    return beam.fields(scenario.frequency_mhz, grid=grid, **_placement(scenario))
+
+
+def _placement(scenario: Scenario) -> dict[str, Any]:
+    """How the pattern of a file is put up."""
+    beam = scenario.beam
     rotations = tuple(angle + beam.turntable_offset_deg for angle in beam.rotations_deg)
-    return read_beam(file).beams(
-        frequency, scenario.lmax, taper=beam.taper, rotations_deg=rotations
-    )
+    return {"taper": beam.taper, "rotations_deg": rotations}
 
 
 def build_sky(scenario: Scenario) -> Sky:

@@ -10,8 +10,12 @@ import numpy as np
 import xarray as xr
 
 from lusee_bayes import datatree, results, visibilities
+from lusee_bayes.beams import read_beam
 from lusee_bayes.checks import InputError
+from lusee_bayes.fits_images import image_names, is_fits
+from lusee_bayes.products import labels
 from lusee_bayes.sky import read_map
+from lusee_bayes.waterfall import read_waterfall
 
 
 def describe(path: str | Path) -> str:
@@ -29,6 +33,12 @@ def describe(path: str | Path) -> str:
         return _describe_posterior(path)
     if kind == datatree.FORMAT:
         return _describe_samples(path)
+    if is_fits(path):
+        names = set(image_names(path))
+        if "etheta_real" in names:
+            return _describe_beam(path)
+        if "combinations" in names:
+            return _describe_waterfall(path)
     return _describe_map(path)
 
 
@@ -38,6 +48,37 @@ def _netcdf_format(path: Path) -> str | None:
     with h5py.File(path) as file:
         kind = file.attrs.get("format")
     return kind.decode() if isinstance(kind, bytes) else kind
+
+
+def _describe_beam(path: Path) -> str:
+    beam = read_beam(path)
+    known = beam.frequencies_mhz
+    return "\n".join(
+        [
+            f"{path}: the beam of one arm (luseepy, scalar)",
+            f"  {len(known)} frequencies from {known[0]:g} to {known[-1]:g} MHz",
+            f"  {len(beam.theta)} angles from the zenith to the horizon, {beam.n_phi} azimuths",
+            f"  gain {beam.gain.min():.4g} to {beam.gain.max():.4g}",
+        ]
+    )
+
+
+def _describe_waterfall(path: Path) -> str:
+    waterfall = read_waterfall(path)
+    grid, observation = waterfall.grid, waterfall.observation
+    here = ~np.isnan(grid).all((1, 2))
+    names = [name for name, there in zip(labels(), here, strict=True) if there]
+    gaps = int(np.isnan(grid[here]).sum())
+    return "\n".join(
+        [
+            f"{path}: a waterfall of luseepy",
+            f"  channels at {', '.join(f'{f:g}' for f in waterfall.frequencies_mhz)} MHz",
+            f"  {len(names)} products ({' '.join(names)}), {observation.n_times} times of "
+            f"{observation.step_s:g} s, {gaps} samples missing",
+            f"  {observation.times[0].isot} to {observation.times[-1].isot} UTC",
+            f"  site: longitude {observation.lon_deg}, latitude {observation.lat_deg} degrees",
+        ]
+    )
 
 
 def _describe_visibilities(path: Path) -> str:

@@ -16,7 +16,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator
 
 from lusee_bayes.beams import HemisphereGrid, stokes_beam
-from lusee_bayes.building import build_monopoles
+from lusee_bayes.building import build_fields
 from lusee_bayes.metrics import ell_cross
 from lusee_bayes.results import MapResult
 from lusee_bayes.scenario import Scenario
@@ -50,7 +50,7 @@ def data_vector(data: Visibilities) -> Figure:
 def beams(scenario: Scenario) -> Figure:
     """An auto and two crosses from above: zenith in the centre, North up, horizon at the rim."""
     grid = HemisphereGrid.gauss_legendre(64, 180)
-    fields = build_monopoles(scenario).fields(scenario.frequency_mhz, grid)
+    fields = build_fields(scenario, grid)
     patterns = np.asarray(stokes_beam(fields))
     panels = [
         ("auto 00 (North)", patterns[0, 0]),

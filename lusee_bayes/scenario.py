@@ -66,7 +66,7 @@ class BeamSection(Section):
 
     ``file``: a scalar beam of luseepy, put up once for each of ``rotations_deg`` (from East towards
     North, on top of ``turntable_offset_deg``); ``taper`` fades it out towards the horizon as
-    luseepy does.
+    luseepy does. ``quadrature: rectangle`` is luseepy's own rule, for data that luseepy has made.
     """
 
     model: Literal["monopole"] = "monopole"
@@ -79,6 +79,7 @@ class BeamSection(Section):
     turntable_offset_deg: float = 0.0
     file: str | None = None
     taper: bool = True
+    quadrature: Literal["exact", "rectangle"] = "exact"
     rotations_deg: Annotated[tuple[float, ...], Field(min_length=1)] = (0.0, 90.0, 180.0, 270.0)
 
     @model_validator(mode="after")

@@ -11,14 +11,11 @@ so that fields times sqrt(2 g / 4 pi) make product beams without any other norma
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from astropy.io import fits
-from astropy.utils.exceptions import AstropyWarning
 from jaxtyping import Complex, Float
 from scipy.interpolate import CubicSpline, make_interp_spline
 
@@ -26,6 +23,7 @@ from lusee_bayes.beams.fields import AntennaFields
 from lusee_bayes.beams.grid import HemisphereGrid
 from lusee_bayes.beams.product_beams import ProductBeams, product_beams
 from lusee_bayes.checks import InputError, require_finite
+from lusee_bayes.fits_images import read_images
 
 FIELDS = ("Etheta_real", "Etheta_imag", "EPhi_real", "EPhi_imag")
 # luseepy turns the pattern by 90 degrees from port to port: North, West, South, East for an arm
@@ -150,7 +148,9 @@ def read_beam(path: str | Path) -> BeamFile:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"no beam file at '{path}'; check beam.file")
-    images, header = _images(path)
+    names = (*FIELDS, "gain_conv", "freq")
+    found, header = read_images(path, names, "a scalar beam file of luseepy, FITS version 2")
+    images = {name: image.astype(np.float64) for name, image in found.items()}
     fields = [images[name] for name in FIELDS]
     frequencies, gain = images["freq"], images["gain_conv"]
     shape = (len(frequencies), header.get("THETA_N"), header.get("PHI_N"))
@@ -176,25 +176,3 @@ def read_beam(path: str | Path) -> BeamFile:
     e_theta, e_phi = ((fields[k] + 1j * fields[k + 1])[:, :, :-1] for k in (0, 2))
     theta = np.linspace(0.0, np.pi / 2.0, shape[1])
     return BeamFile(str(path), frequencies, theta, e_theta, e_phi, gain)
-
-
-def _images(path: Path) -> tuple[dict[str, np.ndarray], fits.Header]:
-    """All images that a beam needs, as float64 by name, and the primary header."""
-    try:
-        with warnings.catch_warnings(), fits.open(path) as hdus:
-            warnings.simplefilter("error", AstropyWarning)
-            found = {hdu.name.lower(): hdu for hdu in hdus}
-            missing = [n for n in (*FIELDS, "gain_conv", "freq") if n.lower() not in found]
-            if missing:
-                raise InputError(
-                    f"{path} has no image '{missing[0]}' (it has "
-                    f"{', '.join(hdu.name for hdu in hdus)}); expected a scalar beam file of "
-                    "luseepy, FITS version 2"
-                )
-            names = (*FIELDS, "gain_conv", "freq")
-            images = {n: np.asarray(found[n.lower()].data, dtype=np.float64) for n in names}
-            return images, hdus[0].header.copy()
-    except InputError:
-        raise
-    except (OSError, TypeError, ValueError, AstropyWarning) as error:
-        raise InputError(f"{path} cannot be read as FITS, or is cut short: {error}") from error
