@@ -102,14 +102,13 @@ def laplace(
     n = sum(value.size for value in unconstrained.values())
     shapes = Whitening(jnp.zeros(n), jnp.zeros((n, 0)), jnp.zeros(()), sites, chart)
     first = shapes.from_values(unconstrained)
-    problem = _Problem(program, arguments, shapes, _predicts(trace))
+    problem = _Problem(program, arguments, shapes, _predicts(trace), tuple(hold))
     if not problem.predicts and n > MOST_FOR_HESSIAN:
         raise InputError(
             f"the program has {n} unknowns and no site CorrelatedNormal, whose curvature is found "
             f"without the Hessian; at most {MOST_FOR_HESSIAN} unknowns are possible"
         )
-    held = [np.full(value.size, name in hold) for name, value in unconstrained.items()]
-    free = jnp.asarray(~np.concatenate(held), dtype=jnp.float64)
+    free = jnp.ones(n).at[problem.held()].set(0.0)
     scale = FIRST * _prior_scale(latent)
     if starts == 1:
         return _climb(problem, first, free, scale)
@@ -173,14 +172,33 @@ class _Problem(eqx.Module):
     arguments: dict[str, Any]
     shapes: Whitening
     predicts: bool = eqx.field(static=True)
+    hold: tuple[str, ...] = eqx.field(static=True)
 
-    def potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
-        values, log_det = self.shapes.to_values(x)
+    def held(self) -> np.ndarray:
+        """Positions of what is held."""
+        sites = self.shapes.sites
+        parts = [np.full(int(np.prod(shape)), name in self.hold) for name, shape in sites]
+        return np.flatnonzero(np.concatenate(parts))
+
+    def values(self, x: Float[Array, " n"], still: bool) -> tuple[dict[str, Array], Array]:
+        """The sites' values at x, and ln|det|; ``still``: without derivatives by what is held."""
+        parts = self.shapes.split(x)
+        for name in self.hold if still else ():
+            if name in parts:
+                parts[name] = jax.lax.stop_gradient(parts[name])
+        return (
+            (parts, jnp.zeros(()))
+            if self.shapes.chart is None
+            else self.shapes.chart.to_values(parts)
+        )
+
+    def potential(self, x: Float[Array, " n"], still: bool = False) -> Float[Array, ""]:
+        values, log_det = self.values(x, still)
         return potential_energy(self.program, (), self.arguments, values) - log_det
 
-    def residual(self, x: Float[Array, " n"]) -> Float[Array, " data"]:
+    def residual(self, x: Float[Array, " n"], still: bool = False) -> Float[Array, " data"]:
         """L^-1 (d - f(x)) of all sites that predict."""
-        values, _ = self.shapes.to_values(x)
+        values, _ = self.values(x, still)
 
         def place(site):
             if site["name"] in values:
@@ -202,7 +220,6 @@ class _Problem(eqx.Module):
         self, x: Float[Array, " n"], scale: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
         """Of the potential at x; ``scale``: lengths over which it is a parabola."""
-        unit = jnp.eye(x.shape[0])
         if not self.predicts:
             # all in one map: second derivatives of banded factors take minutes to compile
             steps = DIFFERENCE * jnp.diag(scale)
@@ -212,20 +229,34 @@ class _Problem(eqx.Module):
             slopes = (up - down) / (2.0 * DIFFERENCE * scale[:, None])
             return gradients[0], 0.5 * (slopes + slopes.T)
 
-        def prior(x):
-            return self.potential(x) - 0.5 * (self.residual(x) ** 2).sum()
+        def prior(x, still=False):
+            return self.potential(x, still) - 0.5 * (self.residual(x, still) ** 2).sum()
 
-        columns = jax.lax.map(
-            lambda e: jax.jvp(self.residual, (x,), (e,))[1], unit, batch_size=COLUMNS
-        )
+        columns = self._derivatives(self.residual, x)
         if self.shapes.chart is None:
             # every site's prior is a product over its values
             _, diagonal = jax.jvp(jax.grad(prior), (x,), (jnp.ones_like(x),))
             return self.slope(x), columns @ columns.T + jnp.diag(jnp.abs(diagonal))
-        prior_curvature = jax.lax.map(
-            lambda e: jax.jvp(jax.grad(prior), (x,), (e,))[1], unit, batch_size=COLUMNS
+        of_prior = self._derivatives(jax.grad(prior), x)
+        return self.slope(x), columns @ columns.T + 0.5 * (of_prior + of_prior.T)
+
+    def _derivatives(
+        self, f: Callable[..., Float[Array, " m"]], x: Float[Array, " n"]
+    ) -> Float[Array, "n m"]:
+        """The transposed Jacobian of f(x, still).
+
+        Apart for what is held: charts need matrices that only scales change, and products of
+        those with every other direction would take longer than all the rest.
+        """
+        held = self.held()
+        unit = jnp.eye(x.shape[0])
+        _, derivative = jax.linearize(lambda x: f(x, True), x)
+        rows = jax.lax.map(derivative, unit, batch_size=COLUMNS)
+        if not len(held):
+            return rows
+        return rows.at[held].set(
+            jax.lax.map(lambda e: jax.jvp(lambda x: f(x, False), (x,), (e,))[1], unit[held])
         )
-        return self.slope(x), columns @ columns.T + 0.5 * (prior_curvature + prior_curvature.T)
 
 
 def _apart(curvature: Float[Array, "n n"], free: Float[Array, " n"]) -> Float[Array, "n n"]:
