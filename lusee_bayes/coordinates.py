@@ -36,6 +36,11 @@ class Chart(eqx.Module):
     def names(self) -> tuple[str, ...]:
         """The sites whose coordinates it changes or needs."""
 
+    @property
+    def factorises(self) -> bool:
+        """Whether it factorises matrices at every evaluation."""
+        return False
+
     @abstractmethod
     def to_values(
         self, x: Mapping[str, Float[Array, "..."]]

@@ -218,8 +218,11 @@ class _Run:
             lambda dynamic: model(*eqx.combine(dynamic, static)),
             whitening.root.shape[1] if all_white else None,
         )
-        # batches of matrices are slow to factorise; several devices would stand idle, though
-        self.one_by_one = len(jax.devices()) == 1 and not predicts(program, arguments)
+        # XLA may stand still over batches of matrices to factorise where cores are few; several
+        # devices, each with a chain of its own, would only stand idle
+        chart = None if whitening is None else whitening.chart
+        factorises = not predicts(program, arguments) or (chart is not None and chart.factorises)
+        self.one_by_one = len(jax.devices()) == 1 and factorises
         self._advance = jax.jit(self._advance_traced)
 
     def start(self) -> HMCState:

@@ -195,6 +195,10 @@ class GainCoordinates(Chart):
         sites = [self.sigma_is_site, self.log_correlation_reach is not None]
         return (SKY, GAIN_NOISE, *(n for n, used in zip(SCALES, sites, strict=True) if used))
 
+    @property
+    def factorises(self) -> bool:
+        return len(self.names) > 2
+
     def to_values(self, x):
         values, noise, log_det = dict(x), x[GAIN_NOISE], jnp.zeros(())
         mean, constant = self._shared()
@@ -202,7 +206,7 @@ class GainCoordinates(Chart):
         noise = jnp.exp(scale) * (noise + (1.0 - scale) * constant) - constant
         values[SKY] = x[SKY] * jnp.exp(-2.0 * scale)
         log_det = (noise.size - 2 * x[SKY].size) * scale
-        if len(self.names) > 2:
+        if self.factorises:
             before, after = self._shapes(x)
             own, mixed = self._covariances(before, after)
             noise = noise + jnp.linalg.solve(own, (noise @ (before - after)).T).T @ after.T
@@ -212,7 +216,7 @@ class GainCoordinates(Chart):
 
     def from_values(self, values):
         x, noise = dict(values), values[GAIN_NOISE]
-        if len(self.names) > 2:
+        if self.factorises:
             before, after = self._shapes(values)
             _, mixed = self._covariances(before, after)
             noise = noise - jnp.linalg.solve(mixed, (noise @ (before - after)).T).T @ after.T
