@@ -131,9 +131,8 @@ def evidence(name: str, seed: int = 0) -> comparison.Evidence:
 # --- evidence -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("sky_marginal", marks=pytest.mark.long), "prior_amplitude"]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["sky_marginal", "prior_amplitude"])
 def test_the_evidence_is_that_of_brute_force(name):
     """Within 5 of the errors it gives itself; the grids are exact to 1e-5."""
     if name == "sky_marginal":

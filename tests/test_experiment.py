@@ -97,6 +97,7 @@ def test_the_map_recovers_the_sky(form):
     )
 
 
+@pytest.mark.long
 def test_the_main_job_on_ulsa(test_data):
     # thresholds from the first attempt on record: rho > 0.9 to ell 10, > 0.5 to 28, cross >= 20
     path = test_data / "ulsa" / "exp10.0MHz_sky_map_with_absorption.hdf5"

@@ -269,7 +269,9 @@ def test_shipped_scenarios_are_what_their_names_say():
         return {"gain": section | known | {"visibilities": "model"}}
 
     def beam(shift, treatment="marginalised"):
-        return {"beam": {"shift_mhz": shift, "parameters": {}, "treatment": treatment}}
+        return {
+            "beam": {"shift_mhz": shift, "file": None, "parameters": {}, "treatment": treatment}
+        }
 
     def radiometer(**changes):
         return {"radiometer": noise.radiometer.model_dump() | changes}
@@ -315,8 +317,8 @@ def test_shipped_scenarios_are_what_their_names_say():
             "'ignore', but .*'marginalised', 'sampled' or 'ignored'",
         ),
         (["noise.gain.visibilities=modle"], "'modle', but .*'model', 'measured' or 'posterior'"),
-        ([SHIFT, PARAMETERS], "give either shift_mhz or parameters"),
-        (["noise.beam.treatment=ignored"], "give either shift_mhz or parameters"),
+        ([SHIFT, PARAMETERS], "give either shift_mhz, file or parameters"),
+        (["noise.beam.treatment=ignored"], "give either shift_mhz, file or parameters"),
         (["noise.gain.sigma=0"], "noise.gain.sigma is 0, but .*greater than 0"),
         (["noise.gain.correlation_h=0"], "correlation_h is 0, but .*greater than 0"),
         (["noise.gain.correlation_h=-3"], "correlation_h is -3, but .*greater than 0"),

@@ -92,6 +92,7 @@ def sampled(e, data, seed=3):
     return sample(program.model, arguments, sampler, about.whitening), posterior
 
 
+@pytest.mark.long
 def test_small_gains_marginalised_and_sampled_give_the_same_sky():
     """sigma_g = 1e-3: mean and variance of every mode to Monte Carlo error.
 
