@@ -10,12 +10,13 @@ export MPLBACKEND := agg
 map: $(VENV)/installed
 	$(BIN)/lusee-bayes map fiducial
 
-# a file's tests stay in one process: they share fixtures and compiled functions
+# a file's tests stay in one process: they share fixtures and compiled functions. Two processes also
+# keep each below the number of memory maps that compiled programs may take up
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 long: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -m long
+	$(BIN)/python -m pytest -m long -n 2 --dist loadfile
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .

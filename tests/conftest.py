@@ -21,6 +21,20 @@ DATA = Path(
 )
 
 
+# Linux lets a process have 65530 memory maps; every compiled program takes some, and XLA crashes
+# where there are no more
+MANY_MAPS = 25_000
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_more_programs_than_memory_maps():
+    """Forgets compiled programs behind a module that leaves too many."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_text().count("\n") > MANY_MAPS:
+        jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def test_data() -> Path:
     """Folder of real data; tests that need it are skipped where it does not exist."""
