@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.time import Time
+from fits_files import write_images
 
 import lusee_bayes as lb
 from lusee_bayes.beams import HemisphereGrid, read_beam
@@ -142,15 +143,8 @@ def write(path, *, without=(), change=None, header=None):
         change(images)
     head = {"THETA_MIN": 0.0, "THETA_MAX": 90.0, "THETA_N": 46}
     head |= {"PHI_MIN": 0.0, "PHI_MAX": 360.0, "PHI_N": 61} | (header or {})
-    hdus = fits.HDUList()
-    for name, image in images.items():
-        if name not in without:
-            hdus.append(fits.ImageHDU(image, name=name) if hdus else fits.PrimaryHDU(image))
-            hdus[-1].header["EXTNAME"] = name
-    for key, value in head.items():
-        hdus[0].header[f"HIERARCH {key}"] = value
-    hdus.writeto(path)
-    return path
+    kept = {name: image for name, image in images.items() if name not in without}
+    return write_images(path, kept, head)
 
 
 def test_between_frequencies_and_directions(tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from astropy.io import fits
+from fits_files import write_images
 
 from lusee_bayes.checks import InputError
 from lusee_bayes.cli import main
@@ -30,15 +30,9 @@ def write(path, data=None, pairs=PAIRS, header=HEADER, frequencies=(10.0, 20.0),
         n = sum(1 if i == j else 2 for i, j in pairs)
         product, time, channel = np.arange(n), np.arange(12), np.arange(len(frequencies))
         data = 100.0 * product[None, :, None] + time[:, None, None] + channel / 10.0
-    hdus = fits.HDUList([fits.PrimaryHDU(data)])
-    hdus[0].header["EXTNAME"] = "data"
-    for name, image in [("freq", np.array(frequencies)), ("combinations", np.array(pairs))]:
-        if name not in without:
-            hdus.append(fits.ImageHDU(image, name=name))
-    for key, value in header.items():
-        hdus[0].header[f"HIERARCH {key}"] = value
-    hdus.writeto(path)
-    return path
+    images = {"data": data, "freq": np.array(frequencies), "combinations": np.array(pairs)}
+    kept = {name: image for name, image in images.items() if name not in without}
+    return write_images(path, kept, header)
 
 
 def test_every_sample_is_in_its_place(tmp_path):
