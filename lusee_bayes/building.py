@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,14 @@ from lusee_bayes.beams import (
     AntennaFields,
     HemisphereGrid,
     Monopoles,
+    PortResponse,
     ProductBeams,
     Regolith,
+    ScalarBeam,
     monopole_beams,
     read_beam,
 )
+from lusee_bayes.beams.gridded import at_frequency
 from lusee_bayes.checks import InputError, nearest
 from lusee_bayes.ephemeris import BODIES, body_direction
 from lusee_bayes.noise import GainDrift
@@ -67,24 +71,69 @@ def build_beams(
     file = scenario.beam.file if file is None else file
     if file is None:
         return monopole_beams(frequency, scenario.lmax, build_monopoles(scenario))
-    beam = read_beam(file)
-    grid = beam.rectangle_grid if scenario.beam.quadrature == "rectangle" else None
-    return beam.beams(frequency, scenario.lmax, grid=grid, **_placement(scenario))
+    beam = build_beam_file(scenario, file)
+    grid = beam.luseepy_grid if scenario.beam.quadrature == "luseepy" else None
+    return beam.beams(frequency, scenario.lmax, grid=grid, **_placement(scenario, beam))
+
+
+def build_background(
+    scenario: Scenario, frequency_mhz: float | None = None, file: str | None = None
+) -> Float[Array, " products"] | None:
+    """Visibilities without any sky, in K: what Moon and antennas emit; None where nothing does.
+
+    ``frequency_mhz``, ``file``: as for :func:`build_beams`.
+    """
+    section = scenario.beam
+    moon, antenna = section.moon_temperature_k, section.antenna_temperature_k
+    file = section.file if file is None else file
+    if file is None or not (moon or antenna):
+        return None
+    beam = build_beam_file(scenario, file)
+    frequency = scenario.frequency_mhz if frequency_mhz is None else frequency_mhz
+    if isinstance(beam, PortResponse):
+        return beam.background(frequency, moon, antenna)
+    if antenna:
+        raise InputError(
+            f"{file} is a scalar beam, which knows of no losses; leave out "
+            "beam.antenna_temperature_k"
+        )
+    grid = beam.luseepy_grid if section.quadrature == "luseepy" else None
+    return beam.background(frequency, moon, grid=grid, **_placement(scenario, beam))
 
 
 def build_fields(scenario: Scenario, grid: HemisphereGrid) -> AntennaFields:
     """Fields of the antennas at the scenario's frequency, embedded or of a file."""
     if scenario.beam.file is None:
         return build_monopoles(scenario).fields(scenario.frequency_mhz, grid)
-    beam = read_beam(scenario.beam.file)
-    return beam.fields(scenario.frequency_mhz, grid=grid, **_placement(scenario))
+    beam = build_beam_file(scenario, scenario.beam.file)
+    return beam.fields(scenario.frequency_mhz, grid=grid, **_placement(scenario, beam))
 
 
-def _placement(scenario: Scenario) -> dict[str, Any]:
-    """How the pattern of a file is put up."""
-    beam = scenario.beam
-    rotations = tuple(angle + beam.turntable_offset_deg for angle in beam.rotations_deg)
-    return {"taper": beam.taper, "rotations_deg": rotations}
+def build_impedance(scenario: Scenario) -> complex:
+    """Impedance of the arms in Ohm, NaN unless a scalar beam file has it."""
+    beam = None if scenario.beam.file is None else build_beam_file(scenario, scenario.beam.file)
+    if not isinstance(beam, ScalarBeam) or beam.impedance is None:
+        return complex(np.nan, np.nan)
+    known = beam.frequencies_mhz
+    (z,) = at_frequency(beam.path, known, scenario.frequency_mhz, beam.impedance)
+    return complex(z)
+
+
+def build_beam_file(scenario: Scenario, file: str) -> ScalarBeam | PortResponse:
+    """The beams of a file, with the scenario's receivers on the ports of a response."""
+    beam = read_beam(file)
+    if isinstance(beam, PortResponse) and scenario.beam.receiver == "open":
+        return replace(beam, receiver=None)
+    return beam
+
+
+def _placement(scenario: Scenario, beam: ScalarBeam | PortResponse) -> dict[str, Any]:
+    """How the patterns of a file are put up."""
+    section = scenario.beam
+    if isinstance(beam, PortResponse):
+        return {"turn_deg": section.turntable_offset_deg}
+    rotations = tuple(angle + section.turntable_offset_deg for angle in section.rotations_deg)
+    return {"taper": section.taper, "rotations_deg": rotations}
 
 
 def build_sky(scenario: Scenario) -> Sky:

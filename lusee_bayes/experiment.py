@@ -86,8 +86,8 @@ class Experiment(Simulation):
         return directions
 
     def base(self, data: Visibilities | None = None) -> LinearGaussian:
-        """d = A m + n with radiometer noise only."""
-        return LinearGaussian(self.coupling, self.prior, self.radiometer(data))
+        """d = A m + background + n with radiometer noise only."""
+        return LinearGaussian(self.coupling, self.prior, self.radiometer(data), self.offset)
 
     def model(
         self,

@@ -10,12 +10,12 @@ import numpy as np
 import xarray as xr
 
 from lusee_bayes import datatree, results, visibilities
-from lusee_bayes.beams import read_beam
+from lusee_bayes.beams import PortResponse, read_beam
 from lusee_bayes.checks import InputError
 from lusee_bayes.fits_images import image_names, is_fits
-from lusee_bayes.products import labels
+from lusee_bayes.products import N_ANTENNAS, auto_indices, labels
 from lusee_bayes.sky import read_map
-from lusee_bayes.waterfall import read_waterfall
+from lusee_bayes.waterfalls import read_waterfall
 
 
 def describe(path: str | Path) -> str:
@@ -35,9 +35,9 @@ def describe(path: str | Path) -> str:
         return _describe_samples(path)
     if is_fits(path):
         names = set(image_names(path))
-        if "etheta_real" in names:
+        if {"etheta_real", "h_theta_real"} & names:
             return _describe_beam(path)
-        if "combinations" in names:
+        if {"combinations", "products"} & names:
             return _describe_waterfall(path)
     return _describe_map(path)
 
@@ -53,30 +53,57 @@ def _netcdf_format(path: Path) -> str | None:
 def _describe_beam(path: Path) -> str:
     beam = read_beam(path)
     known = beam.frequencies_mhz
-    return "\n".join(
-        [
-            f"{path}: the beam of one arm (luseepy, scalar)",
-            f"  {len(known)} frequencies from {known[0]:g} to {known[-1]:g} MHz",
-            f"  {len(beam.theta)} angles from the zenith to the horizon, {beam.n_phi} azimuths",
-            f"  gain {beam.gain.min():.4g} to {beam.gain.max():.4g}",
+    lines = [
+        f"  {len(known)} frequencies from {known[0]:g} to {known[-1]:g} MHz",
+        f"  {len(beam.theta)} angles from the zenith to the horizon, {beam.n_phi} azimuths",
+    ]
+    middle = float(known[len(known) // 2])
+    if isinstance(beam, PortResponse):
+        title = f"{path}: the response of {N_ANTENNAS} coupled ports (luseepy)"
+        kelvin = beam.per_kelvin(middle)
+        emitted = beam.background(middle, 1.0)[auto_indices()]
+        lines += [
+            f"  at {middle:g} MHz: antenna impedance {_ohm(beam.impedance[len(known) // 2][0, 0])}, "
+            f"1 K is {kelvin.min():.4g} to {kelvin.max():.4g} V^2/Hz behind the receivers",
+            f"  {float(emitted.mean()):.3f} of an auto comes from the Moon",
         ]
-    )
+    else:
+        title = f"{path}: the beam of one arm (luseepy, scalar)"
+        lines.append(f"  gain {beam.gain.min():.4g} to {beam.gain.max():.4g}")
+        if beam.impedance is not None:
+            lines.append(f"  impedance {_ohm(beam.impedance[len(known) // 2])} at {middle:g} MHz")
+        ground = float(beam.background(middle, 1.0)[0])
+        lines.append(f"  {ground:.3f} of the beam ends on the ground at {middle:g} MHz")
+    return "\n".join([title, *lines])
+
+
+def _ohm(z: complex) -> str:
+    return f"{z.real:.4g} {'-' if z.imag < 0 else '+'} {abs(z.imag):.4g} i Ohm"
 
 
 def _describe_waterfall(path: Path) -> str:
     waterfall = read_waterfall(path)
     grid, observation = waterfall.grid, waterfall.observation
+    four_port = waterfall.per_kelvin is not None
     here = ~np.isnan(grid).all((1, 2))
     names = [name for name, there in zip(labels(), here, strict=True) if there]
     gaps = int(np.isnan(grid[here]).sum())
+    four_port_lines = []
+    if four_port:
+        kelvin = waterfall.per_kelvin
+        four_port_lines = [
+            f"  in V^2/Hz: 1 K is {kelvin.min():.4g} to {kelvin.max():.4g} of them",
+            f"  with the emission of the Moon at {waterfall.moon_k:g} K",
+        ]
     return "\n".join(
         [
-            f"{path}: a waterfall of luseepy",
+            f"{path}: a waterfall of luseepy" + (", four ports" if four_port else ""),
             f"  channels at {', '.join(f'{f:g}' for f in waterfall.frequencies_mhz)} MHz",
             f"  {len(names)} products ({' '.join(names)}), {observation.n_times} times of "
             f"{observation.step_s:g} s, {gaps} samples missing",
             f"  {observation.times[0].isot} to {observation.times[-1].isot} UTC",
             f"  site: longitude {observation.lon_deg}, latitude {observation.lat_deg} degrees",
+            *four_port_lines,
         ]
     )
 

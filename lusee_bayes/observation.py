@@ -67,6 +67,14 @@ class Observation:
                 f"times {self.times.shape} and run {self.run.shape} must be two lists of the "
                 "same length, with at least one sample"
             )
+        with unannounced_leap_seconds():
+            back = np.flatnonzero(~((self.times[1:] - self.times[:-1]).to_value(u.s) > 0.0))
+        if back.size:
+            here, there = self.times[back[0]].isot, self.times[back[0] + 1].isot
+            raise InputError(
+                f"times must grow from sample to sample, but sample {back[0] + 1} ({there}) does "
+                f"not come after sample {back[0]} ({here}); sort them, and give each time once"
+            )
         steps = np.diff(self.run)
         if (
             self.run[0] != 0

@@ -62,11 +62,14 @@ EMBEDDED = (
 
 
 class BeamSection(Section):
-    """The embedded monopoles and the ground under them, or the pattern of ``file``.
+    """The embedded monopoles and the ground under them, or the beams of ``file``.
 
     ``file``: a scalar beam of luseepy, put up once for each of ``rotations_deg`` (from East towards
-    North, on top of ``turntable_offset_deg``); ``taper`` fades it out towards the horizon as
-    luseepy does. ``quadrature: rectangle`` is luseepy's own rule, for data that luseepy has made.
+    North, on top of ``turntable_offset_deg``), faded out towards the horizon as luseepy does if
+    ``taper``; or a four-port response of luseepy, with ``receiver`` on its ports. Ground of
+    ``moon_temperature_k`` (and antennas of ``antenna_temperature_k``, where the response has
+    losses) add their own radiation. ``quadrature: luseepy`` is luseepy's own rule, for data that
+    luseepy has made.
     """
 
     model: Literal["monopole"] = "monopole"
@@ -79,7 +82,10 @@ class BeamSection(Section):
     turntable_offset_deg: float = 0.0
     file: str | None = None
     taper: bool = True
-    quadrature: Literal["exact", "rectangle"] = "exact"
+    quadrature: Literal["exact", "luseepy"] = "exact"
+    receiver: Literal["jfet", "open"] = "jfet"
+    moon_temperature_k: Annotated[float, Field(ge=0)] = 0.0
+    antenna_temperature_k: Annotated[float, Field(ge=0)] = 0.0
     rotations_deg: Annotated[tuple[float, ...], Field(min_length=1)] = (0.0, 90.0, 180.0, 270.0)
 
     @model_validator(mode="after")
@@ -88,6 +94,11 @@ class BeamSection(Section):
             default = type(self).model_fields[name].default
             if self.file is not None and getattr(self, name) != default:
                 raise ValueError(f"{name} is a parameter of the embedded antennas, not of a file")
+        if self.file is None and (self.moon_temperature_k or self.antenna_temperature_k):
+            raise ValueError(
+                "the beams of the embedded antennas are scaled to the sky alone: temperatures of "
+                "Moon and antennas need beam.file"
+            )
         return self
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from lusee_bayes.beams import ProductBeams
 from lusee_bayes.building import (
+    build_background,
     build_beams,
     build_gain_drift,
     build_monopoles,
@@ -35,6 +36,9 @@ from lusee_bayes.sky import Sky
 from lusee_bayes.systematics import GainDrifts, Instrument, PointSources, Source
 from lusee_bayes.visibilities import Visibilities
 
+# two sites closer than that are one: 30 m
+SAME_SITE_DEG = 1e-3
+
 # a Scene, or what is built upon it
 Kind = TypeVar("Kind")
 
@@ -44,7 +48,8 @@ class Scene:
     """The pieces that a scenario stands for.
 
     responses : (products, times) of each point source to 1 K sr
-    signal : (products, times) visibilities of sky and sources through the modelled beams, in K
+    background : (products,) visibilities without any sky, in K; None where nothing emits
+    signal : (products, times) visibilities of all of it through the modelled beams, in K
     """
 
     scenario: Scenario
@@ -55,6 +60,7 @@ class Scene:
     coupling: CouplingMatrix
     prior: HarmonicPrior
     responses: tuple[Float[Array, "products times"], ...]
+    background: Float[Array, " products"] | None
     signal: Float[Array, "products times"]
 
     @classmethod
@@ -66,14 +72,11 @@ class Scene:
     ) -> Kind:
         """Build everything; with ``data``, for the times and samples that the data have.
 
-        InputError if the data are of another frequency.
+        InputError if the data are of another frequency, another site or other ports.
         """
         stages = stages or Stages()
-        if data is not None and not np.isclose(data.frequency_mhz, scenario.frequency_mhz, 1e-9):
-            raise InputError(
-                f"the data are at {data.frequency_mhz} MHz, the scenario at "
-                f"{scenario.frequency_mhz}; use --set frequency_mhz={data.frequency_mhz}"
-            )
+        if data is not None:
+            require_fitting(data, scenario)
         with stages("sky"):
             sky = build_sky(scenario)
             spectrum = sky.spectrum() * scenario.prior.scale
@@ -83,7 +86,13 @@ class Scene:
         with stages("beams"):
             antennas = build_monopoles(scenario)
             beams = jax.block_until_ready(build_beams(scenario))
+            background = build_background(scenario)
             responses = build_source_responses(scenario, observation, antennas)
+        if data is not None and data.layout.n_products != beams.n_products:
+            raise InputError(
+                f"the data have {data.layout.n_products} products, the beams supply "
+                f"{beams.n_products}; give beam.rotations_deg an angle for every port"
+            )
         with stages("coupling"):
             layout = (
                 data.layout
@@ -95,6 +104,8 @@ class Scene:
             )
             complete = CouplingMatrix.build(beams, pointing)
             signal = complete.layout.scatter(complete @ sky.modes)
+            if background is not None:
+                signal = signal + background[:, None]
             for source, response in zip(scenario.sources.list, responses, strict=True):
                 signal = signal + source_flux(source, scenario.frequency_mhz) * response
             coupling = instrument.coupling_of(beams)
@@ -107,6 +118,7 @@ class Scene:
             coupling,
             HarmonicPrior(spectrum),
             responses,
+            background,
             signal,
         )
 
@@ -129,6 +141,16 @@ class Scene:
             form=section.form,
             duty_cycle=section.duty_cycle,
             factor=section.factor,
+        )
+
+    @property
+    def offset(self) -> Float[Array, " data"] | None:
+        """The background in every datum; None where there is none."""
+        if self.background is None:
+            return None
+        layout = self.coupling.layout
+        return layout.gather(
+            jnp.broadcast_to(self.background[:, None], (layout.n_products, layout.n_times))
         )
 
     @cached_property
@@ -182,6 +204,23 @@ class Scene:
             np.floor(self.observation.hours / section.block_h), return_inverse=True
         )
         return block
+
+
+def require_fitting(data: Visibilities, scenario: Scenario) -> None:
+    """InputError unless data are of the scenario's frequency and site."""
+    if not np.isclose(data.frequency_mhz, scenario.frequency_mhz, 1e-9):
+        raise InputError(
+            f"the data are at {data.frequency_mhz} MHz, the scenario at "
+            f"{scenario.frequency_mhz}; use --set frequency_mhz={data.frequency_mhz}"
+        )
+    here, there = data.observation, scenario.observation
+    east = (here.lon_deg - there.lon_deg + 180.0) % 360.0 - 180.0
+    if max(abs(east), abs(here.lat_deg - there.lat_deg)) > SAME_SITE_DEG:
+        raise InputError(
+            f"the data were taken at longitude {here.lon_deg:g}, latitude {here.lat_deg:g} degrees, "
+            f"the scenario's site is {there.lon_deg:g}, {there.lat_deg:g}; use --set "
+            f"observation.lon_deg={here.lon_deg:g} --set observation.lat_deg={here.lat_deg:g}"
+        )
 
 
 def measured_visibilities(

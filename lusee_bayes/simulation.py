@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from numpyro import handlers
 
 from lusee_bayes.beams import Monopoles, ProductBeams, monopole_beams, placed
-from lusee_bayes.building import build_beams, build_source_responses
+from lusee_bayes.building import build_background, build_beams, build_source_responses
 from lusee_bayes.coupling import CouplingMatrix
 from lusee_bayes.noise import GainDrift, rms_difference, with_gains
 from lusee_bayes.scene import Scene
@@ -78,6 +78,13 @@ class Simulation(Scene):
             return monopole_beams(frequency, self.scenario.lmax, antennas)
         return build_beams(self.scenario, frequency, beam.file)
 
+    def true_background(self) -> Float[Array, " products"] | None:
+        """What simulated data hold without any sky, in K; None where nothing emits."""
+        beam = self.scenario.noise.beam
+        if beam is None or beam.parameters:
+            return self.background
+        return build_background(self.scenario, self.true_antennas()[0], beam.file)
+
     def beam_rms_difference(self) -> float | None:
         """RMS difference of the true beams and the model's, over the model's; None if the same."""
         if self.scenario.noise.beam is None:
@@ -104,9 +111,12 @@ class Simulation(Scene):
         )
 
     def true_signal(self, truth: dict[str, float | np.ndarray]) -> Float[Array, "products times"]:
-        """Visibilities of sky and sources with the true antennas and fluxes, in K."""
+        """Visibilities of sky, ground and sources with the true antennas and fluxes, in K."""
         true = CouplingMatrix.build(self.true_beams(), self.pointing)
         visibilities = true.layout.scatter(true @ self.sky.modes)
+        background = self.true_background()
+        if background is not None:
+            visibilities = visibilities + background[:, None]
         frequency, antennas = self.true_antennas()
         responses = build_source_responses(self.scenario, self.observation, antennas, frequency)
         for section, response in zip(self.scenario.sources.list, responses, strict=True):

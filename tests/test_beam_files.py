@@ -12,7 +12,7 @@ from fits_files import write_images
 
 import lusee_bayes as lb
 from lusee_bayes.beams import HemisphereGrid, read_beam
-from lusee_bayes.beams.files import FIELDS
+from lusee_bayes.beams.scalar_file import FIELDS
 from lusee_bayes.checks import InputError
 from lusee_bayes.experiment import Experiment
 from lusee_bayes.harmonics import from_healpy
@@ -58,15 +58,15 @@ def off(got, expected) -> float:
 @pytest.mark.parametrize("frequency", [5.0, 10.0, 25.0, 50.0])
 def test_all_products_of_luseepys_waterfall(luseepy, frequency):
     """With luseepy's rule both are one sum, in another order; 1e-10 of the peak is asked for."""
-    got = visibilities(luseepy, frequency, grid=luseepy[0].rectangle_grid)
+    got = visibilities(luseepy, frequency, grid=luseepy[0].luseepy_grid)
     assert off(got, luseepy[1][frequency]) < 1e-11
 
 
 def test_azimuth_the_other_way_conjugated_crosses_and_permuted_ports_are_noticed(luseepy):
     beam, waterfall, _, _ = luseepy
-    grid, expected = beam.rectangle_grid, waterfall[25.0]
+    grid, expected = beam.luseepy_grid, waterfall[25.0]
     mirrored = np.r_[0, -1:-180:-1]
-    other = lb.beams.BeamFile(
+    other = lb.beams.ScalarBeam(
         "mirrored",
         beam.frequencies_mhz,
         beam.theta,

@@ -50,6 +50,10 @@ class HemisphereGrid(eqx.Module):
         """Azimuths in radians."""
         return 2.0 * np.pi * np.arange(self.n_phi) / self.n_phi
 
+    def polar_weights(self, lmax: int) -> Float[np.ndarray, "theta modes"]:
+        """What a Fourier sum at each theta adds to every coefficient: w lambda_lm(theta)."""
+        return polar_functions(self.theta, lmax) * self.weights[:, None]
+
     def integrate(self, f: Float[Array, "*batch theta phi"]) -> Float[Array, "*batch"]:
         """Integral over the hemisphere, in units of f times steradian."""
         return (f.sum(-1) @ jnp.asarray(self.weights)) * (2.0 * np.pi / self.n_phi)
@@ -75,6 +79,6 @@ class HemisphereGrid(eqx.Module):
             ],
             axis=-1,
         )
-        polar = jnp.asarray(polar_functions(self.theta, lmax) * self.weights[:, None])
+        polar = jnp.asarray(self.polar_weights(lmax))
         polar = polar.reshape(*(1,) * (f.ndim - 2), *polar.shape)
         return (parts[..., m + lmax] * polar).sum(-2)

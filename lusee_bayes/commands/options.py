@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from cyclopts import Parameter
 
+from lusee_bayes.checks import InputError
+from lusee_bayes.data_files import read_data
 from lusee_bayes.experiment import Experiment
-from lusee_bayes.fits_images import is_fits
 from lusee_bayes.progress import Stages
 from lusee_bayes.scenario import Scenario
-from lusee_bayes.visibilities import Visibilities, read_visibilities
-from lusee_bayes.waterfall import read_waterfall
+from lusee_bayes.visibilities import Visibilities
 
 Overrides = Annotated[list[str], Parameter(name="--set", negative="")]
 Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")]
+# 10,25 or 5:50:5
+Frequencies = Annotated[str | None, Parameter(name="--frequencies")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 
 
@@ -23,7 +27,7 @@ def prepare(
     scenario: Scenario, data: Path | None, stages: Stages
 ) -> tuple[Experiment, Visibilities]:
     """The experiment of a scenario with the data of a file, or with its own simulated ones."""
-    measured = None if data is None else read_data(data, scenario.frequency_mhz)
+    measured = None if data is None else read_data(data, scenario)
     experiment = Experiment.from_scenario(scenario, measured, stages)
     if measured is None:
         with stages("noise"):
@@ -32,8 +36,21 @@ def prepare(
     return experiment, measured
 
 
-def read_data(path: Path, frequency_mhz: float) -> Visibilities:
-    """Visibilities of the package's own files, or one channel of luseepy's waterfalls."""
-    if path.is_file() and is_fits(path):
-        return read_waterfall(path).at(frequency_mhz)
-    return read_visibilities(path)
+def parse_frequencies(text: str) -> list[float]:
+    """MHz out of ``10,25,30`` or of ``first:last:step``, the last included. InputError if neither."""
+    try:
+        if ":" not in text:
+            found = [float(part) for part in text.split(",")]
+        else:
+            first, last, step = (float(part) for part in text.split(":"))
+            count = round((last - first) / step)
+            found = [first + k * step for k in range(count + 1)]
+            if not step > 0 or not np.isclose(found[-1] if found else np.nan, last):
+                raise ValueError
+    except (ValueError, ZeroDivisionError, OverflowError):
+        found = []
+    if not found or any(b <= a for a, b in pairwise(found)):
+        raise InputError(
+            f"--frequencies {text}: expected growing MHz, as 10,25,30 or as 5:50:5 (first, last, step)"
+        )
+    return found

@@ -1,0 +1,71 @@
+"""Visibilities of several frequencies, as a file holds them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.checks import InputError
+from lusee_bayes.layout import DataLayout
+from lusee_bayes.observation import Observation
+from lusee_bayes.products import N_ANTENNAS, all_products
+from lusee_bayes.visibilities import Visibilities
+
+# two frequencies that differ by less, relatively, are one
+SAME_FREQUENCY = 1e-9
+
+
+@dataclass(frozen=True)
+class Waterfall:
+    """Visibilities of several frequencies, NaN where there are none.
+
+    grid : (products, times, frequencies) in K, in the package's order of products
+    per_kelvin : (frequencies, ports) V^2/Hz of 1 K, where the file is in V^2/Hz
+    moon_k, antenna_k : temperatures whose emission the visibilities hold besides the sky's
+    """
+
+    path: str
+    grid: Float[np.ndarray, "products times frequencies"]
+    frequencies_mhz: Float[np.ndarray, " frequencies"]
+    observation: Observation
+    per_kelvin: Float[np.ndarray, "frequencies ports"] | None = None
+    moon_k: float = 0.0
+    antenna_k: float = 0.0
+
+    def channel(self, frequency_mhz: float) -> int:
+        """Which channel is at a frequency. InputError if the file has none there."""
+        known = self.frequencies_mhz
+        nearest = int(np.argmin(np.abs(known - frequency_mhz)))
+        if not np.isclose(known[nearest], frequency_mhz, rtol=SAME_FREQUENCY):
+            raise InputError(
+                f"{self.path} has no channel at {frequency_mhz:g} MHz (it has "
+                f"{', '.join(f'{f:g}' for f in known)}); use --set frequency_mhz="
+                f"{known[nearest]:g}"
+            )
+        return nearest
+
+    def at(self, frequency_mhz: float, n_ports: int = N_ANTENNAS) -> Visibilities:
+        """One channel; samples that are not there or not finite are left out.
+
+        ``n_ports``: of the instrument. InputError for a frequency that the file does not have, or
+        for products of more ports.
+        """
+        channel = self.channel(frequency_mhz)
+        values = self.grid[:, :, channel]
+        present = np.isfinite(values)
+        within = np.array([p.j < n_ports for p in all_products()])
+        if present[~within].any():
+            first = int(np.argmax(present.any(1) & ~within))
+            raise InputError(
+                f"{self.path} has the product {all_products()[first].label}, but the beams are "
+                f"those of {n_ports} ports; give beam.rotations_deg an angle for every port"
+            )
+        try:
+            layout = DataLayout.from_flags(~present[within])
+        except InputError as error:
+            raise InputError(f"{self.path} at {frequency_mhz:g} MHz: {error}") from error
+        data = layout.gather(jnp.asarray(np.where(present, values, 0.0)[within]))
+        return Visibilities(data, layout, self.observation, float(self.frequencies_mhz[channel]))
