@@ -63,8 +63,8 @@ def _describe_beam(path: Path) -> str:
         kelvin = beam.per_kelvin(middle)
         emitted = beam.background(middle, 1.0)[auto_indices()]
         lines += [
-            f"  at {middle:g} MHz: antenna impedance {_ohm(beam.impedance[len(known) // 2][0, 0])}, "
-            f"1 K is {kelvin.min():.4g} to {kelvin.max():.4g} V^2/Hz behind the receivers",
+            f"  at {middle:g} MHz: impedance {_ohm(beam.impedance[len(known) // 2][0, 0])}, 1 K is "
+            f"{kelvin.min():.4g} to {kelvin.max():.4g} V^2/Hz behind the receivers",
             f"  {float(emitted.mean()):.3f} of an auto comes from the Moon",
         ]
     else:

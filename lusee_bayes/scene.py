@@ -217,8 +217,8 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
     east = (here.lon_deg - there.lon_deg + 180.0) % 360.0 - 180.0
     if max(abs(east), abs(here.lat_deg - there.lat_deg)) > SAME_SITE_DEG:
         raise InputError(
-            f"the data were taken at longitude {here.lon_deg:g}, latitude {here.lat_deg:g} degrees, "
-            f"the scenario's site is {there.lon_deg:g}, {there.lat_deg:g}; use --set "
+            f"the data were taken at longitude {here.lon_deg:g}, latitude {here.lat_deg:g} "
+            f"degrees, the scenario's site is {there.lon_deg:g}, {there.lat_deg:g}; use --set "
             f"observation.lon_deg={here.lon_deg:g} --set observation.lat_deg={here.lat_deg:g}"
         )
 

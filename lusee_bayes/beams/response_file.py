@@ -113,9 +113,10 @@ class PortResponse:
             scale = scale / np.sqrt(self.per_kelvin(frequency_mhz))
         mixing = scale[:, None] * self.loading(frequency_mhz)
         turned = (
-            np.stack([on_grid(h, self.theta, grid, turn_deg) for h in part]) for part in parts
+            np.tensordot(mixing, [on_grid(h, self.theta, grid, turn_deg) for h in part], axes=1)
+            for part in parts
         )
-        loaded = (jnp.asarray(np.tensordot(mixing, part, axes=1)) for part in turned)
+        loaded = (jnp.asarray(part) for part in turned)
         return AntennaFields(*loaded, grid)
 
     def beams(
@@ -195,8 +196,8 @@ def read_response(path: str | Path) -> PortResponse:
     off = np.abs(sky + moon + loss - resistance).max() / np.abs(resistance).max()
     if off > SINGLE_PRECISION:
         raise InputError(
-            f"{path}: Rsky + Rmoon + Rloss differ from (ZA + ZA^H) / 2 by {off:.1g} of the largest; "
-            "expected equality"
+            f"{path}: Rsky + Rmoon + Rloss differ from (ZA + ZA^H) / 2 by {off:.1g} of the "
+            "largest; expected equality"
         )
     theta = np.linspace(0.0, np.pi / 2.0, len(theta_deg))
     return PortResponse(str(path), frequencies, theta, h_theta, h_phi, impedance, moon, loss)

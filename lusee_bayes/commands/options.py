@@ -37,7 +37,10 @@ def prepare(
 
 
 def parse_frequencies(text: str) -> list[float]:
-    """MHz out of ``10,25,30`` or of ``first:last:step``, the last included. InputError if neither."""
+    """MHz out of ``10,25,30`` or of ``first:last:step``, the last included.
+
+    InputError if it is neither.
+    """
     try:
         if ":" not in text:
             found = [float(part) for part in text.split(",")]
@@ -51,6 +54,7 @@ def parse_frequencies(text: str) -> list[float]:
         found = []
     if not found or any(b <= a for a, b in pairwise(found)):
         raise InputError(
-            f"--frequencies {text}: expected growing MHz, as 10,25,30 or as 5:50:5 (first, last, step)"
+            f"--frequencies {text}: expected growing MHz, as 10,25,30 or as 5:50:5 (first, last, "
+            "step)"
         )
     return found

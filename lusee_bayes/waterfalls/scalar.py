@@ -1,4 +1,4 @@
-"""Waterfalls of luseepy's scalar simulator: visibilities in K for all times, products and frequencies.
+"""Waterfalls of luseepy's scalar simulator: visibilities in K.
 
 FITS: image ``data`` (time, product, frequency), ``freq`` in MHz, ``combinations`` (pairs of ports;
 an auto has one column, a cross two, Re and Im). Header: LUNAR_DAY (start and end, UTC), DELTAT_SEC,
@@ -100,8 +100,9 @@ def write_waterfall(
     """Write channels of one observation as luseepy's scalar simulator does, whole or not at all.
 
     Missing samples become NaN. ``impedance_ohm``: of the arms, NaN if not known; ``scenario``: its
-    text, kept as an image of bytes that luseepy does not look at. InputError for what the layout cannot hold: times that are not start + k step, turntable angles other than 0,
-    other than 4 ports, channels of different observations, fewer than two channels.
+    text, kept as an image of bytes that luseepy does not look at. InputError for what the layout
+    cannot hold: times that are not start + k step, turntable angles other than 0, other than 4
+    ports, channels of different observations, fewer than two channels.
     """
     path, first = Path(path), channels[0].observation
     if len(channels) < 2:
