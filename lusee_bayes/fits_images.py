@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -46,13 +47,22 @@ def read_images(
 def _open(
     path: Path, names: Sequence[str]
 ) -> tuple[dict[str, np.ndarray], dict[str, str], fits.Header]:
+    with opened(path) as hdus:
+        found = {hdu.name.lower(): hdu.name for hdu in hdus}
+        images = {n: np.array(hdus[n].data) for n in names if n.lower() in found}
+        return images, found, hdus[0].header.copy()
+
+
+@contextmanager
+def opened(path: str | Path) -> Iterator[fits.HDUList]:
+    """An open FITS file. InputError if it, or what is read of it meanwhile, is cut short or bad."""
     try:
         # a file cut short is only warned of
-        with warnings.catch_warnings(), path.open("rb") as file:
+        with warnings.catch_warnings(), Path(path).open("rb") as file:
             warnings.simplefilter("error", AstropyWarning)
-            hdus = fits.open(file, memmap=False)
-            found = {hdu.name.lower(): hdu.name for hdu in hdus}
-            images = {n: np.array(hdus[n].data) for n in names if n.lower() in found}
-            return images, found, hdus[0].header.copy()
+            with fits.open(file, memmap=False) as hdus:
+                yield hdus
+    except InputError:
+        raise
     except (OSError, TypeError, ValueError, AstropyWarning) as error:
         raise InputError(f"{path} cannot be read as FITS, or is cut short: {error}") from error

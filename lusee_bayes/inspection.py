@@ -14,7 +14,7 @@ from lusee_bayes.beams import PortResponse, read_beam
 from lusee_bayes.checks import InputError
 from lusee_bayes.fits_images import image_names, is_fits
 from lusee_bayes.products import N_ANTENNAS, auto_indices, labels
-from lusee_bayes.sky import read_map
+from lusee_bayes.sky import read_alms, read_cube, read_map, sky_kind
 from lusee_bayes.waterfalls import read_waterfall
 
 
@@ -39,7 +39,10 @@ def describe(path: str | Path) -> str:
             return _describe_beam(path)
         if {"combinations", "products"} & names:
             return _describe_waterfall(path)
-    return _describe_map(path)
+    kind = sky_kind(path)
+    if kind == "cube":
+        return _describe_cube(path)
+    return _describe_alms(path) if kind == "alms" else _describe_map(path)
 
 
 def _netcdf_format(path: Path) -> str | None:
@@ -171,5 +174,32 @@ def _describe_map(path: Path) -> str:
         [
             f"{path}: HEALPix sky map, NSIDE {healpy.npix2nside(pixels.size)}, RING, Galactic",
             f"  mean {pixels.mean():.6g} K, from {pixels.min():.4g} to {pixels.max():.4g} K",
+        ]
+    )
+
+
+def _describe_cube(path: Path) -> str:
+    cube = read_cube(path)
+    known, pixels = cube.frequencies_mhz, cube.pixels
+    return "\n".join(
+        [
+            f"{path}: {len(pixels)} HEALPix sky maps, NSIDE {healpy.npix2nside(pixels.shape[1])}, "
+            "taken to be RING and Galactic",
+            f"  {known[0]:g} to {known[-1]:g} MHz, means {pixels[0].mean():.6g} to "
+            f"{pixels[-1].mean():.6g} K, least pixel {pixels.min():.4g} K",
+        ]
+    )
+
+
+def _describe_alms(path: Path) -> str:
+    alms = read_alms(path)
+    known, means = alms.frequencies_mhz, alms.modes[:, 0] / np.sqrt(4 * np.pi)
+    where = "frequency not said"
+    if known is not None:
+        where = f"{', '.join(f'{f:g}' for f in known)} MHz"
+    return "\n".join(
+        [
+            f"{path}: coefficients of {len(means)} skies up to ell = {alms.lmax}, {where}",
+            f"  means {means[0]:.6g} to {means[-1]:.6g} K",
         ]
     )

@@ -103,12 +103,14 @@ class BeamSection(Section):
 
 
 class SkySection(Section):
-    """The embedded Galaxy, or a map from ``file`` (ULSA HDF5 or HEALPix FITS).
+    """The embedded Galaxy, or a sky from ``file``.
+
+    Files: ULSA's HDF5, HEALPix FITS, luseepy's FITS of many maps, healpy's coefficients.
 
     ``sources`` adds the brightest point sources to the embedded Galaxy, not to a file.
 
-    A file made for ``file_frequency_mhz`` is scaled with ``spectral_index``; by default it is
-    taken to be at the scenario's frequency.
+    A file made for ``file_frequency_mhz`` is scaled with ``spectral_index`` (of files with many
+    frequencies, that one is taken); by default it is taken to be at the scenario's frequency.
     """
 
     model: Literal["galaxy"] = "galaxy"

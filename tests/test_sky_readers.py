@@ -106,7 +106,7 @@ def bad_files():
         (holes, "NaN or infinity .* first at .7"),
         (unseen, "1 of 3072 pixels are UNSEEN"),
         (flux, "unit is 'Jy', expected a temperature"),
-        (text, "neither HDF5 nor a readable FITS"),
+        (text, "neither HDF5 nor FITS"),
         (other_dataset, "no dataset 'smooth_absorb' .*did you mean 'smooth_absorp'"),
         (not_healpix, "not a HEALPix map"),
         (missing, "no sky map at"),

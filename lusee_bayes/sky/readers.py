@@ -13,6 +13,7 @@ from astropy.io import fits
 from jaxtyping import Float
 
 from lusee_bayes.checks import InputError, nearest, require_finite
+from lusee_bayes.fits_images import is_fits, opened
 
 ULSA_DATASET = "smooth_absorb"
 
@@ -52,20 +53,18 @@ def _read_hdf5(path: Path, dataset: str) -> np.ndarray:
 
 
 def _read_fits(path: Path) -> np.ndarray:
-    try:
-        with fits.open(path) as hdus:
-            tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
-            if not tables:
-                raise InputError(
-                    f"{path} has no binary table; expected a HEALPix FITS map (or ULSA HDF5)"
-                )
-            header, column = tables[0].header, tables[0].columns[0]
-            values = np.asarray(tables[0].data.field(0), dtype=np.float64).ravel()
-    except OSError as error:
+    if not is_fits(path):
         raise InputError(
-            f"{path} is neither HDF5 nor a readable FITS file ({error}); give an ULSA HDF5 or a "
-            "HEALPix FITS map"
-        ) from error
+            f"{path} is neither HDF5 nor FITS; give an ULSA HDF5 or a HEALPix FITS map"
+        )
+    with opened(path) as hdus:
+        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
+        if not tables:
+            raise InputError(
+                f"{path} has no binary table; expected a HEALPix FITS map (or ULSA HDF5)"
+            )
+        header, column = tables[0].header, tables[0].columns[0]
+        values = np.array(tables[0].data.field(0), dtype=np.float64).ravel()
     ordering = str(header.get("ORDERING", "absent")).strip().upper()
     if ordering != "RING":
         raise InputError(

@@ -10,7 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lusee_bayes.checks import InputError, require_finite, require_float64
+from lusee_bayes.fits_images import is_fits
 from lusee_bayes.harmonics import lmax_of, map_to_modes, power_spectrum, synthesis_matrix
+from lusee_bayes.sky.alms import has_alms, read_alms
+from lusee_bayes.sky.cubes import is_cube, read_cube
 from lusee_bayes.sky.galaxy import galaxy_map
 from lusee_bayes.sky.readers import read_map
 from lusee_bayes.sky.sources import BRIGHT_SOURCES, PointSource
@@ -85,19 +88,41 @@ def sky_from_file(
     file_frequency_mhz: float | None = None,
     spectral_index: float = -2.5,
 ) -> Sky:
-    """The sky of an ULSA HDF5 or HEALPix FITS map (Galactic, RING, K).
+    """The sky of a file: ULSA HDF5, HEALPix FITS, luseepy's FITS of many maps, coefficients.
 
-    ``file_frequency_mhz``: the frequency that the file was made for, if it is not
-    ``frequency_mhz``; the map is then scaled by (frequency / file frequency)^spectral_index.
-    InputError for files that are missing, unreadable, in another order or frame, or hold NaN.
+    ``file_frequency_mhz``: the frequency that the file was made for (or that is taken out of it),
+    if it is not ``frequency_mhz``; the sky is then scaled by (frequency / file frequency)
+    ^spectral_index. InputError for files that are missing, unreadable, in another order or frame,
+    hold NaN, or have other frequencies.
     """
-    pixels = read_map(path, dataset=dataset)
+    path, scale, source_mhz = Path(path), 1.0, float(frequency_mhz)
+    if not path.is_file():
+        raise InputError(f"no sky map at '{path}'; check sky.file")
     if file_frequency_mhz is not None:
         if not file_frequency_mhz > 0:
             raise InputError(f"file_frequency_mhz must be positive, got {file_frequency_mhz}")
-        pixels = pixels * (frequency_mhz / file_frequency_mhz) ** spectral_index
-    try:
-        modes = map_to_modes(pixels, lmax)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    return Sky(jnp.asarray(modes), float(frequency_mhz), Path(path).name)
+        source_mhz = float(file_frequency_mhz)
+        scale = (frequency_mhz / source_mhz) ** spectral_index
+    kind = sky_kind(path)
+    if kind == "alms":
+        modes = read_alms(path).at(source_mhz, lmax)
+    else:
+        pixels = (
+            read_cube(path).at(source_mhz) if kind == "cube" else read_map(path, dataset=dataset)
+        )
+        try:
+            modes = map_to_modes(pixels, lmax)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+    return Sky(jnp.asarray(scale * modes), float(frequency_mhz), path.name)
+
+
+def sky_kind(path: Path) -> str:
+    """Which layout a file of skies has: ``alms``, ``cube`` or ``map``."""
+    if path.suffix == ".npz":
+        return "alms"
+    if not is_fits(path):
+        return "map"
+    if is_cube(path):
+        return "cube"
+    return "alms" if has_alms(path) else "map"

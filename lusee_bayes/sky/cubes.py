@@ -1,0 +1,84 @@
+"""Sky maps of many frequencies: the layout of luseepy's ULSA file, which lowsky writes too.
+
+FITS: one primary image (frequency, pixel) of HEALPix maps, RING, Galactic, K; the header has
+FREQ_START, FREQ_END and FREQ_STEP in MHz. Frame and order are not said in the file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import healpy
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.checks import InputError, require_finite
+from lusee_bayes.fits_images import opened
+
+STEPS = ("FREQ_START", "FREQ_END", "FREQ_STEP")
+
+
+@dataclass(frozen=True)
+class SkyCube:
+    """Maps of several frequencies.
+
+    pixels : (frequencies, pixels) HEALPix RING, Galactic, in K; path : for messages
+    """
+
+    path: str
+    frequencies_mhz: Float[np.ndarray, " frequencies"]
+    pixels: Float[np.ndarray, "frequencies pixels"]
+
+    def at(self, frequency_mhz: float) -> Float[np.ndarray, " pixels"]:
+        """The map at a frequency; in between two by the power law of each pixel.
+
+        InputError outside the file's frequencies, or where a pixel between two frequencies is not
+        positive in both.
+        """
+        known = self.frequencies_mhz
+        if not known[0] <= frequency_mhz <= known[-1]:
+            raise InputError(
+                f"{self.path} has maps from {known[0]:g} to {known[-1]:g} MHz, not at "
+                f"{frequency_mhz:g}; set sky.file_frequency_mhz to one of those, and it is scaled "
+                "with sky.spectral_index"
+            )
+        above = int(np.searchsorted(known, frequency_mhz))
+        if known[above] == frequency_mhz:
+            return self.pixels[above]
+        low, high = self.pixels[above - 1], self.pixels[above]
+        if not ((low > 0) & (high > 0)).all():
+            raise InputError(
+                f"{self.path} has pixels that are not positive at {known[above - 1]:g} or "
+                f"{known[above]:g} MHz, between which there is no power law; take a frequency of "
+                "the file"
+            )
+        share = np.log(frequency_mhz / known[above - 1]) / np.log(known[above] / known[above - 1])
+        return low * (high / low) ** share
+
+
+def is_cube(path: Path) -> bool:
+    """Whether a FITS file has the layout. InputError if it cannot be read."""
+    with opened(path) as hdus:
+        return all(key in hdus[0].header for key in STEPS)
+
+
+def read_cube(path: str | Path) -> SkyCube:
+    """Read a file of maps of many frequencies.
+
+    InputError for a truncated file, steps of frequency that do not fit the maps, maps that are not
+    HEALPix, numbers that are not finite.
+    """
+    with opened(path) as hdus:
+        start, end, step = (float(hdus[0].header[key]) for key in STEPS)
+        pixels = np.array(hdus[0].data, dtype=np.float64)
+    count = round((end - start) / step) + 1 if step > 0 else 0
+    if pixels.ndim != 2 or len(pixels) != count:
+        raise InputError(
+            f"{path}: the image has shape {pixels.shape}, expected {count} maps for {start:g} to "
+            f"{end:g} MHz in steps of {step:g}"
+        )
+    if not healpy.isnpixok(pixels.shape[1]):
+        raise InputError(f"{path}: {pixels.shape[1]} values are not a HEALPix map of 12 NSIDE^2")
+    require_finite(f"{path}: the maps", pixels)
+    return SkyCube(str(path), start + step * np.arange(count), pixels)
