@@ -1,14 +1,25 @@
-"""Run the Python blocks of a Markdown file, in order, in one namespace."""
+"""Run the Python blocks of a Markdown file, in order, in one namespace.
 
+They run in a folder of their own, in which `lusee-bayes map fiducial --compact` has been run.
+"""
+
+import os
 import re
 import sys
+import tempfile
 from pathlib import Path
+
+from lusee_bayes.cli import main
 
 text = Path(sys.argv[1]).read_text()
 namespace: dict[str, object] = {}
 blocks = re.findall(r"^```python\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
 if not blocks:
     sys.exit(f"{sys.argv[1]} has no Python block to run")
-for number, block in enumerate(blocks, 1):
-    exec(compile(block, f"{sys.argv[1]} block {number}", "exec"), namespace)
+with tempfile.TemporaryDirectory() as folder:
+    os.chdir(folder)
+    main(["map", "fiducial", "--compact", "--quiet"])
+    for number, block in enumerate(blocks, 1):
+        exec(compile(block, f"{sys.argv[1]} block {number}", "exec"), namespace)
+    os.chdir("/")
 print(f"{sys.argv[1]}: {len(blocks)} Python block(s) run")

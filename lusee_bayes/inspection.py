@@ -12,7 +12,8 @@ import xarray as xr
 from lusee_bayes import datatree, results, visibilities
 from lusee_bayes.beams import PortResponse, read_beam
 from lusee_bayes.checks import InputError
-from lusee_bayes.fits_images import image_names, is_fits
+from lusee_bayes.compact import is_compact, read_compact
+from lusee_bayes.fits_images import image_names, is_fits, opened
 from lusee_bayes.products import N_ANTENNAS, auto_indices, labels
 from lusee_bayes.sky import read_alms, read_cube, read_map, sky_kind
 from lusee_bayes.waterfalls import read_waterfall
@@ -39,6 +40,8 @@ def describe(path: str | Path) -> str:
             return _describe_beam(path)
         if {"combinations", "products"} & names:
             return _describe_waterfall(path)
+    if path.suffix == ".npz" and is_compact(path):
+        return _describe_compact(path)
     kind = sky_kind(path)
     if kind == "cube":
         return _describe_cube(path)
@@ -168,14 +171,40 @@ def _describe_samples(path: Path) -> str:
     )
 
 
-def _describe_map(path: Path) -> str:
-    pixels = read_map(path)
+def _describe_compact(path: Path) -> str:
+    posterior, about = read_compact(path)
+    n, rank = posterior.directions.shape
     return "\n".join(
         [
-            f"{path}: HEALPix sky map, NSIDE {healpy.npix2nside(pixels.size)}, RING, Galactic",
-            f"  mean {pixels.mean():.6g} K, from {pixels.min():.4g} to {pixels.max():.4g} K",
+            f"{path}: compact posterior over {n} modes (lmax {about['lmax']}) at "
+            f"{about['frequency_mhz']:g} MHz, {about['frame']}",
+            f"  {rank} directions known better than the prior, the best to "
+            f"{np.sqrt(posterior.variances.min()):.2g} of its width",
+            f"  versions: {about['versions']}",
         ]
     )
+
+
+def _describe_map(path: Path) -> str:
+    pixels = read_map(path)
+    lines = [
+        f"{path}: HEALPix sky map, NSIDE {healpy.npix2nside(pixels.size)}, RING, Galactic",
+        f"  mean {pixels.mean():.6g} K, from {pixels.min():.4g} to {pixels.max():.4g} K",
+    ]
+    return "\n".join(lines + (_describe_cards(path) if is_fits(path) else []))
+
+
+def _describe_cards(path: Path) -> list[str]:
+    """What a FITS file of the package says of itself."""
+    with opened(path) as hdus:
+        header = hdus[1].header
+        if "SCENHASH" not in header:
+            return []
+        return [
+            f"  {header['CONTENT']} at {header['FREQ']:g} MHz up to ell = {header['LMAX']}, beam "
+            f"{header['BEAM']}, site {header['SITELON']:g}, {header['SITELAT']:g} degrees",
+            f"  {header['CREATOR']}, scenario {header['SCENHASH'][:12]}",
+        ]
 
 
 def _describe_cube(path: Path) -> str:
@@ -201,5 +230,6 @@ def _describe_alms(path: Path) -> str:
         [
             f"{path}: coefficients of {len(means)} skies up to ell = {alms.lmax}, {where}",
             f"  means {means[0]:.6g} to {means[-1]:.6g} K",
+            *(_describe_cards(path) if is_fits(path) else []),
         ]
     )

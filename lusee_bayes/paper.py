@@ -29,9 +29,9 @@ from lusee_bayes.metrics import (
     signal_to_noise,
     whitened_residuals,
 )
-from lusee_bayes.results import staged, versions
 from lusee_bayes.scenario import Scenario, load_scenario
-from lusee_bayes.version import __version__
+from lusee_bayes.staging import staged
+from lusee_bayes.version import __version__, versions
 
 FORMAT = "lusee_bayes paper case 1"
 

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 
-import healpy
 import jax
 import numpy as np
 import pandas as pd
 import xarray as xr
 from jaxtyping import Float, Shaped
 
-from lusee_bayes.checks import AnyArray, InputError
+from lusee_bayes.checks import AnyArray
+from lusee_bayes.compact import CompactPosterior
 from lusee_bayes.experiment import Experiment
 from lusee_bayes.harmonics import mode_numbers, modes_to_map, pixel_matrix, power_spectrum
 from lusee_bayes.linear_gaussian import LinearGaussian
+from lusee_bayes.map_files import cards, write_map
 from lusee_bayes.metrics import (
     correlation,
     effective_resolution_deg,
@@ -36,9 +31,9 @@ from lusee_bayes.metrics import (
 )
 from lusee_bayes.posterior import Posterior
 from lusee_bayes.progress import Stages, peak_memory_gb
-from lusee_bayes.scenario import Scenario
-from lusee_bayes.sky import kelvin_steradian
-from lusee_bayes.version import __version__
+from lusee_bayes.sky import kelvin_steradian, write_alms
+from lusee_bayes.staging import staged
+from lusee_bayes.version import versions
 from lusee_bayes.visibilities import Visibilities
 
 FORMAT = "lusee_bayes posterior 1"
@@ -174,25 +169,41 @@ class MapResult:
         return xr.Dataset(
             variables,
             coords={"ell": ("mode", ell), "m": ("mode", m)},
-            attrs={
-                "format": FORMAT,
-                "frequency_mhz": scenario.frequency_mhz,
-                "lmax": scenario.lmax,
-                "frame": "galactic",
-                "basis": "real orthonormal spherical harmonics, index ell^2 + ell + m",
-                "versions": json.dumps(versions()),
-                "scenario": scenario.to_yaml(),
-            },
+            attrs={"format": FORMAT, **self.about()},
         )
 
-    def write(self, folder: str | Path, n_draws: int = 0, covariance: bool = False) -> list[Path]:
+    def about(self) -> dict[str, object]:
+        """What a file has to say of its numbers: frequency, frame, versions, scenario."""
+        scenario = self.experiment.scenario
+        return {
+            "frequency_mhz": scenario.frequency_mhz,
+            "lmax": scenario.lmax,
+            "frame": "galactic",
+            "basis": "real orthonormal spherical harmonics, index ell^2 + ell + m",
+            "versions": json.dumps(versions()),
+            "scenario": scenario.to_yaml(),
+        }
+
+    def write(
+        self,
+        folder: str | Path,
+        n_draws: int = 0,
+        covariance: bool = False,
+        compact: bool = False,
+    ) -> list[Path]:
         """Write all files but the figures into ``folder``; see :func:`staged`."""
         with staged(folder) as stage:
             self.to_dataset(n_draws, covariance).to_netcdf(
                 stage / "posterior.nc", engine="h5netcdf"
             )
+            scenario = self.experiment.scenario
             for name, pixels in self.maps().items():
-                write_map_fits(stage / f"{name}.fits", name, pixels, self.experiment.scenario)
+                write_map(stage / f"{name}.fits", name, pixels, scenario)
+            write_alms(stage / "mean_alm.fits", self.posterior.mean, cards("mean", scenario))
+            if compact:
+                CompactPosterior.of(self.posterior).write(
+                    stage / "posterior_compact.npz", self.about()
+                )
             with (stage / "spectra.csv").open("w", newline="") as file:
                 writer = csv.writer(file)
                 columns = self.spectra()
@@ -247,61 +258,3 @@ def flux_table(experiment: Experiment, data: Visibilities, posterior: Posterior)
             rows.append(row if data.truth is None else row | {"true_jy": true[block] * jansky})
             at += 1
     return pd.DataFrame(rows)
-
-
-def write_map_fits(
-    path: Path, name: str, pixels: Float[np.ndarray, " pixels"], scenario: Scenario
-) -> None:
-    """A HEALPix FITS file (RING, Galactic, K) of one map of a scenario."""
-    healpy.write_map(
-        path,
-        pixels,
-        coord="G",
-        column_names=[name.upper()],
-        column_units="K",
-        dtype=np.float64,
-        extra_header=[
-            ("FREQ", scenario.frequency_mhz, "frequency in MHz"),
-            ("LMAX", scenario.lmax, "highest ell of the map"),
-            ("CREATOR", f"lusee_bayes {__version__}"),
-        ],
-    )
-
-
-def versions() -> dict[str, str]:
-    """Versions of the package and of what its numbers depend on."""
-    others = ("jax", "numpyro", "arviz-stats", "numpy", "scipy", "healpy", "astropy", "lunarsky")
-    return {"lusee_bayes": __version__, **{name: metadata.version(name) for name in others}}
-
-
-def require_folder(folder: Path) -> None:
-    """InputError if ``folder``, or what it would lie in, is a file."""
-    for place in (folder, *folder.parents):
-        if place.exists():
-            if not place.is_dir():
-                raise InputError(f"'{place}' is a file; give a folder for the results")
-            return
-
-
-@contextmanager
-def staged(folder: str | Path) -> Iterator[Path]:
-    """A scratch folder inside ``folder`` whose files replace the old ones only when all are done.
-
-    If anything fails or is interrupted before that, the previous files stay as they were.
-    """
-    folder = Path(folder)
-    require_folder(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    stage = Path(tempfile.mkdtemp(prefix=".partial-", dir=folder))
-    try:
-        yield stage
-        for item in sorted(stage.iterdir()):
-            target = folder / item.name
-            if item.is_dir():
-                target.mkdir(exist_ok=True)
-                for inner in sorted(item.iterdir()):
-                    os.replace(inner, target / inner.name)
-            else:
-                os.replace(item, target)
-    finally:
-        shutil.rmtree(stage, ignore_errors=True)

@@ -23,11 +23,12 @@ from lusee_bayes.experiment import Experiment
 from lusee_bayes.inference import Chains, Sampler, sample, site_names
 from lusee_bayes.laplace import laplace
 from lusee_bayes.linear_gaussian import LinearGaussian
+from lusee_bayes.map_files import write_map
 from lusee_bayes.posterior import Posterior
 from lusee_bayes.programs import Program, is_collapsed
 from lusee_bayes.progress import Stages, peak_memory_gb
-from lusee_bayes.results import require_folder, staged, versions, write_map_fits
 from lusee_bayes.sites import SKY
+from lusee_bayes.staging import require_folder, staged
 from lusee_bayes.systematics import SCALES, Systematic
 from lusee_bayes.uncertainty import (
     INTERVAL,
@@ -37,6 +38,7 @@ from lusee_bayes.uncertainty import (
     sky_quantities,
     summary,
 )
+from lusee_bayes.version import versions
 from lusee_bayes.visibilities import Visibilities
 
 SAMPLES, CHAINS = "samples.nc", "chains"
@@ -110,7 +112,7 @@ class SampleRun:
             write_datatree(self.tree, stage / SAMPLES)
             self.summary_table().to_csv(stage / "summary.csv", index_label="quantity")
             for name, pixels in self.maps.items():
-                write_map_fits(stage / f"{name}.fits", name, pixels, scenario)
+                write_map(stage / f"{name}.fits", name, pixels, scenario)
             (stage / "scenario.yaml").write_text(scenario.to_yaml())
             (stage / "sampling.json").write_text(json.dumps(self.figures(), indent=2) + "\n")
             written = sorted(p.name for p in stage.iterdir())

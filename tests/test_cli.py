@@ -1,20 +1,24 @@
 """The commands as a user meets them: files, figures, exit codes, messages."""
 
 import csv
+import hashlib
 import json
 import subprocess
 import sys
 
 import healpy
+import jax
 import matplotlib.image
 import numpy as np
 import pytest
 import xarray as xr
+from astropy.io import fits
 
+import lusee_bayes
 from lusee_bayes import results
 from lusee_bayes.cli import main
-from lusee_bayes.harmonics import modes_to_map, pixel_matrix
-from lusee_bayes.results import staged
+from lusee_bayes.harmonics import from_healpy, modes_to_map, pixel_matrix
+from lusee_bayes.staging import staged
 
 SMALL = [
     argument
@@ -36,8 +40,8 @@ def folder(tmp_path_factory):
 
 def test_map_writes_what_it_promises(folder):
     assert {p.name for p in folder.iterdir()} == {
-        "posterior.nc", "mean.fits", "std.fits", "truth.fits", "residual.fits", "spectra.csv",
-        "summary.json", "scenario.yaml", "figures",
+        "posterior.nc", "mean.fits", "mean_alm.fits", "std.fits", "truth.fits", "residual.fits",
+        "spectra.csv", "summary.json", "scenario.yaml", "figures",
     }  # fmt: skip
     for figure in ("maps", "data_vector", "beams", "fidelity", "spectra"):
         image = matplotlib.image.imread(folder / "figures" / f"{figure}.png")
@@ -64,9 +68,9 @@ def test_the_files_agree_with_each_other(folder):
     # 400 draws: each variance to 5 sigma of sqrt(2 / 400), 49 of them
     ratio = posterior["draws"].values.var(axis=0, ddof=1) / std**2
     assert np.abs(ratio - 1).max() < 5 * np.sqrt(2 / 400)
-    header = healpy.read_map(folder / "mean.fits", h=True)[1]
-    assert dict(header)["COORDSYS"] == "G"
-    assert dict(header)["ORDERING"] == "RING"
+    # sqrt(2) there and back again
+    alm = healpy.read_alm(folder / "mean_alm.fits")
+    np.testing.assert_allclose(from_healpy(alm), mean, rtol=4e-16)
     with (folder / "spectra.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0])[:7] == [
@@ -75,6 +79,25 @@ def test_the_files_agree_with_each_other(folder):
     assert float(rows[2]["cl_posterior_variance"]) == pytest.approx(np.mean(std[4:9] ** 2))
     summary = json.loads((folder / "summary.json").read_text())
     assert (summary["n_data"], summary["n_modes"]) == (16 * 32, 49)
+
+
+def test_headers_say_where_the_numbers_come_from(folder):
+    text = (folder / "scenario.yaml").read_text()
+    for name in ("mean", "std", "truth", "residual", "mean_alm"):
+        with fits.open(folder / f"{name}.fits") as hdus:
+            header = hdus[1].header
+        said = {key: header[key] for key in ("CONTENT", "FREQ", "LMAX", "FRAME", "BEAM")}
+        content = name.removesuffix("_alm")
+        assert list(said.values()) == [content, 25.0, 6, "galactic", "monopole"]
+        assert (header["SITELON"], header["SITELAT"]) == (182.258, -23.814)
+        assert header["SCENHASH"] == hashlib.sha256(text.encode()).hexdigest()
+        assert header["CREATOR"] == f"lusee_bayes {lusee_bayes.__version__}"
+        assert header["V_JAX"] == jax.__version__ and header["V_NUMPY"] == np.__version__
+        if name != "mean_alm":
+            assert (header["COORDSYS"], header["ORDERING"], header["TUNIT1"]) == ("G", "RING", "K")
+            assert header["NSIDE"] == 8
+            # every bit of the pixels
+            assert healpy.read_map(folder / f"{name}.fits", dtype=None).dtype.itemsize == 8
 
 
 def test_the_resolved_scenario_gives_the_same_numbers(folder, tmp_path):
@@ -104,6 +127,8 @@ def test_info_recognises_its_files(folder, tmp_path, capsys):
         (tmp_path / "data.nc", "visibilities at 25 MHz"),
         (folder / "posterior.nc", "posterior over 49 modes"),
         (folder / "mean.fits", "HEALPix sky map, NSIDE 8"),
+        (folder / "mean.fits", "mean at 25 MHz up to ell = 6, beam monopole, site 182.258"),
+        (folder / "mean_alm.fits", "coefficients of 1 skies up to ell = 6"),
     ]:
         assert run("info", path) == 0
         assert words in capsys.readouterr().out

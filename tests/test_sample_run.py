@@ -291,7 +291,7 @@ def test_draws_stay_where_they_are_until_the_results_are_written(short, killed, 
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(sample_run, "write_map_fits", interrupt)
+        patch.setattr(sample_run, "write_map", interrupt)
         with pytest.raises(KeyboardInterrupt):
             mine.write(killed)
     assert content(killed) == before

@@ -12,8 +12,9 @@ from lusee_bayes import plots
 from lusee_bayes.checks import InputError
 from lusee_bayes.commands.options import Output, Overrides, Quiet, prepare
 from lusee_bayes.progress import Stages
-from lusee_bayes.results import MapResult, staged
+from lusee_bayes.results import MapResult
 from lusee_bayes.scenario import load_scenario
+from lusee_bayes.staging import staged
 
 
 def map_command(
@@ -23,6 +24,7 @@ def map_command(
     output: Output = None,
     draws: int = 0,
     covariance: Annotated[bool, Parameter(negative="")] = False,
+    compact: Annotated[bool, Parameter(negative="")] = False,
     set_: Overrides | None = None,
     quiet: Quiet = False,
 ) -> None:
@@ -42,6 +44,8 @@ def map_command(
         How many posterior draws to keep in posterior.nc.
     covariance
         Keep the posterior covariance in posterior.nc.
+    compact
+        Write posterior_compact.npz, of which NumPy alone can make draws.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
     quiet
@@ -60,7 +64,7 @@ def map_command(
     result = MapResult.from_experiment(experiment, measured, stages)
     figures = write_figures(result, folder, stages)
     with stages("files"):
-        files = result.write(folder, draws, covariance)
+        files = result.write(folder, draws, covariance, compact)
     for path in files + figures:
         console.print(f"  {path}", highlight=False)
     console.print(headline(result), highlight=False)

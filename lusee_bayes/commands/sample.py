@@ -13,9 +13,9 @@ from lusee_bayes.commands.options import Output, Overrides, Quiet, prepare
 from lusee_bayes.inference import Sampler
 from lusee_bayes.programs import load_program
 from lusee_bayes.progress import Stages
-from lusee_bayes.results import staged
 from lusee_bayes.sample_run import SampleRun, run_sampler
 from lusee_bayes.scenario import load_scenario
+from lusee_bayes.staging import staged
 
 Resume = Annotated[bool, Parameter(negative="")]
 

@@ -16,9 +16,9 @@ from lusee_bayes.commands.sample import Resume
 from lusee_bayes.inference import Sampler
 from lusee_bayes.programs import load_program
 from lusee_bayes.progress import Stages
-from lusee_bayes.results import staged
 from lusee_bayes.sample_run import run_sampler
 from lusee_bayes.scenario import load_scenario
+from lusee_bayes.staging import staged
 from lusee_bayes.validation import Check, Comparison, compare, require_draws
 
 
