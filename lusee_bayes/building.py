@@ -45,6 +45,7 @@ def build_observation(scenario: Scenario) -> Observation:
         step_s=section.step_s,
         lon_deg=section.lon_deg,
         lat_deg=section.lat_deg,
+        fixed_axis=section.fixed_axis,
     )
 
 

@@ -19,10 +19,13 @@ from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_bod
 from astropy.time import Time
 from jaxtyping import Bool, Float, Int
 from lunarsky import MCMF
+from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.checks import InputError, require_finite, require_positive
 
 CYCLE_DAYS = 27.321661
+# of luseepy's default engines
+LUSEEPY_MONTH_HOURS = 655.72
 EPHEMERIS_YEARS = (1900, 2050)
 
 
@@ -48,6 +51,8 @@ class Observation:
     run : (times,) which run each sample belongs to, 0, 1, ... without going back
     turntable_deg : (runs,) turntable angle of each run
     step_s : integration time of one sample, in seconds
+    fixed_axis : as the default engines of luseepy have it, the sky turns once in 655.72 hours about
+    the axis of the first sample; wrong by several times the radiometer noise, but so are their data
     """
 
     lon_deg: float
@@ -56,6 +61,7 @@ class Observation:
     run: Int[np.ndarray, " times"]
     turntable_deg: tuple[float, ...]
     step_s: float
+    fixed_axis: bool = False
 
     def __post_init__(self):
         if not -90.0 <= self.lat_deg <= 90.0:
@@ -96,6 +102,7 @@ class Observation:
         step_s: float = 7200.0,
         lon_deg: float = 182.258,
         lat_deg: float = -23.814,
+        fixed_axis: bool = False,
     ) -> Observation:
         """Runs that follow one another from ``start`` (UTC, ISO); defaults as in the paper.
 
@@ -131,7 +138,13 @@ class Observation:
             require_ephemeris(Time([t0.jd, last], format="jd", scale="utc"))
             times = t0 + seconds * u.s
         observation = cls(
-            lon_deg, lat_deg, times, run_of, tuple(r.turntable_deg for r in runs), step_s
+            lon_deg,
+            lat_deg,
+            times,
+            run_of,
+            tuple(r.turntable_deg for r in runs),
+            step_s,
+            fixed_axis,
         )
         night_runs = np.array([r.night_only for r in runs])
         if not night_runs.any():
@@ -158,6 +171,7 @@ class Observation:
             renumbered,
             tuple(self.turntable_deg[run] for run in runs),
             self.step_s,
+            self.fixed_axis,
         )
 
     @property
@@ -179,7 +193,11 @@ class Observation:
 
     def mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
         """Rotation at every time that takes Galactic unit vectors to MCMF ones."""
-        return mcmf_from_galactic(self.times)
+        if not self.fixed_axis:
+            return mcmf_from_galactic(self.times)
+        angle = 2.0 * np.pi * self.hours / LUSEEPY_MONTH_HOURS
+        turns = SpatialRotation.from_rotvec(np.outer(-angle, [0.0, 0.0, 1.0])).as_matrix()
+        return turns @ mcmf_from_galactic(self.times[:1])[0]
 
     def topocentric_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
         """Rotation from MCMF to the site's East, North, up axes (its rows)."""

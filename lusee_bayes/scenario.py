@@ -35,13 +35,18 @@ class RunSection(Section):
 
 
 class ObservationSection(Section):
-    """Where and when; ``runs`` follow one another from ``start`` (UTC)."""
+    """Where and when; ``runs`` follow one another from ``start`` (UTC).
+
+    ``fixed_axis``: the Moon turns about the axis of the first sample, as luseepy's default engines
+    have it; for data that they have made.
+    """
 
     lon_deg: float = 182.258
     lat_deg: Annotated[float, Field(ge=-90, le=90)] = -23.814
     start: str = "2027-01-15T00:00:00"
     step_s: Positive = 7200.0
     runs: Annotated[tuple[RunSection, ...], Field(min_length=1)] = (RunSection(),)
+    fixed_axis: bool = False
 
     @field_validator("start", mode="before")
     @classmethod

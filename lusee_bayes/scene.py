@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -81,7 +81,11 @@ class Scene:
             sky = build_sky(scenario)
             spectrum = sky.spectrum() * scenario.prior.scale
         with stages("orientation"):
-            observation = build_observation(scenario) if data is None else data.observation
+            if data is None:
+                observation = build_observation(scenario)
+            else:
+                axis = scenario.observation.fixed_axis
+                observation = replace(data.observation, fixed_axis=axis)
             pointing = Pointing.of(observation, scenario.lmax)
         with stages("beams"):
             antennas = build_monopoles(scenario)

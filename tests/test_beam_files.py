@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import astropy.units as u
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +21,7 @@ from lusee_bayes.harmonics import from_healpy
 from lusee_bayes.observation import Observation
 from lusee_bayes.pointing import Pointing
 from lusee_bayes.products import labels, to_matrix
+from lusee_bayes.waterfalls import read_waterfall
 
 LMAX, PORTS = 47, 4
 
@@ -60,6 +63,18 @@ def test_all_products_of_luseepys_waterfall(luseepy, frequency):
     """With luseepy's rule both are one sum, in another order; 1e-10 of the peak is asked for."""
     got = visibilities(luseepy, frequency, grid=luseepy[0].luseepy_grid)
     assert off(got, luseepy[1][frequency]) < 1e-11
+
+
+def test_the_waterfall_of_luseepys_default_engine(luseepy, test_data):
+    """It turns the sky about the first sample's axis, and patterns in single precision."""
+    with fits.open(test_data / "luseepy" / "waterfall_fixed_axis_engine.fits") as hdus:
+        expected = hdus["data"].data[:, :, list(hdus["freq"].data).index(25.0)].T
+    beam, _, sky, _ = luseepy
+    observation = read_waterfall(test_data / "luseepy" / "waterfall_fixed_axis_engine.fits")
+    observation = replace(observation.observation, fixed_axis=True)
+    beams = beam.beams(25.0, LMAX, grid=beam.luseepy_grid)
+    seen = lb.CouplingMatrix.observe(beams, observation) @ jnp.asarray(sky[25.0])
+    assert off(np.asarray(seen).reshape(16, -1), expected) < 1e-7
 
 
 def test_azimuth_the_other_way_conjugated_crosses_and_permuted_ports_are_noticed(luseepy):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -21,6 +22,7 @@ def map_command(
     scenario: str,
     *,
     data: Path | None = None,
+    truth: Annotated[bool, Parameter(negative="")] = False,
     output: Output = None,
     draws: int = 0,
     covariance: Annotated[bool, Parameter(negative="")] = False,
@@ -32,12 +34,17 @@ def map_command(
 
     Example: lusee-bayes map fiducial --set frequency_mhz=10 -o output/ten
 
+    Example: lusee-bayes map fiducial --data waterfall.fits --set beam.file=beam.fits
+
     Parameters
     ----------
     scenario
         A YAML file, or the name of a scenario of the package (fiducial, ...).
     data
-        Visibilities to map; without them the scenario's own are simulated.
+        Visibilities to map, of a file of simulate or a waterfall of luseepy; without them the
+        scenario's own are simulated.
+    truth
+        The given data are of the scenario's own sky: compare the map with it.
     output
         Folder for the results; by default output/NAME.
     draws
@@ -61,6 +68,8 @@ def map_command(
     folder = output or Path("output") / Path(scenario).stem
     stages = Stages(console)
     experiment, measured = prepare(resolved, data, stages)
+    if truth:
+        measured = replace(measured, truth=experiment.sky.modes)
     result = MapResult.from_experiment(experiment, measured, stages)
     figures = write_figures(result, folder, stages)
     with stages("files"):
