@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -15,6 +17,7 @@ import lusee_bayes as lb
 from lusee_bayes.beams import Receiver, read_beam
 from lusee_bayes.beams.receiver import loading_matrix
 from lusee_bayes.checks import InputError
+from lusee_bayes.cli import main
 from lusee_bayes.data_files import read_data
 from lusee_bayes.experiment import Experiment
 from lusee_bayes.harmonics import from_healpy
@@ -310,3 +313,37 @@ def test_luseepys_data_in_kelvin(luseepy):
         i, j = int(label[0]), int(label[1])
         expected = images["data"][:, place, 1] / np.sqrt(enclosure[i] * enclosure[j])
         np.testing.assert_allclose(data.grid()[place], expected, rtol=1e-14)
+
+
+def test_short_dipoles_see_no_even_ell_above_two(tmp_path):
+    """Their products are polynomials of degree 2 cut at the horizon: (P + P sign(z)) / 2, of which
+    the first part ends at ell = 2 and the second is odd."""
+    modes = np.asarray(read_beam(write(tmp_path / "response.fits")).beams(20.0, 9).modes)
+    ell = np.floor(np.sqrt(np.arange(100))).astype(int)
+    even, odd = (np.abs(modes[:, (ell > 2) & (ell % 2 == p)]).max() for p in (0, 1))
+    assert even < 1e-6 * odd
+
+
+def test_the_map_from_luseepys_four_ports(luseepy, tmp_path, test_data):
+    """10 MHz, V^2/Hz, the Moon at 250 K, a fixed axis: what short dipoles can see comes back."""
+    response, path, _ = luseepy
+    overrides = [
+        "frequency_mhz=10",
+        f"beam.file={response.path}",
+        "beam.quadrature=luseepy",
+        "beam.moon_temperature_k=250",
+        "observation.fixed_axis=true",
+        f"sky.file={test_data / 'luseepy' / 'sky_alm.npz'}",
+    ]
+    arguments = [a for override in overrides for a in ("--set", override)]
+    out = tmp_path / "map"
+    command = ["map", "fiducial", "--data", str(path), "--truth", "-o", str(out), "--quiet"]
+    assert main([*command, *arguments]) == 0
+    with (out / "spectra.csv").open(newline="") as file:
+        rho = np.array([float(row["rho"]) for row in csv.DictReader(file)])
+    assert rho[[1, 2, 3, 5, 7]].min() > 0.9
+    assert rho[1::2].min() > 0.7
+    assert np.abs(rho[4::2]).mean() < 0.2
+    summary = json.loads((out / "summary.json").read_text())
+    # noiseless but for luseepy's single precision
+    assert summary["chi2"] < 0.01 * summary["chi2_expected"]
