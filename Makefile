@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 # numbers that must not depend on the machine's locale or on a display
 export MPLBACKEND := agg
 
-.PHONY: map test long lint bench clean
+.PHONY: map test long lint docs bench clean
 
 # a posterior map of the embedded sky at 25 MHz, in output/fiducial
 map: $(VENV)/installed
@@ -23,13 +23,17 @@ lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
+# the site, in docs/_build/html; every page is read anew, since only then its warnings are seen
+docs: $(VENV)/installed-docs
+	$(BIN)/python -m sphinx -E -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
+
 bench: $(VENV)/installed
 	$(BIN)/python benchmarks/pipeline.py
 	$(BIN)/python benchmarks/structured_noise.py
 	$(BIN)/python benchmarks/sampling.py
 
 clean:
-	rm -rf $(VENV) output
+	rm -rf $(VENV) output docs/_build
 
 $(VENV)/installed: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -38,4 +42,8 @@ $(VENV)/installed: pyproject.toml
 
 $(VENV)/installed-dev: pyproject.toml $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	touch $@
+
+$(VENV)/installed-docs: pyproject.toml $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --editable '.[docs]'
 	touch $@

@@ -47,10 +47,12 @@ class SkyPrior(dist.Distribution):
         return self.prior.diagonal_root()
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+        """Skies of the prior, (*sample_shape, unknowns), in K."""
         u = jax.random.normal(key, (*sample_shape, self.prior.rank), dtype=jnp.float64)
         return self.prior.colour(u)
 
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """ln p(m) of one sky, or of every row of an array of them."""
         scale = self.scale
         u = value / scale.reshape(*(1,) * (value.ndim - 1), -1)
         return -0.5 * (u**2).sum(-1) - jnp.log(scale).sum() - scale.shape[0] * HALF_LOG_2PI
@@ -78,12 +80,14 @@ class CorrelatedNormal(dist.Distribution):
         super().__init__(event_shape=loc.shape, validate_args=validate_args)
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+        """Data vectors, (*sample_shape, data), in K."""
         n = int(np.prod(sample_shape))
         z = jax.random.normal(key, (self.loc.shape[0], n), dtype=jnp.float64)
         draws = self.factor.colour(z).T + self.loc[None]
         return draws.reshape(*sample_shape, -1)
 
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """ln p(d | loc, N) of one data vector, or of every row of an array of them."""
         n = self.loc.shape[0]
         residual = (value - self.loc.reshape(*(1,) * (value.ndim - 1), -1)).reshape(-1, n)
         squared = (self.factor.whiten(residual.T) ** 2).sum(0).reshape(value.shape[:-1])
@@ -118,11 +122,13 @@ class Marginal(dist.Distribution):
         super().__init__(event_shape=(model.n_data,), validate_args=validate_args)
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+        """Data vectors of skies of the prior, (*sample_shape, data), in K."""
         keys = jax.random.split(key, int(np.prod(sample_shape)))
         draws = jax.vmap(lambda k: self.model.sample(k)[1])(keys)
         return draws.reshape(*sample_shape, -1)
 
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """ln p(d) of one data vector, or of every row of an array of them."""
         solver = self.model.factorise()
         flat = value.reshape(-1, value.shape[-1])
         return jax.vmap(solver.log_prob)(flat).reshape(value.shape[:-1])
