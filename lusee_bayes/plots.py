@@ -136,7 +136,9 @@ def mollweide(
     return image
 
 
-def colour_bar(figure: Figure, image: ScalarMappable, axes: Axes, **options: object) -> Colorbar:
+def colour_bar(
+    figure: Figure, image: ScalarMappable, axes: Axes | list[Axes], **options: object
+) -> Colorbar:
     """A colour bar; on a logarithmic scale with plain numbers at 1, 2 and 5 times powers of ten."""
     bar = figure.colorbar(image, ax=axes, **options)
     if isinstance(image.norm, LogNorm):

@@ -41,9 +41,9 @@ def folder(tmp_path_factory):
 def test_map_writes_what_it_promises(folder):
     assert {p.name for p in folder.iterdir()} == {
         "posterior.nc", "mean.fits", "mean_alm.fits", "std.fits", "truth.fits", "residual.fits",
-        "spectra.csv", "summary.json", "scenario.yaml", "figures",
+        "spectra.csv", "summary.json", "scenario.yaml", "diagnostics.nc", "report.html", "figures",
     }  # fmt: skip
-    for figure in ("maps", "data_vector", "beams", "fidelity", "spectra"):
+    for figure in ("maps", "data_vector", "beams", "fidelity", "spectra", "draws", "residuals"):
         image = matplotlib.image.imread(folder / "figures" / f"{figure}.png")
         assert image.std() > 0.01  # not blank
 

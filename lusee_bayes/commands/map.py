@@ -6,13 +6,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+import xarray as xr
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes import plots
+from lusee_bayes import diagnostic_plots, plots
 from lusee_bayes.checks import InputError
 from lusee_bayes.commands.options import Output, Overrides, Quiet, prepare
+from lusee_bayes.diagnostics import diagnostics, write_diagnostics
 from lusee_bayes.progress import Stages
+from lusee_bayes.report import REPORT, write_report
 from lusee_bayes.results import MapResult
 from lusee_bayes.scenario import load_scenario
 from lusee_bayes.staging import staged
@@ -71,18 +74,24 @@ def map_command(
     if truth:
         measured = replace(measured, truth=experiment.sky.modes)
     result = MapResult.from_experiment(experiment, measured, stages)
-    figures = write_figures(result, folder, stages)
+    with stages("diagnostics"):
+        found = diagnostics(result)
+    figures = write_figures(result, found, folder, stages)
     with stages("files"):
         files = result.write(folder, draws, covariance, compact)
+        with staged(folder) as stage:
+            write_diagnostics(found, stage / "diagnostics.nc")
+        files += [folder / "diagnostics.nc", write_report(folder)]
     for path in files + figures:
         console.print(f"  {path}", highlight=False)
     console.print(headline(result), highlight=False)
     for line in flux_lines(result):
         console.print(line, highlight=False)
-    console.print(f"look at {folder}/figures/maps.png", highlight=False)
+    console.print(found.attrs["verdict"], highlight=False)
+    console.print(f"look at {folder / REPORT}", highlight=False)
 
 
-def write_figures(result: MapResult, folder: Path, stages: Stages) -> list[Path]:
+def write_figures(result: MapResult, found: xr.Dataset, folder: Path, stages: Stages) -> list[Path]:
     """Draw every figure of a map run into folder/figures."""
     drawn = {
         "maps": lambda: plots.maps(result),
@@ -90,6 +99,8 @@ def write_figures(result: MapResult, folder: Path, stages: Stages) -> list[Path]
         "beams": lambda: plots.beams(result.experiment.scenario),
         "fidelity": lambda: plots.fidelity(result),
         "spectra": lambda: plots.spectra(result),
+        "draws": lambda: diagnostic_plots.draws(found),
+        "residuals": lambda: diagnostic_plots.residuals(found),
     }
     with stages("figures"), staged(folder) as stage:
         (stage / "figures").mkdir()

@@ -8,11 +8,12 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes import sample_plots
+from lusee_bayes import sample_diagnostic_plots, sample_plots
 from lusee_bayes.commands.options import Output, Overrides, Quiet, prepare
 from lusee_bayes.inference import Sampler
 from lusee_bayes.programs import load_program
 from lusee_bayes.progress import Stages
+from lusee_bayes.report import REPORT, write_report
 from lusee_bayes.sample_run import SampleRun, run_sampler
 from lusee_bayes.scenario import load_scenario
 from lusee_bayes.staging import staged
@@ -80,7 +81,7 @@ def sample_command(
     for path in write_run(run, folder, stages):
         console.print(f"  {path}", highlight=False)
     console.print(headline(run), highlight=False)
-    console.print(f"look at {folder}/figures/uncertainty.png", highlight=False)
+    console.print(f"look at {folder / REPORT}", highlight=False)
 
 
 def write_run(run: SampleRun, folder: Path, stages: Stages) -> list[Path]:
@@ -88,6 +89,10 @@ def write_run(run: SampleRun, folder: Path, stages: Stages) -> list[Path]:
     drawn = {
         "uncertainty": lambda: sample_plots.uncertainty(run),
         "traces": lambda: sample_plots.traces(run),
+        "ranks": lambda: sample_diagnostic_plots.ranks(run.quantities()),
+        "energy": lambda: sample_diagnostic_plots.energy(run.tree["sample_stats"].dataset),
+        "pairs": lambda: sample_diagnostic_plots.pairs(run.quantities()),
+        "against_analytic": lambda: sample_diagnostic_plots.against_analytic(run.tree),
     }
     with stages("figures"), staged(folder) as stage:
         (stage / "figures").mkdir()
@@ -95,6 +100,7 @@ def write_run(run: SampleRun, folder: Path, stages: Stages) -> list[Path]:
             draw().savefig(stage / "figures" / f"{name}.png", dpi=110)
     with stages("files"):
         files = run.write(folder)
+        files.append(write_report(folder))
     return files + [folder / "figures" / f"{name}.png" for name in drawn]
 
 

@@ -16,6 +16,7 @@ from lusee_bayes.commands.sample import Resume
 from lusee_bayes.inference import Sampler
 from lusee_bayes.programs import load_program
 from lusee_bayes.progress import Stages
+from lusee_bayes.report import REPORT, write_report
 from lusee_bayes.sample_run import run_sampler
 from lusee_bayes.scenario import load_scenario
 from lusee_bayes.staging import staged
@@ -90,6 +91,7 @@ def validate_command(
         sample_plots.calibration(ranks).savefig(stage / "figures" / "calibration.png", dpi=110)
         (stage / "validation.json").write_text(json.dumps(as_json(found, ranks), indent=2) + "\n")
         (stage / "validation.md").write_text(as_text(scenario, checks, ranks))
+    written.append(write_report(folder))
     names = [
         "validation.md",
         "validation.json",
@@ -102,7 +104,7 @@ def validate_command(
     passed = all(check.passed for check in checks)
     console.print(
         f"{'passed' if passed else 'FAILED'}: {sum(c.passed for c in checks)} of {len(checks)} "
-        f"checks; look at {folder}/figures/comparison.png",
+        f"checks; look at {folder / REPORT}",
         highlight=False,
     )
     return 0 if passed else 1

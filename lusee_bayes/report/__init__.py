@@ -1,0 +1,5 @@
+"""report.html: one file that says of a run what a person wants to know of it."""
+
+from lusee_bayes.report.report import REPORT, write_report
+
+__all__ = ["REPORT", "write_report"]

@@ -1,0 +1,37 @@
+"""Which report a folder gets, and writing it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from lusee_bayes.checks import InputError
+from lusee_bayes.report.map_report import map_report
+from lusee_bayes.report.sample_report import sample_report
+
+REPORT = "report.html"
+
+
+def write_report(folder: str | Path) -> Path:
+    """Write report.html of the results in a folder, whole or not at all.
+
+    InputError if the folder does not hold the results of ``map``, ``sample`` or ``validate``.
+    """
+    folder = Path(folder)
+    if (folder / "posterior.nc").is_file():
+        text = map_report(folder)
+    elif (folder / "samples.nc").is_file():
+        text = sample_report(folder)
+    else:
+        raise InputError(
+            f"'{folder}' holds neither posterior.nc (lusee-bayes map) nor samples.nc (lusee-bayes "
+            "sample, validate); give the folder of a finished run"
+        )
+    path = folder / REPORT
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(text)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
