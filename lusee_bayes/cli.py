@@ -25,8 +25,11 @@ for _name, _help in {
     "simulate": "Simulate the visibilities of a scenario.",
     "map": "Make a posterior map of a scenario, or of given data.",
     "sample": "Sample the posterior of a NumPyro program by Hamiltonian Monte Carlo.",
+    "plan": "Say what observations would tell, without data.",
     "validate": "Check the analytic posterior by HMC and by simulated data sets.",
     "paper": "Reproduce the figures of the reference paper and judge its claims.",
+    "report": "Write report.html of a finished run anew.",
+    "compare": "Set finished map runs side by side.",
     "info": "Say what is in a file.",
 }.items():
     app.command(f"lusee_bayes.commands.{_name}:{_name}_command", name=_name, help=_help)
