@@ -18,8 +18,13 @@ app = App(
     name="lusee-bayes",
     version=__version__,
     suppress_keyboard_interrupt=False,
-    help="Bayesian maps of the low-frequency sky from LuSEE-Night's visibilities.",
+    help=(
+        "Bayesian maps of the low-frequency sky from LuSEE-Night's visibilities.\n\n"
+        "Exit codes: 0 success, 1 a validation that failed, 2 bad input (one sentence on standard "
+        "error), 130 interrupted. lusee-bayes COMMAND --help shows examples."
+    ),
 )
+app.register_install_completion_command()
 # named by path: each is imported when called, so that --help and completion answer at once
 for _name, _help in {
     "simulate": "Simulate the visibilities of a scenario.",

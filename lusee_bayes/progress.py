@@ -22,10 +22,14 @@ from rich.progress import (
 
 @dataclass
 class Stages:
-    """Names and times the stages of a run; ``console`` None keeps silent."""
+    """Names and times the stages of a run; ``console`` None keeps silent.
+
+    ``verbose``: tells the largest memory so far after every stage, too.
+    """
 
     console: Console | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+    verbose: bool = False
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
@@ -36,9 +40,7 @@ class Stages:
         else:
             with self.console.status(f"{name} ..."):
                 yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-        if self.console is not None:
-            self.console.print(f"  {name:<28} {self.seconds[name]:7.2f} s", highlight=False)
+        self._note(name, start)
 
     @contextmanager
     def progress(self, name: str, total: int) -> Iterator[Callable[[int, str], None]]:
@@ -63,7 +65,9 @@ class Stages:
     def _note(self, name: str, start: float) -> None:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
         if self.console is not None:
-            self.console.print(f"  {name:<28} {self.seconds[name]:7.2f} s", highlight=False)
+            memory = f"  {peak_memory_gb():6.2f} GB" if self.verbose else ""
+            text = f"  {name:<28} {self.seconds[name]:7.2f} s{memory}"
+            self.console.print(text, highlight=False)
 
 
 def peak_memory_gb() -> float:

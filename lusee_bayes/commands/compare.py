@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from lusee_bayes import side_by_side_plots
-from lusee_bayes.commands.options import Quiet
+from lusee_bayes.commands.options import Quiet, Verbose
 from lusee_bayes.finished_runs import read_runs, same_data, table
 from lusee_bayes.progress import Stages
 from lusee_bayes.report import comparison_report
@@ -22,6 +22,7 @@ def compare_command(
     *folders: Path,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("output/comparison"),
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Set finished map runs side by side: maps, spectra, evidence.
 
@@ -35,9 +36,11 @@ def compare_command(
         Folder for comparison.html, comparison.csv and the figures.
     quiet
         Print nothing but errors.
+    verbose
+        Tell the memory in use after every stage.
     """
     console = Console(quiet=quiet, soft_wrap=True)
-    stages = Stages(console)
+    stages = Stages(console, verbose=verbose)
     runs = read_runs(folders)
     rows = table(runs)
     with stages("figures"), staged(output) as stage:

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from lusee_bayes import diagnostic_plots, plots
 from lusee_bayes.checks import InputError
-from lusee_bayes.commands.options import Output, Overrides, Quiet, prepare
+from lusee_bayes.commands.options import Output, Overrides, Quiet, Verbose, prepare
 from lusee_bayes.diagnostics import diagnostics, write_diagnostics
 from lusee_bayes.progress import Stages
 from lusee_bayes.report import REPORT, write_report
@@ -32,6 +32,7 @@ def map_command(
     compact: Annotated[bool, Parameter(negative="")] = False,
     set_: Overrides | None = None,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Make a posterior map of a scenario, or of given data.
 
@@ -60,6 +61,8 @@ def map_command(
         key.path=value; overrides an entry of the scenario, as often as needed.
     quiet
         Print nothing but errors.
+    verbose
+        Tell the memory in use after every stage.
     """
     console = Console(quiet=quiet, soft_wrap=True)
     resolved = load_scenario(scenario, set_ or [])
@@ -69,7 +72,7 @@ def map_command(
             f"use: lusee-bayes sample {scenario}"
         )
     folder = output or Path("output") / Path(scenario).stem
-    stages = Stages(console)
+    stages = Stages(console, verbose=verbose)
     experiment, measured = prepare(resolved, data, stages)
     if truth:
         measured = replace(measured, truth=experiment.sky.modes)

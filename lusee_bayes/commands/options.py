@@ -20,6 +20,7 @@ Overrides = Annotated[list[str], Parameter(name="--set", negative="")]
 Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")]
 # 10,25 or 5:50:5
 Frequencies = Annotated[str | None, Parameter(name="--frequencies")]
+Verbose = Annotated[bool, Parameter(name=["--verbose", "-v"], negative="")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 
 

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from rich.console import Console
 
 from lusee_bayes import sample_diagnostic_plots, sample_plots
-from lusee_bayes.commands.options import Output, Overrides, Quiet, prepare
+from lusee_bayes.commands.options import Output, Overrides, Quiet, Verbose, prepare
 from lusee_bayes.inference import Sampler
 from lusee_bayes.programs import load_program
 from lusee_bayes.progress import Stages
@@ -34,6 +34,7 @@ def sample_command(
     algorithm: Literal["nuts", "hmc"] = "nuts",
     set_: Overrides | None = None,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Sample the posterior of a NumPyro program by Hamiltonian Monte Carlo.
 
@@ -67,6 +68,8 @@ def sample_command(
         key.path=value; overrides an entry of the scenario, as often as needed.
     quiet
         Print nothing but errors.
+    verbose
+        Tell the memory in use after every stage.
     """
     console = Console(quiet=quiet, soft_wrap=True)
     resolved = load_scenario(scenario, set_ or [])
@@ -75,7 +78,7 @@ def sample_command(
         chains=chains, warmup=warmup, draws=draws, seed=resolved.seed, algorithm=algorithm
     )
     folder = output or Path("output") / f"{Path(scenario).stem}-{program.name}"
-    stages = Stages(console)
+    stages = Stages(console, verbose=verbose)
     experiment, measured = prepare(resolved, data, stages)
     run = run_sampler(experiment, measured, program, sampler, folder, resume=resume, stages=stages)
     for path in write_run(run, folder, stages):

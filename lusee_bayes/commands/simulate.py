@@ -11,7 +11,7 @@ from rich.console import Console
 
 from lusee_bayes.building import build_impedance
 from lusee_bayes.checks import InputError
-from lusee_bayes.commands.options import Frequencies, Overrides, Quiet, parse_frequencies
+from lusee_bayes.commands.options import Frequencies, Overrides, Quiet, Verbose, parse_frequencies
 from lusee_bayes.experiment import Experiment
 from lusee_bayes.progress import Stages
 from lusee_bayes.scenario import load_scenario
@@ -25,6 +25,7 @@ def simulate_command(
     frequencies: Frequencies = None,
     set_: Overrides | None = None,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Simulate the visibilities of a scenario.
 
@@ -45,6 +46,8 @@ def simulate_command(
         key.path=value; overrides an entry of the scenario, as often as needed.
     quiet
         Print nothing but errors.
+    verbose
+        Tell the memory in use after every stage.
     """
     console = Console(quiet=quiet, soft_wrap=True)
     resolved = load_scenario(scenario, set_ or [])
@@ -61,7 +64,7 @@ def simulate_command(
         ]
     data = []
     for channel in channels:
-        stages = Stages(console)
+        stages = Stages(console, verbose=verbose)
         if frequencies is not None:
             console.print(f"{channel.frequency_mhz:g} MHz", highlight=False)
         experiment = Experiment.from_scenario(channel, stages=stages)

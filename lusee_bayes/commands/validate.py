@@ -11,7 +11,7 @@ from rich.table import Table
 
 from lusee_bayes import calibration, sample_plots
 from lusee_bayes.calibration import LEVELS, Ranks, calibrate_sky
-from lusee_bayes.commands.options import Output, Overrides, Quiet, prepare
+from lusee_bayes.commands.options import Output, Overrides, Quiet, Verbose, prepare
 from lusee_bayes.commands.sample import Resume
 from lusee_bayes.inference import Sampler
 from lusee_bayes.programs import load_program
@@ -35,6 +35,7 @@ def validate_command(
     simulations: int = 500,
     set_: Overrides | None = None,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> int:
     """Check the analytic posterior of a scenario by HMC and by simulated data sets.
 
@@ -64,6 +65,8 @@ def validate_command(
         key.path=value; overrides an entry of the scenario, as often as needed.
     quiet
         Print nothing but errors.
+    verbose
+        Tell the memory in use after every stage.
     """
     console = Console(quiet=quiet, soft_wrap=True)
     program = load_program("sky")
@@ -72,7 +75,7 @@ def validate_command(
     resolved = load_scenario(scenario, set_ or [])
     sampler = Sampler(chains=chains, warmup=warmup, draws=draws, seed=resolved.seed)
     folder = output or Path("output") / f"{Path(scenario).stem}-validation"
-    stages = Stages(console)
+    stages = Stages(console, verbose=verbose)
     experiment, measured = prepare(resolved, data, stages)
     run = run_sampler(experiment, measured, program, sampler, folder, resume=resume, stages=stages)
     with stages("files"):
