@@ -14,7 +14,7 @@ from lusee_bayes.diagnostics import read_diagnostics
 from lusee_bayes.report import html
 from lusee_bayes.report.explorer import explorer
 from lusee_bayes.report.run_details import details
-from lusee_bayes.residuals import SIGNIFICANCE
+from lusee_bayes.residuals import SIGNIFICANCE, probability
 
 NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "diagnostics.nc", "mean.fits", "std.fits")
 FIGURES = ("maps", "draws", "fidelity", "spectra", "data_vector", "residuals", "beams")
@@ -169,8 +169,8 @@ def _group_row(found: xr.Dataset, row: int) -> tuple[str, ...]:
         str(found["group_name"].values[row]),
         str(int(found["group_n"].values[row])),
         f"{float(found['group_chi2'].values[row]):.1f}",
-        f"{float(found['group_p'].values[row]):.2g}",
-        "no others" if np.isnan(others) else f"{others:.2g}",
+        probability(float(found["group_p"].values[row])),
+        "no others" if np.isnan(others) else probability(others),
     )
 
 
