@@ -88,18 +88,18 @@ class Residuals:
     def verdict(self) -> str:
         """What the residuals say, in a sentence."""
         if self.p > SIGNIFICANCE:
-            return f"The data fit the model (p = {probability(self.p)})."
-        text = f"The data do not fit the model (p = {probability(self.p)})."
+            return f"The data fit the model (p {probability(self.p)})."
+        text = f"The data do not fit the model (p {probability(self.p)})."
         suspects = self.suspects()
         if not suspects:
             return text + " No single product, day or turntable angle is to blame for it."
-        parts = [f"{kind} {g.name} (p = {probability(g.others_p)})" for kind, g in suspects]
+        parts = [f"{kind} {g.name} (p {probability(g.others_p)})" for kind, g in suspects]
         return f"{text} They do without {', or without '.join(parts)}."
 
 
 def probability(p: float) -> str:
-    """In words of two digits; what is too small for a float says so."""
-    return f"{p:.2g}" if p > 0 else "below 1e-300"
+    """``= 0.62``; what is too small for a float says so."""
+    return f"= {p:.2g}" if p > 0 else "< 1e-300"
 
 
 def residuals(model: LinearGaussian, data: Visibilities) -> Residuals:

@@ -169,8 +169,8 @@ def _group_row(found: xr.Dataset, row: int) -> tuple[str, ...]:
         str(found["group_name"].values[row]),
         str(int(found["group_n"].values[row])),
         f"{float(found['group_chi2'].values[row]):.1f}",
-        probability(float(found["group_p"].values[row])),
-        "no others" if np.isnan(others) else probability(others),
+        probability(float(found["group_p"].values[row])).removeprefix("= "),
+        "no others" if np.isnan(others) else probability(others).removeprefix("= "),
     )
 
 
