@@ -24,6 +24,7 @@ jax.config.update("jax_enable_x64", True)
 # loaded when first used: healpy, lunarsky and xarray take seconds together
 _HOMES = {
     "CorrelatedNormal": "sites",
+    "CompactPosterior": "compact",
     "CouplingMatrix": "coupling",
     "Covariance": "covariance",
     "DenseCovariance": "covariance",
@@ -64,11 +65,15 @@ _HOMES = {
     "load_scenario": "scenario",
     "monopole_beams": "beams",
     "radiometer_noise": "noise",
+    "read_beam": "beams",
+    "read_compact": "compact",
     "read_visibilities": "visibilities",
+    "read_waterfall": "waterfalls",
     "sample": "inference",
     "beam_error_noise": "noise",
     "template_noise": "noise",
     "sky_from_file": "sky",
+    "write_waterfall": "waterfalls",
 }
 
 __all__ = ["InputError", "__version__", *sorted(_HOMES)]

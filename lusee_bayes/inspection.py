@@ -9,7 +9,7 @@ import healpy
 import numpy as np
 import xarray as xr
 
-from lusee_bayes import datatree, results, visibilities
+from lusee_bayes import datatree, diagnostics, results, visibilities
 from lusee_bayes.beams import PortResponse, read_beam
 from lusee_bayes.checks import InputError
 from lusee_bayes.compact import is_compact, read_compact
@@ -34,6 +34,8 @@ def describe(path: str | Path) -> str:
         return _describe_posterior(path)
     if kind == datatree.FORMAT:
         return _describe_samples(path)
+    if kind == diagnostics.FORMAT:
+        return _describe_diagnostics(path)
     if is_fits(path):
         names = set(image_names(path))
         if {"etheta_real", "h_theta_real"} & names:
@@ -181,6 +183,20 @@ def _describe_compact(path: Path) -> str:
             f"  {rank} directions known better than the prior, the best to "
             f"{np.sqrt(posterior.variances.min()):.2g} of its width",
             f"  versions: {about['versions']}",
+        ]
+    )
+
+
+def _describe_diagnostics(path: Path) -> str:
+    found = diagnostics.read_diagnostics(path)
+    kinds = found["group_kind"].values
+    counts = [f"{int((kinds == kind).sum())} {kind}s" for kind in ("product", "day", "angle")]
+    return "\n".join(
+        [
+            f"{path}: diagnostics of a map at {found.attrs['frequency_mhz']:g} MHz",
+            f"  {found.attrs['verdict']}",
+            f"  residuals by {', '.join(counts)}; {found.sizes['draw']} draws, "
+            f"{found.sizes['region']} point-spread functions",
         ]
     )
 

@@ -128,6 +128,7 @@ def test_info_recognises_its_files(folder, tmp_path, capsys):
         (folder / "posterior.nc", "posterior over 49 modes"),
         (folder / "mean.fits", "HEALPix sky map, NSIDE 8"),
         (folder / "mean.fits", "mean at 25 MHz up to ell = 6, beam monopole, site 182.258"),
+        (folder / "diagnostics.nc", "residuals by 16 products, 3 days, 1 angles"),
         (folder / "mean_alm.fits", "coefficients of 1 skies up to ell = 6"),
     ]:
         assert run("info", path) == 0

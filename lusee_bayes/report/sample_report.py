@@ -21,11 +21,12 @@ FIGURES = {
         "Draws over time: chains should look alike, and like noise.",
     ),
     "ranks": (
-        "Histograms of the ranks of each chain's draws among all",
-        "Ranks of each chain's draws among all: flat, if the chains agree.",
+        "Differences of the distribution of ranks from an even one, a curve for each chain",
+        "Ranks of each chain's draws among all: the curves stay within the grey band if the chains "
+        "agree.",
     ),
     "energy": (
-        "Histograms of the energy of the draws and of its changes",
+        "BFMI of each chain, and densities of the energy of the draws and of its changes",
         "Energies and their changes from draw to draw: where changes are much narrower, chains "
         "move slowly.",
     ),
