@@ -28,6 +28,7 @@ highlight_language = "text"
 
 # the public names, in the order of the source, with shapes as they are annotated
 autodoc_member_order = "bysource"
+autodoc_default_options = {"exclude-members": "model_config"}
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
