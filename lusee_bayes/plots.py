@@ -52,13 +52,13 @@ def beams(scenario: Scenario) -> Figure:
     grid = HemisphereGrid.gauss_legendre(64, 180)
     fields = build_fields(scenario, grid)
     patterns = np.asarray(stokes_beam(fields))
-    panels = [
-        ("auto 00 (North)", patterns[0, 0]),
-        ("|cross 02| (opposite)", patterns[0, 2]),
-        ("|cross 01| (perpendicular)", patterns[0, 1]),
-    ]
+    names = {0: "auto 00", 2: "|cross 02|", 1: "|cross 01|"}
+    if scenario.beam.file is None:
+        names = {0: "auto 00 (North)", 2: "|cross 02| (opposite)", 1: "|cross 01| (perpendicular)"}
+    panels = [(name, patterns[0, k]) for k, name in names.items() if k < fields.n_antennas]
     figure = Figure(figsize=(11, 4), layout="constrained")
-    for axes, (title, pattern) in zip(figure.subplots(1, 3), panels, strict=True):
+    grid_of_axes = np.atleast_1d(figure.subplots(1, len(panels)))
+    for axes, (title, pattern) in zip(grid_of_axes, panels, strict=True):
         image = orthographic(axes, grid, pattern)
         axes.set_title(title)
     figure.colorbar(image, ax=figure.axes, label="beam / its peak", shrink=0.8)

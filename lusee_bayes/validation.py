@@ -177,10 +177,15 @@ def _bfmi(energy: Float[np.ndarray, "chains draws"]) -> Float[np.ndarray, " chai
 def _chi2_z(
     ratio: Float[np.ndarray, " n"], dof: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Normal scores of variance ratios that are chi^2 over ``dof``: skewness counts at 5 sigma."""
+    """Normal scores of variance ratios that are chi^2 over ``dof``: skewness counts at 5 sigma.
+
+    Where the tail is too small for a float, by Wilson and Hilferty's cube root.
+    """
     upper = ratio > 1
     tail = np.where(upper, stats.chi2.sf(ratio * dof, dof), stats.chi2.cdf(ratio * dof, dof))
-    return np.where(upper, 1.0, -1.0) * stats.norm.isf(np.minimum(tail, 0.5))
+    far = np.abs(np.cbrt(ratio) - 1.0 + 2.0 / (9.0 * dof)) / np.sqrt(2.0 / (9.0 * dof))
+    score = np.where(tail > 0, stats.norm.isf(np.clip(tail, 1e-320, 0.5)), far)
+    return np.where(upper, 1.0, -1.0) * score
 
 
 def _eigenvalues(white: Float[np.ndarray, "chains draws modes"]) -> Float[np.ndarray, " modes"]:

@@ -8,6 +8,7 @@ import astropy.units as u
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 from astropy.io import fits
 from astropy.time import Time
 from fits_files import write_images
@@ -16,6 +17,7 @@ import lusee_bayes as lb
 from lusee_bayes.beams import HemisphereGrid, read_beam
 from lusee_bayes.beams.scalar_file import FIELDS
 from lusee_bayes.checks import InputError
+from lusee_bayes.cli import main
 from lusee_bayes.experiment import Experiment
 from lusee_bayes.harmonics import from_healpy
 from lusee_bayes.observation import Observation
@@ -317,3 +319,12 @@ def test_the_program_of_the_instrument_needs_the_embedded_antennas(tmp_path):
     e = Experiment.from_scenario(lb.load_scenario("fiducial", overrides))
     with pytest.raises(InputError, match="leave out beam.file"):
         e.pieces(e.simulate())["instrument"]()
+
+
+def test_two_ports_from_a_file_make_a_map(tmp_path):
+    path = write(tmp_path / "beam.fits")
+    given = [*TINY, f"beam.file={path}", "beam.rotations_deg=[0,90]"]
+    arguments = [a for override in given for a in ("--set", override)]
+    assert main(["map", "fiducial", *arguments, "-o", str(tmp_path / "map"), "--quiet"]) == 0
+    with xr.open_dataset(tmp_path / "map" / "diagnostics.nc", engine="h5netcdf") as found:
+        assert list(found["product"].values) == ["00R", "01R", "01I", "11R"]
