@@ -37,7 +37,8 @@ def luseepy(test_data):
     folder = test_data / "luseepy"
     with fits.open(folder / "waterfall_exact_engine.fits") as hdus:
         data, frequencies = hdus["data"].data.astype(float), hdus["freq"].data
-    sky = np.load(folder / "sky_alm.npz")
+    with np.load(folder / "sky_alm.npz") as file:
+        sky = dict(file)
     start = Time("2025-02-01 00:00:00", scale="utc")
     times = start + 7200.0 * np.arange(len(data)) * u.s
     observation = Observation(182.258, -23.814, times, np.zeros(len(data), int), (0.0,), 7200.0)
@@ -321,6 +322,7 @@ def test_the_program_of_the_instrument_needs_the_embedded_antennas(tmp_path):
         e.pieces(e.simulate())["instrument"]()
 
 
+@pytest.mark.long
 def test_two_ports_from_a_file_make_a_map(tmp_path):
     path = write(tmp_path / "beam.fits")
     given = [*TINY, f"beam.file={path}", "beam.rotations_deg=[0,90]"]

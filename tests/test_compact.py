@@ -91,6 +91,7 @@ def test_other_files_are_refused(tmp_path):
             read_compact(tmp_path / name)
 
 
+@pytest.mark.long
 def test_readmes_lines_make_draws(tmp_path, monkeypatch):
     """The block of README.md, run as it stands on what ``map --compact`` writes."""
     readme = Path(__file__).resolve().parents[1] / "README.md"

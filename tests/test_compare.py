@@ -12,6 +12,7 @@ import pytest
 from lusee_bayes.cli import main
 from lusee_bayes.finished_runs import read_runs, same_data
 
+pytestmark = pytest.mark.long
 SMALL = ["--set", "lmax=4", "--set", "observation.runs.0.cycles=0.1", "--quiet"]
 
 

@@ -78,7 +78,7 @@ def by_erfa_and_lunartopo(planet, time, lon_deg, lat_deg):
 )
 def test_directions_agree_with_erfa_and_lunartopo(body, planet):
     site = {"lon_deg": 23.4, "lat_deg": -61.0}
-    observation = dates("2027-01-15T03:00:00", "2026-06-02T21:00:00", **site)
+    observation = dates("2026-06-02T21:00:00", "2027-01-15T03:00:00", **site)
     to_topo = observation.topocentric_from_mcmf() @ observation.mcmf_from_galactic()
     got = np.einsum("tij,tj->ti", to_topo, body_direction(body, observation))
     for k in range(2):

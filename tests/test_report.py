@@ -76,7 +76,7 @@ class Outline(HTMLParser):
         assert self.open.pop() == tag
 
 
-@pytest.mark.parametrize("which", ["folder", "sampled"])
+@pytest.mark.parametrize("which", ["folder", pytest.param("sampled", marks=pytest.mark.long)])
 def test_pages_are_whole_and_need_nothing_else(which, request):
     page = (request.getfixturevalue(which) / "report.html").read_text()
     outline = Outline()
@@ -151,6 +151,7 @@ def test_report_makes_it_anew(folder, tmp_path, capsys):
     assert not (tmp_path / "report.html").exists()
 
 
+@pytest.mark.long
 def test_a_corrupted_product_is_pointed_at(tmp_path):
     """One product of a gain run 2 % too large: the page says which."""
     given = ["lmax=8", "observation.runs.0.cycles=0.2"]
@@ -168,6 +169,7 @@ def test_a_corrupted_product_is_pointed_at(tmp_path):
     assert "product 12R" in np.atleast_1d(found.attrs["suspects"])
 
 
+@pytest.mark.long
 def test_summaries_of_sampled_runs(sampled):
     page = (sampled / "report.html").read_text()
     told = json.loads((sampled / "sampling.json").read_text())
@@ -222,7 +224,7 @@ def in_browser(page: str, tmp_path, width: int, points) -> dict:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize("width", [1280, 390])
-@pytest.mark.parametrize("which", ["folder", "sampled"])
+@pytest.mark.parametrize("which", ["folder", pytest.param("sampled", marks=pytest.mark.long)])
 def test_in_a_browser(which, width, request, tmp_path):
     folder = request.getfixturevalue(which)
     rng = np.random.default_rng(3)

@@ -62,7 +62,8 @@ def test_loads_and_scales_are_luseepys(luseepy, channel):
 def simulated(luseepy, test_data, frequency, times, *, fixed_axis=False) -> np.ndarray:
     """V^2/Hz of these samples."""
     response, path, _ = luseepy
-    sky = np.load(test_data / "luseepy" / "sky_alm.npz")
+    with np.load(test_data / "luseepy" / "sky_alm.npz") as file:
+        sky = dict(file)
     modes = from_healpy(sky["alm"][list(sky["freq"]).index(frequency)])
     observation = replace(read_waterfall(path).observation.select(times), fixed_axis=fixed_axis)
     beams = response.beams(frequency, LMAX, grid=response.luseepy_grid, unit="V2/Hz")
@@ -324,6 +325,7 @@ def test_short_dipoles_see_no_even_ell_above_two(tmp_path):
     assert even < 1e-6 * odd
 
 
+@pytest.mark.long
 def test_the_map_from_luseepys_four_ports(luseepy, tmp_path, test_data):
     """10 MHz, V^2/Hz, the Moon at 250 K, a fixed axis: what short dipoles can see comes back."""
     response, path, _ = luseepy

@@ -400,9 +400,11 @@ def test_sample_writes_what_it_promises(runs):
     whole = runs[0]
     assert {p.name for p in whole.iterdir()} == {
         "samples.nc", "summary.csv", "mean.fits", "std.fits", "lower.fits", "upper.fits",
-        "scenario.yaml", "sampling.json", "figures",
+        "scenario.yaml", "sampling.json", "report.html", "figures",
     }  # fmt: skip
-    assert {p.name for p in (whole / "figures").iterdir()} == {"uncertainty.png", "traces.png"}
+    assert {p.stem for p in (whole / "figures").iterdir()} == {
+        "uncertainty", "traces", "ranks", "energy", "pairs", "against_analytic",
+    }  # fmt: skip
     for figure in (whole / "figures").iterdir():
         assert matplotlib.image.imread(figure).std() > 0.01  # not blank
     expected = load_scenario("fiducial", OVERRIDES)

@@ -119,6 +119,7 @@ def test_what_info_says_of_luseepys_files(test_data):
     assert "50 frequencies from 1 to 50 MHz" in text and "91 angles" in text
 
 
+@pytest.mark.long
 def test_the_map_from_luseepys_waterfall(tmp_path, test_data):
     """10 MHz, luseepy's beam, sky and noiseless data, the noise of a fiducial observation in N."""
     folder = test_data / "luseepy"
@@ -225,6 +226,7 @@ def test_what_luseepys_layout_cannot_hold(tmp_path, overrides, message):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_simulate_writes_it_and_map_reads_it(tmp_path):
     path = tmp_path / "w.fits"
     given = ["--set", "lmax=4", "--set", "observation.runs.0.cycles=0.1", "--quiet"]
