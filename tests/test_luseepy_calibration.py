@@ -26,6 +26,7 @@ from lusee_bayes.layout import DataLayout
 from lusee_bayes.scenario import load_scenario
 from lusee_bayes.waterfalls import read_waterfall
 
+pytestmark = pytest.mark.long
 SITE = {"lon_deg": 182.258, "lat_deg": -23.814}
 FREQUENCY, STEP_S, N_DRAWS = 10.0, 7200.0, 4000
 PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]
@@ -69,7 +70,6 @@ def naive(test_data):
     return Naive(test_data / "luseepy" / "synthetic_monopole_beam.fits")
 
 
-@pytest.mark.long
 def test_the_naive_sum_is_luseepys(naive, test_data):
     """All products in the middle, to the rounding of sums over 16380 directions."""
     folder = test_data / "luseepy"

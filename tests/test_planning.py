@@ -34,6 +34,8 @@ from lusee_bayes.scenario import load_scenario
 from lusee_bayes.variations import default_variations
 from lusee_bayes.visibilities import Visibilities
 
+# many shapes, each of which is compiled
+pytestmark = pytest.mark.long
 SMALL = ["lmax=6", "observation.runs.0.cycles=0.3", "noise.radiometer.factor=100"]
 N_SETS = 200
 
@@ -67,7 +69,6 @@ def simulated(variation):
     return model, posteriors[0], np.asarray(skies), means
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("angles", [(0,), (0, 30), (0, 30, 60)], ids=str)
 def test_information_is_the_mean_log_ratio_of_posterior_to_prior_density(angles):
     """ln p(m | d) - ln p(m) at the true sky, with NumPy alone, over 200 data sets."""
@@ -88,7 +89,6 @@ def test_information_is_the_mean_log_ratio_of_posterior_to_prior_density(angles)
     assert error < 0.01 * nats
 
 
-@pytest.mark.long
 def test_expected_snr_is_that_of_simulated_maps():
     """sum_m mean^2 and sum_m (mean - m)^2, averaged over the 200, and the ell where they cross."""
     faint = turned(0, 30, factor=1e7)  # SNR^2 from 120 to 0.2
@@ -199,7 +199,6 @@ def test_an_ell_that_is_not_seen_and_one_without_power():
     np.testing.assert_allclose(found[1:], [3.0, 0.0], atol=1e-15)
 
 
-@pytest.mark.long
 def test_more_data_never_tell_less():
     assert bits("observation.runs.0.cycles=0.15") < bits()
     # the Sun rises in the middle of it
@@ -272,7 +271,6 @@ def rows_of(folder):
         return list(csv.DictReader(file))
 
 
-@pytest.mark.long
 def test_the_command_writes_table_and_figure(tmp_path, capsys, monkeypatch):
     # a few variations are enough; the Sun is up all the time
     monkeypatch.setattr(variations, "CYCLES", (0.05,))
@@ -300,7 +298,6 @@ def test_the_command_writes_table_and_figure(tmp_path, capsys, monkeypatch):
     assert out.strip().splitlines()[-1] == f"look at {tmp_path}/figures/plan.png"
 
 
-@pytest.mark.long
 def test_values_of_ones_own(tmp_path, capsys):
     arguments = ["plan", "fiducial", *TINY, "--vary", "noise.radiometer.duty_cycle=0.5,1", "-q"]
     assert run(*arguments, "--vary", "observation.start=2027-01-15,2027-01-22", "-o", tmp_path) == 0

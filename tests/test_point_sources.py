@@ -309,6 +309,7 @@ def test_the_treatment_changes_the_model_only():
 # --- command --------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_map_command_writes_the_fluxes(tmp_path, capsys):
     arguments = ["map", "fiducial", "-o", str(tmp_path)]
     for override in (*TINY, LIST):

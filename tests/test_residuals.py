@@ -59,12 +59,22 @@ FLAGS[3, 5], FLAGS[:, 11] = True, True
 @pytest.mark.parametrize(
     "case",
     [
-        {"overrides": ()},
-        {"overrides": ("noise.radiometer.form=exact",)},
-        {"overrides": ("noise.gain={sigma: 0.01}", "noise.beam={shift_mhz: 4}")},
-        {"overrides": ("noise.radiometer.form=exact", "noise.gain={sigma: 0.01}"), "flags": FLAGS},
+        pytest.param({"overrides": ()}, id="diagonal"),
+        pytest.param({"overrides": ("noise.radiometer.form=exact",)}, id="blocks"),
+        pytest.param(
+            {"overrides": ("noise.gain={sigma: 0.01}", "noise.beam={shift_mhz: 4}")},
+            id="banded and low rank",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            {
+                "overrides": ("noise.radiometer.form=exact", "noise.gain={sigma: 0.01}"),
+                "flags": FLAGS,
+            },
+            id="banded with gaps",
+            marks=pytest.mark.long,
+        ),
     ],
-    ids=["diagonal", "blocks", "banded and low rank", "banded with gaps"],
 )
 def test_groups_and_single_data_by_hand(case):
     model, data = simulated(*case["overrides"], flags=case.get("flags"))

@@ -181,6 +181,7 @@ def test_a_killed_run_leaves_its_draws_and_nothing_half_made(runs):
     assert SAMPLER.warmup + 3 * CHUNK <= max(done) < SAMPLER.warmup + SAMPLER.draws
 
 
+@pytest.mark.long
 def test_a_killed_run_resumes_to_the_draws_of_an_undisturbed_one(runs, killed, tree, monkeypatch):
     """Bit by bit, in another process, with nothing done twice."""
     before = {i: (p.stat().st_ino, p.stat().st_mtime_ns) for i, p in chunks(killed).items()}
@@ -349,6 +350,7 @@ def test_a_kill_while_the_draws_are_removed_is_no_harm(
     np.testing.assert_array_equal(again.skies, tree["posterior"]["sky"].values[:, :60])
 
 
+@pytest.mark.long
 def test_resuming_a_finished_run_takes_it_over(whole, tree, no_sampling):
     before = content(whole)
     summary = pd.read_csv(whole / "summary.csv", index_col="quantity")
