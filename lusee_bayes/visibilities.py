@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from lusee_bayes.checks import InputError, require_finite, require_float64, requ
 from lusee_bayes.layout import DataLayout
 from lusee_bayes.observation import Observation, unannounced_leap_seconds
 from lusee_bayes.products import labels
+from lusee_bayes.staging import replacing
 from lusee_bayes.version import __version__
 
 FORMAT = "lusee_bayes visibilities 1"
@@ -93,15 +93,9 @@ class Visibilities:
 
     def write(self, path: str | Path, attrs: dict[str, str] | None = None) -> Path:
         """Write to netCDF, whole or not at all; ``attrs`` are added to the file's attributes."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-        try:
+        with replacing(path) as partial:
             self.to_dataset().assign_attrs(attrs or {}).to_netcdf(partial, engine="h5netcdf")
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
-        return path
+        return Path(path)
 
 
 def read_visibilities(path: str | Path) -> Visibilities:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from lusee_bayes.checks import InputError
 from lusee_bayes.report.map_report import map_report
 from lusee_bayes.report.sample_report import sample_report
+from lusee_bayes.staging import replacing
 
 REPORT = "report.html"
 
@@ -28,10 +28,6 @@ def write_report(folder: str | Path) -> Path:
             "sample, validate); give the folder of a finished run"
         )
     path = folder / REPORT
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
+    with replacing(path) as partial:
         partial.write_text(text)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
     return path

@@ -6,7 +6,6 @@ NumPy's .npz: ``alm`` (frequency, coefficient) and ``freq`` in MHz. Galactic, K.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from jaxtyping import Float
 from lusee_bayes.checks import AnyArray, InputError, require_finite
 from lusee_bayes.fits_images import opened
 from lusee_bayes.harmonics import from_healpy, lmax_of, n_modes, to_healpy
+from lusee_bayes.staging import replacing
 
 COLUMNS = ("index", "real", "imag")
 
@@ -101,14 +101,9 @@ def write_alms(
     table.header["MAX-MPOL"] = (lmax, "highest m")
     for key, value in header.items():
         table.header[key] = value
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
+    with replacing(path) as partial:
         fits.HDUList([fits.PrimaryHDU(), table]).writeto(partial)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-    return path
+    return Path(path)
 
 
 def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,6 @@ ZIm_i, are there for luseepy's conversion to V^2/Hz.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from lusee_bayes.checks import InputError
 from lusee_bayes.fits_images import read_images
 from lusee_bayes.observation import Observation, unannounced_leap_seconds
 from lusee_bayes.products import N_ANTENNAS, Product, all_products
+from lusee_bayes.staging import replacing
 from lusee_bayes.version import __version__
 from lusee_bayes.visibilities import Visibilities
 from lusee_bayes.waterfalls.waterfall import Waterfall
@@ -143,13 +143,8 @@ def write_waterfall(
     }
     for key, value in header.items():
         hdus[0].header[key if len(key) <= 8 else f"HIERARCH {key}"] = value
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
+    with replacing(path) as partial:
         hdus.writeto(partial)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
     return path
 
 
