@@ -1,3 +1,4 @@
+import astropy.units as u
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -238,10 +239,12 @@ def test_a_smoothed_source_agrees_with_the_coupling_matrix():
     np.testing.assert_allclose(weights.sum(), 1.0, rtol=0, atol=1e-6)
 
     def integral(turntable):
-        copies = Observation(  # every sample once for each direction
+        # every sample once for each direction, microseconds apart: the Moon turns by 3e-9 meanwhile
+        apart = np.tile(1e-6 * np.arange(len(n)), o.n_times)
+        copies = Observation(
             o.lon_deg,
             o.lat_deg,
-            Time(np.repeat(o.times.jd, len(n)), format="jd", scale="utc"),
+            Time(np.repeat(o.times.jd, len(n)), format="jd", scale="utc") + apart * u.s,
             np.repeat(o.run, len(n)),
             turntable,
             o.step_s,
