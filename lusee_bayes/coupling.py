@@ -42,7 +42,6 @@ class CouplingMatrix(eqx.Module):
     by_order: Float[Array, "runs orders beams degrees"]
     pointing: Pointing
     layout: DataLayout
-    frequency_mhz: float = eqx.field(static=True)
     response: Float[Array, " data"] | None = None
 
     @classmethod
@@ -62,7 +61,7 @@ class CouplingMatrix(eqx.Module):
                 f"the data layout has {layout.n_products} products x {layout.n_times} times, "
                 f"beams and pointing have {beams.n_products} x {pointing.n_times}"
             )
-        return cls.of_modes(beams.modes, pointing, layout, beams.frequency_mhz)
+        return cls.of_modes(beams.modes, pointing, layout)
 
     @classmethod
     def of_modes(
@@ -70,12 +69,11 @@ class CouplingMatrix(eqx.Module):
         modes: Float[Array, "beams modes"],
         pointing: Pointing,
         layout: DataLayout,
-        frequency_mhz: float = 0.0,
     ) -> CouplingMatrix:
         """A of any number of beams, given by their coefficients; nothing is checked."""
         body = _body_beams(modes, pointing)
         lmax = len(pointing.pole_from_galactic.blocks) - 1
-        return cls(body, _by_order(body, lmax), pointing, layout, frequency_mhz)
+        return cls(body, _by_order(body, lmax), pointing, layout)
 
     @classmethod
     def observe(cls, beams: ProductBeams, observation: Observation) -> CouplingMatrix:

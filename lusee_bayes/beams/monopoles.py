@@ -20,7 +20,7 @@ from jaxtyping import Array, Complex, Float
 
 from lusee_bayes.beams.fields import AntennaFields, phasor, wavenumber
 from lusee_bayes.beams.grid import HemisphereGrid
-from lusee_bayes.beams.product_beams import ProductBeams, product_beams
+from lusee_bayes.beams.product_beams import ProductBeams, product_modes
 from lusee_bayes.beams.regolith import Regolith
 from lusee_bayes.checks import AnyArray, require_finite, require_positive
 
@@ -55,7 +55,9 @@ class Monopoles(eqx.Module):
         require_positive("length_m", self.length_m)
         require_positive("height_m", self.height_m)
 
-    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
+    def fields(
+        self, frequency_mhz: float | Float[Array, ""], grid: HemisphereGrid
+    ) -> AntennaFields:
         """Field patterns at one frequency, phase centre at the feed, common to all arms."""
         require_positive("frequency_mhz", frequency_mhz)
         e_theta, e_phi = self.towards(frequency_mhz, grid.theta[:, None], grid.phi[None])
@@ -113,7 +115,6 @@ class Monopoles(eqx.Module):
         return jax.lax.complex(real, imaginary) * (self.length_m / 2.0).astype(jnp.complex128)
 
 
-@eqx.filter_jit
 def monopole_beams(
     frequency_mhz: float,
     lmax: int,
@@ -126,10 +127,22 @@ def monopole_beams(
 
     ``nodes``: of the grid in theta and phi, by default enough to be exact to rounding; fewer are
     faster. Differentiable in every leaf of ``monopoles`` (default: the paper's four arms on its
-    ground).
+    ground). Compiled once for all frequencies.
     """
     monopoles = Monopoles() if monopoles is None else monopoles
+    require_positive("frequency_mhz", frequency_mhz)
+    modes = _modes(_array(frequency_mhz), lmax, monopoles, stokes, nodes)
+    return ProductBeams(modes, float(frequency_mhz))
+
+
+@eqx.filter_jit
+def _modes(
+    frequency_mhz: Float[Array, ""],
+    lmax: int,
+    monopoles: Monopoles,
+    stokes: str,
+    nodes: tuple[int, int] | None,
+) -> Float[Array, "products modes"]:
     exact = HemisphereGrid.for_lmax
     grid = exact(lmax) if nodes is None else HemisphereGrid.gauss_legendre(*nodes)
-    fields = monopoles.fields(frequency_mhz, grid)
-    return product_beams(fields, frequency_mhz, lmax, stokes=stokes)
+    return product_modes(monopoles.fields(frequency_mhz, grid), lmax, stokes=stokes)

@@ -102,10 +102,18 @@ def product_beams(
     ``normalise``: scale so that the Stokes I autos integrate, on average, to one, which makes
     visibilities antenna temperatures in K. Without it the fields' own scale is kept.
     """
+    modes = product_modes(fields, lmax, stokes=stokes, normalise=normalise)
+    return ProductBeams(modes, float(frequency_mhz))
+
+
+def product_modes(
+    fields: AntennaFields, lmax: int, *, stokes: str = "I", normalise: bool = True
+) -> Float[Array, "products modes"]:
+    """The coefficients of :func:`product_beams`."""
     patterns = to_real(stokes_beam(fields, stokes))
     if normalise:
         patterns = patterns / mean_auto_integral(fields)
-    return ProductBeams(fields.grid.modes(patterns, lmax), float(frequency_mhz))
+    return fields.grid.modes(patterns, lmax)
 
 
 def mean_auto_integral(fields: AntennaFields) -> Float[Array, ""]:
