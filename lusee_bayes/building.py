@@ -24,7 +24,8 @@ from lusee_bayes.checks import InputError, nearest
 from lusee_bayes.ephemeris import BODIES, body_direction
 from lusee_bayes.noise import GainDrift
 from lusee_bayes.observation import Observation, Run
-from lusee_bayes.scenario import Scenario, SourceSection
+from lusee_bayes.scenario import Scenario
+from lusee_bayes.sections import SourceSection
 from lusee_bayes.sky import (
     BRIGHT_SOURCES,
     Sky,

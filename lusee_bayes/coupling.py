@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from lusee_bayes.beams import ProductBeams
 from lusee_bayes.checks import InputError, require_float64, require_shape
-from lusee_bayes.harmonics import mode_numbers
+from lusee_bayes.harmonics import lmax_of, mode_numbers
 from lusee_bayes.layout import DataLayout
 from lusee_bayes.observation import Observation
 from lusee_bayes.pointing import Pointing
@@ -148,18 +148,18 @@ class CouplingMatrix(eqx.Module):
 
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:
         """Rows of all products for some samples of one run; times: a slice or numbers."""
-        _, m = mode_numbers(self.lmax)
         factors = self.pointing.tilt_factors()[times]
-        azimuth = self.pointing.azimuth[times]
         tilted = jnp.einsum("tp,kpc->ktc", factors, self.body_beams[run])
-        turned = _turn_each(tilted, azimuth, m)
-        return self.pointing.pole_from_galactic.T(turned)
+        return self.pointing.pole_from_galactic.T(
+            turned_about_pole(tilted, self.pointing.azimuth[times])
+        )
 
 
-def _turn_each(
-    beams: Float[Array, "products times modes"], azimuth: Float[Array, " times"], m: np.ndarray
+def turned_about_pole(
+    beams: Float[Array, "products times modes"], azimuth: Float[Array, " times"]
 ) -> Float[Array, "products times modes"]:
     """D_z(-phi(t)) on the coefficients of every time."""
+    _, m = mode_numbers(lmax_of(beams.shape[-1]))
     mirrored = beams[..., np.arange(len(m)) - 2 * m]
     angle = azimuth[:, None] * jnp.arange(0.0, m.max() + 1.0)[None]
     cosine, sine = jnp.cos(angle), jnp.sin(angle)

@@ -144,7 +144,7 @@ def power_spectrum(modes: Float[AnyArray, "*batch modes"]) -> Float[np.ndarray, 
     return sum_over_m(np.asarray(modes) ** 2) / (2.0 * np.arange(lmax_of(modes.shape[-1]) + 1) + 1)
 
 
-def per_mode(spectrum: Float[Array, " ells"]) -> Float[Array, " modes"]:
+def per_mode(spectrum: Float[Array, "*batch ells"]) -> Float[Array, "*batch modes"]:
     """Spread a quantity given per ell over the modes of that ell."""
     ell, _ = mode_numbers(spectrum.shape[-1] - 1)
-    return spectrum[ell]
+    return spectrum[..., ell]

@@ -22,9 +22,14 @@ from lusee_bayes.checks import (
 )
 from lusee_bayes.coupling import CouplingMatrix
 from lusee_bayes.covariance import Covariance
+from lusee_bayes.information import Information
+from lusee_bayes.normal_matrix import has_structure
 from lusee_bayes.posterior import Posterior
 from lusee_bayes.prior import Prior
 from lusee_bayes.solver import FORMS, Solver, factorise
+
+# a larger A is not formed where it can be done without: some 60,000 data at lmax 47
+DENSE_BYTES = 1.2e9
 
 
 class LinearGaussian(eqx.Module):
@@ -78,8 +83,8 @@ class LinearGaussian(eqx.Module):
     def factorise(self, form: str | None = None) -> Solver:
         """Everything that does not depend on the data; use it to condition on many data vectors.
 
-        ``form``: "map" or "data"; None takes the cheaper one from the sizes. InputError if N is
-        not positive definite.
+        ``form``: "map", "data" or "root" (solver.py); None takes the cheaper of the first two from
+        the sizes. InputError if N is not positive definite.
         """
         if form is None:
             form = "data" if self.n_data < self.prior.rank else "map"
@@ -88,8 +93,31 @@ class LinearGaussian(eqx.Module):
         return factorise(self.coupling, self.prior, self.noise, self.offset, form)
 
     def condition(self, data: Float[AnyArray, " data"], form: str | None = None) -> Posterior:
-        """The posterior over the sky given ``data`` (data,), in K."""
+        """The posterior over the sky given ``data`` (data,), in K.
+
+        ``form``: as for :meth:`factorise`, or "structured", through A^T N^-1 A without A; None
+        takes that one where A would be larger than ``DENSE_BYTES`` and N has structure in time.
+        """
+        if form == "structured" or (form is None and self.too_large):
+            return self.inform(data).posterior(self.prior)
         return self.factorise(form).condition(data)
+
+    @property
+    def too_large(self) -> bool:
+        """Whether A would be larger than ``DENSE_BYTES``, and is not needed."""
+        size = 8 * self.n_data * self.prior.size
+        return size > DENSE_BYTES and has_structure(self.coupling, self.noise)
+
+    def inform(
+        self,
+        data: Float[AnyArray, " data"],
+        key: PRNGKeyArray | None = None,
+        n_perturbations: int = 0,
+    ) -> Information:
+        """What ``data`` say of the sky, see :meth:`Information.of`."""
+        return Information.of(
+            self.coupling, self.prior, self.noise, self.offset, data, key, n_perturbations
+        )
 
     def log_prob(self, data: Float[AnyArray, " data"]) -> Float[Array, ""]:
         """ln p(d), the evidence: the sky is integrated out. Differentiable."""

@@ -31,7 +31,8 @@ from lusee_bayes.observation import Observation
 from lusee_bayes.pointing import Pointing
 from lusee_bayes.prior import HarmonicPrior
 from lusee_bayes.progress import Stages
-from lusee_bayes.scenario import Scenario, SourceSection
+from lusee_bayes.scenario import Scenario
+from lusee_bayes.sections import SourceSection
 from lusee_bayes.sky import Sky
 from lusee_bayes.systematics import GainDrifts, Instrument, PointSources, Source
 from lusee_bayes.visibilities import Visibilities

@@ -11,7 +11,8 @@ from typing import Any
 
 from lusee_bayes.planning import AS_GIVEN, Variation
 from lusee_bayes.products import N_ANTENNAS
-from lusee_bayes.scenario import RunSection, Scenario
+from lusee_bayes.scenario import Scenario
+from lusee_bayes.sections import RunSection
 
 # one turn of the table
 TURN_DEG = 30.0

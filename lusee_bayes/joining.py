@@ -1,0 +1,166 @@
+"""How the processes of a run find each other, and what happens when one of them ends.
+
+A run is spread by how it is started and not by its code. Several processes make up one run if
+:mod:`lusee_bayes.processes` started them on this machine, or if Slurm did (``srun``); else there is
+one. Under Slurm JAX gives every process the one GPU of its rank on the node; a single process per
+node gets several by ``JAX_LOCAL_DEVICE_IDS=0,1,2,3``.
+
+A process that ends before the others takes them with it, after ``HEARTBEAT`` seconds at most. If
+the others wait for a sum they raise :class:`~lusee_bayes.devices.ProcessLost`; but mostly JAX is
+quicker and aborts them, with a message that Python cannot replace (*Terminating process because the
+JAX distributed service detected fatal errors ... another task died*). The launcher on one machine
+is quicker than both and says which process it was.
+"""
+
+from __future__ import annotations
+
+import atexit
+import inspect
+import os
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import jax
+
+from lusee_bayes.checks import InputError
+from lusee_bayes.devices import Fleet
+
+# set for each process by lusee_bayes.processes: host:port of the first, how many, which of them;
+# and a pipe that closes when the launcher is gone
+COORDINATOR = "LUSEE_BAYES_COORDINATOR"
+PROCESSES = "LUSEE_BAYES_PROCESSES"
+PROCESS = "LUSEE_BAYES_PROCESS"
+LEASH = "LUSEE_BAYES_LEASH"
+
+# what srun sets for every process of a step; sbatch alone does not set the last two
+SLURM = ("SLURM_JOB_ID", "SLURM_PROCID", "SLURM_STEP_NODELIST", "SLURM_STEP_NUM_TASKS")
+
+# seconds without a sign of life after which a process counts as dead (an older JAX: always 100)
+HEARTBEAT = 30
+
+
+@contextmanager
+def join() -> Iterator[Fleet]:
+    """Take part in the run that the environment tells of; to be entered before JAX computes.
+
+    At the end all wait for each other. A process that leaves by an exception does not: it ends at
+    once when Python is done with it, and JAX or the launcher end the others.
+    """
+    _hold_leash()
+    settings = _launched(os.environ) or _slurm(os.environ)
+    if settings is None:
+        yield Fleet()
+        return
+    try:
+        fleet = _start(settings)
+        yield fleet
+        fleet.barrier("end")
+    except BaseException as error:
+        # runs before JAX's own, which would wait for the others for minutes
+        atexit.register(_leave, _exit_code(error))
+        raise
+
+
+def _launched(environment: Mapping[str, str]) -> dict[str, Any] | None:
+    """How to start JAX in a process of our launcher, None if it is not one."""
+    if COORDINATOR not in environment:
+        return None
+    try:
+        n, k = (int(environment[name]) for name in (PROCESSES, PROCESS))
+    except (KeyError, ValueError):
+        n = k = 0
+    if not 0 <= k < n:
+        raise InputError(
+            f"{COORDINATOR} is set, but {PROCESSES} and {PROCESS} are not numbers n and 0..n-1; "
+            "unset it, or set all three"
+        )
+    if n == 1:
+        return None
+    address = environment[COORDINATOR]
+    return {
+        "coordinator_address": address,
+        "coordinator_bind_address": address,
+        "num_processes": n,
+        "process_id": k,
+        # a GPU each, where there are some
+        "local_device_ids": None if "JAX_LOCAL_DEVICE_IDS" in environment else [k],
+        "cluster_detection_method": "deactivate",
+    }
+
+
+def _slurm(environment: Mapping[str, str]) -> dict[str, Any] | None:
+    """How to start JAX in one of several processes of a Slurm step, None if it is not one."""
+    if any(name not in environment for name in SLURM):
+        return None
+    several = int(environment["SLURM_STEP_NUM_TASKS"]) > 1
+    return {"cluster_detection_method": "slurm"} if several else None
+
+
+def _start(settings: dict[str, Any]) -> Fleet:
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    # it would keep SIGTERM from ending a process
+    if hasattr(jax.config, "jax_enable_preemption_service"):
+        jax.config.update("jax_enable_preemption_service", False)
+    if "coordinator_address" in settings:
+        # the launcher has seen to it that a proxy is not asked
+        jax.config.update("jax_check_proxy_envs", False)
+    if "heartbeat_timeout_seconds" in inspect.signature(jax.distributed.initialize).parameters:
+        settings = settings | {"heartbeat_timeout_seconds": HEARTBEAT}
+    jax.distributed.initialize(**settings)
+    try:
+        jax.local_devices()
+    except RuntimeError as error:
+        raise InputError(
+            f"JAX cannot start here: {' '.join(str(error).split())[:300]} (are there more "
+            "processes than GPUs, or does this machine's own name not resolve?)"
+        ) from error
+    fleet = Fleet(jax.process_count(), jax.process_index())
+    # processes connect at their first sum, and have to come to it within 30 s of each other
+    with _silent_stdout():
+        fleet.barrier("start")
+    return fleet
+
+
+@contextmanager
+def _silent_stdout() -> Iterator[None]:
+    """Without what C++ prints: Gloo says that it is connected."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+def _hold_leash() -> None:
+    """End this process when its launcher is gone, however that ended."""
+    if LEASH not in os.environ:
+        return
+    # not for processes that this one starts
+    leash = int(os.environ.pop(LEASH))
+
+    def hold():
+        os.read(leash, 1)
+        os._exit(1)
+
+    threading.Thread(target=hold, daemon=True).start()
+
+
+def _exit_code(error: BaseException) -> int:
+    if isinstance(error, SystemExit):
+        return error.code if isinstance(error.code, int) else int(error.code is not None)
+    if isinstance(error, KeyboardInterrupt):
+        return 130
+    return 2 if isinstance(error, InputError) else 1
+
+
+def _leave(code: int) -> None:
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
