@@ -20,6 +20,10 @@ class InputError(ValueError):
     """Something a user supplied cannot be used. The message says what, where and what to do."""
 
 
+class ProcessLost(RuntimeError):
+    """Another process of this run has ended, so that this one cannot go on."""
+
+
 def is_traced(*arrays: Any) -> bool:
     """True if any of ``arrays`` is a tracer, so that its values are not known yet."""
     return any(isinstance(a, jax.core.Tracer) for a in arrays)

@@ -1,7 +1,7 @@
 """The command line: parsing, error messages and exit codes. The work is in ``commands``.
 
-Exit codes: 0 success, 1 a validation that failed, 2 bad input (one sentence on standard error), 130
-interrupted.
+Exit codes: 0 success, 1 a validation that failed or a process that was lost, 2 bad input (one
+sentence on standard error), 130 interrupted.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 from cyclopts import App, CycloptsError
 from rich.console import Console
 
-from lusee_bayes.checks import InputError
+from lusee_bayes.checks import InputError, ProcessLost
 from lusee_bayes.version import __version__
 
 app = App(
@@ -20,8 +20,9 @@ app = App(
     suppress_keyboard_interrupt=False,
     help=(
         "Bayesian maps of the low-frequency sky from LuSEE-Night's visibilities.\n\n"
-        "Exit codes: 0 success, 1 a validation that failed, 2 bad input (one sentence on standard "
-        "error), 130 interrupted. lusee-bayes COMMAND --help shows examples."
+        "Exit codes: 0 success, 1 a validation that failed or a process that was lost, 2 bad input "
+        "(one sentence on standard error), 130 interrupted. lusee-bayes COMMAND --help shows "
+        "examples."
     ),
 )
 app.register_install_completion_command()
@@ -51,6 +52,9 @@ def main(arguments: list[str] | None = None) -> int:
     except CycloptsError as error:
         errors.print(f"lusee-bayes: {' '.join(str(error).split())}", markup=False)
         return 2
+    except ProcessLost as error:
+        errors.print(f"lusee-bayes: {error}", markup=False)
+        return 1
     except KeyboardInterrupt:
         errors.print("lusee-bayes: interrupted; earlier results are as they were")
         return 130

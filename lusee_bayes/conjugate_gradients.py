@@ -46,12 +46,13 @@ def conjugate_gradients(
     z = precondition(residual)
     direction, power = z, (residual * z).sum(1)
     for count in range(iterations + 1):
-        distance = np.sqrt(np.asarray(power))
-        if not np.isfinite(distance).all():
+        squared = np.asarray(power)
+        if not (squared >= 0).all():
             raise InputError(
                 f"conjugate gradients broke down after {count} iterations: the matrix or its "
                 "preconditioner is not positive definite"
             )
+        distance = np.sqrt(squared)
         if report is not None:
             report(count, f"{distance.max():.1e} sigma left")
         if (distance <= tolerance).all():

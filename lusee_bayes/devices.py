@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from lusee_bayes.checks import InputError, require_float64
+from lusee_bayes.checks import InputError, ProcessLost, require_float64
 
 T = TypeVar("T")
 
@@ -22,10 +22,6 @@ SLAB = 1 << 22
 
 # longest time that processes wait for the slowest of them
 WEEK_MS = 7 * 24 * 3600 * 1000
-
-
-class ProcessLost(RuntimeError):
-    """Another process of this run has ended, so that this one cannot go on."""
 
 
 def use_cpu_devices(n: int) -> None:

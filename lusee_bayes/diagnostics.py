@@ -32,7 +32,7 @@ def diagnostics(result: MapResult) -> xr.Dataset:
     """Dims: pixel (HEALPix RING of the maps), region, kernel_pixel, draw, product, time, group."""
     posterior, scenario = result.posterior, result.experiment.scenario
     data, nside = result.data, result.nside
-    found = residuals(result.model, data)
+    found = residuals(result.judged, data)
     layout = data.layout
     key = jax.random.fold_in(jax.random.key(scenario.seed), 1)
     draws = np.asarray(posterior.sample(key, N_DRAWS))

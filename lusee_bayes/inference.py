@@ -222,7 +222,7 @@ class _Run:
         # devices, each with a chain of its own, would only stand idle
         chart = None if whitening is None else whitening.chart
         factorises = not predicts(program, arguments) or (chart is not None and chart.factorises)
-        self.one_by_one = len(jax.devices()) == 1 and factorises
+        self.one_by_one = len(jax.local_devices()) == 1 and factorises
         self._advance = jax.jit(self._advance_traced)
 
     def start(self) -> HMCState:
@@ -278,7 +278,7 @@ class _Run:
         return state, _without_auxiliary(sites) | rows
 
     def _shared_out(self, state: HMCState) -> HMCState:
-        devices = jax.devices()
+        devices = jax.local_devices()
         if len(devices) == 1 or self.sampler.chains % len(devices):
             return state
         mesh = Mesh(np.asarray(devices), ("chain",))

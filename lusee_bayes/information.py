@@ -65,8 +65,8 @@ class Information(eqx.Module):
         data: Float[AnyArray, " data"],
         key: PRNGKeyArray | None = None,
         n_perturbations: int = 0,
-    ) -> Information:
-        """The information in ``data`` about the sky, about its posterior mean under ``prior``.
+    ) -> tuple[Information, Posterior]:
+        """What ``data`` say, about the posterior mean under a prior, and that posterior.
 
         A is not formed where N has structure in time. ``key``: for ``n_perturbations`` draws.
         InputError for data of the wrong length, and if N is not positive definite.
@@ -84,7 +84,9 @@ class Information(eqx.Module):
         nothing, n_data = jnp.zeros(prior.size), jnp.asarray(float(noise.size))
         vector, misfit = _against(coupling, factor, centred, nothing)
         first = cls(matrix, vector, nothing, misfit, factor.log_det(), n_data)
-        mean = first.posterior(prior, settled=False).mean
+        root = _diagonal_root(prior, n_modes=matrix.shape[0])
+        lower = _precision_root(matrix, root)
+        mean = prior.colour(_condition(first, root, lower, jnp.asarray(1))[0])
         vector, misfit = _against(coupling, factor, centred, mean)
         perturbations = None
         if n_perturbations:
@@ -92,7 +94,8 @@ class Information(eqx.Module):
                 raise InputError("give a key for the perturbations")
             drawn = noise.sample(key, n_perturbations)
             perturbations = jnp.stack([_against(coupling, factor, n, nothing)[0] for n in drawn])
-        return cls(matrix, vector, mean, misfit, first.log_det, n_data, perturbations)
+        told = cls(matrix, vector, mean, misfit, first.log_det, n_data, perturbations)
+        return told, told._posterior(prior, lower, 2)
 
     @property
     def n_modes(self) -> int:
@@ -111,24 +114,32 @@ class Information(eqx.Module):
         """|L^-1 (d - A m - offset)|^2 of a sky m."""
         return self.recentred(sky).misfit
 
-    def posterior(self, prior: Prior, *, settled: bool = True) -> Posterior:
+    def posterior(self, prior: Prior) -> Posterior:
         """The posterior over the sky under a prior that is diagonal in the modes.
 
-        InputError for another prior, or if the mean does not converge (``settled`` False: the
-        first solution will do).
+        InputError for another prior, or if the mean does not converge.
         """
-        root = prior.diagonal_root()
-        if root is None:
-            raise InputError("information about modes needs a prior over the same modes")
-        require_shape("the prior", root, (self.n_modes,))
-        u, lower, log_evidence, moved = _condition(self, root)
-        if not is_traced(moved) and settled and not float(moved) <= CONVERGENCE:
+        lower = _precision_root(self.matrix, _diagonal_root(prior, self.n_modes))
+        return self._posterior(prior, lower, REFINEMENTS)
+
+    def _posterior(self, prior: Prior, lower: Array, refinements: int) -> Posterior:
+        root = _diagonal_root(prior, self.n_modes)
+        u, log_evidence, moved = _condition(self, root, lower, jnp.asarray(refinements))
+        if not is_traced(moved) and not float(moved) <= CONVERGENCE:
             raise InputError(
                 f"the posterior mean did not converge: its last step was {float(moved):.2g} "
                 f"standard deviations (accepted: {CONVERGENCE:g}); the data are too precise for "
-                "the normal equations"
+                "the normal equations, or far from anything that the prior allows"
             )
         return Posterior(prior, u, lower, None, log_evidence, moved)
+
+
+def _diagonal_root(prior: Prior, n_modes: int) -> Float[Array, " modes"]:
+    root = prior.diagonal_root()
+    if root is None:
+        raise InputError("information about modes needs a prior over the same modes")
+    require_shape("the prior", root, (n_modes,))
+    return root
 
 
 @eqx.filter_jit
@@ -144,25 +155,33 @@ def _against(
 
 
 @eqx.filter_jit
-def _condition(information: Information, root: Array) -> tuple[Array, Array, Array, Array]:
-    """Mean of u = m / root, L of its precision, ln p(d), and the last step in standard deviations.
+def _precision_root(matrix: Float[Array, "modes modes"], root: Float[Array, " modes"]) -> Array:
+    """L of the precision 1 + G M G of u = m / root."""
+    normal = root[:, None] * matrix * root[None] + jnp.eye(len(root))
+    return jax.lax.linalg.cholesky(normal, symmetrize_input=False)
+
+
+@eqx.filter_jit
+def _condition(
+    information: Information, root: Array, lower: Array, refinements: Array
+) -> tuple[Array, Array, Array]:
+    """Mean of u, ln p(d), and the last step in standard deviations.
 
     u is found as a correction to that of m0; components without prior power are zero.
     """
     start = jnp.where(root > 0, information.about / jnp.where(root > 0, root, 1.0), 0.0)
     here = information.recentred(start * root)
-    normal = root[:, None] * here.matrix * root[None]
-    lower = jax.lax.linalg.cholesky(normal + jnp.eye(len(root)), symmetrize_input=False)
 
     def refine(_, state):
         correction, _ = state
-        gradient = root * here.vector - normal @ correction - (start + correction)
+        pull = here.vector - here.matrix @ (root * correction)
+        gradient = root * pull - (start + correction)
         half = solve_lower(lower, gradient[:, None], transpose=False)
         step = solve_lower(lower, half, transpose=True)[:, 0]
         return correction + step, jnp.linalg.norm(half)
 
     zero = (jnp.zeros_like(root), jnp.asarray(jnp.inf))
-    correction, moved = jax.lax.fori_loop(0, REFINEMENTS, refine, zero)
+    correction, moved = jax.lax.fori_loop(0, refinements, refine, zero)
     u = start + correction
     log_evidence = -0.5 * (
         here.recentred(u * root).misfit
@@ -171,4 +190,4 @@ def _condition(information: Information, root: Array) -> tuple[Array, Array, Arr
         + 2.0 * jnp.log(jnp.diagonal(lower)).sum()
         + here.n_data * np.log(2.0 * np.pi)
     )
-    return u, lower, log_evidence, moved
+    return u, log_evidence, moved

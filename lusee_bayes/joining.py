@@ -6,7 +6,7 @@ one. Under Slurm JAX gives every process the one GPU of its rank on the node; a 
 node gets several by ``JAX_LOCAL_DEVICE_IDS=0,1,2,3``.
 
 A process that ends before the others takes them with it, after ``HEARTBEAT`` seconds at most. If
-the others wait for a sum they raise :class:`~lusee_bayes.devices.ProcessLost`; but mostly JAX is
+the others wait for a sum they raise :class:`~lusee_bayes.checks.ProcessLost`; but mostly JAX is
 quicker and aborts them, with a message that Python cannot replace (*Terminating process because the
 JAX distributed service detected fatal errors ... another task died*). The launcher on one machine
 is quicker than both and says which process it was.
@@ -62,6 +62,11 @@ def join() -> Iterator[Fleet]:
         # runs before JAX's own, which would wait for the others for minutes
         atexit.register(_leave, _exit_code(error))
         raise
+
+
+def is_launched() -> bool:
+    """Whether this process is one of several that our launcher has started."""
+    return COORDINATOR in os.environ
 
 
 def _launched(environment: Mapping[str, str]) -> dict[str, Any] | None:

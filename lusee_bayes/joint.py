@@ -23,8 +23,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lusee_bayes.checks import AnyArray, InputError, require_shape
 from lusee_bayes.covariance.base import solve_lower
-from lusee_bayes.gram import gram
 from lusee_bayes.information import Information
+from lusee_bayes.inverse import inverse_from
 from lusee_bayes.posterior import Posterior
 from lusee_bayes.prior import IndependentPrior
 from lusee_bayes.spectral_prior import SpectralPrior
@@ -42,19 +42,19 @@ def common_part(
     e = None if key is None else information.perturbations
     if rest is None:
         return replace(information, perturbations=e)
-    unit = jnp.eye(rest.shape[0])
-    half = solve_lower(_rest_lower(information, rest), unit, transpose=False)
-    inverse = gram(half)
-    pulled = half @ (rest * information.vector)
-    log_det = -2.0 * jnp.log(jnp.diagonal(half)).sum()
+    lower = _rest_lower(information, rest)
+    inverse = inverse_from(lower)
+    pull = rest * information.vector
+    left = inverse @ pull
+    log_det = 2.0 * jnp.log(jnp.diagonal(lower)).sum()
     if e is not None:
         z = jax.random.normal(key, e.shape, dtype=jnp.float64)
         e = (z + (rest[None] * e - z) @ inverse) / rest[None]
     return Information(
-        (unit - inverse) / rest[:, None] / rest[None],
-        half.T @ pulled / rest,
+        (jnp.eye(rest.shape[0]) - inverse) / rest[:, None] / rest[None],
+        left / rest,
         information.about,
-        information.misfit - pulled @ pulled,
+        information.misfit - pull @ left,
         information.log_det + log_det,
         information.n_data,
         e,
@@ -145,11 +145,22 @@ def solve_directly(
     for channel, information in enumerate(channels):
         if channel >= prior.n_channels:
             raise InputError(f"there are more channels than the prior's {prior.n_channels}")
-        rest = prior.residual_root(channel)
-        sums = _with_channel((information, prior.mixing[channel], rest), sums)
-        count = channel + 1
+        sums, count = summed(sums, prior, channel, information), channel + 1
     if count != prior.n_channels:
         raise InputError(f"there are {count} channels, the prior is for {prior.n_channels}")
+    return component_posterior(sums, prior)
+
+
+def summed(
+    sums: ComponentSums, prior: SpectralPrior, channel: int, information: Information
+) -> ComponentSums:
+    """The sums with one channel more; the given ones are used up."""
+    rest = prior.residual_root(channel)
+    return _with_channel((information, prior.mixing[channel], rest), sums)
+
+
+def component_posterior(sums: ComponentSums, prior: SpectralPrior) -> Posterior:
+    """The posterior of all component maps, in one vector, given the channels that are summed."""
     return sums.information().posterior(IndependentPrior(prior.roots.reshape(-1)))
 
 
@@ -226,8 +237,7 @@ def _channel_sky(
         skies = skies + jax.vmap(remaining)(skies) + loose
         mean = mean + remaining(mean)
         if spread is not None:
-            half = solve_lower(lower, jnp.eye(n), transpose=False)
-            x = gram(half)
+            x = inverse_from(lower)
             inner = x @ (spread / rest[:, None] / rest[None]) @ x + x
             spread = rest[:, None] * inner * rest[None]
     expected = jnp.asarray(jnp.nan)

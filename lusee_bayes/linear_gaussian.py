@@ -99,7 +99,7 @@ class LinearGaussian(eqx.Module):
         takes that one where A would be larger than ``DENSE_BYTES`` and N has structure in time.
         """
         if form == "structured" or (form is None and self.too_large):
-            return self.inform(data).posterior(self.prior)
+            return self.inform(data)[1]
         return self.factorise(form).condition(data)
 
     @property
@@ -113,8 +113,8 @@ class LinearGaussian(eqx.Module):
         data: Float[AnyArray, " data"],
         key: PRNGKeyArray | None = None,
         n_perturbations: int = 0,
-    ) -> Information:
-        """What ``data`` say of the sky, see :meth:`Information.of`."""
+    ) -> tuple[Information, Posterior]:
+        """What ``data`` say of the sky, and the posterior: see :meth:`Information.of`."""
         return Information.of(
             self.coupling, self.prior, self.noise, self.offset, data, key, n_perturbations
         )

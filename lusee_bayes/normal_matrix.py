@@ -115,7 +115,7 @@ def _from_sums(betas: list[Array], sums: list[Array]) -> Float[Array, "modes mod
     modes = [(m, s, ell) for m in range(n) for s in ((0, 1) if m else (0,)) for ell in range(m, n)]
     m, s, ell = np.array(modes).T
     strips = []
-    for first, end in pairwise(np.linspace(0, n, N_BLOCKS + 1).astype(int)):
+    for first, end in pairwise(np.linspace(0, n, N_BLOCKS + 1).astype(int).tolist()):
         if first == end:
             continue
         columns = m < end
@@ -186,11 +186,12 @@ def _streamed(coupling: CouplingMatrix, factor: TimeBandedFactor) -> Float[Array
     pointing, layout = coupling.pointing, coupling.layout
     n_blocks, rows, window = factor.left.shape
     steps, n_modes = rows // layout.n_products, coupling.shape[1]
-    run_of = np.repeat(np.arange(len(pointing.run_starts) - 1), np.diff(pointing.run_starts))
+    starts = np.array(pointing.run_starts)
+    run_of = jnp.asarray(np.repeat(np.arange(len(starts) - 1), np.diff(starts)))
     missing = n_blocks * steps - layout.n_times
 
     def blocked(x: Array) -> Array:
-        padded = jnp.pad(jnp.asarray(x), ((0, missing), *((0, 0),) * (x.ndim - 1)))
+        padded = jnp.pad(x, ((0, missing), *((0, 0),) * (x.ndim - 1)))
         return padded.reshape(n_blocks, steps, *x.shape[1:])
 
     def add(carry, block):

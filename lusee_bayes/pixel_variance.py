@@ -2,7 +2,8 @@
 
 diag(Y C Y^T) ring by ring: on a ring of HEALPix pixels y_lm = lambda_l|m|(theta) f_m(phi), so that
 C shrinks to a matrix over m, m' of each ring before any pixel is looked at. N_modes^2 operations a
-ring, where products with Y take N_modes^2 a pixel.
+ring, where products with Y take N_modes^2 a pixel; a ring and its mirror image in the south, where
+lambda has the sign (-1)^(l + m), share half of them.
 """
 
 from __future__ import annotations
@@ -16,24 +17,17 @@ from jaxtyping import Array, Float
 
 from lusee_bayes.harmonics import azimuth_functions, lmax_of, mode_numbers, polar_functions
 
-# rings that are worked on at once
-CHUNK = 16
-
 
 def pixel_std(covariance: Float[Array, "modes modes"], nside: int) -> Float[np.ndarray, " pixels"]:
-    """Standard deviation of every HEALPix RING pixel's centre, in the covariance's unit squared."""
+    """Standard deviation at every HEALPix RING pixel's centre, in K for a covariance in K^2."""
     lmax = lmax_of(covariance.shape[0])
     theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
     heights, first, count = np.unique(theta, return_index=True, return_counts=True)
-    # rings are padded to the longest one, and so is their number
-    n_rings = -(-len(heights) // CHUNK) * CHUNK
+    # rings are padded to the longest one; those from the equator on are in the south
     place = np.minimum(np.arange(count.max())[None], count[:, None] - 1) + first[:, None]
-    place = np.pad(place, ((0, n_rings - len(heights)), (0, 0)), mode="edge")
-    polar = np.pad(
-        polar_functions(heights, lmax), ((0, n_rings - len(heights)), (0, 0)), mode="edge"
-    )
+    north = polar_functions(heights[: len(heights) // 2 + 1], lmax)
     azimuth = azimuth_functions(phi, lmax)[place]
-    variance = _variance(covariance, jnp.asarray(polar), jnp.asarray(azimuth))
+    variance = _variance(covariance, jnp.asarray(north), jnp.asarray(azimuth))
     found = np.empty(len(theta))
     found[place] = np.asarray(variance)
     return np.sqrt(found)
@@ -42,25 +36,28 @@ def pixel_std(covariance: Float[Array, "modes modes"], nside: int) -> Float[np.n
 @eqx.filter_jit
 def _variance(
     covariance: Float[Array, "modes modes"],
-    polar: Float[Array, "rings modes"],
+    polar: Float[Array, "north modes"],
     azimuth: Float[Array, "rings pixels orders"],
 ) -> Float[Array, "rings pixels"]:
+    """``polar``: of the rings in the north, the equator last."""
     lmax = lmax_of(covariance.shape[0])
     ell, m = mode_numbers(lmax)
-    table = np.full((2 * lmax + 1, lmax + 1), len(m))  # behind the last mode: zero
-    table[m + lmax, ell] = np.arange(len(m))
-    padded = jnp.pad(covariance, ((0, 1), (0, 1)))[table][..., table]
-    heights = jnp.pad(polar, ((0, 0), (0, 1)))[:, table]
+    sign = jnp.asarray((-1.0) ** (ell + m))
+    order_of = jnp.asarray(m[:, None] == np.arange(-lmax, lmax + 1)[None], dtype=jnp.float64)
+    # the modes of every order, and the weight zero where there are none
+    rows = np.zeros((2 * lmax + 1, lmax + 1), dtype=int)
+    inside = np.zeros(rows.shape)
+    rows[m + lmax, ell], inside[m + lmax, ell] = np.arange(len(m)), 1.0
 
-    def some(rings):
-        y, f = rings
-        left = jnp.einsum("rml,mlnk->rmnk", y, padded)
-        both = jnp.einsum("rmnk,rnk->rmn", left, y)
-        return jnp.einsum("rpm,rmn,rpn->rp", f, both, f)
+    def of_order(order):
+        row, there = order
+        y = polar[:, row] * there[None]
+        part = covariance[row]
+        mirrored = (y * sign[row][None]) @ part
+        north = ((y @ part) * polar) @ order_of
+        return north, (mirrored * (polar * sign[None])) @ order_of
 
-    shape = (-1, CHUNK)
-    chunked = (
-        heights.reshape(*shape, *heights.shape[1:]),
-        azimuth.reshape(*shape, *azimuth.shape[1:]),
-    )
-    return jax.lax.map(some, chunked).reshape(azimuth.shape[:2])
+    north, south = jax.lax.map(of_order, (jnp.asarray(rows), jnp.asarray(inside)))
+    # (orders, rings, orders); the equator is its own mirror image
+    both = jnp.concatenate([north, south[:, -2::-1]], axis=1)
+    return jnp.einsum("rpm,mrn,rpn->rp", azimuth, both, azimuth)

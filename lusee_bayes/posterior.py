@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lusee_bayes.checks import AnyArray, InputError, is_traced
 from lusee_bayes.covariance.base import solve_lower
-from lusee_bayes.gram import gram
+from lusee_bayes.inverse import inverse_from
 from lusee_bayes.prior import Prior
 
 # directions handled at once when standard deviations of many of them are asked for
@@ -151,11 +151,11 @@ def _std_of(
 @eqx.filter_jit
 def _covariance(posterior: Posterior) -> Float[Array, "unknowns unknowns"]:
     rank = posterior.prior.rank
-    root = jnp.eye(rank) if posterior.basis is None else posterior.basis.T
-    half = solve_lower(posterior.lower, root, transpose=False)
-    white = gram(half)
-    if posterior.basis is not None:
-        white = white + jnp.eye(rank) - posterior.basis @ posterior.basis.T
+    if posterior.basis is None:
+        white = inverse_from(posterior.lower)
+    else:
+        half = solve_lower(posterior.lower, posterior.basis.T, transpose=False)
+        white = half.T @ half + jnp.eye(rank) - posterior.basis @ posterior.basis.T
     return posterior.prior.colour(posterior.prior.colour(white).T)
 
 

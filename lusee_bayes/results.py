@@ -8,15 +8,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import xarray as xr
 from jaxtyping import Float, Shaped
 
-from lusee_bayes.checks import AnyArray
+from lusee_bayes.checks import AnyArray, InputError
 from lusee_bayes.compact import CompactPosterior
 from lusee_bayes.experiment import Experiment
-from lusee_bayes.harmonics import mode_numbers, modes_to_map, pixel_matrix, power_spectrum
+from lusee_bayes.harmonics import mode_numbers, modes_to_map, power_spectrum
 from lusee_bayes.linear_gaussian import LinearGaussian
 from lusee_bayes.map_files import cards, write_map
 from lusee_bayes.metrics import (
@@ -29,14 +30,26 @@ from lusee_bayes.metrics import (
     signal_to_noise,
     whitened_residuals,
 )
+from lusee_bayes.pixel_variance import pixel_std as pixel_deviations
 from lusee_bayes.posterior import Posterior
+from lusee_bayes.prior import HarmonicPrior
 from lusee_bayes.progress import Stages, peak_memory_gb
+from lusee_bayes.scenario import Scenario
 from lusee_bayes.sky import kelvin_steradian, write_alms
 from lusee_bayes.staging import staged
+from lusee_bayes.updating import composed, given
 from lusee_bayes.version import versions
 from lusee_bayes.visibilities import Visibilities
 
 FORMAT = "lusee_bayes posterior 1"
+
+
+@dataclass(frozen=True)
+class Updatable:
+    """A saved posterior to which new data can be added, and the digests of the data behind it."""
+
+    posterior: Posterior
+    digests: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -45,7 +58,9 @@ class MapResult:
 
     fluxes : of the point sources beside the map, one row each (:func:`flux_table`), if any;
     pixel_std : (pixels,) posterior standard deviation of HEALPix RING pixels, in K;
-    highest_altitude : (pixels,) sin of the highest altitude each reached; seconds : per stage.
+    highest_altitude : (pixels,) sin of the highest altitude each reached; seconds : per stage;
+    update : where earlier data were there, the model of the deviation from their posterior, and the
+    posterior of that; digests : of all data behind the posterior
     """
 
     experiment: Experiment
@@ -59,20 +74,45 @@ class MapResult:
     rounds: int = 1
     fluxes: pd.DataFrame | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+    update: tuple[LinearGaussian, Posterior] | None = None
+    digests: tuple[str, ...] = ()
 
     @classmethod
     def from_experiment(
-        cls, experiment: Experiment, data: Visibilities, stages: Stages | None = None
+        cls,
+        experiment: Experiment,
+        data: Visibilities,
+        stages: Stages | None = None,
+        earlier: Updatable | None = None,
+        *,
+        root: bool = False,
     ) -> MapResult:
-        """Condition the experiment's model on ``data`` and work out the uncertainties."""
+        """Condition the experiment's model on ``data`` and work out the uncertainties.
+
+        ``earlier``: what other data have told, to which these are added; ``root``: by the form that
+        can be updated itself. InputError for data that ``earlier`` holds already.
+        """
         stages = stages or Stages()
+        update, digests = None, (data.digest(),)
         with stages("posterior"):
             model, posterior, rounds = experiment.infer(data)
+            if earlier is not None:
+                if data.digest() in earlier.digests:
+                    raise InputError(
+                        "these data are behind the earlier posterior already; a second time they "
+                        "would count double"
+                    )
+                deviations = given(earlier.posterior, model)
+                deviation = deviations.condition(data.data, form="root")
+                posterior = composed(earlier.posterior, deviation)
+                update, digests = (deviations, deviation), (*earlier.digests, *digests)
+            elif root:
+                posterior = model.condition(data.data, form="root")
             jax.block_until_ready(posterior.white_mean)
         nside = experiment.scenario.map_nside
         with stages("standard deviations"):
             std = np.asarray(posterior.std())
-            pixel_std = np.asarray(posterior.std_of(pixel_matrix(nside, experiment.scenario.lmax)))
+            pixel_std = pixel_deviations(posterior.covariance(), nside)
             residuals = np.asarray(whitened_residuals(model, posterior, data.data))
         fluxes = None
         if experiment.responses and experiment.scenario.sources.treatment != "ignored":
@@ -90,7 +130,14 @@ class MapResult:
             rounds=rounds,
             fluxes=fluxes,
             seconds=stages.seconds,
+            update=update,
+            digests=digests,
         )
+
+    @property
+    def judged(self) -> LinearGaussian:
+        """The model that predicts the data: given the earlier ones, where there are any."""
+        return self.model if self.update is None else self.update[0]
 
     @property
     def nside(self) -> int:
@@ -135,7 +182,9 @@ class MapResult:
             "log_evidence": float(self.posterior.log_evidence),
             "information_bits": float(self.posterior.information_bits()),
             "chi2": self.chi2,
-            "chi2_expected": expected_chi2(self.posterior, self.model.n_data),
+            "chi2_expected": expected_chi2(
+                self.posterior if self.update is None else self.update[1], self.model.n_data
+            ),
             "n_data": self.model.n_data,
             "n_missing": self.data.n_missing,
             "n_modes": self.model.prior.size,
@@ -148,8 +197,13 @@ class MapResult:
             "versions": versions(),
         }
 
-    def to_dataset(self, n_draws: int = 0, covariance: bool = False) -> xr.Dataset:
-        """posterior.nc: on dim ``mode`` with coords ``ell``, ``m``; all in K (K^2)."""
+    def to_dataset(
+        self, n_draws: int = 0, covariance: bool = False, updatable: bool = False
+    ) -> xr.Dataset:
+        """posterior.nc: on dim ``mode`` with coords ``ell``, ``m``; all in K (K^2).
+
+        ``updatable``: with L of the precision in units of the prior, for :func:`read_updatable`.
+        """
         scenario = self.experiment.scenario
         ell, m = mode_numbers(scenario.lmax)
         variables = {
@@ -166,11 +220,14 @@ class MapResult:
         if covariance:
             matrix = np.asarray(self.posterior.covariance())
             variables["covariance"] = (("mode", "mode_2"), matrix, {"units": "K2"})
-        return xr.Dataset(
-            variables,
-            coords={"ell": ("mode", ell), "m": ("mode", m)},
-            attrs={"format": FORMAT, **self.about()},
-        )
+        attrs = {"format": FORMAT, **self.about()}
+        if updatable:
+            lower = np.tril(np.asarray(self.posterior.lower))
+            variables["precision_root"] = (("mode", "mode_2"), lower)
+            variables["white_mean"] = ("mode", np.asarray(self.posterior.white_mean))
+            attrs["log_evidence"] = float(self.posterior.log_evidence)
+            attrs["data_digests"] = json.dumps(self.digests)
+        return xr.Dataset(variables, coords={"ell": ("mode", ell), "m": ("mode", m)}, attrs=attrs)
 
     def about(self) -> dict[str, object]:
         """What a file has to say of its numbers: frequency, frame, versions, scenario."""
@@ -190,10 +247,11 @@ class MapResult:
         n_draws: int = 0,
         covariance: bool = False,
         compact: bool = False,
+        updatable: bool = False,
     ) -> list[Path]:
         """Write all files but the figures into ``folder``; see :func:`staged`."""
         with staged(folder) as stage:
-            self.to_dataset(n_draws, covariance).to_netcdf(
+            self.to_dataset(n_draws, covariance, updatable).to_netcdf(
                 stage / "posterior.nc", engine="h5netcdf"
             )
             scenario = self.experiment.scenario
@@ -223,6 +281,39 @@ class MapResult:
         if truth is not None:
             maps |= {"truth": truth, "residual": mean - truth}
         return maps
+
+
+def read_updatable(folder: str | Path, scenario: Scenario) -> Updatable:
+    """The posterior of an updatable run (``map --updatable``) at the scenario's frequency.
+
+    InputError if the folder has none, or one of another frequency or lmax.
+    """
+    path = Path(folder) / "posterior.nc"
+    if not path.is_file():
+        raise InputError(f"'{folder}' has no posterior.nc; give the folder of a finished map run")
+    with xr.open_dataset(path, engine="h5netcdf") as file:
+        saved = file.load()
+    if "precision_root" not in saved:
+        raise InputError(
+            f"{path} does not hold what an update needs; make that map anew with --updatable"
+        )
+    for name in ("frequency_mhz", "lmax"):
+        if saved.attrs[name] != getattr(scenario, name):
+            raise InputError(
+                f"{path} is of {name} {saved.attrs[name]:g}, the scenario of "
+                f"{getattr(scenario, name):g}; use --set {name}={saved.attrs[name]:g}"
+            )
+    spectrum = power_spectrum(np.asarray(saved["prior_std"]))
+    none = jnp.zeros(())
+    posterior = Posterior(
+        HarmonicPrior(jnp.asarray(spectrum)),
+        jnp.asarray(np.asarray(saved["white_mean"])),
+        jnp.asarray(np.asarray(saved["precision_root"])),
+        None,
+        none + float(saved.attrs["log_evidence"]),
+        none,
+    )
+    return Updatable(posterior, tuple(json.loads(saved.attrs["data_digests"])))
 
 
 def flux_table(experiment: Experiment, data: Visibilities, posterior: Posterior) -> pd.DataFrame:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from dataclasses import dataclass
@@ -164,7 +163,7 @@ def run_sampler(
         jax.block_until_ready(posterior.white_mean)
     identity = {
         "scenario": experiment.scenario.to_yaml(),
-        "data": _digest(data),
+        "data": data.digest(),
         "program": program.name,
         "program text": program.digest,
         **{f"sampler's {name}": value for name, value in sampler.identity().items()},
@@ -268,13 +267,6 @@ def _require_sampleable(program: Program, arguments: dict, data: Visibilities) -
             "or the other"
         )
     return latent
-
-
-def _digest(data: Visibilities) -> str:
-    """Tells data sets apart."""
-    content = hashlib.sha256(np.ascontiguousarray(data.data).tobytes())
-    content.update(data.layout.product.tobytes() + data.layout.time.tobytes())
-    return content.hexdigest()
 
 
 def _finished(folder: Path, identity: dict, sampler: Sampler) -> xr.DataTree | None:

@@ -54,6 +54,7 @@ def updated(
 ) -> Posterior:
     """The posterior given the data of ``posterior`` and new ones, whose noise is independent.
 
+    Drifts that run on from the old data into the new ones are not: they couple the two.
     ``model``: of the new data alone. Its evidence is that of all data. InputError as for
     :func:`given` and :meth:`LinearGaussian.condition`.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,6 +56,13 @@ class Visibilities:
     def labels(self) -> tuple[str, ...]:
         """Product labels in order."""
         return labels(round(np.sqrt(self.layout.n_products)))
+
+    def digest(self) -> str:
+        """Tells data sets apart: of the numbers, and of when they were taken."""
+        content = hashlib.sha256(np.ascontiguousarray(self.data).tobytes())
+        content.update(self.layout.product.tobytes() + self.layout.time.tobytes())
+        content.update(self.observation.times.jd.tobytes())
+        return content.hexdigest()
 
     def grid(self) -> Float[np.ndarray, "products times"]:
         """Visibilities on the full grid in K, NaN where missing: for files and figures only."""

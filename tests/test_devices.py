@@ -36,8 +36,7 @@ def here(name, text=""):
 def run():
     with join() as fleet:
         k = fleet.number
-        here(f"pid{k}.partial", str(os.getpid()))
-        os.rename(f"{folder}/pid{k}.partial", f"{folder}/pid{k}")
+        here(f"pid{k}", str(os.getpid()))
         if what == "sum":
             total = fleet.total(numbers(k))
             mine = np.array(fleet.mine(range(7)), dtype=np.float64)
@@ -51,22 +50,25 @@ def run():
             if k == 1:
                 time.sleep(60)
             fleet.total(np.ones(3))
-        elif what == "compute":
+        elif what == "compute" or (what == "the last finds none" and k == 2):
             time.sleep(60)
         elif what == "one finds bad input" and k == 1:
             raise InputError("the sky is missing")
         elif what == "one fails" and k == 1:
             raise ZeroDivisionError("of process 1")
-        elif what == "all find bad input":
+        elif what in ("all find bad input", "the last finds none"):
+            if what == "the last finds none" and k == 0:
+                time.sleep(0.5)
             raise InputError("the sky is missing")
-        elif what == "deaf":
-            import signal
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
-            here(f"deaf{k}")
-            time.sleep(60)
     return 1 if what == "a verdict" else 0
 
+if what in ("start slowly", "deaf"):
+    import signal
+    if what == "deaf":
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    here(f"pid{os.environ['LUSEE_BAYES_PROCESS']}", str(os.getpid()))
+    time.sleep(60)
 try:
     sys.exit(run())
 except InputError as error:
@@ -138,14 +140,14 @@ def alive(pid: int) -> bool:
     return not status.exists() or status.read_text().rsplit(")", 1)[1].split()[0] != "Z"
 
 
-def pid_of(k: int, folder: Path, also: str = "") -> int:
-    """Waits until process k of a run has joined it."""
-    wanted = [folder / f"pid{k}", *([folder / also] if also else [])]
+def pid_of(k: int, folder: Path) -> int:
+    """Waits until process k of a run is there."""
+    file = folder / f"pid{k}"
     deadline = time.monotonic() + 30
-    while not all(f.exists() for f in wanted):
+    while not file.exists() or not file.read_text():
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    return int(wanted[0].read_text())
+    return int(file.read_text())
 
 
 def check_sums(folder: Path, n: int) -> None:
@@ -165,7 +167,7 @@ def check_sums(folder: Path, n: int) -> None:
     assert sorted(np.concatenate(parts)) == list(range(7))
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("n", [2, 3])
 def test_processes_share_items_and_add_up(n, folder):
     # a proxy that does not exist is not asked
     code, out, err = launch(n, "sum", folder, http_proxy="http://127.0.0.1:9")
@@ -264,9 +266,12 @@ def test_a_process_that_fails_shows_why(folder):
     )
 
 
-@pytest.mark.parametrize("what", ["one finds bad input", "all find bad input"])
-def test_bad_input_is_said_once(what, folder):
-    assert launch(2, what, folder) == (2, "", "crew: the sky is missing\n")
+@pytest.mark.parametrize(
+    ("n", "what"),
+    [(2, "one finds bad input"), (2, "all find bad input"), (3, "the last finds none")],
+)
+def test_bad_input_is_said_once(n, what, folder):
+    assert launch(n, what, folder) == (2, "", "crew: the sky is missing\n")
 
 
 def test_a_common_verdict_is_no_accident(folder):
@@ -280,11 +285,15 @@ def test_processes_out_of_step_are_told(folder):
 
 
 @pytest.mark.parametrize(
-    ("how", "code"),
-    [(signal.SIGINT, 130), (signal.SIGTERM, -signal.SIGTERM), (signal.SIGKILL, -signal.SIGKILL)],
+    ("how", "code", "what"),
+    [
+        (signal.SIGINT, 130, "compute"),
+        (signal.SIGTERM, -signal.SIGTERM, "start slowly"),
+        (signal.SIGKILL, -signal.SIGKILL, "compute"),
+    ],
 )
-def test_nobody_outlives_the_launcher(how, code, folder):
-    with launched(2, "compute", folder) as launcher:
+def test_nobody_outlives_the_launcher(how, code, what, folder):
+    with launched(2, what, folder) as launcher:
         pids = [pid_of(k, folder) for k in range(2)]
         time.sleep(0.5)
         launcher.send_signal(how)
@@ -298,7 +307,7 @@ def test_nobody_outlives_the_launcher(how, code, folder):
 def test_processes_that_do_not_listen_are_killed(folder):
     with launched(2, "deaf", folder) as launcher:
         for k in range(2):
-            pid_of(k, folder, also=f"deaf{k}")
+            pid_of(k, folder)
         launcher.send_signal(signal.SIGINT)
         _, err = launcher.communicate(timeout=20)
         assert launcher.returncode == 130

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from lusee_bayes.checks import InputError
+from lusee_bayes.report.cube_report import cube_report
 from lusee_bayes.report.map_report import map_report
 from lusee_bayes.report.sample_report import sample_report
 from lusee_bayes.staging import replacing
 
 REPORT = "report.html"
+
+
+def _is_cube(folder: Path) -> bool:
+    summary = folder / "summary.json"
+    return summary.is_file() and "frequencies_mhz" in json.loads(summary.read_text())
 
 
 def write_report(folder: str | Path) -> Path:
@@ -19,7 +26,7 @@ def write_report(folder: str | Path) -> Path:
     """
     folder = Path(folder)
     if (folder / "posterior.nc").is_file():
-        text = map_report(folder)
+        text = cube_report(folder) if _is_cube(folder) else map_report(folder)
     elif (folder / "samples.nc").is_file():
         text = sample_report(folder)
     else:
