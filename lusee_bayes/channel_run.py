@@ -116,7 +116,12 @@ def spectral_prior(scenario: Scenario, skies: np.ndarray) -> SpectralPrior:
     common = {"index": section.index, "reference_mhz": section.reference_mhz}
     if section.model == "components":
         return SpectralPrior.components(
-            frequencies, skies, section.components, residual=section.residual, **common
+            frequencies,
+            skies,
+            section.components,
+            turnover_mhz=section.turnover_mhz,
+            residual=section.residual,
+            **common,
         )
     residual = {} if section.residual is None else {"residual": section.residual}
     return SpectralPrior.kernel(frequencies, skies, length=section.length, **common, **residual)

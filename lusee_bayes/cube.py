@@ -10,12 +10,11 @@ from pathlib import Path
 import healpy
 import numpy as np
 import xarray as xr
-from astropy.io import fits
 from jaxtyping import Float
 
 from lusee_bayes.channel_run import ChannelRun
 from lusee_bayes.harmonics import mode_numbers, modes_to_map, power_spectrum, synthesis_matrix
-from lusee_bayes.map_files import cards
+from lusee_bayes.map_files import write_cube
 from lusee_bayes.metrics import correlation, ell_cross, signal_to_noise
 from lusee_bayes.progress import peak_memory_gb
 from lusee_bayes.staging import staged
@@ -246,7 +245,7 @@ class Cube:
         with staged(folder) as stage:
             self.to_dataset().to_netcdf(stage / "posterior.nc", engine="h5netcdf")
             for name, pixels in self.maps().items():
-                self._write_cube(stage / f"{name}.fits", name, pixels)
+                write_cube(stage / f"{name}.fits", name, pixels, self.run.scenario)
             with (stage / "spectra.csv").open("w", newline="") as file:
                 rows = self.spectra()
                 writer = csv.DictWriter(file, rows[0])
@@ -256,24 +255,3 @@ class Cube:
             (stage / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n")
             written = sorted(p.name for p in stage.iterdir())
         return [Path(folder) / name for name in written]
-
-    def _write_cube(self, path: Path, name: str, pixels: np.ndarray) -> None:
-        """The layout of sky cubes (``sky.cubes``): an image (frequency, pixel); the frequencies,
-        which it can only say in even steps, in a table behind it."""
-        image = fits.PrimaryHDU(np.asarray(pixels, dtype=np.float64))
-        header, frequencies = image.header, self.frequencies_mhz
-        for key, value in cards(name, self.run.scenario).items():
-            if key != "FREQ":
-                header[key] = value
-        header["BUNIT"] = "K"
-        header["COORDSYS"] = "G"
-        header["ORDERING"] = "RING"
-        header["NSIDE"] = self.run.scenario.map_nside
-        steps = np.diff(frequencies)
-        if not len(steps) or np.allclose(steps, steps[0], rtol=1e-9):
-            header["HIERARCH FREQ_START"] = (frequencies[0], "MHz")
-            header["FREQ_END"] = (frequencies[-1], "MHz")
-            header["HIERARCH FREQ_STEP"] = (steps[0] if len(steps) else 1.0, "MHz")
-        column = fits.Column("FREQUENCY", "D", unit="MHz", array=frequencies)
-        table = fits.BinTableHDU.from_columns([column], name="FREQUENCIES")
-        fits.HDUList([image, table]).writeto(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 
 from lusee_bayes.cube import Cube
 from lusee_bayes.plots import BLUE, GREY, ORANGE, SEQUENTIAL, colour_bar, mollweide
@@ -47,7 +48,10 @@ def spectra(cube: Cube) -> Figure:
         axes.errorbar(f, mean, std, color=BLUE, fmt=".", ms=4, lw=1, label="posterior")
         if "truth" in values:
             axes.plot(f, values["truth"], color=ORANGE, ls="--", lw=1.2, label="truth")
-        axes.set(title=name, yscale="log", xscale="log")
+        axes.set(title=name, yscale="log", xscale="log", xlim=(0.93 * f[0], 1.07 * f[-1]))
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.xaxis.set_minor_locator(NullLocator())
         axes.set(xlabel="frequency [MHz]", ylabel="brightness temperature [K]")
     axes.legend(frameon=False)
     return figure

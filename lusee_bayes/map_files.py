@@ -7,6 +7,7 @@ from pathlib import Path
 
 import healpy
 import numpy as np
+from astropy.io import fits
 from jaxtyping import Float
 
 from lusee_bayes.scenario import Scenario
@@ -68,3 +69,28 @@ def write_map(
         dtype=np.float64,
         extra_header=extra,
     )
+
+
+def write_cube(
+    path: Path, name: str, pixels: Float[np.ndarray, "frequencies pixels"], scenario: Scenario
+) -> None:
+    """Write maps of all of a scenario's frequencies in the layout of sky cubes (``sky.cubes``).
+
+    One image (frequency, pixel), HEALPix RING, Galactic, K, float64; the frequencies, which its
+    header can only give in even steps, are in a table behind it.
+    """
+    image = fits.PrimaryHDU(np.asarray(pixels, dtype=np.float64))
+    header, frequencies = image.header, np.array(scenario.frequencies_mhz)
+    for key, value in cards(name, scenario).items():
+        if key != "FREQ":
+            header[key] = value
+    header["BUNIT"], header["COORDSYS"], header["ORDERING"] = "K", "G", "RING"
+    header["NSIDE"] = scenario.map_nside
+    steps = np.diff(frequencies)
+    if not len(steps) or np.allclose(steps, steps[0], rtol=1e-9):
+        header["HIERARCH FREQ_START"] = (frequencies[0], "MHz")
+        header["FREQ_END"] = (frequencies[-1], "MHz")
+        header["HIERARCH FREQ_STEP"] = (steps[0] if len(steps) else 1.0, "MHz")
+    column = fits.Column("FREQUENCY", "D", unit="MHz", array=frequencies)
+    table = fits.BinTableHDU.from_columns([column], name="FREQUENCIES")
+    fits.HDUList([image, table]).writeto(path)

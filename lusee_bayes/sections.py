@@ -262,10 +262,11 @@ class SpectralSection(Section):
     """The prior on skies of several frequencies that are mapped together.
 
     ``components``: maps with the spectra of a power law of ``index``, its curvature (times ln nu)
-    and its turnover (times nu^-2.1); ``kernel``: ``index`` times a Gaussian process in ln nu of the
-    given ``length``. C_ell follow from the scenario's skies. ``residual``: rms of what each channel
-    has of its own, over that of its sky; by default what the components leave of the skies, 0.01
-    with the kernel. ``solver``: conjugate gradients where the direct one would not fit.
+    and its turnover (times 1 - exp(-tau), tau = (``turnover_mhz`` / nu)^2.1). ``kernel``: the power law
+    times a Gaussian process in ln nu of the given ``length``. C_ell follow from the scenario's
+    skies. ``residual``: rms of what each channel has of its own, over that of its sky; by default
+    what the components leave of the skies, 0.01 with the kernel. ``solver``: conjugate gradients
+    where the direct one would not fit.
     """
 
     model: Literal["components", "kernel"] = "components"
@@ -274,6 +275,7 @@ class SpectralSection(Section):
     ] = ("power_law", "curvature", "turnover")
     index: float = -2.5
     reference_mhz: Positive = 20.0
+    turnover_mhz: Positive = 5.0
     length: Positive = 1.0
     residual: Annotated[float, Field(ge=0, le=1)] | None = None
     solver: Literal["auto", "direct", "conjugate_gradients"] = "auto"

@@ -26,12 +26,12 @@ from lusee_bayes.checks import (
 from lusee_bayes.harmonics import per_mode, power_spectrum
 from lusee_bayes.prior import HarmonicPrior
 
-# spectra over the power law, x = frequency / reference; free-free absorption goes as nu^-2.1
-# (Altenhoff et al. 1960)
+# spectra over the power law: x is frequency / reference, y frequency / turnover; ionised gas takes
+# 1 - exp(-tau) away, and tau goes as nu^-2.1 (Altenhoff et al. 1960)
 SPECTRA = {
-    "power_law": lambda x: np.ones_like(x),
-    "curvature": np.log,
-    "turnover": lambda x: x**-2.1,
+    "power_law": lambda x, y: np.ones_like(x),
+    "curvature": lambda x, y: np.log(x),
+    "turnover": lambda x, y: -np.expm1(-(y**-2.1)),
 }
 # principal spectra of a kernel with a smaller share of the variance are left out
 KERNEL_TOLERANCE = 1e-10
@@ -78,6 +78,7 @@ class SpectralPrior(eqx.Module):
         *,
         index: float = -2.5,
         reference_mhz: float = 20.0,
+        turnover_mhz: float = 5.0,
         residual: float | None = None,
     ) -> SpectralPrior:
         """Components of ``SPECTRA`` times a power law, with the C_ell of their fit to model skies.
@@ -95,13 +96,20 @@ class SpectralPrior(eqx.Module):
                 f"{len(names)} spectral components need at least as many channels, got "
                 f"{len(frequencies)}"
             )
-        x = frequencies / reference_mhz
+        if residual is None and len(frequencies) == len(names):
+            raise InputError(
+                f"{len(names)} spectral components fit the skies of {len(frequencies)} channels "
+                "exactly, whatever these are; give a residual, or fewer components"
+            )
+        x, y = frequencies / reference_mhz, frequencies / turnover_mhz
         power_law = x**index
-        shapes = np.stack([SPECTRA[name](x) for name in names], axis=1)
+        shapes = np.stack([SPECTRA[name](x, y) for name in names], axis=1)
         # in units of the power law, so that no channel rules the fit
         maps, *_ = np.linalg.lstsq(shapes, skies / power_law[:, None], rcond=None)
         mixing = shapes * power_law[:, None]
-        rest = _rest(skies, skies - mixing @ maps, residual)
+        # the fit has taken its share of the residuals' variance
+        free = len(frequencies) / max(len(frequencies) - len(names), 1)
+        rest = _rest(skies, np.sqrt(free) * (skies - mixing @ maps), residual)
         return cls(
             jnp.asarray(frequencies),
             jnp.asarray(mixing),

@@ -243,6 +243,8 @@ def test_bad_priors_and_channels_are_refused():
         SpectralPrior.components(FREQUENCIES, skies(), ("turnver",))
     with pytest.raises(InputError, match="3 spectral components need at least as many channels"):
         SpectralPrior.components(FREQUENCIES[:2], skies()[:2])
+    with pytest.raises(InputError, match="fit the skies of 2 channels exactly"):
+        SpectralPrior.components(FREQUENCIES[:2], skies()[:2], ("power_law", "curvature"))
     with pytest.raises(InputError, match="must not be negative"):
         SpectralPrior.components(FREQUENCIES, skies(), residual=-0.1)
     prior = PRIORS["kernel"]()

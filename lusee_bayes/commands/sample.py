@@ -5,17 +5,28 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 from cyclopts import Parameter
 from rich.console import Console
 
 from lusee_bayes import sample_diagnostic_plots, sample_plots
-from lusee_bayes.commands.options import Output, Overrides, Quiet, Verbose, prepare
+from lusee_bayes.checks import InputError
+from lusee_bayes.commands.options import (
+    Frequencies,
+    Output,
+    Overrides,
+    Quiet,
+    Verbose,
+    parse_frequencies,
+    prepare,
+)
 from lusee_bayes.inference import Sampler
+from lusee_bayes.map_files import write_cube
 from lusee_bayes.programs import load_program
 from lusee_bayes.progress import Stages
 from lusee_bayes.report import REPORT, write_report
 from lusee_bayes.sample_run import SampleRun, run_sampler
-from lusee_bayes.scenario import load_scenario
+from lusee_bayes.scenario import Scenario, load_scenario
 from lusee_bayes.staging import staged
 
 Resume = Annotated[bool, Parameter(negative="")]
@@ -32,6 +43,7 @@ def sample_command(
     draws: int = 1000,
     warmup: int = 150,
     algorithm: Literal["nuts", "hmc"] = "nuts",
+    frequencies: Frequencies = None,
     set_: Overrides | None = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -41,6 +53,8 @@ def sample_command(
     Draws are written as they come: a run that was stopped goes on with --resume.
 
     Example: lusee-bayes sample fiducial --set lmax=20 --draws 500 -o output/hmc
+
+    Example: lusee-bayes sample gain_1e-2 --frequencies 10,25,40 --resume -o output/three
 
     Parameters
     ----------
@@ -64,6 +78,9 @@ def sample_command(
         Iterations in which the step size is found; they are not kept.
     algorithm
         The No-U-Turn Sampler, or Hamiltonian Monte Carlo with trajectories of fixed length.
+    frequencies
+        Channels in MHz, as 10,25,30 or as first:last:step, one after the other: each in a folder of
+        its own, and their maps together in cubes. With --resume, finished ones are taken over.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
     quiet
@@ -72,19 +89,47 @@ def sample_command(
         Tell the memory in use after every stage.
     """
     console = Console(quiet=quiet, soft_wrap=True)
-    resolved = load_scenario(scenario, set_ or [])
+    overrides = list(set_ or [])
+    if frequencies is not None:
+        overrides.append(f"frequencies_mhz={parse_frequencies(frequencies)}")
+    resolved = load_scenario(scenario, overrides)
+    if resolved.joint:
+        raise InputError(
+            "channels are sampled one by one; the joint posterior is Gaussian, and lusee-bayes map "
+            "--joint --draws N draws from it exactly"
+        )
     program = load_program(model or ("systematics" if resolved.samples else "sky"))
     sampler = Sampler(
         chains=chains, warmup=warmup, draws=draws, seed=resolved.seed, algorithm=algorithm
     )
     folder = output or Path("output") / f"{Path(scenario).stem}-{program.name}"
-    stages = Stages(console, verbose=verbose)
-    experiment, measured = prepare(resolved, data, stages)
-    run = run_sampler(experiment, measured, program, sampler, folder, resume=resume, stages=stages)
-    for path in write_run(run, folder, stages):
-        console.print(f"  {path}", highlight=False)
-    console.print(headline(run), highlight=False)
-    console.print(f"look at {folder / REPORT}", highlight=False)
+
+    def sampled(one: Scenario, where: Path) -> SampleRun:
+        stages = Stages(console, verbose=verbose)
+        experiment, measured = prepare(one, data, stages)
+        run = run_sampler(
+            experiment, measured, program, sampler, where, resume=resume, stages=stages
+        )
+        for path in write_run(run, where, stages):
+            console.print(f"  {path}", highlight=False)
+        console.print(headline(run), highlight=False)
+        return run
+
+    if not resolved.frequencies_mhz:
+        sampled(resolved, folder)
+        console.print(f"look at {folder / REPORT}", highlight=False)
+        return
+    means, stds = [], []
+    for channel in resolved.channels():
+        console.print(f"{channel.frequency_mhz:g} MHz", highlight=False)
+        maps = sampled(channel, folder / f"{channel.frequency_mhz:g}MHz").maps
+        means.append(maps["mean"])
+        stds.append(maps["std"])
+    with staged(folder) as stage:
+        write_cube(stage / "mean.fits", "mean", np.stack(means), resolved)
+        write_cube(stage / "std.fits", "std", np.stack(stds), resolved)
+        (stage / "scenario.yaml").write_text(resolved.to_yaml())
+    console.print(f"look at the {REPORT} of every channel in {folder}", highlight=False)
 
 
 def write_run(run: SampleRun, folder: Path, stages: Stages) -> list[Path]:

@@ -1,0 +1,267 @@
+"""Runs of several frequencies from the command line: independent, joint, resumed, shared out."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import healpy
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+
+from lusee_bayes import channel_run, channels
+from lusee_bayes.cli import main
+from lusee_bayes.experiment import Experiment
+from lusee_bayes.harmonics import modes_to_map
+from lusee_bayes.metrics import signal_to_noise
+from lusee_bayes.scenario import load_scenario
+from lusee_bayes.sky.cubes import read_cube
+
+SMALL = ["--set", "lmax=4", "--set", "observation.runs.0.cycles=0.1"]
+THREE = ["--frequencies", "20:30:5", *SMALL]
+# two components for three channels
+JOINT = [*THREE, "--joint", "--set", "spectral.components=[power_law, curvature]"]
+
+
+def run(*arguments) -> int:
+    return main([str(a) for a in arguments])
+
+
+def posterior_of(folder) -> xr.Dataset:
+    return xr.load_dataset(folder / "posterior.nc", engine="h5netcdf")
+
+
+def assert_equal(got, expected, sigma):
+    """Of two cubes: means within ``sigma`` standard deviations, these within that part."""
+    std = expected["std"].values
+    assert (np.abs(got["mean"].values - expected["mean"].values) / std).max() < sigma
+    np.testing.assert_allclose(got["std"].values, std, rtol=sigma)
+
+
+@pytest.fixture(scope="module")
+def independent(tmp_path_factory):
+    out = tmp_path_factory.mktemp("independent")
+    assert run("map", "fiducial", *THREE, "--draws", 3, "-o", out, "-q") == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def joint(tmp_path_factory):
+    out = tmp_path_factory.mktemp("joint")
+    assert run("map", "fiducial", *JOINT, "--draws", 3, "-o", out, "-q") == 0
+    return out
+
+
+def test_independent_channels_are_maps_of_each_frequency(independent):
+    cube = posterior_of(independent)
+    np.testing.assert_array_equal(cube["frequency"], [20.0, 25.0, 30.0])
+    assert cube["draws"].dims == ("frequency", "draw", "mode") and cube.sizes["draw"] == 3
+    for number, frequency in enumerate((20, 25, 30)):
+        settings = [*SMALL[1::2], f"frequency_mhz={frequency}", f"seed={1 + number}"]
+        experiment = Experiment.from_scenario(load_scenario("fiducial", settings))
+        data = experiment.simulate()
+        expected = experiment.model(data).condition(data.data)
+        here, std = cube.isel(frequency=number), np.asarray(expected.std())
+        assert (np.abs(here["mean"] - np.asarray(expected.mean)) / std).max() < 1e-6
+        # standard deviations of the normal equations
+        np.testing.assert_allclose(here["std"], std, rtol=1e-4)
+        np.testing.assert_array_equal(here["truth"], np.asarray(data.truth))
+    summary = json.loads((independent / "summary.json").read_text())
+    assert summary["joint"] is None and len(summary["channels"]) == 3
+    assert not (independent / "channels").exists()
+
+
+def test_files_of_a_cube_agree_with_each_other(joint):
+    cube = posterior_of(joint)
+    nside = load_scenario("fiducial", SMALL[1::2]).map_nside
+    for name in ("mean", "truth"):
+        read = read_cube(joint / f"{name}.fits")
+        np.testing.assert_allclose(read.frequencies_mhz, cube["frequency"])
+        for k in range(3):
+            expected = modes_to_map(cube[name].values[k], nside)
+            np.testing.assert_allclose(read.at(20.0 + 5 * k), expected, rtol=1e-12)
+    assert read_cube(joint / "std.fits").pixels.shape == (3, healpy.nside2npix(nside))
+    with (joint / "spectra.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(r["frequency_mhz"]) for r in rows] == list(np.repeat([20.0, 25.0, 30.0], 5))
+    for name, column in (("mean", "snr"), ("independent_mean", "snr_independent")):
+        snr = signal_to_noise(cube[name].values[1], cube["truth"].values[1])
+        np.testing.assert_allclose([float(r[column]) for r in rows[5:10]], snr, rtol=1e-9)
+    assert "20 to 30 MHz" in (joint / "report.html").read_text()
+    maps = cube["mixing"].values @ cube["component_mean"].values
+    # the rest of each channel is a few percent of it
+    assert 0 < np.abs(maps - cube["mean"].values).max() < 0.2 * np.abs(maps).max()
+
+
+def test_the_independent_means_of_a_joint_run_are_those_of_an_independent_run(joint, independent):
+    a, b = posterior_of(joint), posterior_of(independent)
+    far = np.abs(a["independent_mean"].values - b["mean"].values) / b["std"].values
+    assert far.max() < 1e-3  # it is where the first solution was
+    assert (np.abs(a["mean"].values - b["mean"].values) / b["std"].values).max() > 0.05
+
+
+def test_conjugate_gradients_give_the_same_maps(joint, tmp_path, capsys):
+    cg = [*JOINT, "--set", "spectral.solver=conjugate_gradients"]
+    assert run("map", "fiducial", *cg, "-o", tmp_path / "cg", "-q") == 0
+    got, expected = posterior_of(tmp_path / "cg"), posterior_of(joint)
+    far = np.abs(got["mean"].values - expected["mean"].values) / expected["std"].values
+    assert far.max() < 1e-6
+    # of 50 draws: a tenth each, and 75 of them
+    assert np.abs(got["std"].values / expected["std"].values - 1).max() < 0.45
+    summary = json.loads((tmp_path / "cg" / "summary.json").read_text())
+    assert summary["log_evidence"] is None and summary["joint"]["iterations"] >= 1
+    assert summary["joint"]["refinement_sigma"] <= 1e-7
+    capsys.readouterr()
+    slow = ["--set", "spectral.iterations=1", "--set", "spectral.tolerance=1e-300"]
+    assert run("map", "fiducial", *cg, *slow, "-o", tmp_path / "slow", "-q") == 2
+    assert "conjugate gradients did not converge: after 1 iter" in capsys.readouterr().err
+    assert not (tmp_path / "slow" / "posterior.nc").exists()
+
+
+def test_an_interrupted_run_goes_on_where_it_was(independent, tmp_path, monkeypatch):
+    made, whole = [], channels.Told.of
+
+    def some(channel, n=0):
+        if len(made) == 2:
+            raise KeyboardInterrupt
+        made.append(channel.name)
+        return whole(channel, n)
+
+    monkeypatch.setattr(channels, "LANES", 1)
+    monkeypatch.setattr(channel_run.Told, "of", some)
+    command = ["map", "fiducial", *THREE, "--draws", 3, "-o", tmp_path, "-q"]
+    assert run(*command) == 130
+    assert made == ["20", "25"] and not (tmp_path / "posterior.nc").exists()
+    made.clear()
+    assert run(*command) == 0
+    assert made == ["30"]
+    xr.testing.assert_identical(
+        posterior_of(tmp_path).drop_attrs(), posterior_of(independent).drop_attrs()
+    )
+
+
+def test_files_of_another_run_are_not_taken_up(tmp_path, monkeypatch):
+    made, whole = [], channels.Told.of
+    monkeypatch.setattr(channels, "LANES", 1)
+    monkeypatch.setattr(
+        channel_run.Told, "of", lambda channel, n=0: made.append(channel.name) or whole(channel, n)
+    )
+    monkeypatch.setattr(channels.ChannelFiles, "forget", lambda files: None)
+    two = ["map", "fiducial", "--frequencies", "20,25", *SMALL, "-o", tmp_path, "-q"]
+    assert run(*two) == 0 and run(*two) == 0
+    assert made == ["20", "25"]
+    assert run(*two, "--set", "noise.radiometer.factor=2") == 0
+    assert made == ["20", "25"] * 2
+
+
+def test_measured_data_of_several_channels(tmp_path, capsys):
+    data = tmp_path / "w.fits"
+    assert run("simulate", "fiducial", *THREE, "-o", data, "-q") == 0
+    arguments = ["map", "fiducial", *THREE, "--data", data, "-q", "-o"]
+    assert run(*arguments, tmp_path / "a", "--truth") == 0
+    assert "truth" in posterior_of(tmp_path / "a")
+    capsys.readouterr()
+    for given, message in (
+        (["--frequencies", "20,40"], "40"),
+        (["--data", tmp_path / "gone.fits"], "no data at"),
+    ):
+        assert run(*arguments, tmp_path / "b", *given) == 2
+        assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--frequencies", "20,60"], "less than or equal to 50"),
+        (["--frequencies", "20,10"], "expected growing MHz"),
+        (["--joint"], "joint needs frequencies_mhz"),
+        (["--processes", "2"], "give --frequencies"),
+        (["--devices", "2"], "give --frequencies"),
+        (["--frequencies", "20,25", "--compact"], "--compact is for a single frequency"),
+        (["--frequencies", "20,25", "--onto", "x"], "--onto is for a single frequency"),
+        (["--frequencies", "20,25", "--joint"], "need at least as many channels, got 2"),
+        (["--set", "spectral.components=[hot]", "--frequencies", "20,25"], "spectral.components"),
+    ],
+    ids=str,
+)
+def test_bad_input_is_one_sentence(arguments, message, tmp_path, capsys):
+    assert run("map", "fiducial", *SMALL, *arguments, "-o", tmp_path / "x", "-q") == 2
+    assert message in capsys.readouterr().err
+
+
+def test_too_many_data_for_a_single_map(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("lusee_bayes.linear_gaussian.DENSE_BYTES", 1e3)
+    assert run("map", "fiducial", *SMALL, "-o", tmp_path / "x", "-q") == 2
+    assert "use --frequencies 25 for a map without that" in capsys.readouterr().err
+    assert run("map", "fiducial", *SMALL, "--frequencies", "25", "-o", tmp_path / "y", "-q") == 0
+    assert read_cube(tmp_path / "y" / "mean.fits").frequencies_mhz == jnp.array([25.0])
+
+
+@pytest.mark.long
+def test_sampling_several_channels(tmp_path, capsys):
+    few = ["--chains", 2, "--draws", 20, "--warmup", 20, "-q", "--set", "lmax=2"]
+    command = ["sample", "fiducial", "--frequencies", "20,30", *SMALL, *few, "-o", tmp_path]
+    assert run(*command) == 0
+    assert read_cube(tmp_path / "mean.fits").pixels.shape[0] == 2
+    for name in ("20MHz", "30MHz"):
+        assert (tmp_path / name / "report.html").is_file()
+    before = (tmp_path / "20MHz" / "samples.nc").read_bytes()
+    assert run(*command, "--resume") == 0
+    assert xr.open_datatree(tmp_path / "20MHz" / "samples.nc", engine="h5netcdf") is not None
+    assert len((tmp_path / "20MHz" / "samples.nc").read_bytes()) == len(before)
+    assert run(*command, "--set", "joint=true") == 2
+    assert "channels are sampled one by one" in capsys.readouterr().err
+
+
+def started(folder, *arguments):
+    """The joint run in a process of its own, with more processes or devices."""
+    command = ["-m", "lusee_bayes.cli", "map", "fiducial", *JOINT, "-o", str(folder), "--draws=3"]
+    return subprocess.Popen(
+        [sys.executable, *command, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"MPLBACKEND": "agg"},
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("how", ["--processes=2", "--devices=3"])
+def test_processes_and_devices_give_the_same_numbers(how, joint, tmp_path):
+    with started(tmp_path, how) as process:
+        said, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert said.count("one posterior") == 1
+    assert_equal(posterior_of(tmp_path), posterior_of(joint), 1e-6)
+
+
+def children_of(pid: int) -> list[int]:
+    text = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True)
+    return [int(line) for line in text.stdout.split()]
+
+
+@pytest.mark.long
+def test_a_killed_process_ends_the_run_which_can_be_resumed(joint, tmp_path):
+    with started(tmp_path, "--processes=2", "-q") as process:
+        deadline = time.monotonic() + 120
+        while not list(tmp_path.glob("channels/*.information.nc")):
+            assert time.monotonic() < deadline and process.poll() is None
+            time.sleep(0.05)
+        victim = children_of(process.pid)[1]
+        os.kill(victim, signal.SIGKILL)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "process 1 of 0..1 was ended by SIGKILL" in errors
+    assert "goes on from what is finished" in errors
+    assert not (tmp_path / "posterior.nc").exists()
+    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("channels/*.nc")}
+    assert kept
+    with started(tmp_path, "--processes=2", "-q") as process:
+        _, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert_equal(posterior_of(tmp_path), posterior_of(joint), 1e-6)
