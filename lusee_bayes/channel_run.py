@@ -25,7 +25,7 @@ from lusee_bayes.checks import InputError
 from lusee_bayes.devices import Fleet
 from lusee_bayes.information import Information
 from lusee_bayes.iterative_joint import DIRECT_UNKNOWNS, solve_iteratively
-from lusee_bayes.joint import ComponentSums, channel_sky, component_posterior, summed
+from lusee_bayes.joint import ComponentSums, channel_sky, component_posterior, paired, summed
 from lusee_bayes.progress import Stages
 from lusee_bayes.scenario import Scenario
 from lusee_bayes.spectral_prior import SpectralPrior
@@ -38,14 +38,17 @@ LEAST_DRAWS = 50
 class Components:
     """The joint posterior of the component maps, in K.
 
-    mean : (components, modes); covariance : None after conjugate gradients, which have no evidence
-    either (NaN); draws : (n, components, modes); refinement : distance left in standard deviations
+    mean : (components, modes); spread : their covariance (``joint.paired``), None after conjugate
+    gradients, which have no evidence either (NaN); draws : (n, components, modes); chi2 : of all
+    data under the model, prior included: chi^2 of N_data if it holds; refinement : distance left in
+    standard deviations
     """
 
     prior: SpectralPrior
     mean: Array
-    covariance: Array | None
+    spread: Array | None
     draws: Array
+    chi2: float
     log_evidence: float
     information_bits: float
     refinement: float
@@ -174,6 +177,7 @@ def _components(
         found.draws,
         unknown,
         unknown,
+        unknown,
         found.distance,
         "conjugate gradients",
         found.iterations,
@@ -221,15 +225,18 @@ def _direct(
             )
             for k, leaf in enumerate(leaves)
         ]
-        posterior = component_posterior(jax.tree.unflatten(shape, whole), prior)
+        told = jax.tree.unflatten(shape, whole).information()
+        posterior = component_posterior(told, prior)
+        chi2 = float(told.chi2(posterior.mean) + (posterior.white_mean**2).sum())
         components, modes = prior.n_components, posterior.mean.shape[0] // prior.n_components
-        covariance = jax.block_until_ready(posterior.covariance())
+        spread = jax.block_until_ready(paired(posterior.covariance(), prior))
         draws = posterior.sample(key, n_draws)
     return Components(
         prior,
         posterior.mean.reshape(components, modes),
-        covariance,
+        spread,
         draws.reshape(n_draws, components, modes),
+        chi2,
         float(posterior.log_evidence),
         float(posterior.information_bits()),
         float(posterior.refinement),
@@ -258,7 +265,7 @@ def _joint_skies(
             number[channel.name],
             told.information,
             components.mean,
-            components.covariance,
+            components.spread,
             components.draws,
             key,
         )

@@ -11,12 +11,14 @@ import healpy
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
+from scipy import stats as distributions
 
 from lusee_bayes.channel_run import ChannelRun
 from lusee_bayes.harmonics import mode_numbers, modes_to_map, power_spectrum, synthesis_matrix
 from lusee_bayes.map_files import write_cube
 from lusee_bayes.metrics import correlation, ell_cross, signal_to_noise
 from lusee_bayes.progress import peak_memory_gb
+from lusee_bayes.residuals import SIGNIFICANCE, probability
 from lusee_bayes.staging import staged
 from lusee_bayes.version import versions
 
@@ -95,11 +97,26 @@ class Cube:
         """Channels whose data do not fit."""
         return [k for k in range(len(self.figures)) if abs(self.deviation(k)) > SIGNIFICANT]
 
+    @property
+    def p(self) -> float | None:
+        """Probability of a larger chi^2 of all data under the joint model; None if unknown."""
+        components = self.run.components
+        if components is None or np.isnan(components.chi2):
+            return None
+        n_data = sum(figures["n_data"] for figures in self.figures)
+        return float(distributions.chi2.sf(components.chi2, n_data))
+
     def verdict(self) -> str:
         """What the residuals say, in a sentence."""
-        bad = self.bad_channels()
+        bad, p = self.bad_channels(), self.p
         if np.isnan(self.deviation(0)):
             return "Conjugate gradients leave the expected chi^2 unknown: fit not judged."
+        if not bad and p is not None and p < SIGNIFICANCE:
+            return (
+                "Residuals of all channels are as they should be, but their skies do not obey the "
+                f"spectral prior (p {probability(p)}): error bars may be too small. Compare the "
+                "evidence of other spectral.components and of a larger spectral.residual."
+            )
         if not bad:
             return "The data of all channels fit the model."
         names = ", ".join(f"{self.frequencies_mhz[k]:g}" for k in bad)
@@ -163,6 +180,7 @@ class Cube:
         joint = None
         if components is not None:
             numbers = {
+                "chi2": components.chi2,
                 "log_evidence": components.log_evidence,
                 "information_bits": components.information_bits,
                 "refinement_sigma": components.refinement,
@@ -173,6 +191,8 @@ class Cube:
                 "iterations": components.iterations,
                 **{name: v for name, v in numbers.items() if not np.isnan(v)},
             }
+            if self.p is not None:
+                joint["p"] = self.p
         evidences = [figures["log_evidence"] for figures in self.figures]
         return {
             "frequencies_mhz": self.frequencies_mhz.tolist(),

@@ -19,11 +19,18 @@ N_BLOCKS = 4
 
 def gram(w: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
     """W^T W, symmetric to the last bit."""
-    columns = w.shape[1]
-    edges = np.linspace(0, columns, N_BLOCKS + 1).astype(int)
+    return symmetric_product(w.T, w)
+
+
+def symmetric_product(
+    left: Float[Array, "n inner"], right: Float[Array, "inner n"]
+) -> Float[Array, "n n"]:
+    """The product of two matrices where that is symmetric, symmetric to the last bit."""
+    n = right.shape[1]
+    edges = np.linspace(0, n, N_BLOCKS + 1).astype(int)
     rows = []
     for first, end in pairwise(edges):
-        block = w[:, first:end].T @ w[:, :end]
-        rows.append(jnp.pad(block, ((0, 0), (0, columns - end))))
+        block = left[first:end] @ right[:, :end]
+        rows.append(jnp.pad(block, ((0, 0), (0, n - end))))
     lower = jnp.tril(jnp.concatenate(rows, axis=0))
     return lower + jnp.tril(lower, -1).T

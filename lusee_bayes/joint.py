@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lusee_bayes.checks import AnyArray, InputError, require_shape
 from lusee_bayes.covariance.base import solve_lower
+from lusee_bayes.gram import symmetric_product
 from lusee_bayes.information import Information
 from lusee_bayes.inverse import inverse_from
 from lusee_bayes.posterior import Posterior
@@ -148,7 +149,7 @@ def solve_directly(
         sums, count = summed(sums, prior, channel, information), channel + 1
     if count != prior.n_channels:
         raise InputError(f"there are {count} channels, the prior is for {prior.n_channels}")
-    return component_posterior(sums, prior)
+    return component_posterior(sums.information(), prior)
 
 
 def summed(
@@ -159,9 +160,24 @@ def summed(
     return _with_channel((information, prior.mixing[channel], rest), sums)
 
 
-def component_posterior(sums: ComponentSums, prior: SpectralPrior) -> Posterior:
-    """The posterior of all component maps, in one vector, given the channels that are summed."""
-    return sums.information().posterior(IndependentPrior(prior.roots.reshape(-1)))
+def component_posterior(told: Information, prior: SpectralPrior) -> Posterior:
+    """The posterior of all component maps, in one vector, given what all channels say of them."""
+    return told.posterior(IndependentPrior(prior.roots.reshape(-1)))
+
+
+@eqx.filter_jit
+def paired(
+    covariance: Float[Array, "unknowns unknowns"], prior: SpectralPrior
+) -> Float[Array, "pairs modes modes"]:
+    """The components' covariance for :func:`channel_sky`: C_cc, and C_cc' + C_c'c for c > c'."""
+    k = prior.n_components
+    blocks = covariance.reshape(k, -1, k, covariance.shape[0] // k)
+    return jnp.stack(
+        [
+            blocks[i, :, j] + blocks[j, :, i] if i > j else blocks[i, :, i]
+            for i, j in zip(*np.tril_indices(k), strict=True)
+        ]
+    )
 
 
 @dataclass(frozen=True)
@@ -185,14 +201,14 @@ def channel_sky(
     channel: int,
     information: Information,
     maps: Float[Array, "components modes"],
-    covariance: Float[Array, "unknowns unknowns"] | None,
+    spread: Float[Array, "pairs modes modes"] | None,
     draws: Float[Array, "n components modes"],
     key: PRNGKeyArray,
 ) -> ChannelSky:
     """The sky of one channel from the posterior of the component maps.
 
-    maps, covariance, draws : mean, covariance and draws of the components; ``key`` : for the draws
-    of the channel's rest, the same for all channels of a run.
+    maps, spread, draws : mean, covariance (:func:`paired`) and draws of the components; ``key`` :
+    for the draws of the channel's rest, the same for all channels of a run.
     """
     require_shape("the component maps", maps, (prior.n_components, None))
     found = _channel_sky(
@@ -200,7 +216,7 @@ def channel_sky(
         prior.residual_root(channel),
         information,
         maps,
-        covariance,
+        spread,
         draws,
         jax.random.fold_in(key, channel),
     )
@@ -213,16 +229,15 @@ def _channel_sky(
     rest: Array | None,
     information: Information,
     maps: Array,
-    covariance: Array | None,
+    pairs: Array | None,
     draws: Array,
     key: PRNGKeyArray,
 ) -> tuple[Array, Array | None, Array, Array, Array]:
-    k, n = maps.shape
     mean, skies = mixing @ maps, jnp.einsum("c,dcm->dm", mixing, draws)
     spread = None
-    if covariance is not None:
-        blocks = covariance.reshape(k, n, k, n)
-        spread = jnp.einsum("i,injm,j->nm", mixing, blocks, mixing)
+    if pairs is not None:
+        first, second = np.tril_indices(mixing.shape[0])
+        spread = jnp.tensordot(mixing[first] * mixing[second], pairs, 1)
     if rest is not None:
         lower = _rest_lower(information, rest)
 
@@ -238,7 +253,7 @@ def _channel_sky(
         mean = mean + remaining(mean)
         if spread is not None:
             x = inverse_from(lower)
-            inner = x @ (spread / rest[:, None] / rest[None]) @ x + x
+            inner = symmetric_product(x @ (spread / rest[:, None] / rest[None]), x) + x
             spread = rest[:, None] * inner * rest[None]
     expected = jnp.asarray(jnp.nan)
     if spread is not None:

@@ -262,8 +262,8 @@ class SpectralSection(Section):
     """The prior on skies of several frequencies that are mapped together.
 
     ``components``: maps with the spectra of a power law of ``index``, its curvature (times ln nu)
-    and its turnover (times 1 - exp(-tau), tau = (``turnover_mhz`` / nu)^2.1). ``kernel``: the power law
-    times a Gaussian process in ln nu of the given ``length``. C_ell follow from the scenario's
+    and its turnover (times 1 - exp(-tau), tau = (``turnover_mhz`` / nu)^2.1). ``kernel``: the power
+    law times a Gaussian process in ln nu of the given ``length``. C_ell follow from the scenario's
     skies. ``residual``: rms of what each channel has of its own, over that of its sky; by default
     what the components leave of the skies, 0.01 with the kernel. ``solver``: conjugate gradients
     where the direct one would not fit.

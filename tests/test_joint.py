@@ -11,7 +11,7 @@ from lusee_bayes.checks import InputError
 from lusee_bayes.conjugate_gradients import conjugate_gradients
 from lusee_bayes.covariance import DiagonalCovariance
 from lusee_bayes.iterative_joint import solve_iteratively
-from lusee_bayes.joint import channel_sky, solve_directly
+from lusee_bayes.joint import channel_sky, paired, solve_directly
 from lusee_bayes.linear_gaussian import LinearGaussian
 from lusee_bayes.spectral_prior import SpectralPrior
 
@@ -115,11 +115,10 @@ def test_the_direct_solution_is_the_textbooks(case):
     std = np.sqrt(np.diag(covariance)).reshape(-1, N_MODES)
     maps = posterior.mean.reshape(prior.n_components, N_MODES)
     draws = posterior.sample(jax.random.key(3), 4000).reshape(4000, -1, N_MODES)
+    spread = paired(posterior.covariance(), prior)
     for k, information in enumerate(told):
         rows = slice(k * N_MODES, (k + 1) * N_MODES)
-        sky = channel_sky(
-            prior, k, information, maps, posterior.covariance(), draws, jax.random.key(5)
-        )
+        sky = channel_sky(prior, k, information, maps, spread, draws, jax.random.key(5))
         # the textbook's own subtraction of s leaves 1e-16 times (signal / noise)^2
         assert np.abs((np.asarray(sky.mean) - mean[rows]) / std[k]).max() < 1e-6
         np.testing.assert_allclose(
@@ -188,9 +187,10 @@ def test_skies_that_do_not_obey_the_prior_are_told():
         for prior_name, prior in (("true", true), ("wrong", wrong)):
             posterior = solve_directly(prior, told, about)
             maps = posterior.mean.reshape(prior.n_components, N_MODES)
+            spread = paired(posterior.covariance(), prior)
             none = jnp.zeros((0, prior.n_components, N_MODES))
             chi2 = [
-                channel_sky(prior, k, t, maps, posterior.covariance(), none, jax.random.key(0))
+                channel_sky(prior, k, t, maps, spread, none, jax.random.key(0))
                 for k, t in enumerate(told)
             ]
             far = [

@@ -52,7 +52,7 @@ def cube_report(folder: Path) -> str:
         f"{folder.resolve().name}: the sky at {len(frequencies)} frequencies, "
         f"{frequencies[0]:g} to {frequencies[-1]:g} MHz"
     )
-    fits = "fit the model." in summary["verdict"] and "not fit" not in summary["verdict"]
+    fits = summary["verdict"].startswith("The data of all channels fit")
     anchors = dict(zip(("maps", "spectra", "fidelity", "chi2"), SECTIONS, strict=False))
     parts = {
         name: [html.figure(folder / "figures" / f"{name}.png", *texts)]

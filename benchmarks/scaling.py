@@ -1,0 +1,178 @@
+"""How time and memory grow: samples, lmax, channels, devices; each case in a process of its own.
+
+    python benchmarks/scaling.py samples lmax        the structured normal matrix
+    python benchmarks/scaling.py channels devices    whole runs of lusee-bayes map (minutes)
+
+The operation count beside a time is that of the products the structure leaves: for A^T N^-1 A
+16 (16 P) N_modes^2 / 2 (P powers of the tilt; P and Q of normal_matrix.py, both triangles left out)
+plus 2 x 16 P' (4 lmax + 2) a sample (P' powers up to twice the order).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from scipy.linalg.blas import dsyrk
+
+import lusee_bayes as lb
+from lusee_bayes.experiment import Experiment
+from lusee_bayes.noise import radiometer_noise
+from lusee_bayes.normal_matrix import normal_matrix
+from lusee_bayes.rotations import tilt_powers
+
+SAMPLES = [(1.0, 7200.0), (1.0, 600.0), (3.0, 7200.0), (12.0, 600.0), (13.368, 600.0)]
+LMAX = [16, 24, 32, 47, 64, 95]
+CHANNELS = [1, 4, 12, 46]
+REPEATS = 5
+
+
+def peak_gb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+
+
+def steady(work) -> float:
+    """Median seconds of some calls after a first one."""
+    seconds = []
+    for _ in range(REPEATS + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(work())
+        seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds[1:]))
+
+
+def normal(cycles: float, step_s: float, lmax: int, order: int | None, dense: bool) -> dict:
+    """The structured normal matrix of one observation, and dsyrk of the whitened A if asked for."""
+    experiment = Experiment.from_scenario(lb.load_scenario("fiducial", [f"lmax={lmax}"]))
+    runs = [lb.Run(cycles)]
+    observation = lb.Observation.from_runs(runs, step_s=step_s)
+
+    def coupling_of(order: int | None):
+        pointing = lb.Pointing.of(observation, lmax, order)
+        return lb.CouplingMatrix.build(experiment.beams, pointing)
+
+    coupling, sky = coupling_of(order), experiment.sky.modes
+    exact = coupling_of(4)
+    signal = exact.layout.scatter(exact @ sky)
+    noise = radiometer_noise(signal, exact.layout, step_s=step_s)
+    off = np.asarray(coupling @ sky - exact @ sky) / np.sqrt(np.asarray(noise.variance))
+    powers = len(tilt_powers(coupling.pointing.order))
+    twice = len(tilt_powers(2 * coupling.pointing.order))
+    modes, times = (lmax + 1) ** 2, observation.n_times
+    found = {
+        "cycles": cycles,
+        "step [s]": step_s,
+        "lmax": lmax,
+        "times": times,
+        "order": coupling.pointing.order,
+        "rms error [sigma]": float(np.sqrt((off**2).mean())),
+        "seconds": steady(lambda: normal_matrix(coupling, noise)),
+        "Gflop": (8 * 16 * powers * modes**2 + 2 * 16 * twice * (4 * lmax + 2) * times) / 1e9,
+        "peak [GB]": peak_gb(),
+    }
+    if dense:
+        white = np.asfortranarray(np.asarray(coupling.dense()))
+        start = time.perf_counter()
+        for _ in range(REPEATS):
+            dsyrk(1.0, white, trans=1, lower=1)
+        found["over dsyrk"] = found["seconds"] / ((time.perf_counter() - start) / REPEATS)
+    return found
+
+
+def posterior_of_a_year() -> dict:
+    """From the data of a year every ten minutes to posterior mean and standard deviations."""
+    runs = "observation.runs=[{cycles: 13.368}]"
+    scenario = lb.load_scenario("fiducial", [runs, "observation.step_s=600"])
+    experiment = Experiment.from_scenario(scenario)
+    data = experiment.simulate()
+    start = time.perf_counter()
+    posterior = experiment.model(data).condition(data.data)
+    posterior.std()
+    return {
+        "visibilities": int(data.layout.size),
+        "seconds": time.perf_counter() - start,
+        "bits": float(posterior.information_bits()),
+        "peak [GB]": peak_gb(),
+    }
+
+
+def run_of_channels(n: int, joint: bool, devices: int, processes: int) -> dict:
+    """lusee-bayes map of n channels from 5 MHz on."""
+    step = 45.0 / max(n - 1, 1)
+    frequencies = ",".join(f"{5 + k * step:g}" for k in range(n))
+    command = [sys.executable, "-m", "lusee_bayes.cli", "map", "fiducial", "-q", "--draws=20"]
+    command += [f"--frequencies={frequencies}"] + ["--joint"] * joint
+    command += [f"--devices={devices}"] * (devices > 1)
+    command += [f"--processes={processes}"] * (processes > 1)
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        subprocess.run([*command, "-o", folder], check=True)
+        seconds = time.perf_counter() - start
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / 1e9
+    return {
+        "channels": n,
+        "kind": "joint" if joint else "independent",
+        "devices": devices,
+        "processes": processes,
+        "seconds": seconds,
+        "peak of a process [GB]": peak,
+    }
+
+
+def cases(topic: str) -> list[list]:
+    """Name of a function above and its arguments, for every row of a table."""
+    if topic == "samples":
+        rows = [["normal", *case, 47, order, False] for case in SAMPLES for order in (1, 2)]
+        rows[0][-1] = rows[1][-1] = True
+        return [*rows, ["posterior_of_a_year"]]
+    if topic == "lmax":
+        return [["normal", 1.0, 7200.0, lmax, 2, True] for lmax in LMAX]
+    if topic == "channels":
+        return [
+            ["run_of_channels", n, joint, 1, 1]
+            for joint in (False, True)
+            for n in CHANNELS
+            if n > 1 or not joint
+        ]
+    return [["run_of_channels", 12, False, d, p] for d, p in ((1, 1), (2, 1), (1, 2))]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("topics", nargs="*", default=["samples", "lmax"])
+    parser.add_argument("--case", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.case:
+        name, *arguments = json.loads(options.case)
+        print(json.dumps(globals()[name](*arguments)))
+        return
+    for topic in options.topics:
+        tables: dict[tuple[str, ...], Table] = {}
+        for case in cases(topic):
+            answer = subprocess.run(
+                [sys.executable, __file__, "--case", json.dumps(case)],
+                check=True,
+                capture_output=True,
+                text=True,
+            ).stdout
+            row = json.loads(answer.splitlines()[-1])
+            heads = tuple(row)
+            if heads not in tables:
+                tables[heads] = Table(*heads, title=topic)
+            cells = [f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()]
+            tables[heads].add_row(*cells)
+        for table in tables.values():
+            Console(width=130).print(table)
+
+
+if __name__ == "__main__":
+    main()
