@@ -221,7 +221,7 @@ def _direct(
             leaf
             if leaf is start.about
             else jnp.asarray(
-                fleet.total(sum((np.asarray(part[k]) for part in parts), np.zeros(leaf.shape)))
+                fleet.total(np.asarray(sum(np.asarray(part[k]) for part in [*parts, leaves])))
             )
             for k, leaf in enumerate(leaves)
         ]

@@ -221,7 +221,7 @@ def result_dataset(sky: ChannelSky, told: Told, nside: int) -> xr.Dataset:
     """
     posterior = told.posterior
     if sky.covariance is None:
-        spread = np.asarray(sky.draws - sky.mean)
+        spread = np.asarray(sky.draws) - np.asarray(sky.mean)
         std = np.sqrt((spread**2).mean(0))
         covariance = jnp.asarray(spread.T @ spread / len(spread))
     else:

@@ -16,6 +16,7 @@ import xarray as xr
 
 from lusee_bayes import channel_run, channels
 from lusee_bayes.cli import main
+from lusee_bayes.datatree import read_datatree
 from lusee_bayes.experiment import Experiment
 from lusee_bayes.harmonics import modes_to_map
 from lusee_bayes.metrics import signal_to_noise
@@ -98,6 +99,7 @@ def test_files_of_a_cube_agree_with_each_other(joint):
     assert 0 < np.abs(maps - cube["mean"].values).max() < 0.2 * np.abs(maps).max()
 
 
+@pytest.mark.long
 def test_the_independent_means_of_a_joint_run_are_those_of_an_independent_run(joint, independent):
     a, b = posterior_of(joint), posterior_of(independent)
     far = np.abs(a["independent_mean"].values - b["mean"].values) / b["std"].values
@@ -105,6 +107,7 @@ def test_the_independent_means_of_a_joint_run_are_those_of_an_independent_run(jo
     assert (np.abs(a["mean"].values - b["mean"].values) / b["std"].values).max() > 0.05
 
 
+@pytest.mark.long
 def test_conjugate_gradients_give_the_same_maps(joint, tmp_path, capsys):
     cg = [*JOINT, "--set", "spectral.solver=conjugate_gradients"]
     assert run("map", "fiducial", *cg, "-o", tmp_path / "cg", "-q") == 0
@@ -145,6 +148,7 @@ def test_an_interrupted_run_goes_on_where_it_was(independent, tmp_path, monkeypa
     )
 
 
+@pytest.mark.long
 def test_files_of_another_run_are_not_taken_up(tmp_path, monkeypatch):
     made, whole = [], channels.Told.of
     monkeypatch.setattr(channels, "LANES", 1)
@@ -159,18 +163,19 @@ def test_files_of_another_run_are_not_taken_up(tmp_path, monkeypatch):
     assert made == ["20", "25"] * 2
 
 
+@pytest.mark.long
 def test_measured_data_of_several_channels(tmp_path, capsys):
     data = tmp_path / "w.fits"
     assert run("simulate", "fiducial", *THREE, "-o", data, "-q") == 0
-    arguments = ["map", "fiducial", *THREE, "--data", data, "-q", "-o"]
-    assert run(*arguments, tmp_path / "a", "--truth") == 0
+    read = ["--data", data]
+    assert run("map", "fiducial", *THREE, *read, "-q", "-o", tmp_path / "a", "--truth") == 0
     assert "truth" in posterior_of(tmp_path / "a")
     capsys.readouterr()
     for given, message in (
-        (["--frequencies", "20,40"], "40"),
-        (["--data", tmp_path / "gone.fits"], "no data at"),
+        (["--frequencies", "20,40", *SMALL, *read], "40"),
+        ([*THREE, "--data", tmp_path / "gone.fits"], "no data at"),
     ):
-        assert run(*arguments, tmp_path / "b", *given) == 2
+        assert run("map", "fiducial", *given, "-q", "-o", tmp_path / "b") == 2
         assert message in capsys.readouterr().err
 
 
@@ -194,6 +199,7 @@ def test_bad_input_is_one_sentence(arguments, message, tmp_path, capsys):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_too_many_data_for_a_single_map(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("lusee_bayes.linear_gaussian.DENSE_BYTES", 1e3)
     assert run("map", "fiducial", *SMALL, "-o", tmp_path / "x", "-q") == 2
@@ -204,16 +210,16 @@ def test_too_many_data_for_a_single_map(monkeypatch, tmp_path, capsys):
 
 @pytest.mark.long
 def test_sampling_several_channels(tmp_path, capsys):
-    few = ["--chains", 2, "--draws", 20, "--warmup", 20, "-q", "--set", "lmax=2"]
+    few = ["--chains", 2, "--draws", 100, "--warmup", 100, "-q", "--set", "lmax=2"]
     command = ["sample", "fiducial", "--frequencies", "20,30", *SMALL, *few, "-o", tmp_path]
     assert run(*command) == 0
     assert read_cube(tmp_path / "mean.fits").pixels.shape[0] == 2
     for name in ("20MHz", "30MHz"):
         assert (tmp_path / name / "report.html").is_file()
-    before = (tmp_path / "20MHz" / "samples.nc").read_bytes()
+    before = read_datatree(tmp_path / "20MHz" / "samples.nc")["posterior"]["sky"].values
     assert run(*command, "--resume") == 0
-    assert xr.open_datatree(tmp_path / "20MHz" / "samples.nc", engine="h5netcdf") is not None
-    assert len((tmp_path / "20MHz" / "samples.nc").read_bytes()) == len(before)
+    after = read_datatree(tmp_path / "20MHz" / "samples.nc")["posterior"]["sky"].values
+    np.testing.assert_array_equal(after, before)
     assert run(*command, "--set", "joint=true") == 2
     assert "channels are sampled one by one" in capsys.readouterr().err
 

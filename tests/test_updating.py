@@ -54,7 +54,7 @@ def exact_tilt(monkeypatch):
     monkeypatch.setattr("lusee_bayes.pointing.LEAST_ORDER", 4)
 
 
-@pytest.mark.parametrize("form", ["paper", "exact"])
+@pytest.mark.parametrize("form", ["paper", pytest.param("exact", marks=pytest.mark.long)])
 def test_a_second_run_adds_to_the_first(form, exact_tilt):
     runs = "observation.runs=[{cycles: 0.2}, {cycles: 0.1, turntable_deg: 30}]"
     parts = two_cycles("lmax=6", runs, f"noise.radiometer.form={form}")
@@ -82,6 +82,7 @@ def test_what_does_not_fit_is_refused():
 SMALL = ("--set", "lmax=5", "--set", "observation.runs.0.cycles=0.1")
 
 
+@pytest.mark.long
 def test_from_the_command_line(tmp_path, capsys):
     def run(*arguments):
         return main([str(a) for a in arguments])
