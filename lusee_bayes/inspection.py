@@ -9,7 +9,7 @@ import healpy
 import numpy as np
 import xarray as xr
 
-from lusee_bayes import datatree, diagnostics, results, visibilities
+from lusee_bayes import cube, datatree, diagnostics, results, visibilities
 from lusee_bayes.beams import PortResponse, read_beam
 from lusee_bayes.checks import InputError
 from lusee_bayes.compact import is_compact, read_compact
@@ -32,6 +32,8 @@ def describe(path: str | Path) -> str:
         return _describe_visibilities(path)
     if kind == results.FORMAT:
         return _describe_posterior(path)
+    if kind == cube.FORMAT:
+        return _describe_posterior_cube(path)
     if kind == datatree.FORMAT:
         return _describe_samples(path)
     if kind == diagnostics.FORMAT:
@@ -132,6 +134,26 @@ def _describe_visibilities(path: Path) -> str:
             f"  site: longitude {observation.lon_deg}, latitude {observation.lat_deg} degrees",
             f"  autos {np.nanmin(autos):.4g} to {np.nanmax(autos):.4g} K",
             f"  true sky {'included' if data.truth is not None else 'not known'}",
+        ]
+    )
+
+
+def _describe_posterior_cube(path: Path) -> str:
+    with xr.open_dataset(path, engine="h5netcdf") as posterior:
+        frequencies, attrs = posterior["frequency"].values, posterior.attrs
+        temperature = posterior["mean"].values[:, 0] / np.sqrt(4 * np.pi)
+        joint = "component_mean" in posterior
+        extra = [name for name in ("truth", "draws", "independent_mean") if name in posterior]
+        modes = posterior.sizes["mode"]
+    kind = "one posterior for all" if joint else "each by itself"
+    return "\n".join(
+        [
+            f"{path}: posterior over {modes} modes (lmax {attrs['lmax']}) at {len(frequencies)} "
+            f"frequencies from {frequencies[0]:g} to {frequencies[-1]:g} MHz, {kind}, "
+            f"{attrs['frame']}",
+            f"  mean temperature {temperature[0]:.6g} K to {temperature[-1]:.6g} K",
+            f"  also holds: {', '.join(extra) or 'nothing else'}",
+            f"  versions: {attrs['versions']}",
         ]
     )
 

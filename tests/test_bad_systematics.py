@@ -17,7 +17,8 @@ from lusee_bayes.experiment import Experiment
 from lusee_bayes.inference import latent_sites
 from lusee_bayes.prior import HarmonicPrior
 from lusee_bayes.programs import load_program
-from lusee_bayes.scenario import SourceSection, load_scenario
+from lusee_bayes.scenario import load_scenario
+from lusee_bayes.sections import SourceSection
 from lusee_bayes.systematics import Source, SpectrumBands, normal_within
 
 TINY = ("lmax=6", "observation.runs.0.cycles=0.02", "sky.sources=false")

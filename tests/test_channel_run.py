@@ -58,6 +58,7 @@ def joint(tmp_path_factory):
     return out
 
 
+@pytest.mark.long
 def test_independent_channels_are_maps_of_each_frequency(independent):
     cube = posterior_of(independent)
     np.testing.assert_array_equal(cube["frequency"], [20.0, 25.0, 30.0])
@@ -77,8 +78,13 @@ def test_independent_channels_are_maps_of_each_frequency(independent):
     assert not (independent / "channels").exists()
 
 
-def test_files_of_a_cube_agree_with_each_other(joint):
+def test_files_of_a_cube_agree_with_each_other(joint, capsys):
     cube = posterior_of(joint)
+    assert run("info", joint / "posterior.nc") == 0
+    said = capsys.readouterr().out
+    assert "25 modes (lmax 4) at 3 frequencies from 20 to 30 MHz, one posterior for all" in said
+    assert run("info", joint / "mean.fits") == 0
+    assert "20" in capsys.readouterr().out
     nside = load_scenario("fiducial", SMALL[1::2]).map_nside
     for name in ("mean", "truth"):
         read = read_cube(joint / f"{name}.fits")
@@ -126,6 +132,7 @@ def test_conjugate_gradients_give_the_same_maps(joint, tmp_path, capsys):
     assert not (tmp_path / "slow" / "posterior.nc").exists()
 
 
+@pytest.mark.long
 def test_an_interrupted_run_goes_on_where_it_was(independent, tmp_path, monkeypatch):
     made, whole = [], channels.Told.of
 

@@ -135,6 +135,7 @@ def test_info_recognises_its_files(folder, tmp_path, capsys):
         assert words in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_data_without_truth(folder, tmp_path):
     run("simulate", "fiducial", *SMALL, "-o", tmp_path / "sim.nc", "-q")
     xr.load_dataset(tmp_path / "sim.nc", engine="h5netcdf", decode_times=False).drop_vars(

@@ -80,8 +80,10 @@ except KeyboardInterrupt:
 """
 
 ROOT = Path(__file__).resolve().parents[1]
+# Ctrl-C is listened to even where the tests run in the background, which ignores it
 LAUNCH = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from lusee_bayes import processes
 processes.GRACE = 1.5
 sys.exit(processes.run_processes(int(sys.argv[1]), sys.argv[2:], module="crew"))
@@ -167,7 +169,7 @@ def check_sums(folder: Path, n: int) -> None:
     assert sorted(np.concatenate(parts)) == list(range(7))
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("n", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_processes_share_items_and_add_up(n, folder):
     # a proxy that does not exist is not asked
     code, out, err = launch(n, "sum", folder, http_proxy="http://127.0.0.1:9")
@@ -175,6 +177,7 @@ def test_processes_share_items_and_add_up(n, folder):
     check_sums(folder, n)
 
 
+@pytest.mark.long
 def test_slurm_is_recognised(folder):
     def start(k):
         slurm = {
@@ -238,7 +241,9 @@ def test_alone_a_sum_is_a_copy():
         fleet.total(np.arange(3))
 
 
-@pytest.mark.parametrize(("victim", "what"), [(0, "compute"), (1, "wait for 1")])
+@pytest.mark.parametrize(
+    ("victim", "what"), [(0, "compute"), pytest.param(1, "wait for 1", marks=pytest.mark.long)]
+)
 def test_a_killed_process_ends_the_run(victim, what, folder):
     with launched(2, what, folder) as launcher:
         pids = [pid_of(k, folder) for k in range(2)]
@@ -256,6 +261,7 @@ def test_a_killed_process_ends_the_run(victim, what, folder):
     assert out == ""
 
 
+@pytest.mark.long
 def test_a_process_that_fails_shows_why(folder):
     code, _, err = launch(2, "one fails", folder)
     assert code == 1
@@ -268,16 +274,22 @@ def test_a_process_that_fails_shows_why(folder):
 
 @pytest.mark.parametrize(
     ("n", "what"),
-    [(2, "one finds bad input"), (2, "all find bad input"), (3, "the last finds none")],
+    [
+        pytest.param(2, "one finds bad input", marks=pytest.mark.long),
+        (2, "all find bad input"),
+        pytest.param(3, "the last finds none", marks=pytest.mark.long),
+    ],
 )
 def test_bad_input_is_said_once(n, what, folder):
     assert launch(n, what, folder) == (2, "", "crew: the sky is missing\n")
 
 
+@pytest.mark.long
 def test_a_common_verdict_is_no_accident(folder):
     assert launch(2, "a verdict", folder) == (1, "", "")
 
 
+@pytest.mark.long
 def test_processes_out_of_step_are_told(folder):
     code, _, err = launch(2, "out of step", folder)
     assert code == 1
@@ -288,8 +300,8 @@ def test_processes_out_of_step_are_told(folder):
     ("how", "code", "what"),
     [
         (signal.SIGINT, 130, "compute"),
-        (signal.SIGTERM, -signal.SIGTERM, "start slowly"),
-        (signal.SIGKILL, -signal.SIGKILL, "compute"),
+        pytest.param(signal.SIGTERM, -signal.SIGTERM, "start slowly", marks=pytest.mark.long),
+        pytest.param(signal.SIGKILL, -signal.SIGKILL, "compute", marks=pytest.mark.long),
     ],
 )
 def test_nobody_outlives_the_launcher(how, code, what, folder):
@@ -304,6 +316,7 @@ def test_nobody_outlives_the_launcher(how, code, what, folder):
     assert err == ("crew: interrupted\n" if how == signal.SIGINT else "")
 
 
+@pytest.mark.long
 def test_processes_that_do_not_listen_are_killed(folder):
     with launched(2, "deaf", folder) as launcher:
         for k in range(2):

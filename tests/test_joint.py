@@ -91,7 +91,13 @@ def drawn(prior, made, seed=2):
     ]
 
 
-@pytest.fixture(scope="module", params=list(PRIORS))
+@pytest.fixture(
+    scope="module",
+    params=[
+        "components",
+        *(pytest.param(p, marks=pytest.mark.long) for p in ("kernel", "no rest")),
+    ],
+)
 def case(request):
     """Prior, models, data, what they tell, and the textbook's answer."""
     prior = PRIORS[request.param]()

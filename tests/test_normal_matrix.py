@@ -69,7 +69,15 @@ def noise_of(kind, layout):
 
 
 @pytest.mark.parametrize("kind", ["diagonal", "blocks", "banded"])
-@pytest.mark.parametrize(("order", "missing"), [(0, True), (1, True), (2, True), (2, False)])
+@pytest.mark.parametrize(
+    ("order", "missing"),
+    [
+        pytest.param(0, True, marks=pytest.mark.long),
+        pytest.param(1, True, marks=pytest.mark.long),
+        (2, True),
+        pytest.param(2, False, marks=pytest.mark.long),
+    ],
+)
 def test_equals_the_product_of_matrices(kind, order, missing):
     coupling = setting(order, missing)
     noise = noise_of(kind, coupling.layout)
@@ -152,6 +160,7 @@ def test_information_under_another_prior():
     np.testing.assert_allclose(got.log_evidence, expected.log_evidence, rtol=1e-11)
 
 
+@pytest.mark.long
 def test_perturbations_are_draws_with_the_normal_matrix_as_covariance():
     gaussian = model()
     n = 4000
