@@ -20,19 +20,13 @@ from lusee_bayes.metrics import correlation, ell_cross, signal_to_noise
 from lusee_bayes.progress import peak_memory_gb
 from lusee_bayes.residuals import SIGNIFICANCE, probability
 from lusee_bayes.staging import staged
+from lusee_bayes.uncertainty import LANDMARKS
 from lusee_bayes.version import versions
 
 FORMAT = "lusee_bayes posterior cube 1"
 # chi^2 of a channel that is further from its mean, in standard deviations of the widest
 # distribution it can have, is called bad
 SIGNIFICANT = 6.0
-# directions whose spectra are shown: Galactic longitude and latitude in degrees
-LANDMARKS = {
-    "Galactic centre": (0.0, 0.0),
-    "anticentre": (180.0, 0.0),
-    "north Galactic pole": (0.0, 90.0),
-    "south Galactic pole": (0.0, -90.0),
-}
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import xarray as xr
@@ -32,24 +31,15 @@ from lusee_bayes.metrics import (
 )
 from lusee_bayes.pixel_variance import pixel_std as pixel_deviations
 from lusee_bayes.posterior import Posterior
-from lusee_bayes.prior import HarmonicPrior
 from lusee_bayes.progress import Stages, peak_memory_gb
-from lusee_bayes.scenario import Scenario
 from lusee_bayes.sky import kelvin_steradian, write_alms
 from lusee_bayes.staging import staged
+from lusee_bayes.updatable import Updatable
 from lusee_bayes.updating import composed, given
 from lusee_bayes.version import versions
 from lusee_bayes.visibilities import Visibilities
 
 FORMAT = "lusee_bayes posterior 1"
-
-
-@dataclass(frozen=True)
-class Updatable:
-    """A saved posterior to which new data can be added, and the digests of the data behind it."""
-
-    posterior: Posterior
-    digests: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -281,39 +271,6 @@ class MapResult:
         if truth is not None:
             maps |= {"truth": truth, "residual": mean - truth}
         return maps
-
-
-def read_updatable(folder: str | Path, scenario: Scenario) -> Updatable:
-    """The posterior of an updatable run (``map --updatable``) at the scenario's frequency.
-
-    InputError if the folder has none, or one of another frequency or lmax.
-    """
-    path = Path(folder) / "posterior.nc"
-    if not path.is_file():
-        raise InputError(f"'{folder}' has no posterior.nc; give the folder of a finished map run")
-    with xr.open_dataset(path, engine="h5netcdf") as file:
-        saved = file.load()
-    if "precision_root" not in saved:
-        raise InputError(
-            f"{path} does not hold what an update needs; make that map anew with --updatable"
-        )
-    for name in ("frequency_mhz", "lmax"):
-        if saved.attrs[name] != getattr(scenario, name):
-            raise InputError(
-                f"{path} is of {name} {saved.attrs[name]:g}, the scenario of "
-                f"{getattr(scenario, name):g}; use --set {name}={saved.attrs[name]:g}"
-            )
-    spectrum = power_spectrum(np.asarray(saved["prior_std"]))
-    none = jnp.zeros(())
-    posterior = Posterior(
-        HarmonicPrior(jnp.asarray(spectrum)),
-        jnp.asarray(np.asarray(saved["white_mean"])),
-        jnp.asarray(np.asarray(saved["precision_root"])),
-        None,
-        none + float(saved.attrs["log_evidence"]),
-        none,
-    )
-    return Updatable(posterior, tuple(json.loads(saved.attrs["data_digests"])))
 
 
 def flux_table(experiment: Experiment, data: Visibilities, posterior: Posterior) -> pd.DataFrame:

@@ -31,6 +31,7 @@ from lusee_bayes.staging import require_folder, staged
 from lusee_bayes.systematics import SCALES, Systematic
 from lusee_bayes.uncertainty import (
     INTERVAL,
+    LANDMARKS,
     pixel_interval,
     pixel_mean,
     pixel_std,
@@ -44,14 +45,6 @@ SAMPLES, CHAINS = "samples.nc", "chains"
 
 # where the mode of a collapsed program is looked for
 STARTS = 4
-
-# directions whose brightness every summary tells: Galactic longitude and latitude in degrees
-LANDMARKS = {
-    "Galactic centre": (0.0, 0.0),
-    "anticentre": (180.0, 0.0),
-    "north Galactic pole": (0.0, 90.0),
-    "south Galactic pole": (0.0, -90.0),
-}
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,13 @@ from lusee_bayes.harmonics import lmax_of, pixel_matrix, power_spectrum, synthes
 # pixels of which all draws are held at once
 CHUNK = 1024
 
+# directions whose brightness summaries and spectra tell: Galactic longitude and latitude in degrees
+LANDMARKS = {
+    "Galactic centre": (0.0, 0.0),
+    "anticentre": (180.0, 0.0),
+    "north Galactic pole": (0.0, 90.0),
+    "south Galactic pole": (0.0, -90.0),
+}
 # columns of summaries: the same with ArviZ 0.8 and 1.x
 INTERVAL = 0.9
 

@@ -11,8 +11,8 @@ from lusee_bayes.cli import main
 from lusee_bayes.experiment import Experiment
 from lusee_bayes.layout import DataLayout
 from lusee_bayes.prior import HarmonicPrior
-from lusee_bayes.results import read_updatable
 from lusee_bayes.scenario import load_scenario
+from lusee_bayes.updatable import read_updatable
 from lusee_bayes.updating import given, updated
 from lusee_bayes.visibilities import Visibilities
 

@@ -29,9 +29,10 @@ from lusee_bayes.joining import is_launched
 from lusee_bayes.processes import run_processes
 from lusee_bayes.progress import Stages
 from lusee_bayes.report import REPORT, write_report
-from lusee_bayes.results import MapResult, read_updatable
+from lusee_bayes.results import MapResult
 from lusee_bayes.scenario import load_scenario
 from lusee_bayes.staging import staged
+from lusee_bayes.updatable import read_updatable
 
 
 def map_command(
