@@ -11,9 +11,10 @@ for version in 3.13 3.12 3.11; do
     folder=.venv-$version
     [ -x "$folder/bin/python" ] || "$python" -m venv "$folder"
     "$folder/bin/python" -m pip install --quiet --editable '.[dev]'
+    "$folder/bin/python" -m pytest -m "long or not long" tests/test_sample_run.py
     exec "$folder/bin/python" -m pytest -n 2 tests/test_sites.py tests/test_programs.py \
-      tests/test_inference.py tests/test_datatree.py tests/test_sample_run.py \
-      tests/test_uncertainty.py tests/test_validation.py
+      tests/test_inference.py tests/test_datatree.py tests/test_uncertainty.py \
+      tests/test_validation.py
   done
 done
 echo "no other Python here: ArviZ was checked with Python $here only"

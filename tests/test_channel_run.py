@@ -78,6 +78,7 @@ def test_independent_channels_are_maps_of_each_frequency(independent):
     assert not (independent / "channels").exists()
 
 
+@pytest.mark.long
 def test_files_of_a_cube_agree_with_each_other(joint, capsys):
     cube = posterior_of(joint)
     assert run("info", joint / "posterior.nc") == 0

@@ -100,6 +100,7 @@ def test_headers_say_where_the_numbers_come_from(folder):
             assert healpy.read_map(folder / f"{name}.fits", dtype=None).dtype.itemsize == 8
 
 
+@pytest.mark.long
 def test_the_resolved_scenario_gives_the_same_numbers(folder, tmp_path):
     assert run("map", folder / "scenario.yaml", "-o", tmp_path, "-q") == 0
     first, again = (

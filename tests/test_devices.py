@@ -296,6 +296,7 @@ def test_processes_out_of_step_are_told(folder):
     assert err.count("the processes of this run are out of step at 'a'") == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("how", "code", "what"),
     [
@@ -355,6 +356,7 @@ def test_without_the_launcher_a_death_ends_the_run_too(victim, folder):
             process.communicate()
 
 
+@pytest.mark.long
 def test_results_do_not_depend_on_the_device(tmp_path):
     code = """
 import sys

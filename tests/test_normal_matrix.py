@@ -130,7 +130,9 @@ def model(kind="diagonal"):
     return LinearGaussian(coupling, prior, noise, offset)
 
 
-@pytest.mark.parametrize("kind", ["diagonal", "offset", "low rank"])
+@pytest.mark.parametrize(
+    "kind", ["diagonal", *(pytest.param(k, marks=pytest.mark.long) for k in ("offset", "low rank"))]
+)
 def test_information_gives_the_posterior_of_the_dense_form(kind):
     gaussian = model(kind)
     rng = np.random.default_rng(11)

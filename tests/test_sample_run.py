@@ -44,6 +44,8 @@ ROOT = Path(lusee_bayes.__file__).resolve().parents[1]
 OVERRIDES = ["lmax=6", "observation.runs.0.cycles=0.1"]
 SMALL = ["fiducial", *(a for override in OVERRIDES for a in ("--set", override))]
 # what SETTINGS make of a scenario with seed 1
+# runs that are killed and resumed take a minute and more together
+pytestmark = pytest.mark.long
 SAMPLER = Sampler(chains=4, warmup=100, draws=1000, seed=1)
 SETTINGS = ["--chains", "4", "--warmup", "100", "--draws", "1000"]
 N_MODES, NSIDE = 49, 8

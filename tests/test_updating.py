@@ -54,7 +54,8 @@ def exact_tilt(monkeypatch):
     monkeypatch.setattr("lusee_bayes.pointing.LEAST_ORDER", 4)
 
 
-@pytest.mark.parametrize("form", ["paper", pytest.param("exact", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("form", ["paper", "exact"])
 def test_a_second_run_adds_to_the_first(form, exact_tilt):
     runs = "observation.runs=[{cycles: 0.2}, {cycles: 0.1, turntable_deg: 30}]"
     parts = two_cycles("lmax=6", runs, f"noise.radiometer.form={form}")
