@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 # numbers that must not depend on the machine's locale or on a display
 export MPLBACKEND := agg
 
-.PHONY: map test long lint docs bench clean
+.PHONY: map test essential long lint docs bench clean
 
 # a posterior map of the embedded sky at 25 MHz, in output/fiducial
 map: $(VENV)/installed
@@ -14,6 +14,10 @@ map: $(VENV)/installed
 # keep each below the number of memory maps that compiled programs may take up
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+# those longer checks that find most for their time
+essential: $(VENV)/installed-dev
+	$(BIN)/python -m pytest -m "long and essential" -n 2 --dist loadfile
 
 long: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m long -n 2 --dist loadfile
@@ -26,6 +30,8 @@ lint: $(VENV)/installed-dev
 # the site, in docs/_build/html; every page is read anew, since only then its warnings are seen
 docs: $(VENV)/installed-docs
 	$(BIN)/python -m sphinx -E -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
+	# no page needs a file from the network
+	! grep -rlE '<(script|img|link|iframe)[^>]* (src|href)="?(https?:)?//' docs/_build/html --include='*.html'
 
 bench: $(VENV)/installed
 	$(BIN)/python benchmarks/pipeline.py

@@ -11,10 +11,10 @@ for version in 3.13 3.12 3.11; do
     folder=.venv-$version
     [ -x "$folder/bin/python" ] || "$python" -m venv "$folder"
     "$folder/bin/python" -m pip install --quiet --editable '.[dev]'
-    "$folder/bin/python" -m pytest -m "long or not long" tests/test_sample_run.py
-    exec "$folder/bin/python" -m pytest -n 2 tests/test_sites.py tests/test_programs.py \
-      tests/test_inference.py tests/test_datatree.py tests/test_uncertainty.py \
-      tests/test_validation.py
+    exec "$folder/bin/python" -m pytest -n 2 --dist loadfile tests/sampling/test_sites.py \
+      tests/sampling/test_programs.py tests/sampling/test_datatree.py \
+      tests/sampling/test_uncertainty.py tests/sampling/test_validation.py \
+      tests/runs/test_sample_run.py
   done
 done
 echo "no other Python here: ArviZ was checked with Python $here only"

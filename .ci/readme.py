@@ -9,7 +9,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from lusee_bayes.cli import main
+from lusee_bayes.cli.main import main
 
 text = Path(sys.argv[1]).read_text()
 namespace: dict[str, object] = {}

@@ -19,8 +19,8 @@ from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpotrf
 
 import lusee_bayes as lb
-from lusee_bayes.building import build_beams, build_observation
-from lusee_bayes.progress import peak_memory_gb
+from lusee_bayes.core.progress import peak_memory_gb
+from lusee_bayes.experiment.model import full_model
 
 
 def timed(work: Callable[[], object], repeats: int) -> tuple[float, float]:
@@ -46,17 +46,18 @@ def main() -> None:
         first, steady = timed(work, options.repeats)
         rows.append((name, first, steady / per, peak_memory_gb()))
 
-    measure("rotations (lunarsky)", lambda: build_observation(scenario).mcmf_from_galactic())
-    observation = build_observation(scenario)
+    section, source = scenario.observation, scenario.beam.source()
+    measure("rotations (lunarsky)", lambda: section.observation().mcmf_from_galactic())
+    observation = section.observation()
     measure("pointing", lambda: lb.Pointing.of(observation, scenario.lmax))
     pointing = lb.Pointing.of(observation, scenario.lmax)
-    measure("b_lm", lambda: build_beams(scenario).modes)
-    experiment = lb.Experiment.from_scenario(scenario)
-    beams = build_beams(scenario)
+    measure("b_lm", lambda: source.beams(scenario.frequency_mhz, scenario.lmax).modes)
+    experiment = lb.build(scenario)
+    setup, data = experiment.setup, experiment.data
+    beams = setup.beams
     measure("A", lambda: lb.CouplingMatrix.build(beams, pointing).dense())
-    measure("A times a sky", lambda: experiment.coupling @ experiment.sky.modes)
-    data = experiment.simulate()
-    model = experiment.model()
+    measure("A times a sky", lambda: setup.coupling @ setup.sky.modes)
+    model = full_model(setup)
 
     def to_posterior():
         coupling = lb.CouplingMatrix.build(beams, pointing)

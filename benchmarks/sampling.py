@@ -18,9 +18,9 @@ from rich.console import Console
 from rich.table import Table
 
 import lusee_bayes as lb
-from lusee_bayes.coordinates import Whitening
-from lusee_bayes.inference import ALGORITHMS, Sampler, sample
-from lusee_bayes.programs import load_program
+from lusee_bayes.sampling.hmc import ALGORITHMS, Sampler, sample
+from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.sampling.whitening import Whitening
 
 
 def main() -> None:
@@ -29,9 +29,9 @@ def main() -> None:
     parser.add_argument("--scenario", default="fiducial")
     parser.add_argument("--set", action="append", default=[], help="override of the scenario")
     options = parser.parse_args()
-    experiment = lb.Experiment.from_scenario(lb.load_scenario(options.scenario, options.set))
-    data = experiment.simulate()
-    model, posterior, _ = experiment.infer(data)
+    experiment = lb.build(lb.load_scenario(options.scenario, options.set))
+    data, found = experiment.data, lb.infer(experiment)
+    model, posterior = found.model, found.posterior
     program = load_program("sky")
     arguments = {**program.arguments(model), "data": data.data}
     whitening = Whitening.of(posterior)

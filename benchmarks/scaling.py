@@ -25,10 +25,12 @@ from rich.table import Table
 from scipy.linalg.blas import dsyrk
 
 import lusee_bayes as lb
-from lusee_bayes.experiment import Experiment
+from lusee_bayes.core.rotations import tilt_powers
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.terms import Around
+from lusee_bayes.linear.normal_matrix import normal_matrix
 from lusee_bayes.noise import radiometer_noise
-from lusee_bayes.normal_matrix import normal_matrix
-from lusee_bayes.rotations import tilt_powers
 
 SAMPLES = [(1.0, 7200.0), (1.0, 600.0), (3.0, 7200.0), (12.0, 600.0), (13.368, 600.0)]
 LMAX = [16, 24, 32, 47, 64, 95]
@@ -52,15 +54,15 @@ def steady(work) -> float:
 
 def normal(cycles: float, step_s: float, lmax: int, order: int | None, dense: bool) -> dict:
     """The structured normal matrix of one observation, and dsyrk of the whitened A if asked for."""
-    experiment = Experiment.from_scenario(lb.load_scenario("fiducial", [f"lmax={lmax}"]))
+    setup = set_up(lb.load_scenario("fiducial", [f"lmax={lmax}"]))
     runs = [lb.Run(cycles)]
     observation = lb.Observation.from_runs(runs, step_s=step_s)
 
     def coupling_of(order: int | None):
         pointing = lb.Pointing.of(observation, lmax, order)
-        return lb.CouplingMatrix.build(experiment.beams, pointing)
+        return lb.CouplingMatrix.build(setup.beams, pointing)
 
-    coupling, sky = coupling_of(order), experiment.sky.modes
+    coupling, sky = coupling_of(order), setup.sky.modes
     exact = coupling_of(4)
     signal = exact.layout.scatter(exact @ sky)
     noise = radiometer_noise(signal, exact.layout, step_s=step_s)
@@ -92,10 +94,10 @@ def posterior_of_a_year() -> dict:
     """From the data of a year every ten minutes to posterior mean and standard deviations."""
     runs = "observation.runs=[{cycles: 13.368}]"
     scenario = lb.load_scenario("fiducial", [runs, "observation.step_s=600"])
-    experiment = Experiment.from_scenario(scenario)
-    data = experiment.simulate()
+    experiment = lb.build(scenario)
+    data = experiment.data
     start = time.perf_counter()
-    posterior = experiment.model(data).condition(data.data)
+    posterior = full_model(experiment.setup, Around(data)).condition(data.data)
     posterior.std()
     return {
         "visibilities": int(data.layout.size),

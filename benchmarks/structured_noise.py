@@ -22,7 +22,9 @@ from scipy.linalg.blas import dsyrk, dtrsm
 from scipy.linalg.lapack import dpotrf
 
 import lusee_bayes as lb
-from lusee_bayes.progress import peak_memory_gb
+from lusee_bayes.core.progress import peak_memory_gb
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.setup import set_up
 
 console = Console(width=100)
 
@@ -40,10 +42,10 @@ def median_seconds(work: Callable[[], object], repeats: int) -> float:
 
 def fiducial() -> tuple[lb.LinearGaussian, jax.Array]:
     """The model with radiometer and gain noise, its A dense, and data."""
-    experiment = lb.Experiment.from_scenario(lb.load_scenario("gain_1e-2"))
-    model = experiment.model()
+    experiment = lb.build(lb.load_scenario("gain_1e-2"))
+    model = full_model(experiment.setup)
     dense = lb.LinearGaussian(model.coupling.dense(), model.prior, model.noise)
-    return dense, experiment.simulate().data
+    return dense, experiment.data.data
 
 
 def routes(repeats: int) -> None:
@@ -55,7 +57,7 @@ def routes(repeats: int) -> None:
     dense = median_seconds(lambda: full.condition(data).white_mean, repeats)
     n = np.asfortranarray(matrix)
     lower = np.asfortranarray(dpotrf(n, lower=1)[0])
-    a = np.asfortranarray(model.coupling)
+    a = np.asfortranarray(model.coupling.dense())
     normal = dsyrk(1.0, a, trans=1, lower=1) + 1e12 * np.eye(a.shape[1])
     parts = {
         "dpotrf N": lambda: dpotrf(n, lower=1)[0],
@@ -80,14 +82,14 @@ def scaling(repeats: int) -> None:
         table.add_column(heading, justify="right")
     factor = eqx.filter_jit(lambda noise: noise.factor())
     for cycles in (0.25, 0.5, 1, 2, 4, 8, 12):
-        experiment = lb.Experiment.from_scenario(
+        setup = set_up(
             lb.load_scenario("gain_1e-2", [f"observation.runs.0.cycles={cycles}", "lmax=8"])
         )
-        noise = experiment.noise()
+        noise = full_model(setup).noise
         seconds = median_seconds(lambda noise=noise: factor(noise).diagonal, repeats)
         table.add_row(
             f"{cycles:g}",
-            str(experiment.observation.n_times),
+            str(setup.observation.n_times),
             str(noise.size),
             f"{seconds:.3f}",
             f"{1e6 * seconds / noise.size:.1f}",

@@ -1,16 +1,11 @@
 """How the documentation is built: ``make docs``; nothing here uses the network."""
 
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parent / "extension"))
-
 import jax
 
-# in signatures: Float[Array, "data"], not Float[jaxlib._jax.Array, "data"]
-jax.Array.__name__ = "Array"
+import lusee_bayes
 
-import lusee_bayes  # noqa: E402
+# signatures show Float[Array, "data"], not Float[jaxlib._jax.Array, "data"]
+jax.Array.__name__ = "Array"
 
 project = "lusee_bayes"
 author = "the lusee_bayes developers"
@@ -20,20 +15,29 @@ html_show_copyright = False
 html_show_sphinx = False
 html_copy_source = False
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "lusee_docs"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "numpydoc",
+    "cyclopts.sphinx_ext",
+]
 exclude_patterns = ["_build"]
 
 myst_heading_anchors = 3
 highlight_language = "text"
+# --option stays two hyphens
+smartquotes = False
 
-# the public names, in the order of the source, with shapes as they are annotated
+# the docstrings give types, shapes and units; signatures give names and defaults
+autodoc_typehints = "none"
 autodoc_member_order = "bysource"
-autodoc_default_options = {"exclude-members": "model_config"}
-autodoc_typehints = "signature"
-autodoc_typehints_format = "short"
+autodoc_default_options = {"members": True, "exclude-members": "model_config"}
 autodoc_preserve_defaults = True
-python_maximum_signature_line_length = 88
-python_use_unqualified_type_names = True
+autosummary_generate = False
+numpydoc_show_class_members = False
+numpydoc_attributes_as_param_list = True
+maximum_signature_line_length = 88
 add_module_names = False
 toc_object_entries_show_parents = "hide"
 

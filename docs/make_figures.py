@@ -15,31 +15,30 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 import lusee_bayes as lb
-from lusee_bayes.building import build_beams
-from lusee_bayes.datatree import read_datatree
-from lusee_bayes.harmonics import modes_to_map, power_spectrum
-from lusee_bayes.metrics import ell_cross, signal_to_noise
-from lusee_bayes.plots import BLUE, ORANGE, colour_bar, mollweide
-from lusee_bayes.results import MapResult
+from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
+from lusee_bayes.experiment.model import base_model
+from lusee_bayes.experiment.simulate import true_values
+from lusee_bayes.linear.metrics import ell_cross, signal_to_noise
+from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar, mollweide
+from lusee_bayes.results.map_result import map_result
+from lusee_bayes.sampling.datatree import read_datatree
+from lusee_bayes.sampling.uncertainty import summary
 from lusee_bayes.sky import BRIGHT_SOURCES
 from lusee_bayes.sky.galaxy import galaxy_map
-from lusee_bayes.sky.sky import source_modes
-from lusee_bayes.uncertainty import summary
 
 HERE = Path(__file__).parent / "figures"
 
 
 def fixed_axis() -> None:
-    """What it costs to let the Moon turn about a fixed axis: visibilities and the map."""
+    """Draw and print the errors of a fixed axis, in visibilities and in the map."""
     scenario = lb.load_scenario("fiducial")
-    experiment = lb.Experiment.from_scenario(scenario)
-    beams, observation = build_beams(scenario), experiment.observation
+    experiment = lb.build(scenario)
+    found, data, sky = lb.infer(experiment), experiment.data.data, experiment.setup.sky.modes
+    beams, observation = experiment.setup.beams, experiment.setup.observation
     exact = lb.CouplingMatrix.build(beams, lb.Pointing.of(observation, scenario.lmax, order=6))
-    noise, data = experiment.noise(), experiment.simulate()
-    sigma = np.sqrt(np.asarray(noise.diagonal()))
-    truth = exact @ experiment.sky.modes
-    model = experiment.model()
-    reference = signal_to_noise(model.condition(data.data).mean, experiment.sky.modes)
+    sigma = np.sqrt(np.asarray(found.model.noise.diagonal()))
+    truth = exact @ sky
+    reference = signal_to_noise(found.posterior.mean, sky)
     print("| axis | rms [sigma] | worst [sigma] | first ell with SNR < 1 |")
     print("| --- | --- | --- | --- |")
     lines = {}
@@ -47,9 +46,9 @@ def fixed_axis() -> None:
         coupling = lb.CouplingMatrix.build(
             beams, lb.Pointing.of(observation, scenario.lmax, order=order)
         )
-        error = np.abs((coupling @ experiment.sky.modes - truth) / sigma)
-        posterior = lb.LinearGaussian(coupling, model.prior, noise).condition(data.data)
-        snr = signal_to_noise(posterior.mean, experiment.sky.modes)
+        error = np.abs((coupling @ sky - truth) / sigma)
+        model = lb.LinearGaussian(coupling, found.model.prior, found.model.noise)
+        snr = signal_to_noise(model.condition(data).mean, sky)
         lines[name] = snr
         print(
             f"| {name} | {np.sqrt(np.mean(error**2)):.2g} | {error.max():.2g} | {ell_cross(snr)} |"
@@ -67,7 +66,7 @@ def fixed_axis() -> None:
 
 
 def embedded_sky(ulsa: Path | None) -> None:
-    """The embedded Galaxy at 1, 3 and 10 MHz, beside ULSA where its maps are at hand."""
+    """Draw the embedded Galaxy at 1, 3 and 10 MHz, beside ULSA's maps if they are given."""
     figure = Figure(figsize=(10, 8.5), layout="constrained")
     for row, frequency in enumerate((1.0, 3.0, 10.0)):
         ours = galaxy_map(frequency)
@@ -97,31 +96,30 @@ def embedded_sky(ulsa: Path | None) -> None:
 
 
 def point_sources() -> None:
-    """The catalogue's sources in the data: fitted beside the map, or left to the map."""
+    """Draw maps of data with the catalogue's sources, fitted separately or left to the map."""
     listed = ", ".join(f"{{name: {source.name}}}" for source in BRIGHT_SOURCES)
     figure = Figure(figsize=(9, 7.5), layout="constrained")
     top, bottom = figure.subfigures(2, 1, height_ratios=(1.1, 1))
     residuals, lines = {}, {}
     for treatment in ("marginalised", "ignored"):
         overrides = [f"sources.list=[{listed}]", f"sources.treatment={treatment}"]
-        experiment = lb.Experiment.from_scenario(lb.load_scenario("fiducial", overrides))
-        data = experiment.simulate()
-        result = MapResult.from_experiment(experiment, data)
-        mean, truth = result.posterior.mean, experiment.sky.modes
+        experiment = lb.build(lb.load_scenario("fiducial", overrides))
+        result = map_result(experiment)
+        mean, truth = result.channel.mean, result.channel.truth
         lines[treatment] = signal_to_noise(mean, truth)
         residuals[treatment] = modes_to_map(mean - truth, 64)
         if result.fluxes is not None:
             print(result.fluxes.to_string(float_format="{:.4g}".format))
-    # what the map of the second row is meant to show: the sky with its sources, as far as ell goes
-    with_sources = truth
+    # the sky with its sources up to lmax, which the second map should show
+    with_sources, fluxes = truth, true_values(experiment.setup)
     for source in BRIGHT_SOURCES:
-        flux = experiment.truth()[f"flux_{source.name.replace(' ', '_')}"]
-        unit = source_modes(source, 25.0, 47) / source.kelvin_steradian(25.0)
+        flux = fluxes[f"flux_{source.name.replace(' ', '_')}"]
+        unit = source.modes(25.0, 47) / source.kelvin_steradian(25.0)
         with_sources = with_sources + flux * unit
     lines["ignored, truth with sources"] = signal_to_noise(mean, with_sources)
     largest = np.percentile(np.abs(residuals["marginalised"]), 99)
     for column, (treatment, title) in enumerate(
-        [("marginalised", "fitted beside the map"), ("ignored", "left to the map")]
+        [("marginalised", "fitted separately"), ("ignored", "left to the map")]
     ):
         axes = top.add_subplot(1, 2, column + 1, projection="mollweide")
         image = mollweide(
@@ -156,12 +154,16 @@ def point_sources() -> None:
 
 
 def regolith(folder: Path) -> None:
-    """Ground, tilt, noise level and map from one data set, and what a wrong ground does to the map.
+    """Draw the posterior of ground, tilt and noise level, and the error of a wrong ground.
 
-    ``folder``: written by ``lusee-bayes sample regolith``.
+    Parameters
+    ----------
+    folder : Path
+        Written by ``lusee-bayes sample regolith``.
     """
-    experiment = lb.Experiment.from_scenario(lb.load_scenario("regolith"))
-    data, true = experiment.simulate(), experiment.truth()
+    experiment = lb.build(lb.load_scenario("regolith"))
+    setup, data = experiment.setup, experiment.data
+    true = true_values(setup)
     tree = read_datatree(folder / "samples.nc")
     draws = {name: tree["posterior"][name].values for name in true}
     table = summary(draws)
@@ -169,12 +171,12 @@ def regolith(folder: Path) -> None:
     for name, value in true.items():
         low, high = np.quantile(draws[name], [0.025, 0.975])
         print(f"| {name} | {value:.6g} | {low:.6g} to {high:.6g} | {low < value < high} |")
-    base, sky = experiment.base(), experiment.sky.modes
+    base, sky = base_model(setup), setup.sky.modes
     ground = {name: true[name] for name in ("surface_permittivity", "zenith_angle_deg")}
-    wrong = ground | {"surface_permittivity": experiment.scenario.beam.surface_permittivity}
+    wrong = ground | {"surface_permittivity": setup.scenario.beam.surface_permittivity}
 
     def fixed(values):
-        model = lb.LinearGaussian(experiment.prepared.dense(values), base.prior, base.noise)
+        model = lb.LinearGaussian(setup.prepared.dense(values), base.prior, base.noise)
         return signal_to_noise(model.condition(data.data).mean, sky)
 
     mean = tree["posterior"]["sky"].values.mean((0, 1))

@@ -1,4 +1,4 @@
-"""The terms of N: what the instrument adds to the sky's visibilities, as covariances."""
+"""The terms of N: covariances of what the instrument adds to the visibilities of the sky."""
 
 from lusee_bayes.noise.beam_error import (
     beam_error_noise,

@@ -1,7 +1,7 @@
-"""Beams that are not quite what A says: N_beam = dA S dA^T along known directions dA.
+"""Errors of the beams in A: N_beam = dA S dA^T along known directions dA.
 
-If the true coupling matrix is A + dA, the data hold dA m besides A m; averaged over skies of the
-prior that is noise of covariance dA S dA^T (paper, section on beam precision). Directions: the
+If the true coupling matrix is A + dA, the data hold dA m besides A m; over skies of the prior, that
+is noise of covariance dA S dA^T (paper, section on beam precision). Directions: the
 difference to another beam (a frequency shift, another file), or the derivative with respect to a
 parameter of the embedded beam times its standard deviation.
 """
@@ -12,28 +12,64 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lusee_bayes.beams import Monopoles, ProductBeams, monopole_beams, parameter, placed
-from lusee_bayes.checks import require_shape
-from lusee_bayes.coupling import CouplingMatrix
-from lusee_bayes.covariance import LowRankCovariance
-from lusee_bayes.prior import Prior
+from lusee_bayes.core.checks import require_shape
+from lusee_bayes.instrument.beams import Monopoles, ProductBeams, monopole_beams, parameter, placed
+from lusee_bayes.instrument.coupling import Coupling
+from lusee_bayes.noise.covariance import LowRankCovariance
+from lusee_bayes.sky.priors import Prior
 
 
-def beam_error_noise(direction: CouplingMatrix, prior: Prior) -> LowRankCovariance:
-    """dA S dA^T, in K^2; ``direction`` is dA: a coupling matrix of the difference of two beams."""
+def beam_error_noise(direction: Coupling, prior: Prior) -> LowRankCovariance:
+    """Return the covariance dA S dA^T of a beam error.
+
+    Parameters
+    ----------
+    direction : Coupling
+        dA: the coupling matrix of a difference of beams.
+    prior : Prior
+        S.
+
+    Returns
+    -------
+    LowRankCovariance
+        In K^2.
+    """
     return LowRankCovariance(prior.colour_columns(direction.dense()), "the beam-error covariance")
 
 
 def difference(true: ProductBeams, model: ProductBeams) -> ProductBeams:
-    """Beams true - model: the direction of a beam error. InputError if they do not match."""
+    """Return the difference true - model of two beams, the direction of a beam error.
+
+    Raises
+    ------
+    InputError
+        If their shapes differ.
+    """
     require_shape("the other beam's coefficients", true.modes, model.modes.shape)
     return ProductBeams(true.modes - model.modes, model.frequency_mhz)
 
 
 def derivative(name: str, frequency_mhz: float, lmax: int, monopoles: Monopoles) -> ProductBeams:
-    """d beams / d (a parameter of the embedded antennas), by forward mode.
+    """Return the derivative of the beams in a parameter of the embedded antennas.
 
-    ``name``: one of ``beams.PARAMETERS``; InputError naming the nearest for others.
+    Parameters
+    ----------
+    name : str
+        One of ``beams.PARAMETERS``.
+    frequency_mhz : float
+    lmax : int
+    monopoles : Monopoles
+        Where to take the derivative.
+
+    Returns
+    -------
+    ProductBeams
+        In K per K and unit of the parameter.
+
+    Raises
+    ------
+    InputError
+        If the parameter is unknown.
     """
 
     def modes(value: Float[Array, ""]) -> Float[Array, "products modes"]:
@@ -45,9 +81,9 @@ def derivative(name: str, frequency_mhz: float, lmax: int, monopoles: Monopoles)
 
 
 def rms_difference(true: ProductBeams, model: ProductBeams) -> float:
-    """RMS over products and directions of the difference of two beams, over the RMS of the model.
+    """Return the RMS difference of two beams, relative to the RMS of ``model``.
 
-    By Parseval, from the coefficients up to lmax.
+    Over products and directions, by Parseval's theorem from the coefficients up to lmax.
     """
     error = difference(true, model).modes
     return float(jnp.sqrt((error**2).sum() / (model.modes**2).sum()))

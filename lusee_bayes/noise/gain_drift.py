@@ -1,9 +1,11 @@
-"""Gains that drift: per-antenna Gaussian processes g_i(t) that multiply the visibilities.
+"""Gain drifts: Gaussian processes g_i(t), one per antenna, that multiply the visibilities.
+
+::
 
     V_ij -> (1 + g_i)(1 + g_j) V_ij,    <g_i(t) g_j(t')> = delta_ij C_g(t, t'),
     C_g = sigma_g^2 exp(-(t - t')^2 / (2 sigma_t^2))
 
-Marginalised over g, the error is a noise term with (paper, appendix A)
+Marginalised over g, the error is a noise term with (paper, appendix A) ::
 
     Cov(e_ij(t), e_kl(t')) = d_ij(t) d_kl(t') C_g [ (dik + dil + djk + djl)
                                                     + C_g (dik djl + dil djk) ]
@@ -20,19 +22,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lusee_bayes.checks import (
+from lusee_bayes.core.checks import (
     AnyArray,
     InputError,
+    is_traced,
     require_finite,
     require_float64,
     require_positive,
     require_shape,
 )
-from lusee_bayes.covariance import TimeBandedCovariance
-from lusee_bayes.layout import DataLayout
-from lusee_bayes.products import Product, all_products
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.products import Product, all_products
+from lusee_bayes.noise.covariance import TimeBandedCovariance
 
-# C_g is dropped where it is below double precision, relative to sigma_g^2: exp(-x^2 / 2) = eps
+# C_g is dropped where it is below double precision relative to sigma_g^2: exp(-x^2 / 2) = eps
 REACH = float(np.sqrt(-2.0 * np.log(np.finfo(np.float64).eps)))
 
 
@@ -41,10 +44,21 @@ def _scalar(x) -> Float[Array, ""]:
 
 
 class GainDrift(eqx.Module):
-    """Gain drifts of standard deviation ``sigma`` and correlation time ``correlation_h`` (hours).
+    """Gain drifts, independent between antennas and alike for all of them.
 
-    The same for all antennas, independent between them. Both are differentiable where the band of
-    the covariance does not have to be worked out from them.
+    Differentiable in both parameters where the width of the band is given.
+
+    Attributes
+    ----------
+    sigma : float
+        Standard deviation sigma_g, relative.
+    correlation_h : float
+        Correlation time sigma_t in hours.
+
+    Raises
+    ------
+    InputError
+        If one of them is not positive.
     """
 
     sigma: Float[Array, ""] = eqx.field(converter=_scalar)
@@ -55,11 +69,11 @@ class GainDrift(eqx.Module):
         require_positive("the gain drift's correlation time in hours", self.correlation_h)
 
     def kernel(self, lag_h: Float[Array, "..."]) -> Float[Array, "..."]:
-        """C_g at lags in hours."""
+        """Return C_g at lags in hours."""
         return self.sigma**2 * jnp.exp(-((lag_h / self.correlation_h) ** 2) / 2.0)
 
     def width(self, hours: Float[np.ndarray, " times"]) -> int:
-        """How many samples apart two times can be and still be correlated."""
+        """Return how many samples apart two times can be and still be correlated."""
         reach = REACH * float(self.correlation_h)
         first = np.searchsorted(hours, np.asarray(hours) - reach)
         return int((np.arange(len(hours)) - first).max())
@@ -67,26 +81,44 @@ class GainDrift(eqx.Module):
     def covariance(
         self,
         visibilities: Float[Array, "products times"],
-        hours: Float[np.ndarray, " times"],
+        hours: Float[AnyArray, " times"],
         layout: DataLayout,
         width: int | None = None,
     ) -> TimeBandedCovariance:
-        """The noise term of the drifts, around given visibilities d, in K^2.
+        """Return the noise term of the drifts around given visibilities d.
 
-        visibilities : d_k(t) of all products on the full time grid, in K; hours : (times,) sample
-        times, growing; width : of the band in samples, by default as far as C_g reaches.
-        Semidefinite: add the radiometer noise before solving with it.
+        It is semidefinite: add the radiometer noise before solving with it.
+
+        Parameters
+        ----------
+        visibilities : (products, times) array
+            d_k(t) on the full grid, in K.
+        hours : (times,) array
+            Growing times of the samples.
+        layout : DataLayout
+        width : int, optional
+            Of the band in samples, by default as far as C_g reaches.
+
+        Returns
+        -------
+        TimeBandedCovariance
+            In K^2.
+
+        Raises
+        ------
+        InputError
+            If shapes do not fit, visibilities are not finite or times do not grow.
         """
         require_float64("the visibilities", visibilities)
         require_shape("the visibilities", visibilities, (layout.n_products, layout.n_times))
         require_finite("the visibilities", visibilities)
         require_shape("hours", hours, (layout.n_times,))
-        if not (np.diff(hours) > 0).all():
+        if not is_traced(hours) and not (np.diff(hours) > 0).all():
             raise InputError("the sample times (hours) must grow from one to the next")
         width = self.width(hours) if width is None else width
         earlier = np.arange(layout.n_times)[:, None] - np.arange(width + 1)[None]
-        lag = np.asarray(hours)[:, None] - np.asarray(hours)[np.maximum(earlier, 0)]
-        kernel = jnp.where(jnp.asarray(earlier >= 0), self.kernel(jnp.asarray(lag)), 0.0)
+        lag = jnp.asarray(hours)[:, None] - jnp.asarray(hours)[np.maximum(earlier, 0)]
+        kernel = jnp.where(jnp.asarray(earlier >= 0), self.kernel(lag), 0.0)
         linear, quadratic = shared_antennas(layout.n_products)
         band = _band(
             visibilities, kernel, jnp.asarray(earlier), jnp.asarray(linear), jnp.asarray(quadratic)
@@ -94,7 +126,7 @@ class GainDrift(eqx.Module):
         return TimeBandedCovariance(band, layout, "the gain-drift covariance")
 
     def mean_response(self, n_products: int) -> Float[Array, " products"]:
-        """Factor by which each product is larger on average: 1 + sigma_g^2 for autos, else 1."""
+        """Return the mean factor of each product: 1 + sigma_g^2 for autos, 1 for crosses."""
         products = all_products(round(np.sqrt(n_products)))
         auto = jnp.asarray([1.0 if p.i == p.j else 0.0 for p in products])
         return 1.0 + self.sigma**2 * auto
@@ -102,7 +134,7 @@ class GainDrift(eqx.Module):
     def sample(
         self, key: PRNGKeyArray, hours: Float[np.ndarray, " times"], n_antennas: int = 4
     ) -> Float[Array, "antennas times"]:
-        """Draw g_i(t) with exactly this covariance."""
+        """Draw g_i(t), (antennas, times), with exactly this covariance."""
         grid = white_grid(hours, float(self.correlation_h))
         white = jax.random.normal(key, (n_antennas, len(grid)), dtype=jnp.float64)
         return self.history(white, hours, grid)
@@ -113,10 +145,23 @@ class GainDrift(eqx.Module):
         hours: Float[AnyArray, " times"],
         grid: Float[AnyArray, " grid"],
     ) -> Float[Array, "antennas times"]:
-        """g_i(t) made of white noise on an even grid of times (:func:`white_grid`), in hours.
+        """Return the gains that white noise on an even grid of times makes.
 
         The noise is convolved with a Gaussian of width sigma_t / sqrt(2); a sum over a spacing of
-        sigma_t / 3 or less equals the integral to exp(-9 pi^2 / 2). Differentiable in all.
+        sigma_t / 3 or less equals the integral to exp(-9 pi^2 / 2). Differentiable in everything.
+
+        Parameters
+        ----------
+        white : (antennas, grid) array
+            Independent unit normals.
+        hours : (times,) array
+        grid : (grid,) array
+            Even times in hours, as of :func:`white_grid`.
+
+        Returns
+        -------
+        (antennas, times) array
+            g_i(t).
         """
         spacing = (grid[1] - grid[0]) / self.correlation_h
         lag = jnp.asarray(hours)[None] - jnp.asarray(grid)[:, None]
@@ -132,10 +177,23 @@ def white_grid(
     per_correlation: float = 4.0,
     margin: float = REACH,
 ) -> Float[np.ndarray, " grid"]:
-    """Times whose white noise makes gains with correlation times from shortest to longest.
+    """Return a grid of times for :meth:`GainDrift.history`.
 
-    ``per_correlation`` of them in each shortest correlation time, from ``margin`` longest ones
-    before the first sample to as many behind the last.
+    Parameters
+    ----------
+    hours : (times,) array
+        Of the samples.
+    shortest_h, longest_h : float
+        Range of correlation times in hours that the grid has to serve; by default one.
+    per_correlation : float
+        Number of grid times in the shortest correlation time.
+    margin : float
+        How far the grid goes on beyond the samples, in longest correlation times.
+
+    Returns
+    -------
+    (grid,) array
+        In hours.
     """
     longest_h = shortest_h if longest_h is None else longest_h
     hours = np.asarray(hours)
@@ -146,14 +204,14 @@ def white_grid(
 def with_gains(
     visibilities: Float[Array, "products times"], gains: Float[Array, "antennas times"]
 ) -> Float[Array, "products times"]:
-    """(1 + g_i)(1 + g_j) V_ij, exactly, for every product."""
+    """Return (1 + g_i)(1 + g_j) V_ij, exactly, for every product."""
     products = all_products(gains.shape[0])
     i, j = np.array([p.i for p in products]), np.array([p.j for p in products])
     return (1.0 + gains[i]) * (1.0 + gains[j]) * visibilities
 
 
 def shared_antennas(n_products: int) -> tuple[np.ndarray, np.ndarray]:
-    """(dik + dil + djk + djl) and (dik djl + dil djk) for every pair of products."""
+    """Return (dik + dil + djk + djl) and (dik djl + dil djk) for every pair of products."""
     products = all_products(round(np.sqrt(n_products)))
 
     def linear(p: Product, q: Product) -> int:
@@ -172,8 +230,8 @@ def shared_antennas(n_products: int) -> tuple[np.ndarray, np.ndarray]:
 def _band(
     visibilities: Array, kernel: Array, earlier: Array, linear: Array, quadratic: Array
 ) -> Float[Array, "times widths products products"]:
-    later = visibilities.T
-    before = later[jnp.maximum(earlier, 0)]  # (times, widths, products)
+    row = visibilities.T
+    column = row[jnp.maximum(earlier, 0)]  # (times, widths, products)
     weight = kernel[:, :, None, None]
     pattern = linear[None, None] + weight * quadratic[None, None]
-    return later[:, None, :, None] * before[:, :, None, :] * weight * pattern
+    return row[:, None, :, None] * column[:, :, None, :] * weight * pattern

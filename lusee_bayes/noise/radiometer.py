@@ -1,7 +1,7 @@
 """Radiometer noise, in two forms.
 
-With T_ij(t) the visibilities of the four antennas in K, bandwidth
-df and integration time dt (times the duty cycle):
+With T_ij(t) the visibilities of the antennas in K, bandwidth df and integration time dt (times the
+duty cycle)::
 
     paper   sigma_k^2 = (T_ii T_jj + V_k^2) / (2 df dt), independent;
     exact   the voltages are complex Gaussian with covariance T(t), so
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lusee_bayes.checks import (
+from lusee_bayes.core.checks import (
     InputError,
     is_traced,
     nearest,
@@ -26,9 +26,9 @@ from lusee_bayes.checks import (
     require_positive,
     require_shape,
 )
-from lusee_bayes.covariance import Covariance, DiagonalCovariance, TimeBlockCovariance
-from lusee_bayes.layout import DataLayout
-from lusee_bayes.products import all_products, auto_indices, to_matrix
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.products import all_products, auto_indices, to_matrix
+from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, TimeBlockCovariance
 
 Scalar = float | int | Float[Array, ""]
 
@@ -45,12 +45,31 @@ def radiometer_noise(
     duty_cycle: Scalar = 1.0,
     factor: Scalar = 1.0,
 ) -> Covariance:
-    """Covariance of the radiometer noise around given visibilities, in K^2.
+    """Return the covariance of the radiometer noise around given visibilities.
 
-    visibilities : modelled or measured V_k(t) of all products on the full time grid, in K;
-    layout : which samples are in the data; duty_cycle : the fraction of ``step_s`` spent
-    integrating; factor : multiplies the variance (10 for ten times the noise power).
-    InputError for parameters that are not positive and for autos that are not positive.
+    Parameters
+    ----------
+    visibilities : (products, times) array
+        Modelled or measured V_k(t) on the full grid, in K.
+    layout : DataLayout
+    bandwidth_hz : float
+    step_s : float
+        Time from sample to sample in seconds.
+    form : {"paper", "exact"}
+    duty_cycle : float
+        Fraction of ``step_s`` spent integrating.
+    factor : float
+        Multiplies the variance: 10 for ten times the noise power.
+
+    Returns
+    -------
+    Covariance
+        In K^2: diagonal in the paper's form, a block per time in the exact one.
+
+    Raises
+    ------
+    InputError
+        For an unknown form, parameters out of range, and autos that are not positive.
     """
     if form not in RADIOMETER_FORMS:
         raise InputError(f"unknown radiometer form '{form}'; {nearest(form, RADIOMETER_FORMS)}")
@@ -77,7 +96,7 @@ def radiometer_noise(
 def paper_variance(
     visibilities: Float[Array, "products times"],
 ) -> Float[Array, "products times"]:
-    """(T_ii T_jj + V_k^2) / 2, in K^2: divide by df dt."""
+    """Return (T_ii T_jj + V_k^2) / 2 in K^2, to be divided by df dt."""
     n = round(np.sqrt(visibilities.shape[0]))
     autos = visibilities[auto_indices(n)]
     products = all_products(n)
@@ -90,10 +109,11 @@ def paper_variance(
 def exact_blocks(
     visibilities: Float[Array, "products times"],
 ) -> Float[Array, "times products products"]:
-    """Covariance of all real products at every time, in K^2: divide by df dt.
+    """Return the covariance of the products at every time in K^2, to be divided by df dt.
 
-    A product is Re(c V_ij) with c = 1 or -i, so
-    Cov[k, l] = Re( c_k conj(c_l) E[dV dV'*] + c_k c_l E[dV dV'] ) / 2.
+    A product is Re(c V_ij) with c = 1 or -i, so ::
+
+        Cov[k, l] = Re( c_k conj(c_l) E[dV dV'*] + c_k c_l E[dV dV'] ) / 2.
     """
     n = round(np.sqrt(visibilities.shape[0]))
     products = all_products(n)

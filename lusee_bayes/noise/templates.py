@@ -1,20 +1,20 @@
-"""Noise along templates that the user brings: T P T^T."""
+"""Noise along templates of the user: T P T^T."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lusee_bayes.checks import (
+from lusee_bayes.core.checks import (
     require_finite,
     require_float64,
     require_positive,
     require_shape,
     require_symmetric,
 )
-from lusee_bayes.covariance import LowRankCovariance
-from lusee_bayes.covariance.base import checked_cholesky
-from lusee_bayes.layout import DataLayout
+from lusee_bayes.core.linalg import checked_cholesky
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.noise.covariance import LowRankCovariance
 
 
 def template_noise(
@@ -22,11 +22,25 @@ def template_noise(
     prior: Float[Array, " templates"] | Float[Array, "templates templates"],
     layout: DataLayout,
 ) -> LowRankCovariance:
-    """Covariance of amplitudes a ~ N(0, P) of known patterns in the data: T P T^T, in K^2.
+    """Return the covariance T P T^T of known patterns with amplitudes a ~ N(0, P).
 
-    templates : T, one column for each pattern, in K per unit of its amplitude; prior : the
-    amplitudes' variances, or their covariance P. InputError for templates of the wrong length and
-    for a P that is not positive definite.
+    Parameters
+    ----------
+    templates : (data, templates) array
+        T: one column for each pattern, in K per unit of its amplitude.
+    prior : (templates,) or (templates, templates) array
+        The variances of the amplitudes, or their covariance P.
+    layout : DataLayout
+
+    Returns
+    -------
+    LowRankCovariance
+        In K^2.
+
+    Raises
+    ------
+    InputError
+        For templates of the wrong length, and for a P that is not positive definite.
     """
     require_float64("the templates", templates)
     require_shape("the templates", templates, (layout.size, None))

@@ -12,9 +12,9 @@ import xarray as xr
 from jaxtyping import Float
 from matplotlib import colormaps
 
-from lusee_bayes.diagnostics import KERNEL_NSIDE, KERNEL_STEP
-from lusee_bayes.plots import DIVERGING, SEQUENTIAL
 from lusee_bayes.report import html
+from lusee_bayes.report.figures.drawing import DIVERGING, SEQUENTIAL
+from lusee_bayes.results.diagnostics import KERNEL_NSIDE, KERNEL_STEP
 
 LAYOUT = """<div class="controls">
 <label for="explorer-layer">show <select id="explorer-layer"></select></label>

@@ -1,29 +1,42 @@
-"""The sky: the embedded Galaxy and its sources, and maps read from files."""
+"""The sky: the embedded Galaxy and its sources, and skies read from files."""
 
-from lusee_bayes.sky.alms import SkyAlms, read_alms, write_alms
-from lusee_bayes.sky.cubes import SkyCube, read_cube
-from lusee_bayes.sky.readers import read_map
-from lusee_bayes.sky.sky import Sky, galaxy_sky, sky_from_file, sky_kind
-from lusee_bayes.sky.sources import (
+from lusee_bayes.sky.alms import SkyAlms, write_alms
+from lusee_bayes.sky.bright_sources import (
     BRIGHT_SOURCES,
     PointSource,
     galactic_unit_vector,
     kelvin_steradian,
 )
+from lusee_bayes.sky.cubes import SkyCube
+from lusee_bayes.sky.files import SkyFile
+from lusee_bayes.sky.maps import SkyMap
+from lusee_bayes.sky.sky import Sky
+from lusee_bayes.sky.source import (
+    SKY_READERS,
+    FileSource,
+    GalaxySource,
+    SkySource,
+    galaxy_sky,
+    read_sky_file,
+    sky_from_file,
+)
 
 __all__ = [
     "BRIGHT_SOURCES",
+    "SKY_READERS",
+    "FileSource",
+    "GalaxySource",
     "PointSource",
     "Sky",
     "SkyAlms",
     "SkyCube",
+    "SkyFile",
+    "SkyMap",
+    "SkySource",
     "galactic_unit_vector",
     "galaxy_sky",
     "kelvin_steradian",
-    "read_alms",
-    "read_cube",
-    "read_map",
+    "read_sky_file",
     "sky_from_file",
-    "sky_kind",
     "write_alms",
 ]

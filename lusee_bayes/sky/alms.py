@@ -14,35 +14,65 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Float
 
-from lusee_bayes.checks import AnyArray, InputError, require_finite
-from lusee_bayes.fits_images import opened
-from lusee_bayes.harmonics import from_healpy, lmax_of, n_modes, to_healpy
-from lusee_bayes.staging import replacing
+from lusee_bayes.core.checks import AnyArray, InputError, require_finite
+from lusee_bayes.core.files import replacing
+from lusee_bayes.core.fits_files import is_fits, opened
+from lusee_bayes.core.harmonics import from_healpy, lmax_of, n_modes, to_healpy
+from lusee_bayes.sky.files import SkyFile
 
 COLUMNS = ("index", "real", "imag")
 
 
 @dataclass(frozen=True)
-class SkyAlms:
+class SkyAlms(SkyFile):
     """Coefficients of one or several frequencies.
 
-    modes : (frequencies, modes) real packed; frequencies_mhz : None where the file does not say
+    Attributes
+    ----------
+    path : str
+        The file, for messages.
+    frequencies_mhz : (frequencies,) array or None
+        None where the file does not say its frequency.
+    modes : (frequencies, modes) array
+        Real packed coefficients, Galactic, in K.
     """
 
     path: str
     frequencies_mhz: Float[np.ndarray, " frequencies"] | None
     modes: Float[np.ndarray, "frequencies modes"]
 
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        if path.suffix == ".npz":
+            return True
+        if not is_fits(path):
+            return False
+        with opened(path) as hdus:
+            tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
+            names = tables[0].columns.names if tables else []
+            return set(COLUMNS) <= {name.lower() for name in names}
+
+    @classmethod
+    def read(cls, path: str | Path, dataset: str | None = None) -> SkyAlms:
+        """Read a file of coefficients.
+
+        Raises
+        ------
+        InputError
+            For a file that cannot be read, arrays that are missing or do not fit, coefficients
+            that do not fill an lmax, and numbers that are not finite.
+        """
+        path = Path(path)
+        frequencies, alm = _read_npz(path) if path.suffix == ".npz" else (None, _read_fits(path))
+        require_finite(f"{path}: the coefficients", np.stack([alm.real, alm.imag]))
+        return cls(str(path), frequencies, from_healpy(np.atleast_2d(alm)))
+
     @property
     def lmax(self) -> int:
         """Highest ell of the coefficients."""
         return lmax_of(self.modes.shape[1])
 
-    def at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
-        """Coefficients up to ``lmax`` at one of the file's frequencies.
-
-        InputError for a frequency or an ell that the file does not have.
-        """
+    def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
         if lmax > self.lmax:
             raise InputError(
                 f"{self.path} has coefficients up to ell = {self.lmax}, not up to {lmax}; lower "
@@ -59,32 +89,36 @@ class SkyAlms:
                 )
         return self.modes[channel, : n_modes(lmax)]
 
-
-def has_alms(path: Path) -> bool:
-    """Whether a file is one of coefficients."""
-    if path.suffix == ".npz":
-        return True
-    with opened(path) as hdus:
-        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
-        return bool(tables) and set(COLUMNS) <= {name.lower() for name in tables[0].columns.names}
-
-
-def read_alms(path: str | Path) -> SkyAlms:
-    """Read a file of coefficients.
-
-    InputError for a file that cannot be read, arrays that are missing or do not fit, coefficients
-    that do not fill an lmax, numbers that are not finite.
-    """
-    path = Path(path)
-    frequencies, alm = _read_npz(path) if path.suffix == ".npz" else (None, _read_fits(path))
-    require_finite(f"{path}: the coefficients", np.stack([alm.real, alm.imag]))
-    return SkyAlms(str(path), frequencies, from_healpy(np.atleast_2d(alm)))
+    def summary(self) -> tuple[str, ...]:
+        known, means = self.frequencies_mhz, self.modes[:, 0] / np.sqrt(4.0 * np.pi)
+        frequencies = "frequency not said"
+        if known is not None:
+            frequencies = f"{', '.join(f'{f:g}' for f in known)} MHz"
+        return (
+            f"coefficients of {len(means)} skies up to ell = {self.lmax}, {frequencies}",
+            f"means {means[0]:.6g} to {means[-1]:.6g} K",
+        )
 
 
 def write_alms(
     path: str | Path, modes: Float[AnyArray, " modes"], header: dict[str, object]
 ) -> Path:
-    """Write coefficients as healpy.write_alm does, in float64, with ``header`` cards besides."""
+    """Write coefficients as healpy.write_alm does, in float64.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file to write; it is replaced in one step.
+    modes : (modes,) array
+        Real packed coefficients, Galactic, in K.
+    header : dict
+        Further cards of the table's header.
+
+    Returns
+    -------
+    Path
+        The file.
+    """
     alm = to_healpy(modes)
     lmax = lmax_of(np.shape(modes)[-1])
     ell, m = healpy.Alm.getlm(lmax)

@@ -1,7 +1,7 @@
 """Sky maps of many frequencies: the layout of luseepy's ULSA file, which lowsky writes too.
 
 FITS: one primary image (frequency, pixel) of HEALPix maps, RING, Galactic, K; the header has
-FREQ_START, FREQ_END and FREQ_STEP in MHz. Frame and order are not said in the file.
+FREQ_START, FREQ_END and FREQ_STEP in MHz. The file does not say its frame and order.
 """
 
 from __future__ import annotations
@@ -13,28 +13,82 @@ import healpy
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.checks import InputError, require_finite
-from lusee_bayes.fits_images import opened
+from lusee_bayes.core.checks import InputError, require_finite
+from lusee_bayes.core.fits_files import is_fits, opened
+from lusee_bayes.sky.files import SkyFile, modes_of_map
 
 STEPS = ("FREQ_START", "FREQ_END", "FREQ_STEP")
 
 
 @dataclass(frozen=True)
-class SkyCube:
+class SkyCube(SkyFile):
     """Maps of several frequencies.
 
-    pixels : (frequencies, pixels) HEALPix RING, Galactic, in K; path : for messages
+    Attributes
+    ----------
+    path : str
+        The file, for messages.
+    frequencies_mhz : (frequencies,) array
+        Growing in equal steps.
+    pixels : (frequencies, pixels) array
+        HEALPix RING, Galactic, in K.
     """
 
     path: str
     frequencies_mhz: Float[np.ndarray, " frequencies"]
     pixels: Float[np.ndarray, "frequencies pixels"]
 
-    def at(self, frequency_mhz: float) -> Float[np.ndarray, " pixels"]:
-        """The map at a frequency; in between two by the power law of each pixel.
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        if not is_fits(path):
+            return False
+        with opened(path) as hdus:
+            return all(key in hdus[0].header for key in STEPS)
 
-        InputError outside the file's frequencies, or where a pixel between two frequencies is not
-        positive in both.
+    @classmethod
+    def read(cls, path: str | Path, dataset: str | None = None) -> SkyCube:
+        """Read a file of maps of many frequencies.
+
+        Raises
+        ------
+        InputError
+            For a truncated file, steps of frequency that do not fit the maps, maps that are not
+            HEALPix, and numbers that are not finite.
+        """
+        with opened(path) as hdus:
+            start, end, step = (float(hdus[0].header[key]) for key in STEPS)
+            pixels = np.array(hdus[0].data, dtype=np.float64)
+        count = round((end - start) / step) + 1 if step > 0 else 0
+        if pixels.ndim != 2 or len(pixels) != count:
+            raise InputError(
+                f"{path}: the image has shape {pixels.shape}, expected {count} maps for {start:g} "
+                f"to {end:g} MHz in steps of {step:g}"
+            )
+        if not healpy.isnpixok(pixels.shape[1]):
+            raise InputError(
+                f"{path}: {pixels.shape[1]} values are not a HEALPix map of 12 NSIDE^2"
+            )
+        require_finite(f"{path}: the maps", pixels)
+        return cls(str(path), start + step * np.arange(count), pixels)
+
+    def map_at(self, frequency_mhz: float) -> Float[np.ndarray, " pixels"]:
+        """Return the map at a frequency; between two maps, by the power law of each pixel.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+            Frequency in MHz.
+
+        Returns
+        -------
+        (pixels,) array
+            HEALPix RING, Galactic, in K.
+
+        Raises
+        ------
+        InputError
+            Outside the file's frequencies, or where a pixel between two frequencies is not
+            positive in both.
         """
         known = self.frequencies_mhz
         if not known[0] <= frequency_mhz <= known[-1]:
@@ -56,29 +110,14 @@ class SkyCube:
         share = np.log(frequency_mhz / known[above - 1]) / np.log(known[above] / known[above - 1])
         return low * (high / low) ** share
 
+    def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
+        return modes_of_map(self.path, self.map_at(frequency_mhz), lmax)
 
-def is_cube(path: Path) -> bool:
-    """Whether a FITS file has the layout. InputError if it cannot be read."""
-    with opened(path) as hdus:
-        return all(key in hdus[0].header for key in STEPS)
-
-
-def read_cube(path: str | Path) -> SkyCube:
-    """Read a file of maps of many frequencies.
-
-    InputError for a truncated file, steps of frequency that do not fit the maps, maps that are not
-    HEALPix, numbers that are not finite.
-    """
-    with opened(path) as hdus:
-        start, end, step = (float(hdus[0].header[key]) for key in STEPS)
-        pixels = np.array(hdus[0].data, dtype=np.float64)
-    count = round((end - start) / step) + 1 if step > 0 else 0
-    if pixels.ndim != 2 or len(pixels) != count:
-        raise InputError(
-            f"{path}: the image has shape {pixels.shape}, expected {count} maps for {start:g} to "
-            f"{end:g} MHz in steps of {step:g}"
+    def summary(self) -> tuple[str, ...]:
+        known, pixels = self.frequencies_mhz, self.pixels
+        return (
+            f"{len(pixels)} HEALPix sky maps, NSIDE {healpy.npix2nside(pixels.shape[1])}, taken "
+            "to be RING and Galactic",
+            f"{known[0]:g} to {known[-1]:g} MHz, means {pixels[0].mean():.6g} to "
+            f"{pixels[-1].mean():.6g} K, least pixel {pixels.min():.4g} K",
         )
-    if not healpy.isnpixok(pixels.shape[1]):
-        raise InputError(f"{path}: {pixels.shape[1]} values are not a HEALPix map of 12 NSIDE^2")
-    require_finite(f"{path}: the maps", pixels)
-    return SkyCube(str(path), start + step * np.arange(count), pixels)

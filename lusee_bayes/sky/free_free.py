@@ -34,12 +34,21 @@ THIN_CLUMPING = 120.0
 
 
 def absorption_per_emission_measure(frequency_mhz: float) -> float:
-    """Optical depth of one unit of emission measure, int <n_e^2> ds = 1 pc cm^-6.
+    """Compute the optical depth of one unit of emission measure, int <n_e^2> ds = 1 pc cm^-6.
 
-    tau = 3.014e-2 T^-1.5 nu^-2 EM g with g = ln(4.955e-2 / nu) + 1.5 ln T, nu in GHz, T in K
-    (Oster 1961, Rev. Mod. Phys. 33, 525; Wilson, Rohlfs & Huettemeister, Tools of Radio
-    Astronomy, eq. 10.35). g carries the Gaunt factor; the usual nu^-2.1 law is its slope near
-    1 GHz, and 20 % too high at 1 MHz.
+    tau = 3.014e-2 T^-1.5 nu^-2 EM g with g = ln(4.955e-2 / nu) + 1.5 ln T, nu in GHz, T in K.
+    g carries the Gaunt factor; the usual nu^-2.1 law is its slope near 1 GHz, and 20 % too high
+    at 1 MHz.
+
+    Parameters
+    ----------
+    frequency_mhz : float
+        Frequency in MHz.
+
+    References
+    ----------
+    Oster 1961, Rev. Mod. Phys. 33, 525; Wilson, Rohlfs & Huettemeister, Tools of Radio
+    Astronomy, eq. 10.35.
     """
     nu_ghz = frequency_mhz / 1e3
     gaunt = np.log(4.955e-2 / nu_ghz) + 1.5 * np.log(ELECTRON_TEMPERATURE_K)
@@ -47,20 +56,20 @@ def absorption_per_emission_measure(frequency_mhz: float) -> float:
 
 
 def thick_disc(radius_kpc: np.ndarray) -> np.ndarray:
-    """Mid-plane <n_e^2> of the thick disc, cm^-6, at Galactocentric cylindrical radius (kpc)."""
+    """Compute the thick disc's mid-plane <n_e^2> in cm^-6 at Galactocentric radii in kpc."""
     edge = 0.5 * np.pi / THICK_EDGE_KPC
     shape = np.cos(edge * np.minimum(radius_kpc, THICK_EDGE_KPC)) / np.cos(edge * SUN_RADIUS_KPC)
     return THICK_CLUMPING * (THICK_DENSITY_CM3 * shape) ** 2
 
 
 def thin_disc(radius_kpc: np.ndarray) -> np.ndarray:
-    """Mid-plane <n_e^2> of the annular thin disc, cm^-6, at cylindrical radius (kpc)."""
+    """Compute the annular thin disc's mid-plane <n_e^2> in cm^-6 at cylindrical radii in kpc."""
     shape = np.exp(-2.0 * ((radius_kpc - THIN_RADIUS_KPC) / THIN_WIDTH_KPC) ** 2)
     return THIN_CLUMPING * THIN_DENSITY_CM3**2 * shape
 
 
 def height_profile(z_kpc: np.ndarray, height_kpc: float) -> np.ndarray:
-    """<n_e^2> at height z over its mid-plane value: NE2001's sech^2, squared."""
+    """Compute <n_e^2> at heights in kpc over its mid-plane value: NE2001's sech^2, squared."""
     return np.cosh(np.minimum(np.abs(z_kpc) / height_kpc, 100.0)) ** -4.0
 
 
@@ -68,8 +77,18 @@ def height_profile(z_kpc: np.ndarray, height_kpc: float) -> np.ndarray:
 class Region:
     """An ellipsoid of uniform <n_e^2> that replaces the discs inside it.
 
-    ``semi_axes_kpc`` are those along the major axis, across it in the plane, and vertical;
-    ``angle_deg`` turns the major axis from +x towards +y.
+    Attributes
+    ----------
+    name : str
+        The region's name.
+    centre_kpc : tuple of float
+        Its centre, Galactocentric.
+    semi_axes_kpc : tuple of float
+        Along the major axis, across it in the plane, and vertical.
+    angle_deg : float
+        Of the major axis from +x towards +y.
+    n_squared_cm6 : float
+        <n_e^2> in cm^-6.
     """
 
     name: str
@@ -79,9 +98,17 @@ class Region:
     n_squared_cm6: float
 
     def chord(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distances from the Sun, kpc, where lines of sight enter and leave the ellipsoid.
+        """Find where lines of sight enter and leave the ellipsoid.
 
-        ``direction`` is (..., 3), unit vectors; both distances are equal where it is missed.
+        Parameters
+        ----------
+        direction : (..., 3) array
+            Unit vectors.
+
+        Returns
+        -------
+        enter, leave : (...) arrays
+            Distances from the Sun in kpc; both are equal where the line misses the ellipsoid.
         """
         c, s = np.cos(np.radians(self.angle_deg)), np.sin(np.radians(self.angle_deg))
         to_ball = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])

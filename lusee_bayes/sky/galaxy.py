@@ -1,7 +1,7 @@
 """The embedded diffuse sky: an ULSA-like model of the Galaxy between 1 and 50 MHz.
 
 Cong et al. 2021 (arXiv:2104.03170): synchrotron emissivity of an axisymmetric Galaxy, integrated
-along every line of sight through free-free absorption, in front of an isotropic background,
+along every line of sight through free-free absorption, in front of an isotropic background, ::
 
     T(l, b) = int j(s) exp(-tau(s)) ds + T_bg exp(-tau(inf)),   tau(s) = int_0^s kappa ds'.
 
@@ -17,7 +17,7 @@ from functools import lru_cache
 import healpy as hp
 import numpy as np
 
-from lusee_bayes.checks import InputError
+from lusee_bayes.core.checks import InputError
 from lusee_bayes.sky import free_free
 from lusee_bayes.sky.free_free import SUN_RADIUS_KPC
 
@@ -52,19 +52,19 @@ TOP_KPC = 10.0
 
 
 def emissivity_in_plane(radius_kpc: np.ndarray) -> np.ndarray:
-    """Mid-plane synchrotron emissivity at 408 MHz, K/kpc, at cylindrical radius (kpc)."""
+    """Compute the mid-plane synchrotron emissivity at 408 MHz in K/kpc, at radii in kpc."""
     log_scaled = np.log((radius_kpc + EMISSIVITY_CORE_KPC) / EMISSIVITY_RADIUS_KPC)
     exponent = EMISSIVITY_RADIAL_INDEX * log_scaled - radius_kpc / EMISSIVITY_RADIUS_KPC
     return EMISSIVITY_K_PER_KPC * np.exp(exponent)
 
 
 def emissivity_height_profile(z_kpc: np.ndarray) -> np.ndarray:
-    """Emissivity at height z over its mid-plane value."""
+    """Compute the emissivity at heights in kpc over its mid-plane value."""
     return np.exp(-((np.abs(z_kpc) / EMISSIVITY_HEIGHT_KPC) ** EMISSIVITY_HEIGHT_INDEX))
 
 
 def background(frequency_mhz: float) -> float:
-    """Extragalactic brightness temperature before absorption, K."""
+    """Compute the extragalactic brightness temperature before absorption, in K."""
     return BACKGROUND_K * (frequency_mhz / BACKGROUND_REFERENCE_MHZ) ** BACKGROUND_INDEX
 
 
@@ -92,8 +92,12 @@ def _nodes() -> tuple[np.ndarray, np.ndarray]:
 class Slabs:
     """Lines of sight in slabs of constant emission and absorption, the nearest first.
 
-    emitted : (slabs, lines) brightness of each at 408 MHz without absorption, in K; column :
-    (slabs, 2, lines) its int n_e^2 ds in cm^-6 kpc, at +|latitude| and -|latitude|
+    Attributes
+    ----------
+    emitted : (slabs, lines) array
+        Brightness of each at 408 MHz without absorption, in K.
+    column : (slabs, 2, lines) array
+        Its int n_e^2 ds in cm^-6 kpc, at ``+|latitude|`` and ``-|latitude|``.
     """
 
     emitted: np.ndarray
@@ -101,7 +105,7 @@ class Slabs:
 
     @classmethod
     def towards(cls, lon_deg: np.ndarray, lat_deg: np.ndarray) -> Slabs:
-        """Of Galactic directions (n,); the sign of ``lat_deg`` is not looked at."""
+        """Make the slabs of Galactic directions (n,) in degrees, at both signs of ``lat_deg``."""
         lon, lat = np.radians(lon_deg), np.radians(np.abs(lat_deg))
         cos_lon, cos_lat, sin_lat = np.cos(lon), np.cos(lat), np.sin(lat)
         up = np.stack([np.sin(lon) * cos_lat, -cos_lon * cos_lat, sin_lat], axis=-1)
@@ -137,7 +141,15 @@ class Slabs:
     def brightness(
         self, frequency_mhz: float, electrons: float = 1.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Brightness temperature (K) and total optical depth, both (2, lines) as ``column``."""
+        """Compute brightness temperature in K and total optical depth, both (2, lines).
+
+        Parameters
+        ----------
+        frequency_mhz : float
+            Frequency in MHz.
+        electrons : float
+            Factor of <n_e^2>.
+        """
         kappa = 1e3 * electrons * free_free.absorption_per_emission_measure(frequency_mhz)
         scale = (frequency_mhz / REFERENCE_MHZ) ** SPECTRAL_INDEX
         temperature, depth = np.zeros((2, *self.column.shape[1:]))
@@ -155,24 +167,35 @@ class Slabs:
 def line_of_sight(
     lon_deg: np.ndarray, lat_deg: np.ndarray, frequency_mhz: float, electrons: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Galactic brightness temperature (K) and total optical depth.
-
-    ``lon_deg`` (n,) and ``lat_deg`` (n,) are Galactic; the sign of ``lat_deg`` is not looked at.
-    Both results are (2, n), row 0 at +|lat|, row 1 at -|lat|: only the local gas differs.
-    ``electrons`` multiplies <n_e^2> everywhere; 0 makes the Galaxy transparent.
+    """Compute the Galactic brightness temperature and the total optical depth.
 
     Each quadrature node stands for a slab of constant j and kappa, for which the transfer
     equation is solved exactly: it adds j/kappa (1 - exp(-dtau)) exp(-tau). So a transparent
     slab adds j ds to the order of the quadrature, and an opaque one the source function. The
     error, against 200 000 steps, is below 1 % at 1 MHz and 0.1 % at 10 MHz; 10 % in the few
     pixels of the opaque Vela shell, whose near side falls inside a slab.
+
+    Parameters
+    ----------
+    lon_deg, lat_deg : (n,) array
+        Galactic directions in degrees; the sign of the latitude is ignored.
+    frequency_mhz : float
+        Frequency in MHz.
+    electrons : float
+        Factor of <n_e^2> everywhere; 0 makes the Galaxy transparent.
+
+    Returns
+    -------
+    temperature, depth : (2, n) array
+        In K, and the optical depth. Row 0 is at ``+|latitude|``, row 1 at
+        ``-|latitude|``: only the local gas differs.
     """
     return Slabs.towards(lon_deg, lat_deg).brightness(frequency_mhz, electrons)
 
 
 @lru_cache(maxsize=1)
 def _northern_slabs(nside: int) -> Slabs:
-    """Of the pixels of the northern hemisphere with the equator: the same at all frequencies."""
+    """Slabs of the northern hemisphere's pixels with the equator: the same at all frequencies."""
     theta, phi = hp.pix2ang(nside, np.arange(6 * nside**2 + 2 * nside))
     return Slabs.towards(np.degrees(phi), 90.0 - np.degrees(theta))
 
@@ -198,7 +221,7 @@ def _fluctuations(nside: int, seed: int) -> np.ndarray:
 
 
 def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int = 1) -> np.ndarray:
-    """Brightness temperature of the diffuse sky in K: float64 (12 nside^2,), RING, Galactic.
+    """Compute the brightness temperature of the diffuse sky.
 
     The Galactic emission is multiplied by exp(g - var(g)/2), g a Gaussian field drawn from
     ``seed``: the pattern is the same at all frequencies, the mean is kept and the sky stays
@@ -209,8 +232,24 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int = 1) -> np.ndarr
     and 10 MHz, and C_ell at 10 MHz within 15 % for 1 <= ell <= 30. At 1 MHz the local gas rules
     the sky, and only the largest scales agree.
 
-    Raises InputError unless 1 <= frequency_mhz <= 50, nside is a power of two and seed a
-    non-negative integer.
+    Parameters
+    ----------
+    frequency_mhz : float
+        Frequency in MHz, 1 to 50.
+    nside : int
+        A power of two.
+    seed : int
+        Of the random component, not negative.
+
+    Returns
+    -------
+    (12 nside^2,) array
+        HEALPix RING, Galactic, in K.
+
+    Raises
+    ------
+    InputError
+        If a parameter lies outside its range.
     """
     if not MINIMUM_MHZ <= frequency_mhz <= MAXIMUM_MHZ:
         raise InputError(

@@ -1,25 +1,36 @@
-"""The two faces of a systematic: in the noise covariance, or a site of a NumPyro program."""
+"""What every systematic offers: a term of the noise covariance, and sites of a NumPyro program."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import replace
 from statistics import NormalDist
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+import numpyro
+from jaxtyping import Array, Float, PRNGKeyArray
 from numpyro import distributions as dist
 
-from lusee_bayes.checks import InputError, require_positive
-from lusee_bayes.coordinates import Chart
-from lusee_bayes.linear_gaussian import LinearGaussian
+from lusee_bayes.core.checks import InputError, require_positive
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.noise.covariance import Covariance
+from lusee_bayes.systematics.chart import Chart
+
+# where programs sample the sky
+SKY = "sky"
+# with more unknowns than this beside an integrated sky, no exact Hessian says how to sample them:
+# finding it takes two gradients of the evidence for each
+MOST_COLLAPSED = 64
 
 
 class Systematic(eqx.Module):
     """Something about the instrument or the sky that is not known.
 
-    ``LinearGaussian`` in, ``LinearGaussian`` out: systematics are applied one after the other.
+    Both methods take a ``LinearGaussian`` and return one, so that systematics are applied one
+    after the other.
     """
 
     @property
@@ -33,23 +44,117 @@ class Systematic(eqx.Module):
         return True
 
     def chart(self, model: LinearGaussian) -> Chart | None:
-        """Coordinates of its sites, and of the sky's, in which ridges are straight, if it has any.
+        """Return coordinates of its sites, and of the sky's, in which ridges are straight.
 
-        ``model``: what :meth:`sampled` is applied to.
+        Parameters
+        ----------
+        model : LinearGaussian
+            What :meth:`sampled` is applied to.
+
+        Returns
+        -------
+        Chart or None
+            None if it needs no such coordinates.
         """
         return None
 
     @abstractmethod
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
-        """The model with it integrated out, as a term of N (and of the mean)."""
+        """Integrate it out of the model, as a term of N (and of the mean).
+
+        Parameters
+        ----------
+        model : LinearGaussian
+            The model without it.
+
+        Returns
+        -------
+        LinearGaussian
+            The model averaged over its prior.
+        """
 
     @abstractmethod
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
-        """The model given its values, which are NumPyro sites; call it inside a program."""
+        """Sample it; call this inside a NumPyro program.
+
+        Parameters
+        ----------
+        model : LinearGaussian
+            The model without it.
+
+        Returns
+        -------
+        LinearGaussian
+            The model given the values of its sites.
+        """
+
+
+class AdditiveNoise(Systematic):
+    """Gaussian noise with a covariance of its own, added to the data.
+
+    A new kind is a subclass with one method, :meth:`covariance`.
+
+    Attributes
+    ----------
+    name : str
+        Its site is ``NAME_noise``.
+    layout : DataLayout
+        The data that the covariance is over.
+    """
+
+    name: str = eqx.field(static=True)
+    layout: DataLayout
+
+    @abstractmethod
+    def covariance(self) -> Covariance:
+        """Return its covariance over the entries of the data vector, in K^2."""
+
+    @property
+    def needs_sky(self) -> bool:
+        return self.covariance().rank > MOST_COLLAPSED
+
+    @property
+    def changes_coupling(self) -> bool:
+        return False
+
+    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
+        return replace(model, noise=model.noise + self.covariance())
+
+    def sampled(self, model: LinearGaussian) -> LinearGaussian:
+        """Sample the site ``NAME_noise``: (rank,) unit normals of which the noise is made."""
+        covariance = self.covariance()
+        normal = dist.Normal(jnp.zeros(covariance.rank), 1.0).to_event(1)
+        noise = covariance.colour(numpyro.sample(f"{self.name}_noise", normal))
+        return replace(model, offset=noise if model.offset is None else model.offset + noise)
+
+    def distort(
+        self, visibilities: Float[Array, "products times"], key: PRNGKeyArray
+    ) -> Float[Array, "products times"]:
+        """Add one draw of the noise, as simulated data hold it.
+
+        Parameters
+        ----------
+        visibilities : (products, times) array
+            Visibilities on the full grid, in K.
+        key : PRNG key
+            For the draw.
+
+        Returns
+        -------
+        (products, times) array
+            In K; samples that the layout leaves out stay as they are.
+        """
+        return visibilities + self.layout.scatter(self.covariance().sample(key))
 
 
 class Marginalised(Systematic):
-    """A systematic whose place among sampled ones is kept, but which is integrated out."""
+    """A systematic that keeps its place among sampled ones, but is integrated out.
+
+    Attributes
+    ----------
+    systematic : Systematic
+        The systematic.
+    """
 
     systematic: Systematic
 
@@ -60,20 +165,62 @@ class Marginalised(Systematic):
         return self.systematic.marginalised(model)
 
 
+class Scale(Systematic):
+    """A systematic without a Gaussian term: marginalised, it stays at its median."""
+
+    @property
+    def changes_coupling(self) -> bool:
+        return False
+
+    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
+        """Return the model as it is."""
+        return model
+
+
+def scalar(value: float | Float[Array, ""]) -> Float[Array, ""]:
+    """Convert a number to a float64 array: a run value that JAX traces, not structure."""
+    return jnp.asarray(value, dtype=jnp.float64)
+
+
+def scalar_or_none(value: float | Float[Array, ""] | None) -> Float[Array, ""] | None:
+    """Convert a number like :func:`scalar`; None stays None."""
+    return None if value is None else scalar(value)
+
+
 def uncertain_scale(
     value: float | Float[Array, ""], log_std: float | Float[Array, ""]
 ) -> dist.Distribution:
-    """A positive number of which ln is Gaussian about ln ``value``, its median."""
-    return dist.LogNormal(jnp.log(jnp.asarray(value, dtype=jnp.float64)), log_std)
+    """Return the prior of a positive number whose logarithm is Gaussian.
+
+    Parameters
+    ----------
+    value : float
+        The median.
+    log_std : float
+        Standard deviation of the natural logarithm.
+    """
+    return dist.LogNormal(jnp.log(scalar(value)), log_std)
 
 
 def normal_within(
     name: str, mean: float, std: float, low: float = -np.inf, high: float = np.inf
 ) -> dist.Distribution:
-    """N(mean, std) cut off at the ends of a parameter's domain.
+    """Return N(mean, std), cut off at the ends of a parameter's domain.
 
-    InputError if a quarter of a percent of it or more would lie outside: the prior says then what
-    cannot be.
+    Parameters
+    ----------
+    name : str
+        The parameter, for messages.
+    mean, std : float
+        Of the Gaussian, in the parameter's unit.
+    low, high : float
+        Ends of the domain.
+
+    Raises
+    ------
+    InputError
+        If 0.25 % or more of the Gaussian lies outside the domain: the prior then allows what
+        cannot be.
     """
     require_positive(f"the prior standard deviation of {name}", std)
     cdf = NormalDist().cdf

@@ -1,4 +1,4 @@
-"""Gain drifts: their covariance in N, or the drifts themselves, (1 + g_i)(1 + g_j) exactly."""
+"""Gain drifts: to second order as a term of N, or exactly as factors (1 + g_i)(1 + g_j)."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ import numpyro
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
-from lusee_bayes.coordinates import Chart
-from lusee_bayes.coupling import CouplingMatrix
-from lusee_bayes.layout import DataLayout
-from lusee_bayes.linear_gaussian import LinearGaussian
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise import GainDrift, white_grid, with_gains
-from lusee_bayes.sites import SKY
-from lusee_bayes.systematics.base import Systematic, uncertain_scale
+from lusee_bayes.systematics.base import SKY, Systematic, scalar_or_none, uncertain_scale
+from lusee_bayes.systematics.chart import Chart
 
 # how far, in standard deviations of ln, a correlation time that is not known can be off, and by
 # which factor where a program of its own says how it is not known
@@ -35,34 +33,60 @@ PER_CORRELATION, MARGIN = 3.0, 6.0
 class GainDrifts(Systematic):
     """Drifts of every antenna's gain, of known or of uncertain strength and correlation time.
 
-    drift : their standard deviation and correlation time (medians, where uncertain)
-    around : (products, times) visibilities that the covariance is built around, in K
-    hours : (times,) of the samples; grid : times of the white noise that drifts are made of
-    width, widest : of the covariance's band in samples, for ``drift`` and for the longest
-    log_sigma_std, log_correlation_std : prior standard deviations of ln of the two; None: known
+    Attributes
+    ----------
+    drift : GainDrift
+        Their standard deviation and correlation time (medians, where uncertain).
+    visibilities : (products, times) array
+        Visibilities that the covariance is built around, in K.
+    hours : (times,) array
+        Sample times in hours.
+    grid : (grid,) array
+        Times in hours of the white noise that drifts are made of.
+    layout : DataLayout
+        The data.
+    width, widest : int
+        Of the covariance's band in samples, for ``drift`` and for the longest correlation time.
+    log_sigma_std, log_correlation_std : () array, optional
+        Prior standard deviations of the natural logarithms of the two; None where known.
     """
 
     drift: GainDrift
-    around: Float[Array, "products times"]
-    hours: tuple[float, ...] = eqx.field(static=True)
+    visibilities: Float[Array, "products times"]
+    hours: Float[Array, " times"]
     grid: Float[Array, " grid"]
     layout: DataLayout
+    # shapes follow from them, so they are structure
     width: int = eqx.field(static=True)
     widest: int = eqx.field(static=True)
-    log_sigma_std: float | None = eqx.field(static=True, default=None)
-    log_correlation_std: float | None = eqx.field(static=True, default=None)
+    log_sigma_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
+    log_correlation_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
 
     @classmethod
     def of(
         cls,
         drift: GainDrift,
-        around: Float[Array, "products times"],
+        visibilities: Float[Array, "products times"],
         hours: Float[np.ndarray, " times"],
         layout: DataLayout,
         log_sigma_std: float | None = None,
         log_correlation_std: float | None = None,
     ) -> GainDrifts:
-        """With the grid and the bands that these drifts need."""
+        """Work out the grid and the bands that these drifts need.
+
+        Parameters
+        ----------
+        drift : GainDrift
+            Standard deviation and correlation time (medians, where uncertain).
+        visibilities : (products, times) array
+            Visibilities that the covariance is built around, in K.
+        hours : (times,) array
+            Sample times in hours, growing.
+        layout : DataLayout
+            The data.
+        log_sigma_std, log_correlation_std : float, optional
+            Prior standard deviations of the natural logarithms of the two; None where known.
+        """
         middle, factor = float(drift.correlation_h), 1.0
         if log_correlation_std is not None:
             factor = float(np.exp(CORRELATION_REACH * log_correlation_std))
@@ -76,8 +100,8 @@ class GainDrifts(Systematic):
         )
         return cls(
             drift,
-            around,
-            tuple(float(t) for t in hours),
+            visibilities,
+            jnp.asarray(hours),
             jnp.asarray(grid),
             layout,
             drift.width(hours),
@@ -96,9 +120,10 @@ class GainDrifts(Systematic):
         return round(np.sqrt(self.layout.n_products))
 
     def scales(self) -> GainDrift:
-        """The drift with its uncertain scales drawn.
+        """Sample the uncertain scales of the drift.
 
-        Sites ``gain_sigma``, and ``gain_log_correlation``, of which ``gain_correlation_h`` is made.
+        The sites are ``gain_sigma`` and ``gain_log_correlation``, of which
+        ``gain_correlation_h`` is made.
         """
         sigma, correlation_h = self.drift.sigma, self.drift.correlation_h
         if self.log_sigma_std is not None:
@@ -111,32 +136,41 @@ class GainDrifts(Systematic):
         return GainDrift(sigma, correlation_h)
 
     def histories(self, drift: GainDrift) -> Float[Array, "antennas times"]:
-        """g_i(t), made of the site ``gain_noise`` (antennas, grid); kept as ``gains``."""
+        """Sample g_i(t), (antennas, times).
+
+        They are made of the site ``gain_noise`` (antennas, grid) and kept as ``gains``.
+
+        Parameters
+        ----------
+        drift : GainDrift
+            Their standard deviation and correlation time.
+        """
         normal = dist.Normal(jnp.zeros((self.n_antennas, len(self.grid))), 1.0).to_event(2)
-        gains = drift.history(numpyro.sample(GAIN_NOISE, normal), np.asarray(self.hours), self.grid)
+        gains = drift.history(numpyro.sample(GAIN_NOISE, normal), self.hours, self.grid)
         return numpyro.deterministic("gains", gains)
 
     def response(self, gains: Float[Array, "antennas times"]) -> Float[Array, " data"]:
-        """(1 + g_i)(1 + g_j) of every datum."""
+        """Compute (1 + g_i)(1 + g_j) of every datum."""
         ones = jnp.ones((self.layout.n_products, self.layout.n_times))
         return self.layout.gather(with_gains(ones, gains))
 
     def chart(self, model: LinearGaussian) -> GainCoordinates | None:
-        """Coordinates in which what sky, gains and scales can exchange lies on straight lines.
+        """Return coordinates in which what sky, gains and scales can exchange is straight.
 
         None for drifts so strong that their mean could be -1, which the coordinates leave out.
         """
         sigma = float(self.drift.sigma)
-        if sigma * np.exp(3.0 * (self.log_sigma_std or 0.0)) > STRONGEST:
+        log_std = 0.0 if self.log_sigma_std is None else float(self.log_sigma_std)
+        if sigma * np.exp(3.0 * log_std) > STRONGEST:
             return None
         noise = self.layout.scatter(model.noise.diagonal())
-        floor = float(noise.sum() / (self.around**2).sum())
+        floor = noise.sum() / (self.visibilities**2).sum()
         reach = None
         if self.log_correlation_std is not None:
             reach = CORRELATION_REACH * self.log_correlation_std
         return GainCoordinates(
             self.drift,
-            jnp.asarray(self.hours),
+            self.hours,
             self.grid,
             self.n_antennas,
             floor,
@@ -145,50 +179,67 @@ class GainDrifts(Systematic):
         )
 
     def marginalised(self, model: LinearGaussian, drift: GainDrift | None = None) -> LinearGaussian:
-        """N with the drifts' covariance, and the autos' mean response.
+        """Add the drifts' covariance to N, and multiply by the autos' mean response.
 
-        ``drift``: of other scales, with a correlation time at most twice as long.
+        Parameters
+        ----------
+        model : LinearGaussian
+            The model without drifts.
+        drift : GainDrift, optional
+            Of other scales than :attr:`drift`, with a correlation time at most twice as long.
         """
         width = self.width if drift is None else self.widest
         drift = self.drift if drift is None else drift
-        noise = drift.covariance(self.around, np.asarray(self.hours), self.layout, width)
+        noise = drift.covariance(self.visibilities, self.hours, self.layout, width)
         mean = drift.mean_response(self.layout.n_products)[:, None]
         grid = jnp.broadcast_to(mean, (self.layout.n_products, self.layout.n_times))
         return _multiplied(replace(model, noise=model.noise + noise), self.layout.gather(grid))
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
-        """The sites of :meth:`scales` and :meth:`histories`."""
+        """Sample the sites of :meth:`scales` and :meth:`histories`."""
         return _multiplied(model, self.response(self.histories(self.scales())))
 
 
 def _multiplied(model: LinearGaussian, response: Float[Array, " data"]) -> LinearGaussian:
     offset = None if model.offset is None else model.offset * response
-    if isinstance(model.coupling, CouplingMatrix):
-        return replace(model, coupling=model.coupling.with_response(response), offset=offset)
-    return replace(model, coupling=model.coupling * response[:, None], offset=offset)
+    return replace(model, coupling=model.coupling.with_response(response), offset=offset)
 
 
 class GainCoordinates(Chart):
-    """Takes out of gains and sky what the data do not tell apart.
+    """Coordinates that take out of gains and sky what the data do not tell apart.
 
     (1 + g_i)(1 + g_j) A m stays the same if all 1 + g grow by exp(k) and m shrinks by its square.
-    The data say nothing of k and nearly everything of the rest, so that the posterior is a thin
-    sheet along k, curved in g and m. With exp(k) - 1 the mean of g, the coordinates are k,
-    exp(-k) (1 + g) and exp(2 k) m, along which it is straight. Likewise where the drifts' strength
-    and correlation time are sites: the gains at the samples, far better known than their scales,
-    stay as they are when those change; what is lost in the noise does not.
+    The data say nothing of k and nearly everything of the other directions, so that the posterior
+    is a thin sheet along k, curved in g and m. With exp(k) - 1 the mean of g, the coordinates are
+    k, exp(-k) (1 + g) and exp(2 k) m, along which it is straight. Likewise where the drifts'
+    strength and correlation time are sites: the gains at the samples, far better known than their
+    scales, stay as they are when those change; what is lost in the noise does not.
 
-    drift : whose white noise the coordinates are; floor : variance of the noise in gains;
-    sigma_is_site, log_correlation_reach : which scales are sites (the latter within +- reach)
+    Attributes
+    ----------
+    drift : GainDrift
+        The drift whose white noise the coordinates are.
+    hours : (times,) array
+        Sample times in hours.
+    grid : (grid,) array
+        Times of the white noise in hours.
+    n_antennas : int
+        Number of antennas.
+    floor : () array
+        Variance of the noise, in units of the gains.
+    sigma_is_site : bool
+        Whether the drifts' standard deviation is a site.
+    log_correlation_reach : () array, optional
+        Half the length of the interval of ln correlation time; None if that is no site.
     """
 
     drift: GainDrift
     hours: Float[Array, " times"]
     grid: Float[Array, " grid"]
     n_antennas: int = eqx.field(static=True)
-    floor: float = eqx.field(static=True)
+    floor: Float[Array, ""]
     sigma_is_site: bool = eqx.field(static=True)
-    log_correlation_reach: float | None = eqx.field(static=True)
+    log_correlation_reach: Float[Array, ""] | None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -227,7 +278,7 @@ class GainCoordinates(Chart):
         return x
 
     def _shared(self) -> tuple[Float[Array, "1 grid"], Float[Array, "1 grid"]]:
-        """What makes the mean gain of white noise, and white noise whose gains are all one."""
+        """Weights of white noise in the mean gain, and white noise whose gains are all one."""
         mean = self._shape(self.drift).mean(1)[None] / self.n_antennas
         # the same at all times: then so are the gains, the grid being wide enough
         return mean, jnp.ones_like(mean) / (self.n_antennas * mean.sum())
@@ -247,7 +298,7 @@ class GainCoordinates(Chart):
         return self._shape(self.drift), self._shape(GainDrift(sigma, correlation_h))
 
     def _covariances(self, before: Array, after: Array) -> tuple[Array, Array]:
-        """Of the gains afterwards, and between before and afterwards; floor added to both.
+        """Covariances of the gains afterwards, and with those before; floor added to both.
 
         Both are those of Gaussian kernels, so that neither is ever singular.
         """

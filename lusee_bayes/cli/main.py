@@ -1,0 +1,61 @@
+"""The command line: parsing, error messages and exit codes. The work is in ``runs``.
+
+Exit codes: 0 success, 1 a validation that failed or a process that was lost, 2 bad input (one
+sentence on standard error), 130 interrupted.
+"""
+
+from __future__ import annotations
+
+from cyclopts import App, CycloptsError
+from rich.console import Console
+
+from lusee_bayes.core.checks import InputError, ProcessLost
+from lusee_bayes.core.version import __version__
+
+app = App(
+    name="lusee-bayes",
+    version=__version__,
+    suppress_keyboard_interrupt=False,
+    help=(
+        "Bayesian maps of the low-frequency sky from LuSEE-Night's visibilities.\n\n"
+        "Exit codes: 0 success, 1 a validation that failed or a process that was lost, 2 bad input "
+        "(one sentence on standard error), 130 interrupted. lusee-bayes COMMAND --help shows "
+        "examples."
+    ),
+)
+app.register_install_completion_command()
+# named by path: each is imported when called, so that --help and completion answer at once
+for _name, _help in {
+    "simulate": "Simulate the visibilities of a scenario.",
+    "map": "Make a posterior map of a scenario, or of given data.",
+    "sample": "Sample the posterior of a NumPyro program by Hamiltonian Monte Carlo.",
+    "plan": "Say what observations would tell, without data.",
+    "validate": "Check the analytic posterior by HMC and by simulated data sets.",
+    "paper": "Reproduce the figures of the reference paper and judge its claims.",
+    "report": "Write report.html of a finished run anew.",
+    "compare": "Set finished map runs side by side.",
+    "info": "Say what is in a file.",
+}.items():
+    app.command(f"lusee_bayes.cli.{_name}_command:{_name}_command", name=_name, help=_help)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    errors = Console(stderr=True, soft_wrap=True, highlight=False)
+    try:
+        code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+    except InputError as error:
+        errors.print(f"lusee-bayes: {error}", markup=False)
+        return 2
+    except CycloptsError as error:
+        errors.print(f"lusee-bayes: {' '.join(str(error).split())}", markup=False)
+        return 2
+    except ProcessLost as error:
+        errors.print(f"lusee-bayes: {error}", markup=False)
+        return 1
+    except KeyboardInterrupt as interrupt:
+        # runs say what their folder holds
+        held = str(interrupt) or "nothing has been written"
+        errors.print(f"lusee-bayes: interrupted; {held}", markup=False)
+        return 130
+    return code if isinstance(code, int) else 0

@@ -1,0 +1,90 @@
+"""What commands have in common: options that mean the same everywhere."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from cyclopts import Parameter
+from rich.console import Console
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
+
+Overrides = Annotated[list[str], Parameter(name="--set", negative="")]
+Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")]
+# 10,25 or 5:50:5
+Frequencies = Annotated[str | None, Parameter(name="--frequencies")]
+Verbose = Annotated[bool, Parameter(name=["--verbose", "-v"], negative="")]
+Flag = Annotated[bool, Parameter(negative="")]
+Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
+
+
+def load(
+    source: str,
+    set_: list[str] | None,
+    frequencies: str | None = None,
+    **flags: str | int | bool | None,
+) -> Scenario:
+    """The scenario of a command, with its ``--set`` and with what options say of it.
+
+    Parameters
+    ----------
+    source : str
+        A YAML file or the name of a scenario.
+    set_ : list of str
+        ``key.path=value``.
+    frequencies : str
+        See :func:`parse_frequencies`.
+    **flags
+        Values of entries, dots written as ``__``; those that are None or False are left alone.
+
+    Raises
+    ------
+    InputError
+        As :func:`.load_scenario`.
+    """
+    overrides = list(set_ or [])
+    if frequencies is not None:
+        overrides.append(f"frequencies_mhz={parse_frequencies(frequencies)}")
+    for name, value in flags.items():
+        if value is not None and value is not False:
+            overrides.append(f"{name.replace('__', '.')}={str(value).lower()}")
+    return load_scenario(source, overrides)
+
+
+def default_folder(source: str, suffix: str = "") -> Path:
+    """Where the results of a scenario go that are not told where."""
+    return Path("output") / f"{Path(source).stem}{suffix}"
+
+
+def say(console: Console, *lines: object) -> None:
+    """Print lines as they are."""
+    for line in lines:
+        console.print(str(line), highlight=False, markup=False)
+
+
+def parse_frequencies(text: str) -> list[float]:
+    """MHz out of ``10,25,30`` or of ``first:last:step``, the last included.
+
+    InputError if it is neither.
+    """
+    try:
+        if ":" not in text:
+            found = [float(part) for part in text.split(",")]
+        else:
+            first, last, step = (float(part) for part in text.split(":"))
+            count = round((last - first) / step)
+            found = [first + k * step for k in range(count + 1)]
+            if not step > 0 or not np.isclose(found[-1] if found else np.nan, last):
+                raise ValueError
+    except (ValueError, ZeroDivisionError, OverflowError):
+        found = []
+    if not found or any(b <= a for a, b in pairwise(found)):
+        raise InputError(
+            f"--frequencies {text}: expected growing MHz, as 10,25,30 or as 5:50:5 (first, last, "
+            "step)"
+        )
+    return found

@@ -1,0 +1,26 @@
+"""lusee-bayes report: the page of a finished run, made anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from lusee_bayes.cli.options import Quiet
+from lusee_bayes.report.pages import write_report
+
+
+def report_command(folder: Path, *, quiet: Quiet = False) -> None:
+    """Write report.html anew from the results that a run has left in its folder.
+
+    Example: lusee-bayes report output/fiducial
+
+    Parameters
+    ----------
+    folder
+        Results of map, sample or validate.
+    quiet
+        Print nothing but errors.
+    """
+    path = write_report(folder)
+    Console(quiet=quiet, soft_wrap=True).print(f"look at {path}", highlight=False, markup=False)

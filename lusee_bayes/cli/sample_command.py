@@ -1,0 +1,107 @@
+"""lusee-bayes sample: draws from the posterior of a NumPyro program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from rich.console import Console
+
+from lusee_bayes.cli.options import (
+    Flag,
+    Frequencies,
+    Output,
+    Overrides,
+    Quiet,
+    Verbose,
+    default_folder,
+    load,
+    say,
+)
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.report.pages import REPORT
+from lusee_bayes.runs.sample_run import default_program, run_sample
+from lusee_bayes.sampling.hmc import Sampler
+from lusee_bayes.sampling.programs import load_program
+
+
+def sample_command(
+    scenario: str,
+    *,
+    model: str | None = None,
+    data: Path | None = None,
+    output: Output = None,
+    resume: Flag = False,
+    chains: int = 4,
+    draws: int = 1000,
+    warmup: int = 150,
+    algorithm: Literal["nuts", "hmc"] = "nuts",
+    frequencies: Frequencies = None,
+    set_: Overrides | None = None,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Sample the posterior of a NumPyro program by Hamiltonian Monte Carlo.
+
+    Draws are written as they come: a run that was stopped goes on with --resume.
+
+    Example: lusee-bayes sample fiducial --set lmax=20 --draws 500 -o output/hmc
+
+    Example: lusee-bayes sample gain_1e-2 --frequencies 10,25,40 --resume -o output/three
+
+    Parameters
+    ----------
+    scenario
+        A YAML file, or the name of a scenario of the package (fiducial, ...).
+    model
+        The program: a Python file with a function model, or one of the package by its name (sky,
+        sky_marginal, gains, instrument, ...). By default systematics, where the scenario says that
+        something is to be sampled, else sky.
+    data
+        Visibilities to use; without them the scenario's own are simulated.
+    output
+        Folder for the results; by default output/NAME-MODEL.
+    resume
+        Go on with the unfinished run in the folder.
+    chains
+        Chains side by side.
+    draws
+        Draws of each chain, after warmup.
+    warmup
+        Iterations in which the step size is found; they are not kept.
+    algorithm
+        The No-U-Turn Sampler, or Hamiltonian Monte Carlo with trajectories of fixed length.
+    frequencies
+        Channels in MHz, as 10,25,30 or as first:last:step, one after the other: each in a folder of
+        its own, and their maps together in cubes. With --resume, finished ones are taken over.
+    set_
+        key.path=value; overrides an entry of the scenario, as often as needed.
+    quiet
+        Print nothing but errors.
+    verbose
+        Tell the memory in use after every stage.
+    """
+    console = Console(quiet=quiet, soft_wrap=True)
+    resolved = load(scenario, set_, frequencies)
+    program = default_program(resolved) if model is None else load_program(model)
+    sampler = Sampler(
+        chains=chains, warmup=warmup, draws=draws, seed=resolved.seed, algorithm=algorithm
+    )
+    run = run_sample(
+        resolved,
+        output or default_folder(scenario, f"-{program.name}"),
+        program=program,
+        sampler=sampler,
+        data=data,
+        resume=resume,
+        stages=Stages(console, verbose=verbose),
+    )
+    say(console, *(f"  {path}" for path in run.files))
+    for result in run.results:
+        if resolved.frequencies_mhz:
+            say(console, f"{result.experiment.scenario.frequency_mhz:g} MHz")
+        say(console, *result.lines())
+    if resolved.frequencies_mhz:
+        say(console, f"look at the {REPORT} of every channel in {run.folder}")
+    else:
+        say(console, f"look at {run.folder / REPORT}")

@@ -1,0 +1,97 @@
+"""lusee-bayes validate: Hamiltonian Monte Carlo and simulations against the analytic posterior."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from lusee_bayes.cli.options import (
+    Flag,
+    Output,
+    Overrides,
+    Quiet,
+    Verbose,
+    default_folder,
+    load,
+    say,
+)
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.report.pages import REPORT
+from lusee_bayes.results.validation_result import allowed
+from lusee_bayes.runs.validate_run import run_validate
+from lusee_bayes.sampling.hmc import Sampler
+from lusee_bayes.sampling.validation import Check
+
+
+def validate_command(
+    scenario: str,
+    *,
+    data: Path | None = None,
+    output: Output = None,
+    resume: Flag = False,
+    chains: int = 4,
+    draws: int = 1000,
+    warmup: int = 150,
+    simulations: int = 500,
+    set_: Overrides | None = None,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> int:
+    """Check the analytic posterior of a scenario by HMC and by simulated data sets.
+
+    Ends with exit code 1 if a check fails; the thresholds are in validation.md.
+
+    Example: lusee-bayes validate gain_1e-2 --set lmax=8 -o output/check
+
+    Parameters
+    ----------
+    scenario
+        A YAML file, or the name of a scenario of the package (fiducial, ...).
+    data
+        Visibilities to use; without them the scenario's own are simulated.
+    output
+        Folder for the results; by default output/NAME-validation.
+    resume
+        Go on with the unfinished run in the folder, or judge the finished one again.
+    chains
+        Chains side by side.
+    draws
+        Draws of each chain, after warmup.
+    warmup
+        Iterations in which the step size is found; they are not kept.
+    simulations
+        Data sets for simulation-based calibration.
+    set_
+        key.path=value; overrides an entry of the scenario, as often as needed.
+    quiet
+        Print nothing but errors.
+    verbose
+        Tell the memory in use after every stage.
+    """
+    console = Console(quiet=quiet, soft_wrap=True)
+    resolved = load(scenario, set_)
+    run = run_validate(
+        resolved,
+        output or default_folder(scenario, "-validation"),
+        name=Path(scenario).stem,
+        sampler=Sampler(chains=chains, warmup=warmup, draws=draws, seed=resolved.seed),
+        simulations=simulations,
+        data=data,
+        resume=resume,
+        stages=Stages(console, verbose=verbose),
+    )
+    say(console, *(f"  {path}" for path in run.files))
+    console.print(as_table(run.result.checks))
+    say(console, f"{run.result.headline()}; look at {run.folder / REPORT}")
+    return 0 if run.result.passed else 1
+
+
+def as_table(checks: list[Check]) -> Table:
+    """The checks for the terminal."""
+    table = Table("check", "value", "allowed", "", "what it is")
+    for check in checks:
+        verdict = "ok" if check.passed else "FAILED"
+        table.add_row(check.name, f"{check.value:.4g}", allowed(check), verdict, check.meaning)
+    return table

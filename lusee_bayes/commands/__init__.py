@@ -1,1 +1,0 @@
-"""What each command does: scenario in, files and a few figures out."""

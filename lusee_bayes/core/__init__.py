@@ -1,0 +1,1 @@
+"""What every other folder needs: checks, harmonics, rotations, linear algebra, files, progress."""

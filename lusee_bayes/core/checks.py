@@ -1,0 +1,173 @@
+"""Checks of input that raise one clear sentence where bad input enters.
+
+Inside a JAX transformation an array is a tracer and its values are not known: the checks of values
+pass it through, those of dtype and shape do not.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import numpy as np
+
+AnyArray = jax.Array | np.ndarray
+
+
+class InputError(ValueError):
+    """Input that cannot be used. The message says what is wrong, where, and what to do."""
+
+
+class ProcessLost(RuntimeError):
+    """Raised when another process of the run has ended, so that this one cannot go on."""
+
+
+def is_traced(*arrays: Any) -> bool:
+    """Return whether any of ``arrays`` is a tracer, whose values are not known yet."""
+    return any(isinstance(a, jax.core.Tracer) for a in arrays)
+
+
+def require_float64(name: str, array: Any) -> None:
+    """Check that an array holds 64-bit floats; Lambda's condition number is about 1e10.
+
+    Parameters
+    ----------
+    name : str
+        Name of the array, for the error message.
+    array : object
+
+    Raises
+    ------
+    InputError
+        If it is not an array of float64.
+    """
+    dtype = getattr(array, "dtype", None)
+    if dtype != np.float64:
+        got = f"an array of {dtype}" if dtype is not None else f"a {type(array).__name__}"
+        raise InputError(
+            f"{name} must be a float64 array, got {got}; convert it with "
+            "numpy.asarray(x, dtype=numpy.float64)"
+        )
+
+
+def require_shape(name: str, array: Any, shape: tuple[int | None, ...]) -> None:
+    """Check the shape of an array.
+
+    Parameters
+    ----------
+    name : str
+        Name of the array, for the error message.
+    array : array
+    shape : tuple of int or None
+        The expected shape; None stands for any length.
+
+    Raises
+    ------
+    InputError
+        If the shape differs.
+    """
+    got = tuple(array.shape)
+    fits = len(got) == len(shape) and all(
+        s is None or s == g for s, g in zip(shape, got, strict=True)
+    )
+    if not fits:
+        expected = str(shape).replace("None", "any")
+        raise InputError(f"{name} has shape {got}, expected {expected}")
+
+
+def _first_offenders(bad: np.ndarray) -> str:
+    where = np.argwhere(np.atleast_1d(bad))
+    shown = ", ".join(str(tuple(int(i) for i in w)) for w in where[:3])
+    return f"{len(where)} of {bad.size} entries, first at {shown}"
+
+
+def require_finite(name: str, array: Any) -> None:
+    """Check that an array holds no NaN and no infinity.
+
+    Parameters
+    ----------
+    name : str
+        Name of the array, for the error message.
+    array : array
+        Not checked if it is a tracer.
+
+    Raises
+    ------
+    InputError
+        If an entry is not finite; the message names the first ones.
+    """
+    if is_traced(array):
+        return
+    bad = ~np.isfinite(np.asarray(array))
+    if bad.any():
+        raise InputError(
+            f"{name} holds NaN or infinity ({_first_offenders(bad)}); "
+            "flag missing samples instead of storing a value for them"
+        )
+
+
+def require_positive(name: str, array: Any, hint: str = "") -> None:
+    """Check that every entry is positive and finite.
+
+    Parameters
+    ----------
+    name : str
+        Name of the value or array, for the error message.
+    array : float or array
+        Not checked if it is a tracer.
+    hint : str
+        What to do about it, added to the message.
+
+    Raises
+    ------
+    InputError
+        If an entry is zero, negative or not finite.
+    """
+    if is_traced(array):
+        return
+    values = np.asarray(array)
+    bad = ~(values > 0) | ~np.isfinite(values)
+    if bad.any():
+        detail = f"got {values}" if values.ndim == 0 else f"fails at {_first_offenders(bad)}"
+        raise InputError(f"{name} must be positive, {detail}" + (f"; {hint}" if hint else ""))
+
+
+# a matrix that is meant to be symmetric differs from its transpose by rounding, relative to its
+# largest entry
+SYMMETRY_TOLERANCE = 1e-12
+
+
+def require_symmetric(name: str, matrices: Any) -> None:
+    """Check that a matrix, or each of a stack, is symmetric.
+
+    Parameters
+    ----------
+    name : str
+        Name of the matrix, for the error message.
+    matrices : (..., n, n) array
+        Not checked if it is a tracer.
+
+    Raises
+    ------
+    InputError
+        If entries differ from their mirror images by more than rounding.
+    """
+    if is_traced(matrices):
+        return
+    values = np.asarray(matrices)
+    largest = float(np.abs(values).max())
+    asymmetry = float(np.abs(values - np.swapaxes(values, -1, -2)).max())
+    if asymmetry > SYMMETRY_TOLERANCE * largest:
+        raise InputError(
+            f"{name} is not symmetric: entries differ by up to {asymmetry:.3g} from their mirror "
+            f"images (largest entry {largest:.3g}); give (N + N.T) / 2 if that is what you mean"
+        )
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return a hint that names the closest of ``known``, or all of them if none is close."""
+    known = list(known)
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return f"did you mean '{close[0]}'?" if close else f"known: {', '.join(sorted(known))}"

@@ -1,0 +1,215 @@
+"""Files and folders that are written whole or not at all.
+
+A folder of results changes in one transaction. Everything is written into a scratch folder first;
+renaming that one is the moment from which the new results count. Its files are then moved into
+place, and where that is interrupted, whoever opens the folder next (:func:`recover`) completes it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from lusee_bayes.core.checks import InputError
+
+# names inside a folder of results: scratch folders (with the process's number), the new results
+# that are still to be moved into place, and the list of what the last run has written
+SCRATCH, COMMITTED, MANIFEST = ".partial-", ".committed", "manifest.json"
+
+
+def require_folder(folder: Path) -> None:
+    """InputError if ``folder``, or what it would lie in, is a file."""
+    for place in (folder, *folder.parents):
+        if place.exists():
+            if not place.is_dir():
+                raise InputError(f"'{place}' is a file; give a folder for the results")
+            return
+
+
+@contextmanager
+def transaction(folder: str | Path, kind: str, discard: Sequence[str] = ()) -> Iterator[Path]:
+    """Write a run's results into a folder: all of them take effect at once, or none does.
+
+    Files that an earlier run has left there and this one does not write are removed; files that no
+    run has written stay.
+
+    Parameters
+    ----------
+    folder : path
+        Folder of the results; made if there is none.
+    kind : str
+        The kind of run, kept in ``manifest.json``.
+    discard : sequence of str
+        Folders inside ``folder`` that hold unfinished work, removed with the old results.
+
+    Yields
+    ------
+    Path
+        A scratch folder to write the results into.
+
+    Raises
+    ------
+    InputError
+        If ``folder``, or what it would lie in, is a file; if one of the results has the name of a
+        folder there; and as :func:`recover`.
+    """
+    folder = Path(folder)
+    require_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    recover(folder)
+    stage = Path(tempfile.mkdtemp(prefix=f"{SCRATCH}{os.getpid()}-", dir=folder))
+    try:
+        yield stage
+        files = sorted(str(p.relative_to(stage)) for p in stage.rglob("*") if p.is_file())
+        _require_free(folder, files)
+        manifest = {"kind": kind, "files": files, "discard": list(discard)}
+        (stage / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n")
+        with uninterrupted():
+            os.replace(stage, folder / COMMITTED)
+            recover(folder)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+
+
+def recover(folder: str | Path) -> None:
+    """Complete what an interrupted transaction has begun, and remove scratch folders left behind.
+
+    Harmless at any time; every reader of a folder of results calls it first.
+
+    Raises
+    ------
+    InputError
+        If the folder's manifest cannot be read.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        return
+    old, committed = read_manifest(folder), folder / COMMITTED
+    # a new manifest is moved last: until then this can be begun again, and where there is none the
+    # new results are in place
+    new = read_manifest(committed)
+    if new is not None:
+        for name in new["files"]:
+            if (committed / name).is_file():
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                _move(committed / name, folder / name)
+        for name in sorted(set(old["files"] if old else ()) - set(new["files"])):
+            (folder / name).unlink(missing_ok=True)
+            _remove_if_empty((folder / name).parent, folder)
+        for name in new["discard"]:
+            shutil.rmtree(folder / name, ignore_errors=True)
+        _move(committed / MANIFEST, folder / MANIFEST)
+    shutil.rmtree(committed, ignore_errors=True)
+    for scratch in folder.glob(f"{SCRATCH}*"):
+        if not _alive(scratch.name.removeprefix(SCRATCH).split("-")[0]):
+            shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _move(source: Path, target: Path) -> None:
+    # where another process completes the same transaction, it may have moved the file already
+    with suppress(FileNotFoundError):
+        os.replace(source, target)
+
+
+def _remove_if_empty(place: Path, folder: Path) -> None:
+    """Remove the folder ``place``, and those that it lies in below ``folder``, where empty."""
+    while place != folder:
+        with suppress(FileNotFoundError):
+            if any(place.iterdir()):
+                return
+            place.rmdir()
+        place = place.parent
+
+
+def _require_free(folder: Path, files: Sequence[str]) -> None:
+    """InputError if a folder has the name of one of the files, or a file that of a folder."""
+    for name in files:
+        target = folder / name
+        if target.is_dir():
+            raise InputError(f"'{target}' is a folder, and a file of the results has its name")
+        require_folder(target.parent)
+
+
+def read_manifest(folder: Path) -> dict | None:
+    """What the last run has written into a folder: ``kind`` and ``files``; None if it is not said.
+
+    Raises
+    ------
+    InputError
+        If the manifest cannot be read.
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        return None
+    try:
+        manifest = json.loads(path.read_text())
+        found = {name: manifest[name] for name in ("kind", "files", "discard")}
+        if not all(isinstance(name, str) for name in (*found["files"], *found["discard"])):
+            raise TypeError("names of files are expected")
+        return found
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"'{path}' cannot be read ({type(error).__name__}: {error}); delete it, and the next "
+            "run replaces the files of its own names"
+        ) from error
+
+
+def _alive(process: str) -> bool:
+    if not process.isdigit():
+        return False
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold back the signals that end a program until the block is done."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    # handlers and not masks: a signal that is masked here is taken by another of JAX's threads
+    before = {
+        number: signal.signal(number, lambda came_in, _: came.append(came_in))
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        if signal.getsignal(number) not in (signal.SIG_IGN, None)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in came:
+            os.kill(os.getpid(), number)
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Write a single file whole or not at all.
+
+    Yields
+    ------
+    Path
+        A scratch name beside ``path``; what is written there takes its place when all is done. If
+        anything fails or is interrupted before that, the previous file stays as it was.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)

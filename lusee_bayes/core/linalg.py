@@ -1,0 +1,116 @@
+"""Linear algebra on JAX at less than XLA's own cost.
+
+XLA has no symmetric rank-k update on the CPU: ``W.T @ W`` computes both triangles. Splitting the
+columns and forming only the blocks on and below the diagonal does 5/8 of the work. XLA also solves
+triangular systems as if their right-hand sides were full. Inverting L by halves, and leaving out
+the zeros of L^-1 in L^-T L^-1, takes n^3 / 3 multiplications each, in matrix products.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lusee_bayes.core.checks import InputError, is_traced
+
+# strips into which a triangle is split: measured for W^T W at 5232 x 2304 on two cores, 4 strips
+# take 0.40 s, one product 0.49 s; halving recursively takes 0.35 s but 0.1 GB more memory
+N_BLOCKS = 4
+
+# largest triangle that is inverted by substitution
+MAX_SUBSTITUTED = 160
+
+
+def checked_cholesky(name: str, matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+    """Return the lower Cholesky factor of a matrix, or of each of a stack.
+
+    Parameters
+    ----------
+    name : str
+        Name of the matrix, for the error message.
+    matrix : (..., n, n) array
+        Symmetric; only the lower triangle is read.
+
+    Returns
+    -------
+    (..., n, n) array
+
+    Raises
+    ------
+    InputError
+        If a matrix is not positive definite; the message gives its lowest eigenvalue. Not inside
+        a JAX transformation, where the factor holds NaN instead.
+    """
+    lower = jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
+    if not is_traced(lower) and not bool(jnp.isfinite(lower).all()):
+        lowest = float(jnp.linalg.eigvalsh(matrix).min())
+        largest = float(jnp.abs(matrix).max())
+        raise InputError(
+            f"{name} is not positive definite: its lowest eigenvalue is {lowest:.3g} "
+            f"(largest entry {largest:.3g}); check the term's amplitude and symmetry"
+        )
+    return lower
+
+
+def solve_lower(
+    lower: Float[Array, "*batch n n"], x: Float[Array, "*batch n columns"], *, transpose: bool
+) -> Float[Array, "*batch n columns"]:
+    """Return L^-1 x, or L^-T x with ``transpose``, for lower triangular L."""
+    return jax.lax.linalg.triangular_solve(
+        lower, x, left_side=True, lower=True, transpose_a=transpose
+    )
+
+
+def gram_matrix(w: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
+    """Return W^T W, symmetric to the last bit."""
+    return symmetric_product(w.T, w)
+
+
+def symmetric_product(
+    left: Float[Array, "n inner"], right: Float[Array, "inner n"]
+) -> Float[Array, "n n"]:
+    """Return the product of two matrices that is known to be symmetric.
+
+    Only the lower triangle is computed, so that the result is symmetric to the last bit.
+    """
+    n = right.shape[1]
+    return _from_strips([left[first:end] @ right[:, :end] for first, end in _strips(n)])
+
+
+def invert_lower(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Return L^-1 for lower triangular L; entries above the diagonal are not read."""
+    n = lower.shape[0]
+    if n <= MAX_SUBSTITUTED:
+        return solve_lower(jnp.tril(lower), jnp.eye(n), transpose=False)
+    h = n // 2
+    first, last = invert_lower(lower[:h, :h]), invert_lower(lower[h:, h:])
+    between = -last @ (lower[h:, :h] @ first)
+    top = jnp.concatenate([first, jnp.zeros((h, n - h))], axis=1)
+    return jnp.concatenate([top, jnp.concatenate([between, last], axis=1)])
+
+
+def inverse_from_cholesky(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Return (L L^T)^-1 for lower triangular L, symmetric to the last bit."""
+    x = invert_lower(lower)
+    # columns of L^-1 begin at their own row
+    return _from_strips(
+        [x[first:, first:end].T @ x[first:, :end] for first, end in _strips(x.shape[0])]
+    )
+
+
+def _strips(n: int) -> Iterator[tuple[int, int]]:
+    """First row and end of each strip of a triangle with n rows."""
+    return pairwise(np.linspace(0, n, min(N_BLOCKS, n) + 1).astype(int).tolist())
+
+
+def _from_strips(strips: list[Float[Array, "_ _"]]) -> Float[Array, "n n"]:
+    """The symmetric matrix whose rows, up to their diagonal block, are these."""
+    n = strips[-1].shape[1]
+    rows = [jnp.pad(strip, ((0, 0), (0, n - strip.shape[1]))) for strip in strips]
+    lower = jnp.tril(jnp.concatenate(rows))
+    return lower + jnp.tril(lower, -1).T

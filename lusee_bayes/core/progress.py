@@ -1,0 +1,95 @@
+"""Progress of a run: the stage that is running, and how long each one took."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+
+@dataclass
+class Stages:
+    """Shows and times the stages of a run.
+
+    Attributes
+    ----------
+    console : Console or None
+        Where to print; None prints nothing.
+    seconds : dict of str to float
+        Wall-clock time of every finished stage; a stage that runs twice is added up.
+    verbose : bool
+        Also print the peak memory after every stage.
+    """
+
+    console: Console | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    verbose: bool = False
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Run a ``with`` block as a stage: a spinner while it runs, its time when it is done."""
+        start = time.perf_counter()
+        if self.console is None:
+            yield
+        else:
+            with self.console.status(f"{name} ..."):
+                yield
+        self._finish(name, start)
+
+    @contextmanager
+    def progress(self, name: str, total: int) -> Iterator[Callable[[int, str], None]]:
+        """Run a ``with`` block as a stage with a progress bar.
+
+        Parameters
+        ----------
+        name : str
+        total : int
+            Number of steps.
+
+        Yields
+        ------
+        callable
+            Updates the bar; its arguments are the number of steps done and a remark.
+        """
+        start = time.perf_counter()
+        if self.console is None:
+            yield lambda done, remark="": None
+        else:
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                TimeRemainingColumn(),
+                TextColumn("{task.fields[remark]}"),
+            )
+            with Progress(*columns, console=self.console, transient=True) as bar:
+                task = bar.add_task(name, total=total, remark="")
+                yield lambda done, remark="": bar.update(task, completed=done, remark=remark)
+        self._finish(name, start)
+
+    def _finish(self, name: str, start: float) -> None:
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+        if self.console is not None:
+            memory = f"  {peak_memory_gb():6.2f} GB" if self.verbose else ""
+            text = f"  {name:<28} {self.seconds[name]:7.2f} s{memory}"
+            self.console.print(text, highlight=False)
+
+
+def peak_memory_gb() -> float:
+    """Return the largest resident size of this process so far, in GB (10^9 bytes)."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e9 if sys.platform == "darwin" else peak * 1024 / 1e9

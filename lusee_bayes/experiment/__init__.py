@@ -1,0 +1,1 @@
+"""A scenario in YAML, turned into A, S, N and data."""

@@ -1,0 +1,91 @@
+"""d = A m + n of a setup: with radiometer noise alone, or with every systematic."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.experiment.terms import TERMS, Around, measured_visibilities, point_sources
+from lusee_bayes.instrument.coupling import DenseCoupling
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.noise import radiometer_noise
+from lusee_bayes.noise.covariance import Covariance
+from lusee_bayes.systematics import Marginalised, PointSources, Systematic
+
+
+def radiometer(setup: Setup, data: Visibilities | None = None) -> Covariance:
+    """Radiometer term of N, from the modelled sky or, if the scenario says so, ``data``; in K^2."""
+    section = setup.scenario.noise.radiometer
+    visibilities = setup.signal
+    if section.temperature == "measured" and data is not None:
+        visibilities = measured_visibilities(data, setup.signal)
+    return radiometer_noise(
+        visibilities,
+        setup.layout,
+        bandwidth_hz=section.bandwidth_hz,
+        step_s=setup.observation.step_s,
+        form=section.form,
+        duty_cycle=section.duty_cycle,
+        factor=section.factor,
+    )
+
+
+def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, Systematic]]:
+    """Treatment and systematic, for all that the scenario does not ignore, in their order."""
+    around = around or Around()
+    return [found for term in TERMS for found in term.build(setup, around)]
+
+
+def base_model(setup: Setup, data: Visibilities | None = None) -> LinearGaussian:
+    """d = A m + background + n with radiometer noise only."""
+    return LinearGaussian(setup.coupling, setup.prior, radiometer(setup, data), setup.offset)
+
+
+def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
+    """d = A m + n with every systematic in N that is not ignored.
+
+    Those that are to be sampled, too, to first order: what a Gaussian can say about them.
+    """
+    around = around or Around()
+    model = base_model(setup, around.data)
+    for _, systematic in systematics(setup, around):
+        model = systematic.marginalised(model)
+    return model
+
+
+def model_with_fluxes(setup: Setup, around: Around | None = None) -> LinearGaussian:
+    """:func:`full_model`, but with the sources' fluxes among the unknowns, behind the sky's.
+
+    Raises
+    ------
+    InputError
+        If the scenario has no sources.
+    """
+    around = around or Around()
+    model, sources = base_model(setup, around.data), point_sources(setup)
+    for _, systematic in systematics(setup, around):
+        if not isinstance(systematic, PointSources):
+            model = systematic.marginalised(model)
+    return sources.joint(model)
+
+
+def model_to_sample(
+    setup: Setup, data: Visibilities
+) -> tuple[LinearGaussian, tuple[Systematic, ...]]:
+    """The model before anything is sampled, and what is then to be applied to it.
+
+    Systematics that are marginalised come in their place in the order, as sampled ones without a
+    site.
+    """
+    model, later = base_model(setup, data), []
+    for treatment, systematic in systematics(setup, Around(data)):
+        if treatment == "sampled":
+            later.append(systematic)
+        elif later:
+            later.append(Marginalised(systematic))
+        else:
+            model = systematic.marginalised(model)
+    if later and not any(systematic.changes_coupling for systematic in later):
+        model = replace(model, coupling=DenseCoupling(model.coupling.dense()))
+    return model, tuple(later)

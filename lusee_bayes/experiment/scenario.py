@@ -1,0 +1,183 @@
+"""A scenario: everything that determines a run, as YAML, validated before anything is computed.
+
+Unknown keys are errors that name the nearest known one. ``to_yaml`` writes the resolved scenario,
+defaults included; running that file again gives the same numbers.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+from pydantic import Field, ValidationError, model_validator
+
+from lusee_bayes.core.checks import InputError, nearest
+from lusee_bayes.experiment.overrides import apply_override
+from lusee_bayes.experiment.scenario_errors import one_sentence
+from lusee_bayes.experiment.schema import (
+    BeamSection,
+    Frequency,
+    GalaxySection,
+    MonopoleBeamSection,
+    NoiseSection,
+    ObservationSection,
+    OutputSection,
+    PriorSection,
+    Section,
+    SkySection,
+    SourcesSection,
+    SpectralSection,
+)
+
+# the scenarios that ship with the package
+FOLDER = resources.files("lusee_bayes.experiment") / "scenarios"
+
+
+class Scenario(Section):
+    """A complete run: of one frequency, or of all of ``frequencies_mhz``.
+
+    ``joint``: channels share a posterior, with the spectral prior; else each has its own.
+    """
+
+    frequency_mhz: Frequency = 25.0
+    frequencies_mhz: tuple[Frequency, ...] = ()
+    joint: bool = False
+    lmax: Annotated[int, Field(ge=1, le=383)] = 47
+    nside: Annotated[int, Field(ge=1)] | None = None
+    observation: ObservationSection = ObservationSection()
+    beam: BeamSection = MonopoleBeamSection()
+    sky: SkySection = GalaxySection()
+    prior: PriorSection = PriorSection()
+    noise: NoiseSection = NoiseSection()
+    sources: SourcesSection = SourcesSection()
+    spectral: SpectralSection = SpectralSection()
+    output: OutputSection = OutputSection()
+    seed: Annotated[int, Field(ge=0)] = 1
+
+    @model_validator(mode="after")
+    def _frequencies_grow(self) -> Scenario:
+        if any(b <= a for a, b in pairwise(self.frequencies_mhz)):
+            raise ValueError("frequencies_mhz must grow from one to the next")
+        if self.joint and not self.frequencies_mhz:
+            raise ValueError("joint needs frequencies_mhz, the channels that share a posterior")
+        return self
+
+    @model_validator(mode="after")
+    def _sources_are_there_once(self) -> Scenario:
+        if self.sky.sources and self.sources.list:
+            raise ValueError(
+                "the embedded sky holds the catalogue's sources already; with sources.list of "
+                "its own, set sky.sources=false"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _files_have_no_parameters(self) -> Scenario:
+        error = self.noise.beam
+        if self.beam.is_file and error is not None and error.parameters:
+            raise ValueError(
+                "noise.beam.parameters are those of the embedded antennas, which beam.file "
+                "replaces; use noise.beam.shift_mhz or noise.beam.file"
+            )
+        from_file = self.beam.is_file or (error is not None and error.file is not None)
+        if from_file and self.sources.list:
+            raise ValueError(
+                "sources.list needs the exact beams of the embedded antennas; leave out beam.file "
+                "and noise.beam.file, or the sources"
+            )
+        return self
+
+    def channels(self) -> tuple[Scenario, ...]:
+        """The scenario of every channel; draws of each have a seed of their own, one further."""
+        alone = {"frequencies_mhz": (), "joint": False}
+        return tuple(
+            self.model_copy(update={**alone, "frequency_mhz": f, "seed": self.seed + number})
+            for number, f in enumerate(self.frequencies_mhz)
+        )
+
+    @property
+    def samples(self) -> bool:
+        """Whether something besides the sky is to be sampled."""
+        prior = self.prior
+        return (
+            "sampled" in _treatments(self)
+            or self.noise.radiometer.log_factor_std is not None
+            or prior.log_amplitude_std is not None
+            or prior.tilt_std is not None
+            or bool(prior.band_edges)
+        )
+
+    @property
+    def map_nside(self) -> int:
+        """NSIDE of maps that leave the program: at least two pixels for each ell."""
+        if self.nside is not None:
+            return self.nside
+        return 2 ** max(3, (self.lmax // 2).bit_length())
+
+    def to_yaml(self) -> str:
+        """The resolved scenario, defaults included."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+
+
+def _treatments(section: Section) -> set[str]:
+    """What a section, and all within it, say is done about what is not known."""
+    found = {section.treatment} if "treatment" in type(section).model_fields else set()
+    for name in type(section).model_fields:
+        value = getattr(section, name)
+        if isinstance(value, Section):
+            found |= _treatments(value)
+    return found
+
+
+def scenario_names() -> list[str]:
+    """Names of the scenarios that ship with the package."""
+    return sorted(
+        p.name.removesuffix(".yaml") for p in FOLDER.iterdir() if p.name.endswith(".yaml")
+    )
+
+
+def load_scenario(source: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Scenario:
+    """Read a YAML file, or a scenario of the package by name, and apply ``key.path=value``.
+
+    InputError with one sentence for a missing file, bad YAML, an unknown key or a bad value.
+    """
+    scenario = _validate(_read_yaml(source), source)
+    if not overrides:
+        return scenario
+    tree = scenario.model_dump(mode="json")  # defaults included, so that any entry can be set
+    for override in overrides:
+        apply_override(tree, override)
+    return _validate(tree, source)
+
+
+def _validate(tree: dict[str, Any], source: str | Path) -> Scenario:
+    try:
+        return Scenario.model_validate(tree)
+    except ValidationError as error:
+        raise InputError(one_sentence(error, str(source), Scenario)) from error
+
+
+def _read_yaml(source: str | Path) -> dict[str, Any]:
+    path = Path(source)
+    if path.is_file():
+        text = path.read_text()
+    elif str(source) in scenario_names():
+        text = (
+            resources.files("lusee_bayes.experiment") / "scenarios" / f"{source}.yaml"
+        ).read_text()
+    else:
+        raise InputError(
+            f"no scenario '{source}': neither a file nor a name; "
+            f"{nearest(str(source), scenario_names())}"
+        )
+    try:
+        tree = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise InputError(f"{source} is not valid YAML: {' '.join(str(error).split())}") from error
+    tree = {} if tree is None else tree
+    if not isinstance(tree, dict):
+        raise InputError(f"{source} must hold keys and values, got a {type(tree).__name__}")
+    return tree

@@ -1,0 +1,55 @@
+"""The sections of a scenario: what can be said, with which defaults, and what goes together."""
+
+from lusee_bayes.experiment.schema.beam import (
+    BEAM_SECTIONS,
+    BeamSection,
+    MonopoleBeamSection,
+    ResponseSection,
+    ScalarBeamSection,
+    section_of_file,
+)
+from lusee_bayes.experiment.schema.noise import (
+    BeamErrorSection,
+    GainSection,
+    NoiseSection,
+    RadiometerSection,
+)
+from lusee_bayes.experiment.schema.observation import ObservationSection, RunSection
+from lusee_bayes.experiment.schema.output import OutputSection
+from lusee_bayes.experiment.schema.prior import IsotropicPriorSection, PriorSection
+from lusee_bayes.experiment.schema.section import Frequency, Section
+from lusee_bayes.experiment.schema.sky import (
+    SKY_SECTIONS,
+    FileSkySection,
+    GalaxySection,
+    SkySection,
+)
+from lusee_bayes.experiment.schema.sources import SourceSection, SourcesSection
+from lusee_bayes.experiment.schema.spectral import SpectralSection
+
+__all__ = [
+    "BEAM_SECTIONS",
+    "SKY_SECTIONS",
+    "BeamErrorSection",
+    "BeamSection",
+    "FileSkySection",
+    "Frequency",
+    "GainSection",
+    "GalaxySection",
+    "IsotropicPriorSection",
+    "MonopoleBeamSection",
+    "NoiseSection",
+    "ObservationSection",
+    "OutputSection",
+    "PriorSection",
+    "RadiometerSection",
+    "ResponseSection",
+    "RunSection",
+    "ScalarBeamSection",
+    "Section",
+    "SkySection",
+    "SourceSection",
+    "SourcesSection",
+    "SpectralSection",
+    "section_of_file",
+]

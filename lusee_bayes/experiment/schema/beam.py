@@ -1,0 +1,214 @@
+"""The beams: one section for each kind, told apart by ``model``.
+
+A new kind is a class here, with its :class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import reduce
+from operator import or_
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, Field
+
+from lusee_bayes.experiment.schema.section import Positive, Section, without_other_kinds
+from lusee_bayes.instrument.beams import (
+    BeamSource,
+    EmbeddedBeams,
+    Monopoles,
+    Regolith,
+    ResponseBeams,
+    ScalarFileBeams,
+)
+from lusee_bayes.instrument.beams.files import is_response
+from lusee_bayes.instrument.beams.response_file import read_response
+from lusee_bayes.instrument.beams.scalar_file import read_scalar_beam
+from lusee_bayes.instrument.products import N_ANTENNAS
+
+
+class MonopoleBeamSection(Section):
+    """The embedded antennas: four monopoles over layered regolith.
+
+    Attributes
+    ----------
+    length_m, zenith_angle_deg, height_m : float
+        Length of an arm, its angle from the zenith, height of the feed over the ground.
+    surface_permittivity, deep_permittivity, loss_tangent : float
+        Of the regolith: at the surface, 100 m deep, and everywhere.
+    turntable_offset_deg : float
+        By how much the turntable is further round than it says, from East towards North.
+    """
+
+    is_file: ClassVar[bool] = False
+
+    model: Literal["monopole"] = "monopole"
+    length_m: Positive = 3.0
+    zenith_angle_deg: Annotated[float, Field(gt=0, lt=180)] = 75.0
+    height_m: Positive = 2.0
+    surface_permittivity: Annotated[float, Field(ge=1)] = 3.7
+    deep_permittivity: Annotated[float, Field(ge=1)] = 6.1
+    loss_tangent: Annotated[float, Field(ge=0)] = 0.01
+    turntable_offset_deg: float = 0.0
+
+    @property
+    def label(self) -> str:
+        """Which antennas, for the header of a file."""
+        return self.model
+
+    @property
+    def n_ports(self) -> int:
+        """Number of antennas."""
+        return N_ANTENNAS
+
+    def source(self) -> BeamSource:
+        """The antennas."""
+        return EmbeddedBeams(
+            Monopoles(
+                regolith=Regolith(
+                    self.surface_permittivity, self.deep_permittivity, self.loss_tangent
+                ),
+                length_m=self.length_m,
+                zenith_angle_deg=self.zenith_angle_deg,
+                height_m=self.height_m,
+                turntable_offset_deg=self.turntable_offset_deg,
+            )
+        )
+
+
+class _FileSection(Section):
+    """What the beams of all files have in common."""
+
+    is_file: ClassVar[bool] = True
+
+    file: str
+    turntable_offset_deg: float = 0.0
+    quadrature: Literal["exact", "luseepy"] = "exact"
+    moon_temperature_k: Annotated[float, Field(ge=0)] = 0.0
+
+    @property
+    def label(self) -> str:
+        """Which antennas, for the header of a file."""
+        return Path(self.file).name
+
+
+class ScalarBeamSection(_FileSection):
+    """A scalar beam of luseepy: the pattern of one arm, put up once for every port.
+
+    Attributes
+    ----------
+    file : str
+        FITS version 2.
+    rotations_deg : tuple of float
+        By how much the pattern is turned for each port, from East towards North, on top of
+        ``turntable_offset_deg``.
+    taper : bool
+        Fade out towards the horizon as luseepy does.
+    quadrature : {"exact", "luseepy"}
+        ``luseepy`` is luseepy's own rule, for data that luseepy has made.
+    moon_temperature_k : float
+        Temperature of the ground, which adds its own radiation.
+    """
+
+    model: Literal["luseepy"] = "luseepy"
+    taper: bool = True
+    rotations_deg: Annotated[tuple[float, ...], Field(min_length=1)] = (0.0, 90.0, 180.0, 270.0)
+
+    @property
+    def n_ports(self) -> int:
+        """Number of ports."""
+        return len(self.rotations_deg)
+
+    def source(self) -> BeamSource:
+        """The pattern of the file, put up at every angle."""
+        return ScalarFileBeams(
+            read_scalar_beam(self.file),
+            turntable_offset_deg=self.turntable_offset_deg,
+            taper=self.taper,
+            rotations_deg=self.rotations_deg,
+            luseepy_quadrature=self.quadrature == "luseepy",
+            moon_k=self.moon_temperature_k,
+        )
+
+
+class ResponseSection(_FileSection):
+    """A four-port response of luseepy: coupled antennas with their receivers.
+
+    Attributes
+    ----------
+    file : str
+        FITS version 3.
+    receiver : {"jfet", "open"}
+        What is connected to the ports: luseepy's preamplifiers, or nothing.
+    moon_temperature_k, antenna_temperature_k : float
+        Temperatures of the ground and of the antennas' losses, which add their own radiation.
+    """
+
+    model: Literal["response"] = "response"
+    receiver: Literal["jfet", "open"] = "jfet"
+    antenna_temperature_k: Annotated[float, Field(ge=0)] = 0.0
+
+    @property
+    def n_ports(self) -> int:
+        """Number of ports."""
+        return N_ANTENNAS
+
+    def source(self) -> BeamSource:
+        """The response of the file, with its receivers."""
+        response = read_response(self.file)
+        if self.receiver == "open":
+            response = replace(response, receiver=None)
+        return ResponseBeams(
+            response,
+            turntable_offset_deg=self.turntable_offset_deg,
+            luseepy_quadrature=self.quadrature == "luseepy",
+            moon_k=self.moon_temperature_k,
+            antenna_k=self.antenna_temperature_k,
+        )
+
+
+BEAM_SECTIONS = {
+    section.model_fields["model"].default: section
+    for section in (MonopoleBeamSection, ScalarBeamSection, ResponseSection)
+}
+
+
+def _one_kind(value: Any) -> Any:
+    """``beam: {file: ...}`` without a model, as scenarios had it before: the file tells."""
+    if not isinstance(value, dict):
+        return value
+    tree = dict(value)
+    default = MonopoleBeamSection.model_fields["model"].default
+    tree["model"] = tree.get("model") or default
+    file = tree.get("file")
+    if tree["model"] == default and file is not None:
+        tree["model"] = "response" if is_response(file) else "luseepy"
+    temperatures = ("moon_temperature_k", "antenna_temperature_k")
+    if tree["model"] == default and any(tree.get(name) for name in temperatures):
+        raise ValueError(
+            "the beams of the embedded antennas are scaled to the sky alone: temperatures of "
+            "Moon and antennas need beam.file"
+        )
+    if tree["model"] == "luseepy" and tree.get("antenna_temperature_k"):
+        raise ValueError(
+            f"{file} is a scalar beam, which knows of no losses; leave out "
+            "beam.antenna_temperature_k"
+        )
+    return without_other_kinds(tree, BEAM_SECTIONS, strict=True)
+
+
+BeamSection = Annotated[
+    reduce(or_, BEAM_SECTIONS.values()), Field(discriminator="model"), BeforeValidator(_one_kind)
+]
+
+
+def section_of_file(file: str, like: Any) -> Any:
+    """The section of another beam file, put up as the beams of ``like`` are."""
+    kind = BEAM_SECTIONS["response" if is_response(file) else "luseepy"]
+    shared = {
+        name: value
+        for name, value in like.model_dump().items()
+        if name in kind.model_fields and name not in ("model", "file")
+    }
+    return kind(file=file, **shared)

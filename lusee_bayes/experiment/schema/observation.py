@@ -1,0 +1,51 @@
+"""Where, when and with which turntable angles."""
+
+from __future__ import annotations
+
+from datetime import date
+from typing import Annotated, Any
+
+from pydantic import Field, field_validator
+
+from lusee_bayes.experiment.schema.section import Positive, Section
+from lusee_bayes.instrument.observation import Observation, Run
+
+
+class RunSection(Section):
+    """One stretch of data at one turntable angle."""
+
+    cycles: Positive = 1.0
+    turntable_deg: float = 0.0
+    night_only: bool = False
+
+
+class ObservationSection(Section):
+    """Where and when; ``runs`` follow one another from ``start`` (UTC).
+
+    ``fixed_axis``: the Moon turns about the axis of the first sample, as luseepy's default engines
+    have it; for data that they have made.
+    """
+
+    lon_deg: float = 182.258
+    lat_deg: Annotated[float, Field(ge=-90, le=90)] = -23.814
+    start: str = "2027-01-15T00:00:00"
+    step_s: Positive = 7200.0
+    runs: Annotated[tuple[RunSection, ...], Field(min_length=1)] = (RunSection(),)
+    fixed_axis: bool = False
+
+    @field_validator("start", mode="before")
+    @classmethod
+    def _as_text(cls, value: Any) -> Any:
+        """YAML reads an unquoted date as a date."""
+        return value.isoformat() if isinstance(value, date) else value
+
+    def observation(self) -> Observation:
+        """Site, times and turntable angles."""
+        return Observation.from_runs(
+            tuple(Run(r.cycles, r.turntable_deg, r.night_only) for r in self.runs),
+            start=self.start,
+            step_s=self.step_s,
+            lon_deg=self.lon_deg,
+            lat_deg=self.lat_deg,
+            fixed_axis=self.fixed_axis,
+        )

@@ -1,0 +1,51 @@
+"""The prior on the sky."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from lusee_bayes.experiment.schema.section import Positive, Section
+from lusee_bayes.sky import Sky
+from lusee_bayes.sky.priors import HarmonicPrior, Prior
+
+
+class IsotropicPriorSection(Section):
+    """Independent coefficients with C_ell the spectrum of the scenario's sky, times ``scale``.
+
+    Sampled where they are not known: ln of an amplitude and a tilt, C_ell A ((ell + 1) / 10)^tilt,
+    of prior standard deviations ``log_amplitude_std`` and ``tilt_std``; or (``band_edges``: first
+    ell of each band but the lowest) ln of one amplitude for every band, of ``log_band_std``.
+    """
+
+    model: Literal["isotropic"] = "isotropic"
+    scale: Positive = 1.0
+    log_amplitude_std: Positive | None = None
+    tilt_std: Positive | None = None
+    band_edges: tuple[Annotated[int, Field(ge=1)], ...] = ()
+    log_band_std: Positive = 1.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _spectrum_had_one_value(cls, value: Any) -> Any:
+        """``spectrum: sky`` was an entry once, with this one value."""
+        if isinstance(value, dict) and value.get("spectrum") == "sky":
+            return {name: v for name, v in value.items() if name != "spectrum"}
+        return value
+
+    @model_validator(mode="after")
+    def _one_parameterisation(self) -> IsotropicPriorSection:
+        if self.band_edges and (self.log_amplitude_std or self.tilt_std):
+            raise ValueError("give either band_edges or log_amplitude_std and tilt_std")
+        if list(self.band_edges) != sorted(set(self.band_edges)):
+            raise ValueError("band_edges must grow from one to the next")
+        return self
+
+    def prior(self, sky: Sky) -> Prior:
+        """S of a model sky."""
+        return HarmonicPrior(sky.spectrum() * self.scale)
+
+
+# a further prior joins here, told apart by ``model``
+PriorSection = IsotropicPriorSection

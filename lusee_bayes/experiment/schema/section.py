@@ -1,0 +1,75 @@
+"""What all sections of a scenario have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0)]
+# of LuSEE-Night's band, in MHz
+Frequency = Annotated[float, Field(ge=1, le=50)]
+# what is done about something that is not known
+Treatment = Literal["marginalised", "sampled", "ignored"]
+
+
+class Section(BaseModel):
+    """Part of a scenario: no key that is not declared, no NaN, nothing changed once made."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def known_keys(kinds: Mapping[str, type[Section]]) -> set[str]:
+    """Every key of a section that comes in several kinds."""
+    return {name for kind in kinds.values() for name in kind.model_fields}
+
+
+def without_other_kinds(
+    tree: dict[str, Any], kinds: Mapping[str, type[Section]], *, strict: bool
+) -> dict[str, Any]:
+    """A section's entries without those that only other kinds of it have.
+
+    Scenarios that were written with all keys, or in which one kind is put in another's place by
+    ``--set``, still hold the keys of the other kind.
+
+    Parameters
+    ----------
+    tree : dict
+        The section's entries, ``model`` among them.
+    kinds : mapping
+        The section of each ``model``.
+    strict : bool
+        Refuse a key of another kind whose value is not that kind's default.
+
+    Returns
+    -------
+    dict
+        The entries that the kind has, and those that no kind has.
+
+    Raises
+    ------
+    ValueError
+        For such a key, where ``strict``.
+    """
+    own = kinds.get(tree["model"])
+    if own is None:
+        return tree
+    kept = {}
+    for key, value in tree.items():
+        others = [k for k in kinds.values() if key in k.model_fields]
+        if key in own.model_fields or not others:
+            kept[key] = value
+            continue
+        theirs = others[0]
+        default = theirs.model_fields[key].get_default(call_default_factory=True)
+        same = value is None or value == default or value == _plain(default)
+        if strict and not same:
+            names = ", ".join(name for name, kind in kinds.items() if kind in others)
+            raise ValueError(f"{key} is an entry of model {names}, not of {tree['model']}")
+    return kept
+
+
+def _plain(value: Any) -> Any:
+    """As YAML has it."""
+    return list(value) if isinstance(value, tuple) else value

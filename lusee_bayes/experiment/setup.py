@@ -1,0 +1,237 @@
+"""A scenario's instrument pointed at its sky: all that is fixed before there are data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from lusee_bayes.core.checks import InputError, nearest
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.schema import SourceSection
+from lusee_bayes.instrument.beams import BeamSource, Monopoles, ProductBeams
+from lusee_bayes.instrument.coupling import CouplingMatrix
+from lusee_bayes.instrument.ephemeris import BODIES, body_direction
+from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.pointing import Pointing
+from lusee_bayes.instrument.source_response import source_response
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.sky import BRIGHT_SOURCES, Sky, galactic_unit_vector, kelvin_steradian
+from lusee_bayes.sky.priors import Prior
+
+# two sites closer than that are one: 30 m
+SAME_SITE_DEG = 1e-3
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The pieces of d = A m + n that a scenario stands for.
+
+    Attributes
+    ----------
+    scenario : Scenario
+    observation : Observation
+    sky : Sky
+        The scenario's model sky, up to lmax.
+    beam_source : BeamSource
+    instrument : Instrument
+        Orientations and samples, of which A is made for given beams.
+    beams : ProductBeams
+    coupling : CouplingMatrix
+        A.
+    prior : Prior
+        S.
+    responses : tuple of (products, times) arrays
+        Of each point source beside the map, to 1 K sr.
+    background : (products,) array
+        Visibilities without any sky, in K.
+    signal : (products, times) array
+        Visibilities of sky, background and sources through the modelled beams, in K.
+    """
+
+    scenario: Scenario
+    observation: Observation
+    sky: Sky
+    beam_source: BeamSource
+    instrument: Instrument
+    beams: ProductBeams
+    coupling: CouplingMatrix
+    prior: Prior
+    responses: tuple[Float[Array, "products times"], ...]
+    background: Float[Array, " products"]
+    signal: Float[Array, "products times"]
+
+    @property
+    def pointing(self) -> Pointing:
+        """The orientation of the lander at every sample."""
+        return self.instrument.pointing
+
+    @property
+    def layout(self) -> DataLayout:
+        """The product and the time of every datum."""
+        return self.coupling.layout
+
+    @property
+    def offset(self) -> Float[Array, " data"] | None:
+        """The background in every datum, in K; None where nothing emits."""
+        if not self.beam_source.emits:
+            return None
+        grid = (self.layout.n_products, self.layout.n_times)
+        return self.layout.gather(jnp.broadcast_to(self.background[:, None], grid))
+
+    @cached_property
+    def prepared(self) -> Instrument:
+        """The instrument, prepared for A to be made of many beams."""
+        return self.instrument.prepared()
+
+
+def set_up(
+    scenario: Scenario, data: Visibilities | None = None, stages: Stages | None = None
+) -> Setup:
+    """Build everything that does not depend on the values of data.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    data : Visibilities, optional
+        Take the times and the samples that these data have, not the scenario's.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        If the data are of another frequency, another site or other ports.
+    """
+    stages = stages or Stages()
+    if data is not None:
+        require_fitting(data, scenario)
+    with stages("sky"):
+        sky = scenario.sky.source().at(scenario.frequency_mhz, scenario.lmax)
+        prior = scenario.prior.prior(sky)
+    with stages("orientation"):
+        if data is None:
+            observation = scenario.observation.observation()
+        else:
+            fixed_axis = scenario.observation.fixed_axis
+            observation = replace(data.observation, fixed_axis=fixed_axis)
+        pointing = Pointing.of(observation, scenario.lmax)
+    with stages("beams"):
+        source = scenario.beam.source()
+        beams = jax.block_until_ready(source.beams(scenario.frequency_mhz, scenario.lmax))
+        background = source.background(scenario.frequency_mhz)
+        # sources need the exact pattern, which only the embedded antennas have
+        responses: tuple[Float[Array, "products times"], ...] = ()
+        if scenario.sources.list:
+            responses = source_responses(
+                scenario, observation, source.monopoles, scenario.frequency_mhz
+            )
+    if data is not None and data.layout.n_products != beams.n_products:
+        raise InputError(
+            f"the data have {data.layout.n_products} products, the beams supply "
+            f"{beams.n_products}; give beam.rotations_deg an angle for every port"
+        )
+    with stages("coupling"):
+        complete = CouplingMatrix.build(beams, pointing)
+        layout = complete.layout if data is None else data.layout
+        signal = complete.layout.scatter(complete @ sky.modes) + background[:, None]
+        for section, response in zip(scenario.sources.list, responses, strict=True):
+            signal = signal + mean_flux(section, scenario.frequency_mhz) * response
+        instrument = Instrument(
+            _antennas(scenario, source), pointing, layout, scenario.frequency_mhz, scenario.lmax
+        )
+        coupling = instrument.coupling_of(beams)
+    return Setup(
+        scenario,
+        observation,
+        sky,
+        source,
+        instrument,
+        beams,
+        coupling,
+        prior,
+        responses,
+        background,
+        signal,
+    )
+
+
+def _antennas(scenario: Scenario, source: BeamSource) -> Monopoles:
+    """The embedded antennas that an Instrument needs; those of a file have no parameters."""
+    return Monopoles() if scenario.beam.is_file else source.monopoles
+
+
+def require_fitting(data: Visibilities, scenario: Scenario) -> None:
+    """InputError unless data are of the scenario's frequency and site."""
+    if not np.isclose(data.frequency_mhz, scenario.frequency_mhz, 1e-9):
+        raise InputError(
+            f"the data are at {data.frequency_mhz} MHz, the scenario at "
+            f"{scenario.frequency_mhz}; use --set frequency_mhz={data.frequency_mhz}"
+        )
+    here, there = data.observation, scenario.observation
+    east = (here.lon_deg - there.lon_deg + 180.0) % 360.0 - 180.0
+    if max(abs(east), abs(here.lat_deg - there.lat_deg)) > SAME_SITE_DEG:
+        raise InputError(
+            f"the data were taken at longitude {here.lon_deg:g}, latitude {here.lat_deg:g} "
+            f"degrees, the scenario's site is {there.lon_deg:g}, {there.lat_deg:g}; use --set "
+            f"observation.lon_deg={here.lon_deg:g} --set observation.lat_deg={here.lat_deg:g}"
+        )
+
+
+def source_responses(
+    scenario: Scenario, observation: Observation, antennas: Monopoles, frequency_mhz: float
+) -> tuple[Float[Array, "products times"], ...]:
+    """Response to 1 K sr of each of the scenario's sources, with these antennas, in K."""
+    return tuple(
+        source_response(
+            observation,
+            _direction(source, observation),
+            frequency_mhz,
+            antennas,
+            stokes_v=source.stokes_v,
+        )
+        for source in scenario.sources.list
+    )
+
+
+def _direction(source: SourceSection, observation: Observation) -> Float[np.ndarray, "..."]:
+    """Galactic unit vector(s) of a source: its own, the catalogue's, or the ephemeris'."""
+    if source.ra_deg is not None:
+        return galactic_unit_vector(source.ra_deg, source.dec_deg)
+    if source.name in BODIES:
+        return body_direction(source.name, observation)
+    known = {s.name: s for s in BRIGHT_SOURCES}
+    if source.name not in known:
+        raise InputError(
+            f"unknown source '{source.name}'; {nearest(source.name, [*known, *BODIES])} "
+            "(or give ra_deg and dec_deg of your own)"
+        )
+    return galactic_unit_vector(known[source.name].ra_deg, known[source.name].dec_deg)
+
+
+def mean_flux(source: SourceSection, frequency_mhz: float) -> float:
+    """Mean of the prior of a source's flux, in K sr. InputError if nothing is known about it."""
+    if source.flux_jy is not None:
+        return float(kelvin_steradian(source.flux_jy, frequency_mhz))
+    for known in BRIGHT_SOURCES:
+        if known.name == source.name:
+            return float(known.kelvin_steradian(frequency_mhz))
+    raise InputError(
+        f"the source '{source.name}' is not in the catalogue, so that its flux is not known; give "
+        "flux_jy, the mean of its prior"
+    )
+
+
+def block_of_times(section: SourceSection, observation: Observation) -> Int[np.ndarray, " times"]:
+    """Which of a source's amplitudes belongs to each time."""
+    if section.block_h is None:
+        return np.zeros(observation.n_times, dtype=int)
+    _, block = np.unique(np.floor(observation.hours / section.block_h), return_inverse=True)
+    return block

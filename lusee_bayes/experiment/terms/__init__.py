@@ -1,0 +1,41 @@
+"""The systematics of a scenario: how each is built, and what simulated data hold of it.
+
+A new one is a :class:`Systematic`, its section in the schema, and its line in ``TERMS``.
+"""
+
+from lusee_bayes.experiment.terms.beam_error import (
+    BeamErrorTerm,
+    beam_directions,
+    beam_rms_difference,
+    true_beams,
+    true_instrument,
+)
+from lusee_bayes.experiment.terms.gain_drift import GainTerm, gain_drifts, measured_visibilities
+from lusee_bayes.experiment.terms.noise_level import NoiseLevelTerm
+from lusee_bayes.experiment.terms.prior_spectrum import PriorSpectrumTerm
+from lusee_bayes.experiment.terms.sources import SourcesTerm, point_sources
+from lusee_bayes.experiment.terms.term import AdditiveTerm, Around, Term, Truth
+
+# in the order in which they are applied to the model, and to simulated visibilities
+TERMS: tuple[Term, ...] = (
+    NoiseLevelTerm(),
+    PriorSpectrumTerm(),
+    BeamErrorTerm(),
+    SourcesTerm(),
+    GainTerm(),
+)
+
+__all__ = [
+    "TERMS",
+    "AdditiveTerm",
+    "Around",
+    "Term",
+    "Truth",
+    "beam_directions",
+    "beam_rms_difference",
+    "gain_drifts",
+    "measured_visibilities",
+    "point_sources",
+    "true_beams",
+    "true_instrument",
+]

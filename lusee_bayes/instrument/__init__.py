@@ -1,0 +1,1 @@
+"""A and d: beams, observation, pointing, coupling matrix, visibilities."""

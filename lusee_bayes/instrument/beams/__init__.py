@@ -1,0 +1,43 @@
+"""From the electric fields of antennas to the beam of every correlation product."""
+
+from lusee_bayes.instrument.beams.directions import beams_towards
+from lusee_bayes.instrument.beams.fields import AntennaFields, displaced
+from lusee_bayes.instrument.beams.files import read_beam
+from lusee_bayes.instrument.beams.grid import HemisphereGrid
+from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams
+from lusee_bayes.instrument.beams.parameters import PARAMETERS, parameter, placed
+from lusee_bayes.instrument.beams.product_beams import ProductBeams, product_beams, stokes_beam
+from lusee_bayes.instrument.beams.receiver import Receiver
+from lusee_bayes.instrument.beams.regolith import Regolith
+from lusee_bayes.instrument.beams.response_file import PortResponse
+from lusee_bayes.instrument.beams.scalar_file import ScalarBeam
+from lusee_bayes.instrument.beams.source import (
+    BeamSource,
+    EmbeddedBeams,
+    ResponseBeams,
+    ScalarFileBeams,
+)
+
+__all__ = [
+    "PARAMETERS",
+    "AntennaFields",
+    "BeamSource",
+    "EmbeddedBeams",
+    "HemisphereGrid",
+    "Monopoles",
+    "PortResponse",
+    "ProductBeams",
+    "Receiver",
+    "Regolith",
+    "ResponseBeams",
+    "ScalarBeam",
+    "ScalarFileBeams",
+    "beams_towards",
+    "displaced",
+    "monopole_beams",
+    "parameter",
+    "placed",
+    "product_beams",
+    "read_beam",
+    "stokes_beam",
+]

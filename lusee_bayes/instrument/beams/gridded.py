@@ -1,0 +1,86 @@
+"""Interpolation of fields between the directions and the frequencies of a file."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.interpolate import CubicSpline, make_interp_spline
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.instrument.beams.grid import HemisphereGrid
+
+
+def at_frequency(
+    path: str,
+    known_mhz: Float[np.ndarray, " frequencies"],
+    frequency_mhz: float,
+    *parts: np.ndarray,
+) -> list[np.ndarray]:
+    """Interpolate arrays in frequency by cubic splines.
+
+    Parameters
+    ----------
+    path : str
+        File that the arrays come from, for the error message.
+    known_mhz : (frequencies,) array
+        Growing.
+    frequency_mhz : float
+    *parts : (frequencies, ...) array
+
+    Returns
+    -------
+    list of array
+        The parts at ``frequency_mhz``, without their first axis; exactly those of the file where
+        it has this frequency.
+
+    Raises
+    ------
+    InputError
+        Outside the known frequencies.
+    """
+    if not known_mhz[0] <= frequency_mhz <= known_mhz[-1]:
+        raise InputError(
+            f"{path} has beams from {known_mhz[0]:g} to {known_mhz[-1]:g} MHz, not at "
+            f"{frequency_mhz:g}; change frequency_mhz, or give a file that reaches there"
+        )
+    exact = np.flatnonzero(known_mhz == frequency_mhz)
+    if len(exact):
+        return [np.asarray(part[exact[0]]) for part in parts]
+    degree = min(3, len(known_mhz) - 1)
+    splines = [make_interp_spline(known_mhz, part, k=degree) for part in parts]
+    return [np.asarray(spline(frequency_mhz)) for spline in splines]
+
+
+def on_grid(
+    rows: Complex[np.ndarray, "theta phi"],
+    theta: Float[np.ndarray, " theta"],
+    grid: HemisphereGrid,
+    angle_deg: float = 0.0,
+) -> Complex[np.ndarray, "grid_theta grid_phi"]:
+    """Interpolate a pattern to a grid: splines in theta, Fourier sums in phi.
+
+    Parameters
+    ----------
+    rows : (theta, phi) array
+        The pattern at azimuths 2 pi k / n.
+    theta : (theta,) array
+        Of the pattern, in radians.
+    grid : HemisphereGrid
+        Nothing is interpolated where its directions are those of the pattern.
+    angle_deg : float
+        How far to turn the pattern, from East towards North.
+
+    Returns
+    -------
+    (grid_theta, grid_phi) array
+    """
+    same = len(grid.theta) == len(theta) and bool((grid.theta == theta).all())
+    rows = rows if same else CubicSpline(theta, rows)(grid.theta)
+    n = rows.shape[1]
+    steps = angle_deg * n / 360.0
+    if grid.n_phi == n and steps == round(steps):
+        return np.roll(rows, round(steps), axis=1)
+    m = np.fft.fftfreq(n, 1.0 / n)
+    spectrum = np.fft.fft(rows, axis=1) / n
+    phi = grid.phi - np.radians(angle_deg)
+    return spectrum @ np.exp(1j * m[:, None] * phi[None])

@@ -1,0 +1,261 @@
+"""Coupled antennas over ground, with their receivers, from the four-port files of luseepy.
+
+FITS version 3: bare effective lengths H_theta, H_phi (port, frequency, theta, phi) in m, RMS, of a
+wave arriving from (theta, phi), phi from East towards North; impedance ZA and its resistive parts
+Rsky, Rmoon, Rloss (frequency, port, port) in Ohm, with ZA + ZA^H = 2 (Rsky + Rmoon + Rloss); freq
+in MHz, theta and phi in degrees. At the receivers' inputs, one-sided, ::
+
+    V_ab = k eta0 / lambda^2 int (M Ht)_a conj((M Ht)_b) + (M Hp)_a conj((M Hp)_b) T dOmega
+           + 4 k (M (T_moon Rmoon + T_antenna Rloss) M^H)_ab    in V^2/Hz.
+
+An enclosure of 1 K makes U = 4 k M (ZA + ZA^H) / 2 M^H; V_ab / sqrt(U_aa U_bb) is in K.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+from scipy.constants import Boltzmann, physical_constants
+
+from lusee_bayes.core.checks import InputError, nearest, require_finite
+from lusee_bayes.core.fits_files import read_images
+from lusee_bayes.instrument.beams.fields import SPEED_OF_LIGHT, AntennaFields
+from lusee_bayes.instrument.beams.grid import HemisphereGrid
+from lusee_bayes.instrument.beams.gridded import at_frequency, on_grid
+from lusee_bayes.instrument.beams.luseepy_rules import BandLimitedGrid
+from lusee_bayes.instrument.beams.product_beams import ProductBeams, product_beams
+from lusee_bayes.instrument.beams.receiver import Receiver, loading_matrix
+from lusee_bayes.instrument.beams.scalar_file import require_growing
+from lusee_bayes.instrument.products import N_ANTENNAS, to_real
+
+VACUUM_OHM = physical_constants["characteristic impedance of vacuum"][0]
+LENGTHS = ("H_theta", "H_phi")
+MATRICES = ("ZA", "Rsky", "Rmoon", "Rloss")
+AXES = ("freq", "theta", "phi")
+# files hold the matrices in single precision; three of them are added up
+RESISTANCE_TOLERANCE = 1e-6
+UNITS = ("K", "V2/Hz")
+Unit = Literal["K", "V2/Hz"]
+
+
+@dataclass(frozen=True)
+class PortResponse:
+    """Coupled antennas at several frequencies.
+
+    Attributes
+    ----------
+    path : str
+        The file, for error messages.
+    frequencies_mhz : (frequencies,) array
+    theta : (theta,) array
+        From 0 to pi / 2 in equal steps; azimuths are 2 pi k / n_phi.
+    h_theta, h_phi : (frequencies, ports, theta, phi) complex array
+        Effective lengths in m.
+    impedance : (frequencies, ports, ports) complex array
+        ZA in Ohm.
+    moon_resistance, loss_resistance : (frequencies, ports, ports) complex array
+        Rmoon and Rloss in Ohm.
+    receiver : Receiver or None
+        What is connected to the ports; None leaves them open.
+    """
+
+    path: str
+    frequencies_mhz: Float[np.ndarray, " frequencies"]
+    theta: Float[np.ndarray, " theta"]
+    h_theta: Complex[np.ndarray, "frequencies ports theta phi"]
+    h_phi: Complex[np.ndarray, "frequencies ports theta phi"]
+    impedance: Complex[np.ndarray, "frequencies ports ports"]
+    moon_resistance: Complex[np.ndarray, "frequencies ports ports"]
+    loss_resistance: Complex[np.ndarray, "frequencies ports ports"]
+    receiver: Receiver | None = Receiver()
+
+    @property
+    def n_phi(self) -> int:
+        """Number of azimuths."""
+        return self.h_theta.shape[3]
+
+    @property
+    def luseepy_grid(self) -> BandLimitedGrid:
+        """The directions of the file with the rule of luseepy's four-port engine."""
+        return BandLimitedGrid.of(self.theta, self.n_phi)
+
+    def loading(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
+        """Return M = ZL (ZA + ZL)^-1. InputError outside the frequencies of the file."""
+        impedance = self._impedance(frequency_mhz)
+        load = None if self.receiver is None else self.receiver.load(frequency_mhz)
+        return loading_matrix(impedance, load)
+
+    def per_kelvin(self, frequency_mhz: float) -> Float[np.ndarray, " ports"]:
+        """Return U_aa, the V^2/Hz that an enclosure of 1 K makes at each receiver's input."""
+        loading, impedance = self.loading(frequency_mhz), self._impedance(frequency_mhz)
+        resistance = (impedance + impedance.conj().T) / 2.0
+        return 4.0 * Boltzmann * (loading @ resistance @ loading.conj().T).diagonal().real
+
+    def fields(
+        self,
+        frequency_mhz: float,
+        *,
+        grid: HemisphereGrid | None = None,
+        turn_deg: float = 0.0,
+        unit: Unit = "K",
+    ) -> AntennaFields:
+        """Return the fields of the ports; their products are beams in ``unit`` per K and sr.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+            Cubic splines interpolate between those of the file.
+        grid : HemisphereGrid, optional
+            By default nodes that integrate across the horizon exactly; ``luseepy_grid`` is the
+            rule of luseepy.
+        turn_deg : float
+            How far the instrument is turned, from East towards North.
+        unit : {"K", "V2/Hz"}
+            V^2/Hz are those at the receivers' inputs.
+
+        Returns
+        -------
+        AntennaFields
+
+        Raises
+        ------
+        InputError
+            Outside the frequencies of the file, or for an unknown unit.
+        """
+        if unit not in UNITS:
+            raise InputError(f"unknown unit '{unit}'; {nearest(unit, UNITS)}")
+        parts = at_frequency(
+            self.path, self.frequencies_mhz, frequency_mhz, self.h_theta, self.h_phi
+        )
+        if grid is None:
+            grid = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
+        wavelength = SPEED_OF_LIGHT / (1e6 * frequency_mhz)
+        # product beams are halves of the sums over polarisations
+        scale = np.full(N_ANTENNAS, np.sqrt(2.0 * Boltzmann * VACUUM_OHM) / wavelength)
+        if unit == "K":
+            scale = scale / np.sqrt(self.per_kelvin(frequency_mhz))
+        mixing = scale[:, None] * self.loading(frequency_mhz)
+        turned = (
+            np.tensordot(mixing, [on_grid(h, self.theta, grid, turn_deg) for h in part], axes=1)
+            for part in parts
+        )
+        loaded = (jnp.asarray(part) for part in turned)
+        return AntennaFields(*loaded, grid)
+
+    def beams(
+        self,
+        frequency_mhz: float,
+        lmax: int,
+        *,
+        grid: HemisphereGrid | None = None,
+        turn_deg: float = 0.0,
+        unit: Unit = "K",
+    ) -> ProductBeams:
+        """Return the beams of all products, in ``unit`` per K; arguments as of :meth:`fields`."""
+        fields = self.fields(frequency_mhz, grid=grid, turn_deg=turn_deg, unit=unit)
+        return product_beams(fields, frequency_mhz, lmax, normalise=False)
+
+    def background(
+        self,
+        frequency_mhz: float,
+        moon_k: float,
+        antenna_k: float = 0.0,
+        *,
+        unit: Unit = "K",
+    ) -> Float[Array, " products"]:
+        """Return the visibilities without any sky: what the Moon and lossy antennas emit.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+        moon_k, antenna_k : float
+            Temperatures of the Moon and of the antennas in K.
+        unit : {"K", "V2/Hz"}
+
+        Returns
+        -------
+        (products,) array
+
+        Raises
+        ------
+        InputError
+            Outside the frequencies of the file.
+        """
+        moon, loss = at_frequency(
+            self.path,
+            self.frequencies_mhz,
+            frequency_mhz,
+            self.moon_resistance,
+            self.loss_resistance,
+        )
+        loading = self.loading(frequency_mhz)
+        emitted = moon_k * moon + antenna_k * loss
+        seen = 4.0 * Boltzmann * loading @ emitted @ loading.conj().T
+        if unit == "K":
+            root = np.sqrt(self.per_kelvin(frequency_mhz))
+            seen = seen / (root[:, None] * root[None])
+        return to_real(jnp.asarray(seen))
+
+    def _impedance(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
+        (impedance,) = at_frequency(self.path, self.frequencies_mhz, frequency_mhz, self.impedance)
+        return impedance
+
+
+def read_response(path: str | Path) -> PortResponse:
+    """Read a four-port response of luseepy, FITS version 3.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    PortResponse
+        With luseepy's receivers on the ports.
+
+    Raises
+    ------
+    InputError
+        For a missing or truncated file, a missing image, shapes that do not fit, directions other
+        than the hemisphere above the horizon, frequencies that do not grow, numbers that are not
+        finite, or resistances that do not add up.
+    """
+    path = Path(path)
+    names = [f"{name}_{part}" for name in (*LENGTHS, *MATRICES) for part in ("real", "imag")]
+    kind = "a four-port response of luseepy, FITS version 3"
+    images, _ = read_images(path, (*names, *AXES), kind)
+    images = {name: image.astype(np.float64) for name, image in images.items()}
+    frequencies, theta_deg, phi_deg = (images[name] for name in AXES)
+    shapes = dict.fromkeys(LENGTHS, (N_ANTENNAS, *(images[name].size for name in AXES)))
+    shapes |= dict.fromkeys(MATRICES, (len(frequencies), N_ANTENNAS, N_ANTENNAS))
+    for name in names:
+        expected = shapes[name.rsplit("_", 1)[0]]
+        if images[name].shape != expected:
+            raise InputError(f"{path}: {name} has shape {images[name].shape}, expected {expected}")
+    for name, values in images.items():
+        require_finite(f"{path}: {name}", values)
+    require_growing(path, frequencies)
+    for name, degrees, last in (("theta", theta_deg, 90.0), ("phi", phi_deg, 360.0)):
+        if not np.allclose(degrees, np.linspace(0.0, last, len(degrees)), rtol=0, atol=1e-9):
+            raise InputError(
+                f"{path}: {name} goes from {degrees[0]:g} to {degrees[-1]:g} degrees; expected "
+                f"equal steps from 0 to {last:g}"
+            )
+    complex_ = {n: images[f"{n}_real"] + 1j * images[f"{n}_imag"] for n in (*LENGTHS, *MATRICES)}
+    # the last azimuth is the first once more
+    h_theta, h_phi = (np.moveaxis(complex_[name], 0, 1)[..., :-1] for name in LENGTHS)
+    impedance, sky, moon, loss = (complex_[name] for name in MATRICES)
+    resistance = (impedance + impedance.conj().swapaxes(1, 2)) / 2.0
+    off = np.abs(sky + moon + loss - resistance).max() / np.abs(resistance).max()
+    if off > RESISTANCE_TOLERANCE:
+        raise InputError(
+            f"{path}: Rsky + Rmoon + Rloss differ from (ZA + ZA^H) / 2 by {off:.1g} of the "
+            "largest; expected equality"
+        )
+    theta = np.linspace(0.0, np.pi / 2.0, len(theta_deg))
+    return PortResponse(str(path), frequencies, theta, h_theta, h_phi, impedance, moon, loss)

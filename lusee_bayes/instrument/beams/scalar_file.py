@@ -1,0 +1,231 @@
+"""The field pattern of one arm, put up once for each port, from the scalar files of luseepy.
+
+FITS version 2: images Etheta_real, Etheta_imag, EPhi_real, EPhi_imag (frequency, theta, phi), the
+response to a wave arriving from (theta, phi), phi from East towards North, time convention
+exp(+i w t); gain_conv g(frequency), freq in MHz, Z_real and Z_imag in Ohm. Visibilities in K are ::
+
+    T_ij = sqrt(g_i g_j) / (4 pi) int (Et_i conj(Et_j) + Ep_i conj(Ep_j)) I dOmega,
+
+so that fields times sqrt(2 g / 4 pi) give product beams without any other normalisation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from lusee_bayes.core.checks import InputError, require_finite
+from lusee_bayes.core.fits_files import image_names, read_images
+from lusee_bayes.instrument.beams.fields import AntennaFields
+from lusee_bayes.instrument.beams.grid import HemisphereGrid
+from lusee_bayes.instrument.beams.gridded import at_frequency, on_grid
+from lusee_bayes.instrument.beams.luseepy_rules import rectangle_rule
+from lusee_bayes.instrument.beams.product_beams import ProductBeams, product_beams, stokes_beam
+from lusee_bayes.instrument.products import to_real
+
+FIELDS = ("Etheta_real", "Etheta_imag", "EPhi_real", "EPhi_imag")
+IMPEDANCE = ("Z_real", "Z_imag")
+# luseepy turns the pattern by 90 degrees from port to port: North, West, South, East for an arm
+# that points North
+ROTATIONS_DEG = (0.0, 90.0, 180.0, 270.0)
+# luseepy fades beams out by 1 - (arctan((theta - pi / 2) / width) / pi + 1 / 2)^2
+TAPER_WIDTH = 0.03
+
+
+@dataclass(frozen=True)
+class ScalarBeam:
+    """The pattern of one arm at several frequencies.
+
+    Attributes
+    ----------
+    path : str
+        The file, for error messages.
+    frequencies_mhz : (frequencies,) array
+    theta : (theta,) array
+        From 0 to pi / 2 in equal steps; azimuths are 2 pi k / n_phi.
+    e_theta, e_phi : (frequencies, theta, phi) complex array
+        Fields in the unit of the file.
+    gain : (frequencies,) array
+        gain_conv of the file.
+    impedance : (frequencies,) complex array or None
+        Of the arm in Ohm; None where the file has none.
+    """
+
+    path: str
+    frequencies_mhz: Float[np.ndarray, " frequencies"]
+    theta: Float[np.ndarray, " theta"]
+    e_theta: Complex[np.ndarray, "frequencies theta phi"]
+    e_phi: Complex[np.ndarray, "frequencies theta phi"]
+    gain: Float[np.ndarray, " frequencies"]
+    impedance: Complex[np.ndarray, " frequencies"] | None = None
+
+    @property
+    def n_phi(self) -> int:
+        """Number of azimuths."""
+        return self.e_theta.shape[2]
+
+    @property
+    def luseepy_grid(self) -> HemisphereGrid:
+        """The directions of the file with luseepy's rule: sin(theta) dtheta dphi."""
+        return rectangle_rule(self.theta, self.n_phi)
+
+    def fields(
+        self,
+        frequency_mhz: float,
+        *,
+        grid: HemisphereGrid | None = None,
+        taper: bool = True,
+        rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
+    ) -> AntennaFields:
+        """Return the fields of the arms; their products are beams in K per K.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+            Cubic splines interpolate between those of the file.
+        grid : HemisphereGrid, optional
+            By default nodes that integrate across the horizon exactly; ``luseepy_grid`` is the
+            rule of luseepy.
+        taper : bool
+            Fade out towards the horizon as luseepy does.
+        rotations_deg : tuple of float
+            How far the pattern is turned for each port, from East towards North.
+
+        Returns
+        -------
+        AntennaFields
+            In sqrt(1 / sr).
+
+        Raises
+        ------
+        InputError
+            Outside the frequencies of the file.
+        """
+        *parts, gain = at_frequency(
+            self.path, self.frequencies_mhz, frequency_mhz, self.e_theta, self.e_phi, self.gain
+        )
+        if grid is None:
+            grid = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
+        scale = np.full(len(grid.theta), np.sqrt(2.0 * float(gain) / (4.0 * np.pi)))
+        if taper:
+            below = np.arctan((grid.theta - np.pi / 2.0) / TAPER_WIDTH) / np.pi + 0.5
+            scale = scale * (1.0 - below**2)
+        turned = (
+            np.stack([on_grid(part, self.theta, grid, a) for a in rotations_deg]) * scale[:, None]
+            for part in parts
+        )
+        return AntennaFields(*(jnp.asarray(x, dtype=jnp.complex128) for x in turned), grid)
+
+    def beams(
+        self,
+        frequency_mhz: float,
+        lmax: int,
+        *,
+        grid: HemisphereGrid | None = None,
+        taper: bool = True,
+        rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
+    ) -> ProductBeams:
+        """Return the beams of all products, in K per K; arguments as of :meth:`fields`."""
+        fields = self.fields(frequency_mhz, grid=grid, taper=taper, rotations_deg=rotations_deg)
+        return product_beams(fields, frequency_mhz, lmax, normalise=False)
+
+    def background(
+        self,
+        frequency_mhz: float,
+        moon_k: float,
+        *,
+        grid: HemisphereGrid | None = None,
+        taper: bool = True,
+        rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
+    ) -> Float[Array, " products"]:
+        """Return the visibilities without any sky: what ground of ``moon_k`` kelvin emits.
+
+        An auto receives from the ground the part of its beam that the sky leaves. Arms in an
+        enclosure of one temperature are taken to be uncorrelated, as they are where nothing
+        couples them, so that a cross receives the part of the sky with the opposite sign.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+        moon_k : float
+            Temperature of the ground in K.
+        grid, taper, rotations_deg
+            As of :meth:`fields`.
+
+        Returns
+        -------
+        (products,) array
+            In K.
+
+        Raises
+        ------
+        InputError
+            Outside the frequencies of the file.
+        """
+        fields = self.fields(frequency_mhz, grid=grid, taper=taper, rotations_deg=rotations_deg)
+        sky = fields.grid.integrate(to_real(stokes_beam(fields)))
+        return moon_k * (to_real(jnp.eye(len(rotations_deg), dtype=jnp.complex128)) - sky)
+
+
+def read_scalar_beam(path: str | Path) -> ScalarBeam:
+    """Read a scalar beam file of luseepy, FITS version 2.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    ScalarBeam
+
+    Raises
+    ------
+    InputError
+        For a missing or truncated file, a missing image, shapes that do not fit, directions other
+        than the hemisphere above the horizon, frequencies that do not grow, or numbers that are
+        not finite.
+    """
+    path = Path(path)
+    known = image_names(path)
+    impedance = IMPEDANCE if {name.lower() for name in IMPEDANCE} <= set(known) else ()
+    names = (*FIELDS, "gain_conv", "freq", *impedance)
+    found, header = read_images(path, names, "a scalar beam file of luseepy, FITS version 2")
+    images = {name: image.astype(np.float64) for name, image in found.items()}
+    fields = [images[name] for name in FIELDS]
+    frequencies = images["freq"]
+    shape = (len(frequencies), header.get("THETA_N"), header.get("PHI_N"))
+    for name, image in zip(FIELDS, fields, strict=True):
+        if image.shape != shape:
+            raise InputError(
+                f"{path}: {name} has shape {image.shape}, expected {shape} (frequencies, THETA_N, "
+                "PHI_N)"
+            )
+    for name in ("gain_conv", *impedance):
+        if images[name].shape != frequencies.shape:
+            raise InputError(
+                f"{path}: {name} has {images[name].size} values for {len(frequencies)} in freq"
+            )
+    require_growing(path, frequencies)
+    ends = [header.get(key) for key in ("THETA_MIN", "THETA_MAX", "PHI_MIN", "PHI_MAX")]
+    if ends != [0.0, 90.0, 0.0, 360.0]:
+        raise InputError(
+            f"{path} covers theta {ends[0]} to {ends[1]} and phi {ends[2]} to {ends[3]} degrees; "
+            "expected 0 to 90 and 0 to 360"
+        )
+    for name, values in images.items():
+        require_finite(f"{path}: {name}", values)
+    # the last azimuth is the first once more
+    e_theta, e_phi = ((fields[k] + 1j * fields[k + 1])[:, :, :-1] for k in (0, 2))
+    theta = np.linspace(0.0, np.pi / 2.0, shape[1])
+    z = images["Z_real"] + 1j * images["Z_imag"] if impedance else None
+    return ScalarBeam(str(path), frequencies, theta, e_theta, e_phi, images["gain_conv"], z)
+
+
+def require_growing(path: Path, frequencies: Float[np.ndarray, " frequencies"]) -> None:
+    """Check that each frequency is above the one before; InputError otherwise."""
+    if not (np.diff(frequencies) > 0).all():
+        raise InputError(f"{path}: the frequencies in freq do not grow")

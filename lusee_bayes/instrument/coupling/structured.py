@@ -1,0 +1,328 @@
+"""A of the beams of an observation: from sky coefficients to visibilities.
+
+With b_rk the coefficients of product k in run r, turned into the Moon-fixed frame, and W_p its
+tilted copies (``rotations.tilts``), a visibility is ::
+
+    V_k(t) = [ D_z(-phi(t)) sum_p e_p(t) W_p b_rk ] . a        (a: the sky in the mean-pole frame)
+           = sum_p e_p(t) sum_m ( cos m phi(t) X_pm + sin m phi(t) Y_pm ),
+    X_pm = sum_l (W_lm a_lm + W_l,-m a_l,-m),    Y_pm = sum_l (W_lm a_l,-m - W_l,-m a_lm).
+
+Time enters only through exp(i m phi) and the slow scalars e_p, beams only through b: a product of
+A with a vector never forms A, and nothing in it but the last sum grows with the number of times.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from lusee_bayes.core.checks import InputError, require_shape
+from lusee_bayes.core.harmonics import lmax_of, mode_numbers
+from lusee_bayes.core.rotations import tilts, turn_about_z
+from lusee_bayes.instrument.beams import ProductBeams
+from lusee_bayes.instrument.coupling.base import Coupling
+from lusee_bayes.instrument.coupling.dense import DenseCoupling
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.pointing import Pointing
+
+
+class CouplingMatrix(Coupling):
+    """A of the beams of an observation, in Galactic coordinates, with its structure in time.
+
+    ``A @ sky`` and ``A.transpose_mv(data)`` use the structure; :meth:`rows` and :meth:`dense` give
+    the numbers. Differentiable in the beams and the response. Made by :meth:`observe`,
+    :meth:`build` or :meth:`of_modes`.
+
+    Attributes
+    ----------
+    body_beams : (runs, products, powers, modes) array
+        Beams turned by the turntable into the Moon-fixed frame, and their tilted copies.
+    by_order : (runs, orders, beams, degrees) array
+        The same coefficients order by order: the matrices behind X and Y of the module's equations.
+    pointing : Pointing
+        The orientations at every sample.
+    layout : DataLayout
+        The product and the time of every row.
+    """
+
+    body_beams: Float[Array, "runs products powers modes"]
+    by_order: Float[Array, "runs orders beams degrees"]
+    pointing: Pointing
+    layout: DataLayout
+
+    @classmethod
+    def build(
+        cls,
+        beams: ProductBeams,
+        pointing: Pointing,
+        layout: DataLayout | None = None,
+    ) -> CouplingMatrix:
+        """Build A from beams and orientations.
+
+        Parameters
+        ----------
+        beams : ProductBeams
+            Beams of all products, up to the lmax of ``pointing``.
+        pointing : Pointing
+            The orientations at every sample.
+        layout : DataLayout, optional
+            Leaves out missing samples; without it none is missing.
+
+        Returns
+        -------
+        CouplingMatrix
+            A of these beams.
+
+        Raises
+        ------
+        InputError
+            If beams, pointing and layout differ in lmax, products or times.
+        """
+        n_modes = sum(b.shape[0] for b in pointing.pole_from_galactic.blocks)
+        require_shape("the beam coefficients", beams.modes, (beams.n_products, n_modes))
+        if layout is None:
+            layout = DataLayout(beams.n_products, pointing.n_times)
+        if (layout.n_products, layout.n_times) != (beams.n_products, pointing.n_times):
+            raise InputError(
+                f"the data layout has {layout.n_products} products x {layout.n_times} times, "
+                f"beams and pointing have {beams.n_products} x {pointing.n_times}"
+            )
+        return cls.of_modes(beams.modes, pointing, layout)
+
+    @classmethod
+    def of_modes(
+        cls,
+        modes: Float[Array, "beams modes"],
+        pointing: Pointing,
+        layout: DataLayout,
+    ) -> CouplingMatrix:
+        """Build A of any number of beams from their coefficients; nothing is checked.
+
+        Parameters
+        ----------
+        modes : (beams, modes) array
+            Harmonic coefficients in the topocentric frame, real packed.
+        pointing : Pointing
+            The orientations at every sample.
+        layout : DataLayout
+            With as many products as there are beams.
+
+        Returns
+        -------
+        CouplingMatrix
+            A of these beams.
+        """
+        body = _body_beams(modes, pointing)
+        lmax = len(pointing.pole_from_galactic.blocks) - 1
+        return cls(body, _by_order(body, lmax), pointing, layout)
+
+    @classmethod
+    def observe(cls, beams: ProductBeams, observation: Observation) -> CouplingMatrix:
+        """Build A of a complete observation.
+
+        Parameters
+        ----------
+        beams : ProductBeams
+            Beams of all products; their lmax is that of the sky.
+        observation : Observation
+            Place, times and turntable angles.
+
+        Returns
+        -------
+        CouplingMatrix
+            A with a row for every product and time.
+        """
+        return cls.build(beams, Pointing.of(observation, beams.lmax))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.layout.size, self.body_beams.shape[-1]
+
+    @property
+    def lmax(self) -> int:
+        """Highest ell of the sky it acts on."""
+        return len(self.pointing.pole_from_galactic.blocks) - 1
+
+    @property
+    def has_time_structure(self) -> bool:
+        return self.response is None
+
+    def plus(self, amplitude, direction):
+        if direction.response is not None:
+            raise InputError("the direction must have no response of its own")
+        if not isinstance(direction, CouplingMatrix):
+            plain = replace(self, response=None).dense()
+            return DenseCoupling(plain, response=self.response).plus(amplitude, direction)
+        self.layout.require_same(direction.layout)
+        return replace(
+            self,
+            body_beams=self.body_beams + amplitude * direction.body_beams,
+            by_order=self.by_order + amplitude * direction.by_order,
+        )
+
+    def rows(
+        self, product: Int[np.ndarray, " rows"], time: Int[np.ndarray, " rows"]
+    ) -> Float[Array, "rows modes"]:
+        """Compute chosen rows of A, flagged or not, without the response.
+
+        Parameters
+        ----------
+        product, time : (rows,) arrays of int
+            Product and time number of every row.
+
+        Returns
+        -------
+        (rows, modes) array
+            The rows, in the order asked for.
+
+        Raises
+        ------
+        InputError
+            If a number is out of range, or the two arrays differ in length.
+        """
+        product, time = np.asarray(product), np.asarray(time)
+        require_shape("time", time, product.shape)
+        for name, numbers, limit in [
+            ("product", product, self.layout.n_products),
+            ("time", time, self.layout.n_times),
+        ]:
+            if ((numbers < 0) | (numbers >= limit)).any():
+                raise InputError(f"{name} numbers must lie in 0..{limit - 1}, got {numbers}")
+        rows = jnp.zeros((len(product), self.shape[1]))
+        for run, span in self.pointing.runs():
+            here = np.flatnonzero((time >= span.start) & (time < span.stop))
+            times, position = np.unique(time[here], return_inverse=True)
+            block = self._block(run, times)[product[here], position]
+            rows = rows.at[here].set(block)
+        return rows
+
+    def dense(self) -> Float[Array, "data modes"]:
+        """A as a matrix (96 MB for 5232 x 2304)."""
+        return _dense(self)
+
+    def _forward(self, sky):
+        return _forward(self, sky)
+
+    def _backward(self, data):
+        return _backward(self, data)
+
+    def _block(self, run: int, times) -> Float[Array, "products times modes"]:
+        """Rows of all products for some samples of one run; times: a slice or numbers."""
+        factors = self.pointing.tilt_factors()[times]
+        tilted = jnp.einsum("tp,kpc->ktc", factors, self.body_beams[run])
+        return self.pointing.pole_from_galactic.T(
+            turned_about_pole(tilted, self.pointing.azimuth[times])
+        )
+
+
+def turned_about_pole(
+    beams: Float[Array, "products times modes"], azimuth: Float[Array, " times"]
+) -> Float[Array, "products times modes"]:
+    """Turn beams about the pole by the azimuth of every time: D_z(-phi(t)).
+
+    Parameters
+    ----------
+    beams : (products, times, modes) array
+        Coefficients in the Moon-fixed frame.
+    azimuth : (times,) array
+        phi(t), in radians.
+
+    Returns
+    -------
+    (products, times, modes) array
+        Coefficients in the mean-pole frame.
+    """
+    _, m = mode_numbers(lmax_of(beams.shape[-1]))
+    mirrored = beams[..., np.arange(len(m)) - 2 * m]
+    angle = azimuth[:, None] * jnp.arange(0.0, m.max() + 1.0)[None]
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    signed = sine[:, np.abs(m)] * _signs(m)[None]
+    return beams * cosine[None, :, np.abs(m)] - mirrored * signed[None]
+
+
+@eqx.filter_jit
+def _body_beams(
+    modes: Float[Array, "products modes"], pointing: Pointing
+) -> Float[Array, "runs products powers modes"]:
+    """Tilted copies of the beams in the Moon-fixed frame, for every run's turntable angle."""
+    runs = []
+    for run in range(len(pointing.run_starts) - 1):
+        body = pointing.mcmf_from_topocentric(turn_about_z(modes, pointing.turntable[run]))
+        runs.append(jnp.stack(tilts(body, pointing.order), axis=1))
+    return jnp.stack(runs)
+
+
+@eqx.filter_jit
+def _dense(coupling: CouplingMatrix) -> Float[Array, "data modes"]:
+    blocks = [coupling._block(run, span) for run, span in coupling.pointing.runs()]
+    grid = blocks[0] if len(blocks) == 1 else jnp.concatenate(blocks, axis=1)
+    rows = coupling.layout.gather(grid)
+    return rows if coupling.response is None else rows * coupling.response[:, None]
+
+
+def _phases(pointing: Pointing, lmax: int) -> tuple[Array, Array]:
+    """cos m phi(t) and sin m phi(t), each (times, orders)."""
+    angle = pointing.azimuth[:, None] * jnp.arange(lmax + 1.0)[None]
+    return jnp.cos(angle), jnp.sin(angle)
+
+
+@eqx.filter_jit
+def _by_order(
+    body_beams: Float[Array, "runs products powers modes"], lmax: int
+) -> Float[Array, "runs orders beams degrees"]:
+    """W_lm and W_l,-m side by side for every order: the matrices behind X and Y.
+
+    A tenth of the time of sums over modes that lie in the packed order (fiducial size).
+    """
+    pair = _pairs(body_beams, lmax)
+    n_runs, n_beams = body_beams.shape[0], body_beams.shape[1] * body_beams.shape[2]
+    return pair.reshape(n_runs, n_beams, 2 * (lmax + 1), lmax + 1).transpose(0, 3, 1, 2)
+
+
+def _pairs(modes: Float[Array, "*batch modes"], lmax: int) -> Float[Array, "*batch degrees orders"]:
+    """c_lm for l = 0..lmax, then c_l,-m, of m = 0..lmax; zero for l < m, and for c_l,-0."""
+    ell, m = np.arange(lmax + 1)[:, None], np.arange(lmax + 1)[None]
+    centre = ell**2 + ell
+    plus = jnp.where(ell >= m, modes[..., np.where(ell >= m, centre + m, 0)], 0.0)
+    inside = (ell >= m) & (m > 0)
+    minus = jnp.where(inside, modes[..., np.where(inside, centre - m, 0)], 0.0)
+    return jnp.concatenate([plus, minus], axis=-2)
+
+
+@eqx.filter_jit
+def _forward(coupling: CouplingMatrix, sky: Float[Array, " modes"]) -> Float[Array, " data"]:
+    n_products, n_powers = coupling.body_beams.shape[1:3]
+    pairs = _pairs(coupling.pointing.pole_from_galactic(sky), coupling.lmax)
+    plus, minus = pairs[: coupling.lmax + 1], pairs[coupling.lmax + 1 :]
+    zero_order = jnp.arange(coupling.lmax + 1)[None] == 0
+    crossed = jnp.concatenate([minus, -jnp.where(zero_order, 0.0, plus)])
+    both = jnp.stack([pairs.T, crossed.T], axis=-1)
+    cosine, sine = _phases(coupling.pointing, coupling.lmax)
+    factors = coupling.pointing.tilt_factors()
+    grids = []
+    for run, span in coupling.pointing.runs():
+        x_and_y = jnp.einsum("mbl,mlc->mbc", coupling.by_order[run], both)
+        x_and_y = x_and_y.reshape(-1, n_products, n_powers, 2)
+        c = jnp.einsum("tm,mkp->ktp", cosine[span], x_and_y[..., 0])
+        s = jnp.einsum("tm,mkp->ktp", sine[span], x_and_y[..., 1])
+        grids.append(jnp.einsum("tp,ktp->kt", factors[span], c + s))
+    data = coupling.layout.gather(jnp.concatenate(grids, axis=1))
+    return data if coupling.response is None else data * coupling.response
+
+
+@eqx.filter_jit
+def _backward(coupling: CouplingMatrix, data: Float[Array, " data"]) -> Float[Array, " modes"]:
+    """The transpose of :func:`_forward`, which is linear in the sky."""
+    sky = jax.ShapeDtypeStruct((coupling.shape[1],), jnp.float64)
+    (transposed,) = jax.linear_transpose(lambda a: _forward(coupling, a), sky)(data)
+    return transposed
+
+
+def _signs(m: np.ndarray) -> Float[Array, " modes"]:
+    return jnp.sign(jnp.asarray(m, dtype=jnp.float64))

@@ -1,0 +1,165 @@
+"""The orientation of the lander at every time, split so that time enters only through scalars.
+
+In the frame P whose z axis is the mean pole of the Moon over the samples, the rotation to the
+Moon-fixed frame is a turn phi(t) about z followed by a small tilt, exactly::
+
+    MCMF <- P  at t  =  exp(ex(t) K_x + ey(t) K_y)  exp(phi(t) K_z).
+
+The pole wanders by 0.04 degrees over one cycle, so the tilt is expanded in powers of (ex, ey); the
+order is chosen such that the largest neglected term is below ``TILT_TOLERANCE`` of any mode.
+"""
+
+from __future__ import annotations
+
+from math import factorial
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation as SpatialRotation
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.rotations import Rotation, tilt_powers
+from lusee_bayes.instrument.observation import Observation
+
+# bound on the relative error of a mode at lmax, and least order for any lmax: the bright low modes
+# then err by at most 4e-5 of the radiometer noise of a sample, over one cycle or three
+TILT_TOLERANCE = 1e-5
+LEAST_ORDER = 2
+
+
+class Pointing(eqx.Module):
+    """How an observation turns the sky above the antennas, for harmonics up to one lmax.
+
+    Attributes
+    ----------
+    azimuth : (times,) array
+        phi(t) in radians.
+    tilt : (times, 2) array
+        Rotation vector (ex, ey) in radians.
+    pole_from_galactic : Rotation
+        From Galactic coordinates to the frame P.
+    mcmf_from_topocentric : Rotation
+        From the frame of the site, at turntable angle zero, to the Moon-fixed one.
+    turntable : (runs,) array
+        In radians, positive from East towards North.
+    run_starts : tuple of int
+        First sample of each run, and the number of samples.
+    order : int
+        Of the expansion in the tilt.
+    """
+
+    azimuth: Float[Array, " times"]
+    tilt: Float[Array, "times 2"]
+    pole_from_galactic: Rotation
+    mcmf_from_topocentric: Rotation
+    turntable: Float[Array, " runs"]
+    run_starts: tuple[int, ...] = eqx.field(static=True)
+    order: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, observation: Observation, lmax: int, order: int | None = None) -> Pointing:
+        """Return the pointing of every sample of an observation.
+
+        Parameters
+        ----------
+        observation : Observation
+        lmax : int
+        order : int, optional
+            Of the expansion in the tilt: 0 fixes the axis at its mean; by default the lowest one
+            whose error is negligible, see :func:`sufficient_order`.
+
+        Returns
+        -------
+        Pointing
+
+        Raises
+        ------
+        InputError
+            If the order is negative.
+        """
+        if order is not None and order < 0:
+            raise InputError(f"the order of the tilt expansion must be 0, 1, ..., got {order}")
+        mcmf = observation.mcmf_from_galactic()
+        pole_frame = mean_pole_frame(mcmf)
+        azimuth, tilt = split(mcmf @ pole_frame.T)
+        starts = np.searchsorted(observation.run, np.arange(observation.n_runs + 1))
+        return cls(
+            azimuth=jnp.asarray(azimuth),
+            tilt=jnp.asarray(tilt),
+            pole_from_galactic=Rotation.from_matrix(pole_frame, lmax),
+            mcmf_from_topocentric=Rotation.from_matrix(observation.topocentric_from_mcmf().T, lmax),
+            turntable=jnp.radians(jnp.asarray(observation.turntable_deg, dtype=jnp.float64)),
+            run_starts=tuple(int(s) for s in starts),
+            order=sufficient_order(tilt, lmax) if order is None else order,
+        )
+
+    @property
+    def n_times(self) -> int:
+        """Number of samples."""
+        return self.azimuth.shape[0]
+
+    def runs(self) -> list[tuple[int, slice]]:
+        """Return the number of each run and the slice of its samples."""
+        bounds = zip(self.run_starts[:-1], self.run_starts[1:], strict=True)
+        return [(number, slice(first, end)) for number, (first, end) in enumerate(bounds)]
+
+    def tilt_factors(self) -> Float[Array, "times powers"]:
+        """Return (-ex)^a (-ey)^b / (a + b)! in the order of ``rotations.tilts``.
+
+        They multiply the tilted *beams*: a row of A is b^T exp(ex K_x + ey K_y) ..., and the
+        transpose of the exponential has the opposite sign.
+        """
+        ex, ey = -self.tilt[:, 0], -self.tilt[:, 1]
+        terms = [ex**a * ey**b / factorial(a + b) for a, b in tilt_powers(self.order)]
+        return jnp.stack(terms, axis=1)
+
+
+def mean_pole_frame(mcmf: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation from Galactic axes to axes whose z is the Moon's mean pole."""
+    z = mcmf[:, 2].mean(axis=0)
+    z /= np.linalg.norm(z)
+    x = np.cross([0.0, 0.0, 1.0], z)  # the Moon's pole lies 60 degrees from the Galactic one
+    x /= np.linalg.norm(x)
+    return np.array([x, np.cross(z, x), z])
+
+
+def split(
+    rotations: Float[np.ndarray, "times 3 3"],
+) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"]]:
+    """Split rotations exactly: R = exp(ex K_x + ey K_y) exp(phi K_z).
+
+    Parameters
+    ----------
+    rotations : (times, 3, 3) array
+
+    Returns
+    -------
+    azimuth : (times,) array
+        phi in radians.
+    tilt : (times, 2) array
+        (ex, ey) in radians.
+    """
+    pole = rotations[:, :, 2]  # where z goes: only the tilt moves it
+    horizontal = np.hypot(pole[:, 0], pole[:, 1])
+    angle = np.arctan2(horizontal, pole[:, 2])
+    # angle / sin(angle) -> 1 where the axis does not move at all
+    stretch = np.divide(angle, horizontal, out=np.ones_like(angle), where=horizontal > 0)
+    tilt = np.stack([-pole[:, 1], pole[:, 0]], axis=1) * stretch[:, None]
+    vectors = np.concatenate([tilt, np.zeros((len(tilt), 1))], axis=1)
+    about_z = SpatialRotation.from_rotvec(vectors).inv().as_matrix() @ rotations
+    return np.arctan2(about_z[:, 1, 0], about_z[:, 0, 0]), tilt
+
+
+def sufficient_order(tilt: Float[np.ndarray, "times 2"], lmax: int) -> int:
+    """Return the lowest order of the expansion in the tilt whose error is negligible.
+
+    This is the lowest n >= LEAST_ORDER with ``(lmax |tilt|)^(n+1) / (n+1)! < TILT_TOLERANCE``.
+    """
+    size = lmax * float(np.hypot(tilt[:, 0], tilt[:, 1]).max())
+    order, neglected = 0, size
+    while neglected > TILT_TOLERANCE:
+        order += 1
+        neglected *= size / (order + 1)
+    return max(order, LEAST_ORDER)

@@ -1,0 +1,195 @@
+"""A posterior in a small file: mean, and covariance as a diagonal less a matrix of low rank.
+
+In units of the prior's standard deviations the covariance is the identity wherever the data say
+nothing. Only the directions v_k in which they say something are kept, with variances c_k < 1::
+
+    C = D (1 - V diag(1 - c) V^T) D,    a draw = mean + D (1 - V diag(1 - sqrt(c)) V^T) z,
+
+D = diag(prior standard deviations), z ~ N(0, 1).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.harmonics import lmax_of, mode_numbers
+from lusee_bayes.linear.posterior import Posterior
+
+FORMAT = "lusee_bayes compact posterior 1"
+# directions whose variance the data reduce by less than this share are left at the prior's
+TOLERANCE = 1e-2
+
+
+@dataclass(frozen=True)
+class CompactPosterior:
+    """Mean and covariance of real harmonic coefficients.
+
+    Attributes
+    ----------
+    mean : (modes,) array
+        In K.
+    prior_std : (modes,) array
+        Prior standard deviations D, in K.
+    directions : (modes, rank) array
+        V: orthonormal columns, in units of ``prior_std``.
+    variances : (rank,) array
+        c, below 1.
+    """
+
+    mean: Float[np.ndarray, " modes"]
+    prior_std: Float[np.ndarray, " modes"]
+    directions: Float[np.ndarray, "modes rank"]
+    variances: Float[np.ndarray, " rank"]
+
+    @classmethod
+    def of(cls, posterior: Posterior, tolerance: float = TOLERANCE) -> CompactPosterior:
+        """Make the compact form of a posterior.
+
+        Parameters
+        ----------
+        posterior : Posterior
+            Over harmonic coefficients.
+        tolerance : float
+            Directions whose variance is above (1 - tolerance) of the prior's keep the prior's. So
+            no variance is too small, and none too large by more than this share of the prior's.
+
+        Returns
+        -------
+        CompactPosterior
+            With as few directions as that allows.
+
+        Raises
+        ------
+        InputError
+            If the prior is not diagonal.
+        """
+        scale = posterior.prior.diagonal_root()
+        if scale is None:
+            raise InputError("only posteriors over harmonic coefficients have a compact form")
+        lower = np.tril(np.asarray(posterior.lower))
+        # the singular values of L: its eigenvalues squared are lost where Lambda is formed
+        left, singular, _ = np.linalg.svd(lower)
+        variances = singular**-2.0
+        kept = variances < 1.0 - tolerance
+        directions = left[:, kept]
+        if posterior.basis is not None:
+            directions = np.asarray(posterior.basis) @ directions
+        return cls(np.asarray(posterior.mean), np.asarray(scale), directions, variances[kept])
+
+    def covariance(self) -> Float[np.ndarray, "modes modes"]:
+        """Compute C as a matrix.
+
+        Returns
+        -------
+        (modes, modes) array
+            In K^2.
+        """
+        inner = (self.directions * (1.0 - self.variances)) @ self.directions.T
+        return self.prior_std[:, None] * (np.eye(len(self.mean)) - inner) * self.prior_std
+
+    def std(self) -> Float[np.ndarray, " modes"]:
+        """Compute the standard deviation of every coefficient.
+
+        Returns
+        -------
+        (modes,) array
+            In K.
+        """
+        squared = self.directions**2
+        outside = 1.0 - squared.sum(1)
+        return self.prior_std * np.sqrt(outside + squared @ self.variances)
+
+    def sample(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n modes"]:
+        """Draw from the posterior.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+            Source of random numbers.
+        n : int
+            Number of draws.
+
+        Returns
+        -------
+        (n, modes) array
+            In K.
+        """
+        z = rng.standard_normal((n, len(self.mean)))
+        z = z - (z @ self.directions) * (1.0 - np.sqrt(self.variances)) @ self.directions.T
+        return self.mean + self.prior_std * z
+
+    def write(self, path: Path, metadata: dict[str, object]) -> None:
+        """Write a NumPy .npz file.
+
+        Parameters
+        ----------
+        path : Path
+            Of the file.
+        metadata : dict
+            What JSON can hold; it is written under the name ``about``.
+        """
+        ell, m = mode_numbers(lmax_of(len(self.mean)))
+        with path.open("wb") as file:
+            np.savez(
+                file,
+                mean=self.mean,
+                prior_std=self.prior_std,
+                directions=self.directions,
+                variances=self.variances,
+                ell=ell,
+                m=m,
+                about=json.dumps({"format": FORMAT, **metadata}),
+            )
+
+
+def read_compact(path: str | Path) -> tuple[CompactPosterior, dict[str, object]]:
+    """Read a file that :meth:`CompactPosterior.write` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        Of the file.
+
+    Returns
+    -------
+    CompactPosterior
+        The posterior.
+    dict
+        The metadata.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or of another kind.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            metadata = json.loads(str(file["about"]))
+            names = ("mean", "prior_std", "directions", "variances")
+            posterior = CompactPosterior(*(file[name] for name in names))
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"'{path}' cannot be read as a compact posterior: {error}") from error
+    return posterior, metadata
+
+
+def is_compact(path: Path) -> bool:
+    """Tell whether a .npz file holds a compact posterior.
+
+    Parameters
+    ----------
+    path : Path
+        Of a .npz file.
+
+    Returns
+    -------
+    bool
+        True if it does.
+    """
+    with np.load(path, allow_pickle=False) as file:
+        return "directions" in file

@@ -1,0 +1,282 @@
+"""The log-likelihood of data as a quadratic form in the sky.
+
+::
+
+    ln p(d | m) = -1/2 [ chi^2 - 2 v.(m - m0) + (m - m0)^T M (m - m0) + ln|N| + N_data ln 2 pi ],
+    M = A^T N^-1 A,    v = A^T N^-1 (d - A m0 - offset),    chi^2 = |L^-1 (d - A m0 - offset)|^2
+
+for any reference sky m0. It has the size of the sky, however many data there are. With a prior it
+gives the posterior, with those of other frequencies a joint one. m0 is chosen near the posterior
+mean: for m0 = 0 the terms are 1e10 times larger than their sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lusee_bayes.core.checks import (
+    AnyArray,
+    InputError,
+    is_traced,
+    require_finite,
+    require_float64,
+    require_shape,
+)
+from lusee_bayes.core.linalg import gram_matrix, solve_lower
+from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
+from lusee_bayes.linear.normal_matrix import has_structure, normal_matrix
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.linear.solver import CONVERGENCE
+from lusee_bayes.noise.covariance import Covariance, Factor
+from lusee_bayes.sky.priors import Prior
+
+# how often the solution is repeated on what is left of the gradient
+REFINEMENTS = 3
+
+
+class Information(eqx.Module):
+    """ln p(d | m) of some data as a function of the sky m; see the module's equations.
+
+    Attributes
+    ----------
+    matrix : (modes, modes) array
+        M = A^T N^-1 A, in 1/K^2.
+    vector : (modes,) array
+        v, the gradient of ln p(d | m) at the reference sky, in 1/K.
+    reference : (modes,) array
+        The reference sky m0, in K.
+    misfit : () array
+        chi^2 of the reference sky.
+    log_det : () array
+        ln|N|, with N in K^2.
+    n_data : () array
+        Number of data, as a float.
+    perturbations : (n, modes) array or None
+        Draws of A^T N^-1 n with n ~ N(0, N), in 1/K. Solving for them gives posterior draws.
+    """
+
+    matrix: Float[Array, "modes modes"]
+    vector: Float[Array, " modes"]
+    reference: Float[Array, " modes"]
+    misfit: Float[Array, ""]
+    log_det: Float[Array, ""]
+    n_data: Float[Array, ""]
+    perturbations: Float[Array, "n modes"] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        coupling: Coupling,
+        prior: Prior,
+        noise: Covariance,
+        offset: Float[Array, " data"] | None,
+        data: Float[AnyArray, " data"],
+        key: PRNGKeyArray | None = None,
+        n_perturbations: int = 0,
+    ) -> tuple[Information, Posterior]:
+        """Compute the information of data, and the posterior under a prior.
+
+        A is not formed where N has structure in time.
+
+        Parameters
+        ----------
+        coupling : Coupling
+            A, of shape (data, modes).
+        prior : Prior
+            Diagonal in the modes. Its posterior mean becomes the reference sky.
+        noise : Covariance
+            N, in K^2.
+        offset : (data,) array or None
+            Mean of the data without a sky, in K; None for zero.
+        data : (data,) array
+            d, in K.
+        key : PRNGKeyArray, optional
+            For the perturbations.
+        n_perturbations : int
+            Number of draws of A^T N^-1 n.
+
+        Returns
+        -------
+        Information
+            Of these data; only its reference sky depends on the prior.
+        Posterior
+            Under the prior.
+
+        Raises
+        ------
+        InputError
+            If ``data`` is not float64, not finite or of another length, N is not positive definite,
+            the prior is not diagonal in the modes, ``key`` is missing, or the mean does not
+            converge.
+        """
+        require_float64("the data", data)
+        require_shape("the data", data, (noise.size,))
+        require_finite("the data", data)
+        factor = noise.factor()
+        if has_structure(coupling, noise):
+            matrix = normal_matrix(coupling, noise)
+        else:
+            coupling = DenseCoupling(coupling.dense())
+            matrix = gram_matrix(factor.whiten(coupling.dense()))
+        centred = jnp.asarray(data) if offset is None else data - offset
+        zero, n_data = jnp.zeros(prior.size), jnp.asarray(float(noise.size))
+        vector, misfit = _gradient_and_misfit(coupling, factor, centred, zero)
+        first = cls(matrix, vector, zero, misfit, factor.log_det(), n_data)
+        root = _diagonal_root(prior, n_modes=matrix.shape[0])
+        lower = _precision_root(matrix, root)
+        mean = prior.colour(_condition(first, root, lower, jnp.asarray(1))[0])
+        vector, misfit = _gradient_and_misfit(coupling, factor, centred, mean)
+        perturbations = None
+        if n_perturbations:
+            if key is None:
+                raise InputError("give a key for the perturbations")
+            drawn = noise.sample(key, n_perturbations)
+            perturbations = jnp.stack(
+                [_gradient_and_misfit(coupling, factor, n, zero)[0] for n in drawn]
+            )
+        information = cls(matrix, vector, mean, misfit, first.log_det, n_data, perturbations)
+        return information, information._posterior(prior, lower, 2)
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes of the sky."""
+        return self.reference.shape[0]
+
+    def recentred(self, sky: Float[Array, " modes"]) -> Information:
+        """Write the same function with another reference sky.
+
+        Parameters
+        ----------
+        sky : (modes,) array
+            The new reference sky, in K.
+
+        Returns
+        -------
+        Information
+            With the same values for every sky.
+
+        Raises
+        ------
+        InputError
+            If ``sky`` has another length.
+        """
+        require_shape("the sky", sky, (self.n_modes,))
+        shift = sky - self.reference
+        pulled = self.matrix @ shift
+        misfit = self.misfit - 2.0 * (self.vector @ shift) + shift @ pulled
+        return replace(self, vector=self.vector - pulled, reference=sky, misfit=misfit)
+
+    def chi2(self, sky: Float[Array, " modes"]) -> Float[Array, ""]:
+        """Compute ``chi^2 = |L^-1 (d - A m - offset)|^2`` of a sky.
+
+        Parameters
+        ----------
+        sky : (modes,) array
+            m, in K.
+
+        Returns
+        -------
+        () array
+            chi^2.
+
+        Raises
+        ------
+        InputError
+            If ``sky`` has another length.
+        """
+        return self.recentred(sky).misfit
+
+    def posterior(self, prior: Prior) -> Posterior:
+        """Compute the posterior over the sky.
+
+        Parameters
+        ----------
+        prior : Prior
+            Diagonal in the modes.
+
+        Returns
+        -------
+        Posterior
+            With the evidence of the data.
+
+        Raises
+        ------
+        InputError
+            If the prior is not diagonal in the modes, or the mean does not converge.
+        """
+        lower = _precision_root(self.matrix, _diagonal_root(prior, self.n_modes))
+        return self._posterior(prior, lower, REFINEMENTS)
+
+    def _posterior(self, prior: Prior, lower: Array, refinements: int) -> Posterior:
+        root = _diagonal_root(prior, self.n_modes)
+        u, log_evidence, moved = _condition(self, root, lower, jnp.asarray(refinements))
+        if not is_traced(moved) and not float(moved) <= CONVERGENCE:
+            raise InputError(
+                f"the posterior mean did not converge: its last step was {float(moved):.2g} "
+                f"standard deviations (accepted: {CONVERGENCE:g}); the data are too precise for "
+                "the normal equations, or far from anything that the prior allows"
+            )
+        return Posterior(prior, u, lower, None, log_evidence, moved)
+
+
+def _diagonal_root(prior: Prior, n_modes: int) -> Float[Array, " modes"]:
+    root = prior.diagonal_root()
+    if root is None:
+        raise InputError("information about modes needs a prior over the same modes")
+    require_shape("the prior", root, (n_modes,))
+    return root
+
+
+@eqx.filter_jit
+def _gradient_and_misfit(
+    coupling: Coupling, factor: Factor, data: Array, sky: Array
+) -> tuple[Array, Array]:
+    """A^T N^-1 (d - A m) and |L^-1 (d - A m)|^2."""
+    white = factor.whiten(data - coupling @ sky)
+    solved = factor.whiten_transpose(white)
+    return coupling.transpose_mv(solved), white @ white
+
+
+@eqx.filter_jit
+def _precision_root(matrix: Float[Array, "modes modes"], root: Float[Array, " modes"]) -> Array:
+    """L of the precision 1 + G M G of u = m / root."""
+    normal = root[:, None] * matrix * root[None] + jnp.eye(len(root))
+    return jax.lax.linalg.cholesky(normal, symmetrize_input=False)
+
+
+@eqx.filter_jit
+def _condition(
+    information: Information, root: Array, lower: Array, refinements: Array
+) -> tuple[Array, Array, Array]:
+    """Mean of u, ln p(d), and the last step in standard deviations.
+
+    u is found as a correction to that of m0; components without prior power are zero.
+    """
+    start = jnp.where(root > 0, information.reference / jnp.where(root > 0, root, 1.0), 0.0)
+    here = information.recentred(start * root)
+
+    def refine(_, state):
+        correction, _ = state
+        pull = here.vector - here.matrix @ (root * correction)
+        gradient = root * pull - (start + correction)
+        half = solve_lower(lower, gradient[:, None], transpose=False)
+        step = solve_lower(lower, half, transpose=True)[:, 0]
+        return correction + step, jnp.linalg.norm(half)
+
+    zero = (jnp.zeros_like(root), jnp.asarray(jnp.inf))
+    correction, moved = jax.lax.fori_loop(0, refinements, refine, zero)
+    u = start + correction
+    log_evidence = -0.5 * (
+        here.recentred(u * root).misfit
+        + u @ u
+        + here.log_det
+        + 2.0 * jnp.log(jnp.diagonal(lower)).sum()
+        + here.n_data * np.log(2.0 * np.pi)
+    )
+    return u, log_evidence, moved

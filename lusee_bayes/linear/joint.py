@@ -1,0 +1,281 @@
+"""One posterior for the skies of several frequencies.
+
+With m_f = sum_c s_fc a_c + r_f (spectral_prior.py), the residual r_f of each channel is integrated
+out by itself. In units of its prior, P = R^1/2 M R^1/2, and ::
+
+    M' = R^-1/2 [1 - (1 + P)^-1] R^-1/2,    v' = R^-1/2 (1 + P)^-1 R^1/2 v
+
+are the channel's information about the common part sum_c s_fc a_c. Sums over channels of
+s_fc s_fc' M' are the information of all channels about the component maps, (components x modes)
+unknowns, from which the posterior follows as for one sky. Given the components, each residual has a
+posterior of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lusee_bayes.core.checks import AnyArray, InputError
+from lusee_bayes.core.linalg import inverse_from_cholesky
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.sky.priors import IndependentPrior
+from lusee_bayes.sky.spectral_prior import SpectralPrior
+
+
+@eqx.filter_jit
+def common_part(
+    information: Information,
+    residual_root: Float[Array, " modes"] | None,
+    key: PRNGKeyArray | None = None,
+) -> Information:
+    """Integrate a channel's residual out of its information about the sky.
+
+    Parameters
+    ----------
+    information : Information
+        About the channel's whole sky.
+    residual_root : (modes,) array or None
+        R^1/2, the prior standard deviations of the residual, in K; None if there is no residual.
+    key : PRNGKeyArray, optional
+        For the perturbations, which are to be draws of N(0, M'). With z ~ N(0, 1) and the draws e
+        of N(0, M), R^-1/2 (1 + P)^-1 (P z + R^1/2 e) is one. Without a key they are dropped.
+
+    Returns
+    -------
+    Information
+        About the common part of the channel's sky.
+    """
+    e = None if key is None else information.perturbations
+    if residual_root is None:
+        return replace(information, perturbations=e)
+    lower = residual_lower(information, residual_root)
+    inverse = inverse_from_cholesky(lower)
+    gradient = residual_root * information.vector
+    solved = inverse @ gradient
+    log_det = 2.0 * jnp.log(jnp.diagonal(lower)).sum()
+    if e is not None:
+        z = jax.random.normal(key, e.shape, dtype=jnp.float64)
+        e = (z + (residual_root[None] * e - z) @ inverse) / residual_root[None]
+    unit = jnp.eye(residual_root.shape[0])
+    return Information(
+        (unit - inverse) / residual_root[:, None] / residual_root[None],
+        solved / residual_root,
+        information.reference,
+        information.misfit - gradient @ solved,
+        information.log_det + log_det,
+        information.n_data,
+        e,
+    )
+
+
+def residual_lower(
+    information: Information, residual_root: Float[Array, " modes"]
+) -> Float[Array, "modes modes"]:
+    """L L^T = 1 + P."""
+    p = residual_root[:, None] * information.matrix * residual_root[None]
+    normal = p + jnp.eye(p.shape[0])
+    return jax.lax.linalg.cholesky(normal, symmetrize_input=False)
+
+
+class ComponentSums(eqx.Module):
+    """Sums over channels that make up the information about the component maps.
+
+    Attributes
+    ----------
+    matrices : (pairs, modes, modes) array
+        sum_f s_fc s_fc' M' for c >= c', row by row, in 1/K^2.
+    vectors : (components, modes) array
+        sum_f s_fc v', in 1/K.
+    reference : (components, modes) array
+        The reference maps, in K.
+    misfit : () array
+        Sum of the channels' chi^2 at the reference maps.
+    log_det : () array
+        Sum of the channels' log determinants.
+    n_data : () array
+        Number of data of all channels.
+    """
+
+    matrices: Float[Array, "pairs modes modes"]
+    vectors: Float[Array, "components modes"]
+    reference: Float[Array, "components modes"]
+    misfit: Float[Array, ""]
+    log_det: Float[Array, ""]
+    n_data: Float[Array, ""]
+
+    @classmethod
+    def empty(
+        cls, prior: SpectralPrior, reference: Float[AnyArray, "channels modes"]
+    ) -> ComponentSums:
+        """Start the sums, with no channel in them.
+
+        Parameters
+        ----------
+        prior : SpectralPrior
+            Of all channels.
+        reference : (channels, modes) array
+            A reference sky for every channel, near its posterior mean, in K.
+
+        Returns
+        -------
+        ComponentSums
+            Zeros, with the component maps that fit the reference skies best as reference maps.
+        """
+        k = prior.n_components
+        maps = reference_maps(prior, reference)
+        n, zero = maps.shape[1], jnp.zeros(())
+        matrices = jnp.zeros((k * (k + 1) // 2, n, n))
+        # distinct buffers: the sums are donated
+        return cls(matrices, jnp.zeros((k, n)), maps, zero, zero + 0.0, zero + 0.0)
+
+    def information(self) -> Information:
+        """Information about all component maps in one vector, the first map first."""
+        return _assembled(self)
+
+
+def reference_maps(
+    prior: SpectralPrior, reference: Float[AnyArray, "channels modes"]
+) -> Float[Array, "components modes"]:
+    """Fit component maps to a sky of every channel, by least squares.
+
+    Parameters
+    ----------
+    prior : SpectralPrior
+        With the spectra of the components.
+    reference : (channels, modes) array
+        A sky for every channel, in K.
+
+    Returns
+    -------
+    (components, modes) array
+        The maps, in K.
+    """
+    return jnp.asarray(np.linalg.pinv(np.asarray(prior.mixing)) @ np.asarray(reference))
+
+
+@eqx.filter_jit(donate="all-except-first")
+def _with_channel(
+    channel: tuple[Information, Array, Array | None], sums: ComponentSums
+) -> ComponentSums:
+    """Add a channel (information, mixing, residual root); the given sums are used up."""
+    information, mixing, residual_root = channel
+    here = common_part(information, residual_root).recentred(mixing @ sums.reference)
+    first, second = np.tril_indices(mixing.shape[0])
+    weights = mixing[first] * mixing[second]
+    return ComponentSums(
+        sums.matrices + weights[:, None, None] * here.matrix[None],
+        sums.vectors + mixing[:, None] * here.vector[None],
+        sums.reference,
+        sums.misfit + here.misfit,
+        sums.log_det + here.log_det,
+        sums.n_data + here.n_data,
+    )
+
+
+@eqx.filter_jit
+def _assembled(sums: ComponentSums) -> Information:
+    k, n = sums.reference.shape
+    pair = {}
+    for number, (i, j) in enumerate(zip(*np.tril_indices(k), strict=True)):
+        pair[i, j] = pair[j, i] = sums.matrices[number]
+    rows = [jnp.concatenate([pair[i, j] for j in range(k)], axis=1) for i in range(k)]
+    return Information(
+        jnp.concatenate(rows),
+        sums.vectors.reshape(k * n),
+        sums.reference.reshape(k * n),
+        sums.misfit,
+        sums.log_det,
+        sums.n_data,
+    )
+
+
+def solve_directly(
+    prior: SpectralPrior,
+    channels: Iterable[Information],
+    reference: Float[AnyArray, "channels modes"],
+) -> Posterior:
+    """Compute the posterior of all component maps by factorising its matrix.
+
+    Parameters
+    ----------
+    prior : SpectralPrior
+        Of all channels.
+    channels : iterable of Information
+        In the prior's order; read once, one after the other.
+    reference : (channels, modes) array
+        A reference sky for every channel, such as that of its information, in K.
+
+    Returns
+    -------
+    Posterior
+        Of the component maps in one vector, the first map first, with the evidence of all data.
+
+    Raises
+    ------
+    InputError
+        If there are more or fewer channels than the prior has, or the mean does not converge.
+    """
+    sums, count = ComponentSums.empty(prior, reference), 0
+    for channel, information in enumerate(channels):
+        if channel >= prior.n_channels:
+            raise InputError(f"there are more channels than the prior's {prior.n_channels}")
+        sums, count = summed(sums, prior, channel, information), channel + 1
+    if count != prior.n_channels:
+        raise InputError(f"there are {count} channels, the prior is for {prior.n_channels}")
+    return component_posterior(sums.information(), prior)
+
+
+def summed(
+    sums: ComponentSums, prior: SpectralPrior, channel: int, information: Information
+) -> ComponentSums:
+    """Add a channel to the sums.
+
+    Parameters
+    ----------
+    sums : ComponentSums
+        Of other channels. Its memory is reused: it cannot be read afterwards.
+    prior : SpectralPrior
+        Of all channels.
+    channel : int
+        Number of the channel in the prior.
+    information : Information
+        Of the channel's data.
+
+    Returns
+    -------
+    ComponentSums
+        The sums with the channel.
+    """
+    root = prior.residual_root(channel)
+    return _with_channel((information, prior.mixing[channel], root), sums)
+
+
+def component_posterior(information: Information, prior: SpectralPrior) -> Posterior:
+    """Compute the posterior of all component maps from the information of all channels.
+
+    Parameters
+    ----------
+    information : Information
+        About all component maps in one vector (:meth:`ComponentSums.information`).
+    prior : SpectralPrior
+        Of all channels.
+
+    Returns
+    -------
+    Posterior
+        Of the component maps in one vector, the first map first.
+
+    Raises
+    ------
+    InputError
+        If the mean does not converge.
+    """
+    return information.posterior(IndependentPrior(prior.roots.reshape(-1)))

@@ -1,0 +1,166 @@
+"""The sky of one channel, from the joint posterior of the component maps.
+
+Given the components, the residual of each channel (:mod:`.joint`) has a posterior of its own, from
+the channel's data alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower, symmetric_product
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.joint import residual_lower
+from lusee_bayes.sky.spectral_prior import SpectralPrior
+
+
+@eqx.filter_jit
+def paired(
+    covariance: Float[Array, "unknowns unknowns"], prior: SpectralPrior
+) -> Float[Array, "pairs modes modes"]:
+    """Pack the components' covariance for :func:`channel_sky`.
+
+    Parameters
+    ----------
+    covariance : (components * modes, components * modes) array
+        Of all component maps in one vector, in K^2.
+    prior : SpectralPrior
+        Of all channels.
+
+    Returns
+    -------
+    (pairs, modes, modes) array
+        C_cc, and C_cc' + C_c'c for c > c', row by row, in K^2.
+    """
+    k = prior.n_components
+    blocks = covariance.reshape(k, -1, k, covariance.shape[0] // k)
+    return jnp.stack(
+        [
+            blocks[i, :, j] + blocks[j, :, i] if i > j else blocks[i, :, i]
+            for i, j in zip(*np.tril_indices(k), strict=True)
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class ChannelSky:
+    """The posterior of one channel's sky, given the data of all channels.
+
+    Attributes
+    ----------
+    mean : (modes,) array
+        In K.
+    covariance : (modes, modes) array or None
+        In K^2; None if the component maps are known by draws only.
+    draws : (n, modes) array
+        In K.
+    chi2 : () array
+        Of the channel's data, at the mean.
+    chi2_expected : () array
+        Its expectation if the model holds: N_data less the trace of M times the covariance. NaN
+        without a covariance.
+    """
+
+    mean: Float[Array, " modes"]
+    covariance: Float[Array, "modes modes"] | None
+    draws: Float[Array, "n modes"]
+    chi2: Float[Array, ""]
+    chi2_expected: Float[Array, ""]
+
+
+def channel_sky(
+    prior: SpectralPrior,
+    channel: int,
+    information: Information,
+    maps: Float[Array, "components modes"],
+    covariances: Float[Array, "pairs modes modes"] | None,
+    draws: Float[Array, "n components modes"],
+    key: PRNGKeyArray,
+) -> ChannelSky:
+    """Compute the sky of one channel from the posterior of the component maps.
+
+    Parameters
+    ----------
+    prior : SpectralPrior
+        Of all channels.
+    channel : int
+        Number of the channel in the prior.
+    information : Information
+        Of the channel's data.
+    maps : (components, modes) array
+        Mean of the component maps, in K.
+    covariances : (pairs, modes, modes) array or None
+        Their covariance as packed by :func:`paired`, in K^2; None if it is not known.
+    draws : (n, components, modes) array
+        Draws of the component maps, in K.
+    key : PRNGKeyArray
+        For draws of the channel's residual. Give the same key for all channels of a run.
+
+    Returns
+    -------
+    ChannelSky
+        The posterior of the channel's sky.
+
+    Raises
+    ------
+    InputError
+        If ``maps`` has another number of components than the prior.
+    """
+    require_shape("the component maps", maps, (prior.n_components, None))
+    found = _channel_sky(
+        prior.mixing[channel],
+        prior.residual_root(channel),
+        information,
+        maps,
+        covariances,
+        draws,
+        jax.random.fold_in(key, channel),
+    )
+    return ChannelSky(*found)
+
+
+@eqx.filter_jit
+def _channel_sky(
+    mixing: Array,
+    residual_root: Array | None,
+    information: Information,
+    maps: Array,
+    covariances: Array | None,
+    draws: Array,
+    key: PRNGKeyArray,
+) -> tuple[Array, Array | None, Array, Array, Array]:
+    mean, skies = mixing @ maps, jnp.einsum("c,dcm->dm", mixing, draws)
+    covariance = None
+    if covariances is not None:
+        first, second = np.tril_indices(mixing.shape[0])
+        covariance = jnp.tensordot(mixing[first] * mixing[second], covariances, 1)
+    if residual_root is not None:
+        lower = residual_lower(information, residual_root)
+
+        def residual_mean(common: Array) -> Array:
+            """Mean of the residual, given the common part."""
+            shift = common - information.reference
+            gradient = residual_root * (information.vector - information.matrix @ shift)
+            half = solve_lower(lower, gradient[:, None], transpose=False)
+            return residual_root * solve_lower(lower, half, transpose=True)[:, 0]
+
+        z = jax.random.normal(key, skies.shape, dtype=jnp.float64)
+        deviations = residual_root[None] * solve_lower(lower, z.T, transpose=True).T
+        skies = skies + jax.vmap(residual_mean)(skies) + deviations
+        mean = mean + residual_mean(mean)
+        if covariance is not None:
+            scale = residual_root[:, None]
+            inverse = inverse_from_cholesky(lower)
+            white = symmetric_product(inverse @ (covariance / scale / scale.T), inverse) + inverse
+            covariance = scale * white * scale.T
+    expected = jnp.asarray(jnp.nan)
+    if covariance is not None:
+        expected = information.n_data - (information.matrix * covariance).sum()
+    return mean, covariance, skies, information.chi2(mean), expected

@@ -1,0 +1,236 @@
+"""The linear Gaussian model d = A m + n: a distribution over data, and its posterior over m.
+
+::
+
+    Lambda = A^T N^-1 A + S^-1,    C = Lambda^-1,    mean = C A^T N^-1 d
+
+The posterior is computed in a map-space form, of the size of the sky, or a data-space form, of the
+size of the data; :mod:`lusee_bayes.linear.solver` has the algebra of both.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lusee_bayes.core.checks import (
+    AnyArray,
+    InputError,
+    nearest,
+    require_finite,
+    require_float64,
+    require_shape,
+)
+from lusee_bayes.instrument.coupling import Coupling, as_coupling
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.normal_matrix import has_structure
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.linear.solver import FORMS, Solver, factorise
+from lusee_bayes.noise.covariance import Covariance
+from lusee_bayes.sky.priors import Prior
+
+# a larger A is not formed if N has structure in time: some 60,000 data at lmax 47
+DENSE_BYTES = 1.2e9
+
+
+class LinearGaussian(eqx.Module):
+    """d = A m + offset + n, m ~ N(0, S), n ~ N(0, N): a distribution over data vectors.
+
+    Parameters
+    ----------
+    coupling : Coupling or (data, unknowns) array
+        A. An array is wrapped in a ``DenseCoupling``.
+    prior : Prior
+        S, in K^2.
+    noise : Covariance
+        N, in K^2.
+    offset : (data,) array or None
+        Mean of the data without a sky, in K; None for zero.
+
+    Raises
+    ------
+    InputError
+        If the sizes do not fit together, or an array is not float64 or not finite.
+    """
+
+    coupling: Coupling = eqx.field(converter=as_coupling)
+    prior: Prior
+    noise: Covariance
+    offset: Float[Array, " data"] | None = None
+
+    def __check_init__(self):
+        n_data, n_unknowns = self.coupling.shape
+        if self.noise.size != n_data:
+            raise InputError(
+                f"the coupling matrix has {n_data} rows, the noise covariance {self.noise.size}; "
+                "build both for the same observation and flags"
+            )
+        if self.prior.size != n_unknowns:
+            raise InputError(
+                f"the coupling matrix has {n_unknowns} columns, the prior {self.prior.size} "
+                "unknowns; give both the same lmax"
+            )
+        if self.offset is not None:
+            require_float64("the offset", self.offset)
+            require_shape("the offset", self.offset, (n_data,))
+            require_finite("the offset", self.offset)
+
+    @property
+    def n_data(self) -> int:
+        """Number of data."""
+        return self.coupling.shape[0]
+
+    def predict(self, sky: Float[Array, " unknowns"]) -> Float[Array, " data"]:
+        """Predict the mean data of a sky, without noise.
+
+        Parameters
+        ----------
+        sky : (unknowns,) array
+            m, in K.
+
+        Returns
+        -------
+        (data,) array
+            A m + offset, in K.
+
+        Raises
+        ------
+        InputError
+            If ``sky`` is not float64 or has another length.
+        """
+        seen = self.coupling @ sky
+        return seen if self.offset is None else seen + self.offset
+
+    def sample(self, key: PRNGKeyArray) -> tuple[Float[Array, " unknowns"], Float[Array, " data"]]:
+        """Draw a sky from the prior, and data of that sky.
+
+        Parameters
+        ----------
+        key : PRNGKeyArray
+            Random key.
+
+        Returns
+        -------
+        (unknowns,) array
+            m, in K.
+        (data,) array
+            d, in K.
+
+        Raises
+        ------
+        InputError
+            If N is not positive definite.
+        """
+        sky_key, noise_key = jax.random.split(key)
+        sky = self.prior.sample(sky_key)
+        return sky, self.predict(sky) + self.noise.sample(noise_key)
+
+    def factorise(self, form: str | None = None) -> Solver:
+        """Do all work that does not depend on the data, to condition on many data vectors.
+
+        Parameters
+        ----------
+        form : {"map", "data", "root"}, optional
+            See :mod:`lusee_bayes.linear.solver`. By default the cheaper of "map" and "data".
+
+        Returns
+        -------
+        Solver
+            The factorised model.
+
+        Raises
+        ------
+        InputError
+            If the form is unknown, N is not positive definite, or Lambda cannot be factorised.
+        """
+        if form is None:
+            form = "data" if self.n_data < self.prior.rank else "map"
+        if form not in FORMS:
+            raise InputError(f"unknown form '{form}'; {nearest(form, FORMS)}")
+        return factorise(self.coupling, self.prior, self.noise, self.offset, form)
+
+    def condition(self, data: Float[AnyArray, " data"], form: str | None = None) -> Posterior:
+        """Compute the posterior over the sky given data.
+
+        Parameters
+        ----------
+        data : (data,) array
+            d, in K.
+        form : {"map", "data", "root", "structured"}, optional
+            As for :meth:`factorise`, or "structured": through A^T N^-1 A without A. That is the
+            default where A would be larger than ``DENSE_BYTES`` and N has structure in time.
+
+        Returns
+        -------
+        Posterior
+            With the evidence of the data.
+
+        Raises
+        ------
+        InputError
+            If the data are not float64, not finite or of another length, the model cannot be
+            factorised, or the mean does not converge.
+        """
+        if form == "structured" or (form is None and self.too_large):
+            return self.inform(data)[1]
+        return self.factorise(form).condition(data)
+
+    @property
+    def too_large(self) -> bool:
+        """Whether A would be larger than ``DENSE_BYTES`` and the posterior does not need it."""
+        size = 8 * self.n_data * self.prior.size
+        return size > DENSE_BYTES and has_structure(self.coupling, self.noise)
+
+    def inform(
+        self,
+        data: Float[AnyArray, " data"],
+        key: PRNGKeyArray | None = None,
+        n_perturbations: int = 0,
+    ) -> tuple[Information, Posterior]:
+        """Compute the information of data, and the posterior; see :meth:`Information.of`.
+
+        Parameters
+        ----------
+        data : (data,) array
+            d, in K.
+        key : PRNGKeyArray, optional
+            For the perturbations.
+        n_perturbations : int
+            Number of draws of A^T N^-1 n.
+
+        Returns
+        -------
+        Information
+            ln p(d | m) as a function of the sky.
+        Posterior
+            Under the model's prior.
+
+        Raises
+        ------
+        InputError
+            As :meth:`Information.of`.
+        """
+        return Information.of(
+            self.coupling, self.prior, self.noise, self.offset, data, key, n_perturbations
+        )
+
+    def log_prob(self, data: Float[AnyArray, " data"]) -> Float[Array, ""]:
+        """Compute the evidence ln p(d), with the sky integrated out. Differentiable.
+
+        Parameters
+        ----------
+        data : (data,) array
+            d, in K.
+
+        Returns
+        -------
+        () array
+            ln p(d), for data in K.
+
+        Raises
+        ------
+        InputError
+            As :meth:`condition`.
+        """
+        return self.factorise().log_prob(data)

@@ -1,0 +1,269 @@
+"""The posterior over sky maps: mean, covariance, standard deviations, draws."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lusee_bayes.core.checks import AnyArray, InputError, is_traced
+from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower
+from lusee_bayes.sky.priors import Prior
+
+# directions whose standard deviations are computed at once
+CHUNK = 2048
+
+# largest relative error of standard deviations that is accepted
+PRECISION = 1e-3
+
+
+class Posterior(eqx.Module):
+    """N(mean, C) over the sky's unknowns m = G u, in K.
+
+    Attributes
+    ----------
+    prior : Prior
+        S = G G^T.
+    white_mean : (white,) array
+        Mean of u.
+    lower : (rank, rank) array
+        L of Lambda = L L^T, the precision of u, or of v = Q^T u where ``basis`` is given.
+    basis : (white, rank) array or None
+        Q. Outside of its span u keeps its prior, N(0, 1).
+    log_evidence : () array
+        ln p(d), for data in K.
+    refinement : () array
+        Last correction of the mean, in posterior standard deviations.
+    """
+
+    prior: Prior
+    white_mean: Float[Array, " white"]
+    lower: Float[Array, "rank rank"]
+    basis: Float[Array, "white rank"] | None
+    log_evidence: Float[Array, ""]
+    refinement: Float[Array, ""]
+
+    @property
+    def mean(self) -> Float[Array, " unknowns"]:
+        """Posterior mean of m in K; of harmonics: Galactic, real packed."""
+        return self.prior.colour(self.white_mean)
+
+    def std(self) -> Float[Array, " unknowns"]:
+        """Compute the standard deviation of every unknown.
+
+        Returns
+        -------
+        (unknowns,) array
+            In K.
+
+        Raises
+        ------
+        InputError
+            If rounding in the map-space form makes one of them wrong by more than ``PRECISION``.
+        """
+        white, rounding = _white_std(self)
+        if not is_traced(rounding) and float(rounding) > PRECISION:
+            raise InputError(
+                f"standard deviations of the map-space form would be wrong by {rounding:.1g} of "
+                f"themselves (accepted: {PRECISION:g}): the data are too precise for the normal "
+                "equations; use form='data'"
+            )
+        scale = self.prior.diagonal_root()
+        return self.std_of(jnp.eye(self.prior.size)) if scale is None else scale * white
+
+    def std_of(self, directions: Float[AnyArray, "n unknowns"]) -> Float[Array, " n"]:
+        """Compute the standard deviation of linear combinations of the unknowns.
+
+        Parameters
+        ----------
+        directions : (n, unknowns) array
+            One combination a row, such as rows of ``harmonics.pixel_matrix`` for pixels.
+
+        Returns
+        -------
+        (n,) array
+            In K, if the directions have no unit.
+        """
+        parts = [
+            _std_of(self, jnp.asarray(directions[i : i + CHUNK]))
+            for i in range(0, directions.shape[0], CHUNK)
+        ]
+        return jnp.concatenate(parts)
+
+    def covariance(self) -> Float[Array, "unknowns unknowns"]:
+        """Compute C as a matrix.
+
+        Returns
+        -------
+        (unknowns, unknowns) array
+            In K^2.
+        """
+        return _covariance(self)
+
+    def root(self) -> Float[Array, "unknowns white"]:
+        """Compute R with C = R R^T: a draw is mean + R z, z ~ N(0, 1).
+
+        Returns
+        -------
+        (unknowns, white) array
+            In K.
+        """
+        return _times_root(self, jnp.eye(self.prior.rank)).T
+
+    def whiten(self, skies: Float[AnyArray, "n unknowns"]) -> Float[Array, "n white"]:
+        """Compute z = R^-1 (m - mean): standard normals, if the skies are draws of this posterior.
+
+        Parameters
+        ----------
+        skies : (n, unknowns) array
+            One m a row, in K.
+
+        Returns
+        -------
+        (n, white) array
+            One z a row.
+
+        Raises
+        ------
+        InputError
+            If the prior is over pixels or has C_ell = 0: then R has no inverse.
+        """
+        scale = self.prior.diagonal_root()
+        if scale is None or (not is_traced(scale) and not bool((scale > 0).all())):
+            raise InputError(
+                "only draws of harmonic coefficients with C_ell > 0 at every ell can be whitened"
+            )
+        return _whiten(self, jnp.asarray(skies))
+
+    def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
+        """Draw from the posterior.
+
+        Parameters
+        ----------
+        key : PRNGKeyArray
+            Random key.
+        n : int, optional
+            Number of draws.
+
+        Returns
+        -------
+        (unknowns,) or (n, unknowns) array
+            One draw, or with ``n`` that many, in K.
+        """
+        z = jax.random.normal(key, (1 if n is None else n, self.prior.rank), dtype=jnp.float64)
+        draws = self.mean[None] + _times_root(self, z)
+        return draws[0] if n is None else draws
+
+    def prior_fraction(self) -> Float[Array, " unknowns"]:
+        """Compute the share of each unknown's prior variance that is left: diag(C) / diag(S).
+
+        Returns
+        -------
+        (unknowns,) array
+            1 where the data say nothing, 0 where they leave no uncertainty, and 0 where the prior
+            variance is zero.
+
+        Raises
+        ------
+        InputError
+            As :meth:`std`.
+        """
+        prior = self.prior.variance()
+        return jnp.where(prior > 0, self.std() ** 2 / jnp.where(prior > 0, prior, 1.0), 0.0)
+
+    def rms_shift_from(self, other: Posterior) -> Float[Array, ""]:
+        """Compute the distance of two posterior means.
+
+        Parameters
+        ----------
+        other : Posterior
+            With the same prior.
+
+        Returns
+        -------
+        () array
+            Rms over modes, in standard deviations of this posterior.
+        """
+        shift = self.white_mean - other.white_mean
+        inside = shift if self.basis is None else self.basis.T @ shift
+        squared = ((inside @ jnp.tril(self.lower)) ** 2).sum()
+        if self.basis is not None:
+            squared = squared + ((shift - self.basis @ inside) ** 2).sum()
+        return jnp.sqrt(squared / shift.shape[0])
+
+    def information_bits(self) -> Float[Array, ""]:
+        """Compute the information about the sky gained from the data: ln|Lambda| / 2 in bits.
+
+        Returns
+        -------
+        () array
+            In bits.
+        """
+        return jnp.log(jnp.diagonal(self.lower)).sum() / np.log(2.0)
+
+
+@eqx.filter_jit
+def _white_std(posterior: Posterior) -> tuple[Float[Array, " white"], Float[Array, ""]]:
+    """Standard deviations of u, and the relative error that rounding of Lambda makes in them.
+
+    Lambda_jj (Lambda^-1)_jj, the inflation of a mode's variance by all others, is the condition
+    number that counts: rescaling modes does not change it. Times eps it predicts the difference
+    between the two forms to within a factor 1.5 (fiducial: 1e-6).
+    """
+    white = _std_of(posterior, None)
+    if posterior.basis is not None:
+        return white, jnp.zeros(())
+    inflation = (jnp.tril(posterior.lower) ** 2).sum(1) * white**2
+    return white, np.finfo(np.float64).eps * inflation.max()
+
+
+@eqx.filter_jit
+def _std_of(
+    posterior: Posterior, directions: Float[Array, "n unknowns"] | None
+) -> Float[Array, " n"]:
+    """Standard deviations of given directions of m, or with None of every component of u."""
+    if directions is None:
+        white = jnp.eye(posterior.prior.rank)
+    else:
+        white = posterior.prior.colour_columns(directions)
+    inside = white if posterior.basis is None else white @ posterior.basis
+    half = solve_lower(posterior.lower, inside.T, transpose=False)
+    variance = (half**2).sum(0)
+    if posterior.basis is not None:
+        outside = white - inside @ posterior.basis.T
+        variance = variance + (outside**2).sum(1)
+    return jnp.sqrt(variance)
+
+
+@eqx.filter_jit
+def _covariance(posterior: Posterior) -> Float[Array, "unknowns unknowns"]:
+    rank = posterior.prior.rank
+    if posterior.basis is None:
+        white = inverse_from_cholesky(posterior.lower)
+    else:
+        half = solve_lower(posterior.lower, posterior.basis.T, transpose=False)
+        white = half.T @ half + jnp.eye(rank) - posterior.basis @ posterior.basis.T
+    return posterior.prior.colour(posterior.prior.colour(white).T)
+
+
+@eqx.filter_jit
+def _times_root(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array, "n unknowns"]:
+    """R z = G (L^-T z), or with a basis: z outside its span, L^-T Q^T z inside."""
+    inside = z if posterior.basis is None else z @ posterior.basis
+    drawn = solve_lower(posterior.lower, inside.T, transpose=True).T
+    if posterior.basis is not None:
+        drawn = z + (drawn - inside) @ posterior.basis.T
+    return posterior.prior.colour(drawn)
+
+
+@eqx.filter_jit
+def _whiten(posterior: Posterior, skies: Float[Array, "n unknowns"]) -> Float[Array, "n white"]:
+    """The inverse of :func:`_times_root`, for skies less the mean."""
+    u = skies / posterior.prior.diagonal_root()[None] - posterior.white_mean[None]
+    inside = u if posterior.basis is None else u @ posterior.basis
+    white = inside @ jnp.tril(posterior.lower)
+    if posterior.basis is None:
+        return white
+    return u + (white - inside) @ posterior.basis.T

@@ -1,0 +1,57 @@
+"""Rows of the resolution matrix: the point-spread functions of a map.
+
+On average over noise the posterior mean is R m, R = C A^T N^-1 A = 1 - C S^-1. A pixel in direction
+p is y_p^T R m: an integral of the sky with the kernel R(p, q) = y_p^T R y_q over directions q.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lusee_bayes.core.checks import AnyArray, InputError
+from lusee_bayes.core.linalg import solve_lower
+from lusee_bayes.linear.posterior import Posterior
+
+
+def resolution_rows(
+    posterior: Posterior, directions: Float[AnyArray, "n modes"]
+) -> Float[Array, "n modes"]:
+    """Compute y^T R for linear combinations y of the modes.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Over harmonic coefficients.
+    directions : (n, modes) array
+        One y a row, for example of ``harmonics.pixel_matrix``.
+
+    Returns
+    -------
+    (n, modes) array
+        Rows of y^T R. Their values in a direction q, ``rows @ y_q``, are per steradian. Columns of
+        modes without prior variance are zero, as those modes are in the map.
+
+    Raises
+    ------
+    InputError
+        If the prior is not over harmonic coefficients.
+    """
+    if posterior.prior.diagonal_root() is None:
+        raise InputError("resolution needs a prior over harmonic coefficients")
+    return _rows(posterior, jnp.asarray(directions))
+
+
+@eqx.filter_jit
+def _rows(posterior: Posterior, directions: Float[Array, "n modes"]) -> Float[Array, "n modes"]:
+    """y D (1 - C_w) D^-1 in white coordinates, D the prior's standard deviations."""
+    scale = posterior.prior.diagonal_root()
+    white = directions * scale[None]
+    inside = white if posterior.basis is None else white @ posterior.basis
+    half = solve_lower(posterior.lower, inside.T, transpose=False)
+    known = inside - solve_lower(posterior.lower, half, transpose=True).T
+    if posterior.basis is not None:
+        known = known @ posterior.basis.T
+    divisor = jnp.where(scale > 0, scale, 1.0)
+    return jnp.where((scale > 0)[None], known / divisor[None], 0.0)

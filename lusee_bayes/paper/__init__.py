@@ -1,0 +1,1 @@
+"""The reference paper: its cases, its claims and its figures."""

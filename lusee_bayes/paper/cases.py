@@ -1,0 +1,183 @@
+"""The paper's cases: which scenarios they are, and what figures and claims need of each."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+import xarray as xr
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.version import __version__, versions
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
+from lusee_bayes.experiment.schema import FileSkySection
+from lusee_bayes.experiment.terms import beam_rms_difference
+from lusee_bayes.instrument.beams import HemisphereGrid, stokes_beam
+from lusee_bayes.paper.claims import FREQUENCIES, Cases, cross, frequency_case
+from lusee_bayes.results.channel import channel_of_posterior
+
+FORMAT = "lusee_bayes paper case 1"
+
+# by name: a scenario of the package and what differs from it; those after the frequencies are not
+# among the paper's figures, but its text speaks of them or they tell why a claim does not hold
+CASES = {
+    "fiducial": ("fiducial", []),
+    "noise_x10": ("noise_x10", []),
+    "noise_x100": ("noise_x100", []),
+    "duty_cycle_50": ("duty_cycle_50", []),
+    "gain_1e-2": ("gain_1e-2", []),
+    "gain_1e-3": ("gain_1e-3", []),
+    "gain_ignored": ("gain_ignored", []),
+    "beam_4MHz": ("beam_4MHz", []),
+    "beam_0.4MHz": ("beam_0.4MHz", []),
+    "beam_ignored": ("beam_ignored", []),
+    "two_cycles": ("two_cycles", []),
+    "three_cycles": ("three_cycles", []),
+    "quarter_cycle": ("quarter_cycle", []),
+    **{
+        frequency_case(f): ("fiducial", [f"frequency_mhz={f}"])
+        for f in FREQUENCIES
+        if frequency_case(f) != "fiducial"
+    },
+    "gain_1e-1": ("gain_1e-2", ["noise.gain.sigma=0.1"]),
+    "half_cycle": ("fiducial", ["observation.runs.0.cycles=0.5"]),
+    "prior_x10": ("fiducial", ["prior.scale=10"]),
+    "three_cycles_at_rest": (
+        "three_cycles",
+        [f"observation.runs.{k}.turntable_deg=0" for k in (1, 2)],
+    ),
+    # the quarters that follow the scenario's, which starts on 15 January
+    "quarter_2nd": ("quarter_cycle", ["observation.start=2027-01-22"]),
+    "quarter_3rd": ("quarter_cycle", ["observation.start=2027-01-29"]),
+    "quarter_4th": ("quarter_cycle", ["observation.start=2027-02-05"]),
+}
+
+# nodes in zenith angle and azimuth of the beams that a case file keeps for the figure
+BEAM_NODES = (48, 96)
+
+
+def paper_scenarios(
+    overrides: Sequence[str] = (), skies: Sequence[str | Path] = ()
+) -> dict[str, Scenario]:
+    """The resolved scenario of every case."""
+    files = {sky_frequency_mhz(path): Path(path).resolve() for path in skies}
+    scenarios = {
+        name: load_scenario(base, [*changes, *overrides]) for name, (base, changes) in CASES.items()
+    }
+    return {name: with_sky(s, files) for name, s in scenarios.items()} if files else scenarios
+
+
+def sky_frequency_mhz(path: str | Path) -> float:
+    """Frequency in a file name like ULSA's: exp10.0MHz_sky_map_with_absorption.hdf5.
+
+    InputError if the file is missing or its name does not tell.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"no sky map at '{path}'")
+    found = re.search(r"exp(\d+(?:\.\d+)?)MHz", Path(path).name)
+    if found is None or float(found[1]) == 0.0:
+        raise InputError(
+            f"'{Path(path).name}' does not tell its frequency; name the file exp<F>MHz..., for "
+            "example exp10.0MHz_sky_map.hdf5"
+        )
+    return float(found[1])
+
+
+def with_sky(scenario: Scenario, files: Mapping[float, Path]) -> Scenario:
+    """The scenario with the file (by MHz) nearest in log frequency, scaled to its frequency."""
+    nearest = min(files, key=lambda f: abs(np.log(f / scenario.frequency_mhz)))
+    sky = FileSkySection(file=str(files[nearest]), file_frequency_mhz=nearest)
+    return scenario.model_copy(update={"sky": sky})
+
+
+def read_case(path: Path, scenario: Scenario) -> xr.Dataset | None:
+    """A case computed before with the same scenario and version of the package, or None."""
+    if not h5py.is_hdf5(path):
+        return None
+    case = xr.load_dataset(path, engine="h5netcdf")
+    wanted = {"format": FORMAT, "scenario": scenario.to_yaml(), "version": __version__}
+    return case if all(case.attrs.get(key) == value for key, value in wanted.items()) else None
+
+
+def compute_case(scenario: Scenario) -> xr.Dataset:
+    """Simulate and map a scenario; all that figures and claims need of it.
+
+    Returns
+    -------
+    xarray.Dataset
+        On dims ell, mode, pixel (HEALPix RING, Galactic), product and time, pattern and theta and
+        phi; temperatures in K. Attributes: the scenario, the versions and what is one number.
+    """
+    experiment = build(scenario)
+    setup, data = experiment.setup, experiment.data
+    inference = infer(experiment)
+    channel = channel_of_posterior(experiment, inference)
+    spectra, maps = channel.spectra(), channel.maps()
+    variances = data.layout.scatter(radiometer(setup).diagonal())
+    grid = HemisphereGrid.gauss_legendre(*BEAM_NODES)
+    fields = setup.beam_source.fields(scenario.frequency_mhz, grid)
+    beams = np.abs(stokes_beam(fields))
+    rms = beam_rms_difference(setup)
+    return xr.Dataset(
+        {
+            **{name: ("ell", spectra[name]) for name in ("rho", "snr", "cl_mean", "cl_truth")},
+            "mean_modes": ("mode", channel.mean),
+            "truth_modes": ("mode", channel.truth),
+            "std_modes": ("mode", channel.std),
+            "mean": ("pixel", maps["mean"]),
+            "truth": ("pixel", maps["truth"]),
+            "highest_altitude": ("pixel", channel.highest_altitude),
+            "data": (("product", "time"), data.grid()),
+            "noise_std": (("product", "time"), np.sqrt(np.asarray(variances))),
+            "beam": (
+                ("pattern", "theta", "phi"),
+                np.stack([beams[0, 0], beams[0, 2], beams[0, 1]]).astype(np.float32),
+            ),
+        },
+        coords={
+            "ell": np.arange(scenario.lmax + 1),
+            "product": list(data.labels),
+            "pattern": ["auto 00", "|cross 02|", "|cross 01|"],
+            "theta": grid.theta,
+            "phi": grid.phi,
+        },
+        attrs={
+            "format": FORMAT,
+            "scenario": scenario.to_yaml(),
+            "version": __version__,
+            "versions": json.dumps(versions()),
+            "frequency_mhz": scenario.frequency_mhz,
+            "log_evidence": channel.log_evidence,
+            "chi2": channel.chi2,
+            "chi2_expected": channel.chi2_expected,
+            "n_data": channel.n_data,
+            "n_modes": len(channel.mean),
+            **({} if rms is None else {"beam_rms_difference": rms}),
+        },
+    )
+
+
+def case_table(cases: Cases) -> list[dict[str, object]]:
+    """Rows of cases.csv."""
+    rows = []
+    for name, case in cases.items():
+        row: dict[str, object] = {"case": name, "frequency_mhz": case.attrs["frequency_mhz"]}
+        for metric in ("rho", "snr"):
+            for ell in (1, 10, 20, 30, 40):
+                inside = ell < case.sizes["ell"]
+                row[f"{metric}_{ell}"] = f"{float(case[metric][ell]):.4g}" if inside else "beyond"
+        row["ell_cross"] = cross(case) if cross(case) < case.sizes["ell"] else "none"
+        for key in ("log_evidence", "chi2", "chi2_expected"):
+            row[key] = f"{case.attrs[key]:.1f}"
+        row["n_data"] = case.attrs["n_data"]
+        rms = case.attrs.get("beam_rms_difference")
+        row["beam_rms_difference"] = "none" if rms is None else f"{rms:.4f}"
+        rows.append(row)
+    return rows

@@ -1,0 +1,254 @@
+"""The paper's figures 2 to 9 in content, drawn from the computed cases."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+
+from lusee_bayes.instrument.beams import HemisphereGrid
+from lusee_bayes.paper.claims import FREQUENCIES, SHOWN_FREQUENCIES, Cases, frequency_case
+from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, mollweide, orthographic
+
+# the paper's colours by group, of lightness different enough for colour-blind readers; the lines
+# within a group differ in style
+GROUPS = {
+    "radiometer noise": (
+        "#E08A00",
+        {
+            "noise_x10": "noise x 10",
+            "noise_x100": "noise x 100",
+            "duty_cycle_50": "duty cycle 50 %",
+        },
+    ),
+    "beam error": (
+        "#009E73",
+        {
+            "beam_4MHz": "4 MHz, marginalised",
+            "beam_0.4MHz": "0.4 MHz, marginalised",
+            "beam_ignored": "4 MHz, ignored",
+        },
+    ),
+    "gain drift": (
+        "#B2182B",
+        {
+            "gain_1e-2": "1 %, marginalised",
+            "gain_1e-3": "0.1 %, marginalised",
+            "gain_ignored": "1 %, ignored",
+        },
+    ),
+    "cycles and turntable": (
+        "#7B4FB5",
+        {
+            "two_cycles": "2 cycles, 0 and 30°",
+            "three_cycles": "3 cycles, 0, 30 and 60°",
+            "quarter_cycle": "quarter cycle",
+        },
+    ),
+}
+LINES = ("-", "--", ":")
+MAP_CASES = (
+    "fiducial", "noise_x10", "noise_x100", "beam_4MHz", "beam_0.4MHz", "gain_1e-2", "gain_1e-3",
+    "two_cycles", "three_cycles", "quarter_cycle", "duty_cycle_50",
+)  # fmt: skip
+
+
+def beams(cases: Cases) -> Figure:
+    """Figure 2: an auto and two crosses at five frequencies, each over its peak."""
+    figure = Figure(figsize=(13, 8), layout="constrained")
+    panels = figure.subplots(3, len(SHOWN_FREQUENCIES))
+    for column, frequency in enumerate(SHOWN_FREQUENCIES):
+        beam = cases[frequency_case(frequency)]["beam"]
+        grid = HemisphereGrid.gauss_legendre(beam.sizes["theta"], beam.sizes["phi"])
+        for row, name in enumerate(beam["pattern"].values):
+            image = orthographic(panels[row, column], grid, beam.values[row].astype(complex))
+            panels[0, column].set_title(f"{frequency} MHz")
+            panels[row, 0].set_ylabel(str(name))
+    figure.colorbar(image, ax=panels, label="beam / its peak", shrink=0.6)
+    figure.suptitle("Beams of the antenna that points North (0): zenith at the centre, North up")
+    return figure
+
+
+def data_vector(cases: Cases) -> Figure:
+    """Figure 3: the products at 25 MHz side by side, time running within each."""
+    data = cases["fiducial"]["data"]
+    n_products, n_times = data.shape
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    axes = figure.subplots()
+    for k, series in enumerate(data.values):
+        axes.plot(k * n_times + np.arange(n_times), series, color=BLUE, lw=1.0)
+        axes.axvline(k * n_times, color=GREY, lw=0.4)
+    centres = (np.arange(n_products) + 0.5) * n_times
+    axes.set_xticks(centres, [str(name) for name in data["product"].values], fontsize=8)
+    axes.tick_params(axis="x", length=0)
+    axes.set(
+        xlabel="product (time runs within each)",
+        ylabel="visibility [K]",
+        xlim=(0, data.size),
+        title=f"Data vector at 25 MHz: {n_products} products, {n_times} samples each",
+    )
+    return figure
+
+
+def frequency_maps(cases: Cases) -> Figure:
+    """Figure 4: truth, posterior mean and difference over the mean, at five frequencies."""
+    figure = Figure(figsize=(18, 9), layout="constrained")
+    columns = len(SHOWN_FREQUENCIES)
+    for column, frequency in enumerate(SHOWN_FREQUENCIES):
+        case = cases[frequency_case(frequency)]
+        mean, truth = case["mean"].values, case["truth"].values
+        percent = 100.0 * (mean - truth) / truth.mean()
+        limit = float(np.percentile(np.abs(percent), 99.0))
+        norm = temperature_norm(truth)
+        rows = [
+            ("truth", truth, norm, "inferno", None),
+            ("posterior mean", mean, norm, "inferno", case["highest_altitude"].values),
+            (
+                "difference", percent, Normalize(-limit, limit), DIVERGING,
+                case["highest_altitude"].values,
+            ),
+        ]  # fmt: skip
+        for row, (name, pixels, scale, cmap, altitude) in enumerate(rows):
+            axes = figure.add_subplot(
+                3, columns, row * columns + column + 1, projection="mollweide"
+            )
+            image = mollweide(axes, pixels, norm=scale, cmap=cmap, highest_altitude=altitude)
+            axes.set_title(f"{frequency} MHz, {name}", fontsize=10)
+            axes.set_xticklabels([])
+            axes.set_yticklabels([])
+            colour_bar(figure, axes, image, "K" if row < 2 else "% of the mean sky")
+    figure.suptitle("Galactic coordinates, longitude grows to the left; dashed: never observed")
+    return figure
+
+
+def temperature_norm(pixels: Float[np.ndarray, " pixels"]) -> LogNorm:
+    """Logarithmic colours over all but the extreme pixels."""
+    return LogNorm(*np.percentile(pixels[pixels > 0], [0.5, 99.8]))
+
+
+def colour_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> None:
+    """A flat bar below; three round numbers on a logarithmic one."""
+    bar = figure.colorbar(
+        image,
+        ax=axes,
+        label=unit,
+        location="bottom",
+        shrink=0.7,
+        aspect=30 if isinstance(axes, Axes) else 60,
+        extend="both",
+        pad=0.04,
+    )
+    if isinstance(image.norm, LogNorm):
+        low, high = np.log10([image.norm.vmin, image.norm.vmax])
+        ticks = [float(f"{10**t:.1e}") for t in np.linspace(low, high, 5)[[0, 2, 4]]]
+        inside = np.clip(ticks, image.norm.vmin, image.norm.vmax)
+        bar.set_ticks(inside, labels=[f"{tick:,.0f}" for tick in ticks])
+        bar.set_ticks([], minor=True)
+
+
+def rho_by_frequency(cases: Cases) -> Figure:
+    """Figure 5: rho_ell at 5 to 50 MHz."""
+    return by_frequency(cases, "rho")
+
+
+def snr_by_frequency(cases: Cases) -> Figure:
+    """Figure 6: SNR_ell at 5 to 50 MHz."""
+    return by_frequency(cases, "snr")
+
+
+def by_frequency(cases: Cases, metric: str) -> Figure:
+    """One curve for each frequency, from dark (low) to light."""
+    figure = Figure(figsize=(8, 4.8), layout="constrained")
+    axes = figure.subplots()
+    shades = colormaps["viridis"](np.linspace(0.0, 0.92, len(FREQUENCIES)))
+    for k, (frequency, shade) in enumerate(zip(FREQUENCIES, shades, strict=True)):
+        curve = cases[frequency_case(frequency)][metric]
+        line = LINES[k % 2]
+        axes.plot(curve["ell"][1:], curve[1:], color=shade, ls=line, label=f"{frequency} MHz")
+    dress(axes, metric, int(curve["ell"][-1]))
+    axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes.set_title("The fiducial experiment: one lunar cycle, turntable at rest")
+    return figure
+
+
+def dress(axes: Axes, metric: str, lmax: int) -> None:
+    """Labels, limits and the levels that the text speaks of."""
+    axes.set(xlabel=r"multipole $\ell$", xlim=(1, lmax))
+    if metric == "rho":
+        axes.set(ylabel=r"correlation with the truth $\rho_\ell$", ylim=(-0.35, 1.05))
+        levels = (0.0, 0.5, 0.9)
+    else:
+        axes.set(ylabel=r"$\mathrm{SNR}_\ell$", yscale="log")
+        levels = (1.0,)
+    for level in levels:
+        axes.axhline(level, color=GREY, lw=0.7, ls=":", zorder=0)
+
+
+def rho_by_scenario(cases: Cases) -> Figure:
+    """Figure 7: rho_ell of the scenarios at 25 MHz."""
+    return by_scenario(cases, "rho")
+
+
+def snr_by_scenario(cases: Cases) -> Figure:
+    """Figure 8: SNR_ell of the scenarios at 25 MHz."""
+    return by_scenario(cases, "snr")
+
+
+def by_scenario(cases: Cases, metric: str) -> Figure:
+    """A panel for each group of scenarios, the fiducial one in black in all of them."""
+    figure = Figure(figsize=(12, 8), layout="constrained")
+    panels = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
+    for axes, (title, (colour, members)) in zip(panels, GROUPS.items(), strict=True):
+        curve = cases["fiducial"][metric]
+        axes.plot(curve["ell"][1:], curve[1:], color="black", lw=1.6, label="fiducial")
+        for line, (name, label) in zip(LINES, members.items(), strict=True):
+            curve = cases[name][metric]
+            axes.plot(curve["ell"][1:], curve[1:], color=colour, ls=line, lw=1.6, label=label)
+        dress(axes, metric, int(curve["ell"][-1]))
+        axes.label_outer()
+        axes.set_title(title)
+        axes.legend(frameon=False, fontsize=9, ncols=2, loc="upper center")
+    # room above the curves for the legends
+    low, high = panels[0].get_ylim()
+    panels[0].set_ylim(low, 8 * high if metric == "snr" else 1.4)
+    if metric == "rho":
+        panels[0].set_yticks([-0.25, 0.0, 0.25, 0.5, 0.75, 1.0])
+    figure.suptitle("Scenarios at 25 MHz")
+    return figure
+
+
+def scenario_maps(cases: Cases) -> Figure:
+    """Figure 9: the true sky at 25 MHz and the map of every scenario, in the same colours."""
+    labels = {name: f"{group}: {label}" for group, (_, members) in GROUPS.items()
+              for name, label in members.items()}  # fmt: skip
+    truth = cases["fiducial"]["truth"].values
+    norm = temperature_norm(truth)
+    figure = Figure(figsize=(13, 11), layout="constrained")
+    panels = [("truth", truth, None)] + [
+        (labels.get(name, name), cases[name]["mean"].values, cases[name]["highest_altitude"].values)
+        for name in MAP_CASES
+    ]
+    for position, (title, pixels, altitude) in enumerate(panels, 1):
+        axes = figure.add_subplot(4, 3, position, projection="mollweide")
+        image = mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
+        axes.set_title(title, fontsize=11)
+        axes.set_xticklabels([])
+        axes.set_yticklabels([])
+    colour_bar(figure, figure.axes, image, "K")
+    figure.suptitle("Maps at 25 MHz, Galactic coordinates; dashed: never observed")
+    return figure
+
+
+FIGURES = {
+    "2_beams": beams,
+    "3_data_vector": data_vector,
+    "4_frequency_maps": frequency_maps,
+    "5_rho_frequencies": rho_by_frequency,
+    "6_snr_frequencies": snr_by_frequency,
+    "7_rho_scenarios": rho_by_scenario,
+    "8_snr_scenarios": snr_by_scenario,
+    "9_scenario_maps": scenario_maps,
+}

@@ -1,0 +1,57 @@
+"""The page that sets finished runs side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from lusee_bayes.report import html
+from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, same_data
+
+HEADER = {
+    "run": "run",
+    "frequency_mhz": "MHz",
+    "n_data": "data",
+    "ell_cross": "SNR < 1 from ell",
+    "effective_resolution_deg": "resolution [°]",
+    "information_bits": "bits",
+    "log_evidence": "ln evidence",
+    "log_evidence_less_best": "less the best",
+    "p": "p of the data",
+    "mean_std_k": "mean standard deviation [K]",
+}
+
+
+def comparison_page(runs: Sequence[FinishedRun], figures: Path) -> str:
+    """The page as text; ``figures``: folder with maps.png and curves.png."""
+    rows = [[_shown(row[key]) for key in HEADER] for row in comparison_rows(runs)]
+    caveat = (
+        "All runs map the same data: differences of ln evidence say which model they prefer."
+        if same_data(runs)
+        else "The runs map different data: their evidences cannot be compared with each other."
+    )
+    names = ", ".join(run.name for run in runs)
+    return html.page(
+        f"Side by side: {names}",
+        [
+            html.paragraph(caveat, "verdict"),
+            html.table(list(HEADER.values()), rows),
+            html.figure(
+                figures / "curves.png",
+                "Correlation with the truth, signal-to-noise and share of the prior over "
+                "multipole ell, a line for each run",
+                "Fidelity and the share of the prior.",
+            ),
+            html.figure(
+                figures / "maps.png",
+                "Galactic maps of posterior mean and standard deviation, a row for each run",
+                "Posterior means, and standard deviations, on one scale each.",
+            ),
+        ],
+    )
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "none"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

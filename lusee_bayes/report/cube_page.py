@@ -1,0 +1,115 @@
+"""The report of a run of several frequencies, out of what it has left in its folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.report import html
+from lusee_bayes.report.run_details import details
+
+NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "mean.fits", "std.fits")
+FIGURES = {
+    "maps": (
+        "Galactic maps of posterior mean and standard deviation at several frequencies",
+        "Posterior mean and standard deviation, from the lowest channel to the highest.",
+    ),
+    "spectra": (
+        "Brightness temperature against frequency with error bars in four directions of the sky",
+        "Spectra of four directions (pixels of the map) with one standard deviation.",
+    ),
+    "fidelity": (
+        "Signal-to-noise ratio by multipole and frequency, and its mean over channels",
+        "Signal-to-noise ratio by multipole and frequency where the truth is known, else the share "
+        "of the variance that the prior supplies; right: mean over channels.",
+    ),
+    "chi2": (
+        "Chi-squared of every channel over its expectation",
+        "Residuals of every channel about its map; grey: two standard deviations of the widest "
+        "distribution they can have if the model holds.",
+    ),
+}
+SECTIONS = [
+    ("maps", "The maps"),
+    ("spectra", "Spectra"),
+    ("scales", "Scales"),
+    ("data", "Data and prediction"),
+    ("run", "The run"),
+]
+
+
+def cube_page(folder: Path, name: str) -> str:
+    """The page as text.
+
+    Parameters
+    ----------
+    folder : Path
+        With the files of a run.
+    name : str
+        Of the run, for the title.
+
+    Raises
+    ------
+    InputError
+        If something is missing in the folder.
+    """
+    for needed in (*NEEDED, *(f"figures/{figure}.png" for figure in FIGURES)):
+        if not (folder / needed).is_file():
+            raise InputError(
+                f"'{folder}' has no {needed}; make the results anew with lusee-bayes map"
+            )
+    summary = json.loads((folder / "summary.json").read_text())
+    frequencies = summary["frequencies_mhz"]
+    title = (
+        f"{name}: the sky at {len(frequencies)} frequencies, "
+        f"{frequencies[0]:g} to {frequencies[-1]:g} MHz"
+    )
+    fits = summary["verdict"].startswith("The data of all channels fit")
+    anchors = dict(zip(("maps", "spectra", "fidelity", "chi2"), SECTIONS, strict=False))
+    parts = {
+        name: [html.figure(folder / "figures" / f"{name}.png", *texts)]
+        for name, texts in FIGURES.items()
+    }
+    parts["maps"].append(html.paragraph(_how(summary)))
+    parts["chi2"].append(_table(summary))
+    return html.page(
+        title,
+        [
+            html.contents(SECTIONS),
+            html.paragraph(summary["verdict"], "verdict" if fits else "verdict bad"),
+            *(html.section(*anchors[name], *inside) for name, inside in parts.items()),
+            html.section(*SECTIONS[-1], *details(folder, summary)),
+        ],
+    )
+
+
+def _how(summary: dict) -> str:
+    joint, evidence = summary["joint"], summary["log_evidence"]
+    known = "" if evidence is None else f" ln evidence {evidence:.1f}."
+    if joint is None:
+        return f"Every channel has a posterior of its own.{known}"
+    solver = joint["solver"]
+    if joint["iterations"]:
+        solver += f" ({joint['iterations']} iterations)"
+    names = ", ".join(name.replace("_", " ") for name in joint["components"])
+    return (
+        f"All channels share one posterior; component maps: {names}. Solved by {solver}, last step "
+        f"{joint['refinement_sigma']:.1g} sigma.{known}"
+    )
+
+
+def _table(summary: dict) -> str:
+    header = ("MHz", "data", "missing", "chi²", "expected", "first ell with SNR < 1")
+    rows = [
+        (
+            f"{c['frequency_mhz']:g}",
+            c["n_data"],
+            c["n_missing"],
+            f"{c['chi2']:.0f}",
+            f"{c['chi2_expected']:.0f}" if "chi2_expected" in c else "unknown",
+            "" if c["ell_cross"] is None else c["ell_cross"],
+        )
+        for c in summary["channels"]
+    ]
+    return html.folded("every channel", html.table(header, rows))

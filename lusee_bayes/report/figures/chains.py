@@ -1,0 +1,83 @@
+"""Figures that tell whether chains can be trusted: ArviZ's, and the analytic witness."""
+
+from __future__ import annotations
+
+import arviz_base
+import arviz_plots
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+from matplotlib import pyplot
+from matplotlib.figure import Figure
+
+from lusee_bayes.report.figures.drawing import BLUE, GREY
+from lusee_bayes.systematics.base import SKY
+
+# quantities in the figures, the first of a run's list
+N_RANKS, N_PAIRS = 8, 5
+SIZE = {"layout": "constrained"}
+
+Quantities = dict[str, Float[np.ndarray, "chains draws"]]
+
+
+def ranks(quantities: Quantities) -> Figure:
+    """Ranks of each chain's draws among all: differences of their ECDFs from even ones.
+
+    The grey band holds 99 % of the curves of chains that agree.
+    """
+    chosen = dict(list(quantities.items())[:N_RANKS])
+    rows = (len(chosen) + 3) // 4
+    collection = arviz_plots.plot_rank(
+        arviz_base.from_dict({"posterior": chosen}),
+        backend="matplotlib",
+        figure_kwargs={**SIZE, "figsize": (12, 2.6 * rows + 0.4)},
+    )
+    return _figure(collection, "Ranks among the draws of all chains, one curve for each chain")
+
+
+def energy(statistics: xr.Dataset) -> Figure:
+    """Energies of the draws about their mean, their changes from draw to draw, and BFMI."""
+    tree = arviz_base.from_dict({"sample_stats": {"energy": statistics["energy"].values}})
+    collection = arviz_plots.plot_energy(
+        tree, backend="matplotlib", figure_kwargs={**SIZE, "figsize": (11, 3.6)}
+    )
+    return _figure(collection, "Energies; BFMI below 0.3 tells of chains that move slowly")
+
+
+def pairs(quantities: Quantities) -> Figure:
+    """Draws of the first quantities against each other."""
+    chosen = dict(list(quantities.items())[:N_PAIRS])
+    side = 2.2 * len(chosen) + 0.6
+    collection = arviz_plots.plot_pair(
+        arviz_base.from_dict({"posterior": chosen}),
+        visuals={"scatter": {"alpha": 0.3}, "divergence": False},
+        backend="matplotlib",
+        figure_kwargs={**SIZE, "figsize": (side, side)},
+    )
+    return _figure(collection, "Pairs of quantities")
+
+
+def against_analytic(tree: xr.DataTree) -> Figure:
+    """Means and standard deviations of the sky's draws against the analytic posterior."""
+    skies, constants = tree["posterior"][SKY].values, tree["constant_data"]
+    mean, std = constants["analytic_mean"].values, constants["analytic_std"].values
+    flat = skies.reshape(-1, skies.shape[-1])
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    dots = {"ls": "", "marker": ".", "ms": 3, "color": BLUE}
+    left.plot((flat.mean(axis=0) - mean) / std, **dots)
+    left.axhline(0.0, color=GREY, lw=0.8)
+    left.set(xlabel="mode", ylabel="difference [standard deviations]", title="Means")
+    right.plot(flat.std(axis=0, ddof=1) / std, **dots)
+    right.axhline(1.0, color=GREY, lw=0.8)
+    right.set(xlabel="mode", ylabel="draws / analytic", title="Standard deviations")
+    figure.suptitle("Draws against the analytic posterior, mode by mode")
+    return figure
+
+
+def _figure(collection: arviz_plots.PlotCollection, title: str) -> Figure:
+    """The figure of a collection, which pyplot then forgets."""
+    figure = collection.viz["figure"].item()
+    figure.suptitle(title)
+    pyplot.close(figure)
+    return figure

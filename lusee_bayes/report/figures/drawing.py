@@ -1,0 +1,104 @@
+"""What figures are drawn with: colours, projections of the sky and of beams, colour bars."""
+
+from __future__ import annotations
+
+import healpy
+import numpy as np
+from jaxtyping import Complex, Float
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import LogLocator
+
+from lusee_bayes.instrument.beams import HemisphereGrid
+
+# safe for colour-blind readers: perceptually uniform, and a blue-orange pair (Okabe-Ito) for lines
+SEQUENTIAL, DIVERGING = "inferno", "PuOr_r"
+BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#666666"
+
+
+def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Complex[np.ndarray, "theta phi"]):
+    """Draw ``|pattern|`` on the plane of the horizon: x East, y North."""
+    power = np.abs(pattern)
+    phi = np.append(grid.phi, 2 * np.pi)
+    closed = np.concatenate([power, power[:, :1]], axis=1) / power.max()
+    # the grid has no node at the zenith itself: every azimuth of the first ring meets there
+    closed = np.concatenate([np.full((1, closed.shape[1]), closed[0].mean()), closed])
+    theta = np.append(0.0, grid.theta)
+    x, y = (np.outer(np.sin(theta), f(phi)) for f in (np.cos, np.sin))
+    image = axes.pcolormesh(
+        x, y, closed, cmap=SEQUENTIAL, vmin=0, vmax=1, shading="gouraud", rasterized=True
+    )
+    axes.set(aspect="equal", xticks=[], yticks=[], xlim=(-1.15, 1.15), ylim=(-1.15, 1.15))
+    axes.add_artist(Circle((0, 0), 1.0, fill=False, color=GREY, lw=0.8))
+    for name, (px, py) in {
+        "N": (0, 1.08),
+        "E": (1.08, 0),
+        "S": (0, -1.08),
+        "W": (-1.08, 0),
+    }.items():
+        axes.text(px, py, name, ha="center", va="center", fontsize=8)
+    axes.set_frame_on(False)
+    return image
+
+
+def mollweide(
+    axes: Axes,
+    pixels: Float[np.ndarray, " pixels"],
+    *,
+    norm: Normalize,
+    cmap: str = SEQUENTIAL,
+    highest_altitude: Float[np.ndarray, " pixels"] | None = None,
+):
+    """A Galactic HEALPix RING map on Mollweide axes: centre l = 0, longitude grows to the left.
+
+    ``highest_altitude``: draws a dashed line round the region that never rose.
+    """
+    # a degree between nodes, shaded smoothly: no finer than the eye needs, four times faster
+    lon = np.linspace(180.0, -180.0, 361)
+    lat = np.linspace(-90.0, 90.0, 181)
+    grid_lon, grid_lat = np.meshgrid(lon, lat)
+
+    def at(values):
+        return healpy.get_interp_val(values, grid_lon, grid_lat, lonlat=True)
+
+    x, y = np.radians(-grid_lon), np.radians(grid_lat)
+    # negative temperatures have no logarithm: they take the darkest colour
+    colours = colormaps[cmap].with_extremes(bad=colormaps[cmap](0.0))
+    image = axes.pcolormesh(
+        x, y, at(pixels), cmap=colours, norm=norm, shading="gouraud", rasterized=True
+    )
+    if highest_altitude is not None and (highest_altitude < 0).any():
+        rim = axes.contour(
+            x,
+            y,
+            at(highest_altitude),
+            [0.0],
+            colors="black",
+            linestyles="dashed",
+            linewidths=1.2,
+        )
+        # seen on dark maps and on light ones
+        rim.set_path_effects([withStroke(linewidth=2.4, foreground="white", alpha=0.7)])
+    axes.set_xticks(np.radians([-120, -60, 0, 60, 120]), ["120°", "60°", "0°", "300°", "240°"])
+    axes.set_yticks(np.radians([-60, -30, 0, 30, 60]))
+    axes.tick_params(labelsize=7)
+    axes.grid(alpha=0.25, lw=0.4)
+    return image
+
+
+def colour_bar(
+    figure: Figure, image: ScalarMappable, axes: Axes | list[Axes], **options: object
+) -> Colorbar:
+    """A colour bar; on a logarithmic scale with plain numbers at 1, 2 and 5 times powers of ten."""
+    bar = figure.colorbar(image, ax=axes, **options)
+    if isinstance(image.norm, LogNorm):
+        bar.set_ticks(LogLocator(subs=(1.0, 2.0, 5.0)), minor=False)
+        bar.set_ticks([], minor=True)
+        bar.long_axis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+    return bar

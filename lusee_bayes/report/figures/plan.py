@@ -1,0 +1,142 @@
+"""The figure of a plan: what every variation would tell, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from lusee_bayes.report.figures.drawing import BLUE, GREY, ORANGE
+from lusee_bayes.results.forecast import AS_GIVEN, Forecast
+
+# told apart without colour vision (Okabe-Ito) and by shape; again from the first after four
+STYLES = ((BLUE, "o"), (ORANGE, "s"), ("#009E73", "^"), ("#000000", "D"))
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One number of a forecast: the words of its axis, and its ``value`` (None: there is none)."""
+
+    label: str
+    attribute: str
+
+    def value(self, forecast: Forecast) -> float | int | None:
+        return getattr(forecast, self.attribute)
+
+
+PANELS = (
+    Panel("information about the sky [bits]", "information_bits"),
+    Panel("modes with SNR > 1 [number]", "modes"),
+    Panel(r"first $\ell$ with expected SNR$_\ell$ < 1", "ell_cross"),
+)
+
+
+def forecasts(planned: Sequence[Forecast]) -> Figure:
+    """Information, modes with SNR > 1 and ell_cross of every variation, grouped by what differs.
+
+    Dashed: each scenario as given. An open marker beyond lmax: SNR > 1 at every ell.
+    """
+    rows = row_positions(planned)
+    sources = list(dict.fromkeys(f.variation.source for f in planned))
+    height = 1.6 + 0.23 * (max(rows.values()) + 1)
+    figure = Figure(figsize=(11.5, height), layout="constrained")
+    axes = figure.subplots(1, len(PANELS), sharey=True)
+    for number, source in enumerate(sources):
+        mine = [f for f in planned if f.variation.source == source]
+        # beside one another, so that equal values do not hide
+        lower = 0.2 * (number - (len(sources) - 1) / 2)
+        own = {row: y + lower for row, y in rows.items()}
+        for panel, axis in zip(PANELS, axes, strict=True):
+            draw(axis, panel, mine, own, STYLES[number % len(STYLES)], len(sources) == 1)
+    for panel, axis in zip(PANELS, axes, strict=True):
+        axis.set_xlabel(panel.label)
+        axis.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        axis.grid(axis="x", alpha=0.3, lw=0.5)
+        for (_, name), y in rows.items():
+            if name:
+                axis.axhline(y, color=GREY, alpha=0.25, lw=0.5, zorder=0)
+        axis.margins(x=0.14)
+        axis.tick_params(axis="y", length=0)
+        axis.spines[["top", "right", "left"]].set_visible(False)
+    label_rows(axes[0], rows)
+    if len(sources) > 1:
+        figure.legend(
+            *axes[0].get_legend_handles_labels(),
+            loc="outside lower center",
+            ncols=4,
+            frameon=False,
+        )
+    figure.suptitle(title(planned, sources))
+    return figure
+
+
+def row_positions(planned: Sequence[Forecast]) -> dict[tuple[str, str], int]:
+    """The row of every (family, variation) and of each family's own name, (family, "")."""
+    rows: dict[tuple[str, str], int] = {}
+    families = dict.fromkeys(f.variation.family for f in planned)
+    for family in families:
+        names = dict.fromkeys(f.variation.name for f in planned if f.variation.family == family)
+        if family != AS_GIVEN:
+            rows[family, ""] = len(rows)
+        for name in names:
+            rows[family, name] = len(rows)
+    return rows
+
+
+def draw(
+    axes: Axes,
+    panel: Panel,
+    mine: Sequence[Forecast],
+    rows: dict[tuple[str, str], float],
+    style: tuple[str, str],
+    numbers: bool,
+) -> None:
+    """The marks of one scenario in one panel; ``numbers``: with their values beside them."""
+    colour, marker = style
+    for forecast in mine:
+        value = panel.value(forecast)
+        # without a crossing, one ell beyond the last
+        x = len(forecast.snr_squared) if value is None else value
+        y = rows[forecast.variation.family, forecast.variation.name]
+        face = "white" if value is None else colour
+        label = forecast.variation.source if forecast is mine[0] else None
+        axes.plot(x, y, marker, color=colour, mfc=face, ms=6, label=label)
+        if numbers:
+            text = f"> {x - 1}" if value is None else f"{value:.0f}"
+            axes.annotate(
+                text,
+                (x, y),
+                (7, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=8,
+                bbox={"fc": "white", "ec": "none", "pad": 0.8},
+            )
+    reference = panel.value(mine[0])
+    if reference is not None:
+        axes.axvline(reference, color=colour, lw=0.9, ls="--", zorder=0)
+
+
+def label_rows(axes: Axes, rows: dict[tuple[str, str], int]) -> None:
+    """Name every row from the top down; the families' names stand out."""
+    axes.set_yticks(list(rows.values()), [name or family for family, name in rows])
+    axes.set_ylim(max(rows.values()) + 0.7, -0.7)
+    for (_, name), tick in zip(rows, axes.get_yticklabels(), strict=True):
+        tick.set_fontsize(9)
+        if not name:
+            tick.set_fontweight("bold")
+            tick.set_color(GREY)
+
+
+def title(planned: Sequence[Forecast], sources: Sequence[str]) -> str:
+    """What was planned, with frequency and lmax where all have the same."""
+    scenarios = [f.variation.scenario for f in planned]
+    found = ", ".join(sources) if len(sources) == 1 else f"{len(sources)} scenarios"
+    if len({s.frequency_mhz for s in scenarios}) == 1:
+        found += f" at {scenarios[0].frequency_mhz:g} MHz"
+    if len({s.lmax for s in scenarios}) == 1:
+        found += rf", up to $\ell$ = {scenarios[0].lmax}"
+    return f"What an observation would tell: {found} (dashed: as given)"

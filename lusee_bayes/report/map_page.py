@@ -1,0 +1,226 @@
+"""The report of a map run, out of what it has left in its folder."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.linear.residuals import SIGNIFICANCE, probability
+from lusee_bayes.report import html
+from lusee_bayes.report.explorer import explorer
+from lusee_bayes.report.run_details import details
+from lusee_bayes.results.diagnostics import read_diagnostics
+
+NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "diagnostics.nc", "mean.fits", "std.fits")
+FIGURES = ("maps", "draws", "fidelity", "spectra", "data_vector", "residuals", "beams")
+SECTIONS = [
+    ("map", "The map"),
+    ("scales", "Scales"),
+    ("data", "Data and prediction"),
+    ("numbers", "Numbers"),
+    ("run", "The run"),
+]
+# days in the table, the worst first
+WORST_DAYS = 5
+
+
+def map_page(folder: Path, name: str) -> str:
+    """The page as text.
+
+    Parameters
+    ----------
+    folder : Path
+        With the files of a run.
+    name : str
+        Of the run, for the title.
+
+    Raises
+    ------
+    InputError
+        If something is missing in the folder.
+    """
+    for needed in (*NEEDED, *(f"figures/{figure}.png" for figure in FIGURES)):
+        if not (folder / needed).is_file():
+            raise InputError(
+                f"'{folder}' has no {needed}; make the results anew with lusee-bayes map"
+            )
+    summary = json.loads((folder / "summary.json").read_text())
+    found = read_diagnostics(folder / "diagnostics.nc")
+    title = f"{name}: the sky at {summary['frequency_mhz']:g} MHz"
+    bad = found.attrs["p"] < SIGNIFICANCE
+    return html.page(
+        title,
+        [
+            html.contents(SECTIONS),
+            html.paragraph(found.attrs["verdict"], "verdict bad" if bad else "verdict"),
+            html.section("map", SECTIONS[0][1], *_map(folder, summary, found)),
+            html.section("scales", SECTIONS[1][1], *_scales(folder, summary)),
+            html.section("data", SECTIONS[2][1], *_data(folder, found)),
+            html.section("numbers", SECTIONS[3][1], *_numbers(folder, summary)),
+            html.section("run", SECTIONS[4][1], *details(folder, summary)),
+        ],
+    )
+
+
+def _figure(folder: Path, name: str, alternative: str, caption: str) -> str:
+    return html.figure(folder / "figures" / f"{name}.png", alternative, caption)
+
+
+def _map(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
+    hidden = summary["never_observed_fraction"]
+    return [
+        html.paragraph(
+            f"{hidden:.1%} of the sky never rose above the horizon: there the map is the prior's. "
+            "The share from the prior is that of a pixel's variance, the monopole left out."
+        ),
+        explorer(folder, found),
+        _figure(
+            folder,
+            "maps",
+            "Galactic maps: posterior mean and its standard deviation, and, where the true sky is "
+            "known, truth and difference",
+            "Posterior mean and standard deviation; truth and difference where the sky is known.",
+        ),
+        _figure(
+            folder,
+            "draws",
+            "Galactic maps of four draws of the posterior",
+            "Draws of the posterior: skies that the data and the prior allow. What they share is "
+            "known, what differs is not.",
+        ),
+    ]
+
+
+def _scales(folder: Path, summary: dict) -> list[str]:
+    cross, resolution = summary["ell_cross"], summary["effective_resolution_deg"]
+    text = []
+    with (folder / "spectra.csv").open(newline="") as file:
+        known = "snr" in next(csv.reader(file))
+    if known:
+        text.append(
+            "SNR_ell stays above 1 at every ell."
+            if cross is None
+            else f"SNR_ell falls below 1 first at ell = {cross}."
+        )
+    if resolution is None:
+        text.append("The data supply more than the prior up to the highest ell.")
+    else:
+        text.append(
+            f"The prior supplies more than half of the variance from ell = {180 / resolution:.0f} "
+            f"on: a resolution of {resolution:.1f} degrees."
+        )
+    return [
+        html.paragraph(" ".join(text)),
+        _figure(
+            folder,
+            "fidelity",
+            "Curves over multipole ell: correlation with the truth and signal-to-noise where the "
+            "truth is known, and the share of the variance that the prior supplies",
+            "Correlation with the truth, signal-to-noise ratio, and the share of the prior.",
+        ),
+        _figure(
+            folder,
+            "spectra",
+            "Power spectra of prior, posterior mean, posterior variance and truth",
+            "Power spectra. Where the posterior variance meets the prior, the data say nothing.",
+        ),
+    ]
+
+
+def _data(folder: Path, found: xr.Dataset) -> list[str]:
+    kinds = found["group_kind"].values
+    header = ("", "data", "chi² given all others", "its p", "p of the others without it")
+    parts = [
+        html.paragraph(
+            "Each datum, and each product, day and turntable angle as a whole, is compared with "
+            "what all other data predict of it. A bad group spoils the predictions of others too; "
+            "what tells it is that the others fit once it is left out (last column). Days may also "
+            "stand out by a sky that is brighter in places than the prior expects and that no "
+            "other day has seen as well."
+        ),
+        _figure(
+            folder,
+            "residuals",
+            "Standardised residuals of every datum by product and time, and p-values by product",
+            "Every datum against the prediction of all others, in standard deviations.",
+        ),
+    ]
+    suspects = list(np.atleast_1d(found.attrs["suspects"]))
+    for kind, title, name in (
+        ("product", "By product", "product"),
+        ("day", "By day", "day"),
+        ("angle", "By turntable angle", "turntable angle"),
+    ):
+        rows = np.flatnonzero(kinds == kind)
+        note = ""
+        if kind == "day" and len(rows) > WORST_DAYS:
+            order = np.argsort(found["group_p"].values[rows])
+            note = f" (the {WORST_DAYS} least probable of {len(rows)})"
+            rows = rows[order[:WORST_DAYS]]
+        cells = [_group_row(found, int(row)) for row in rows]
+        bad = [f"{name} {cell[0]}" in suspects for cell in cells]
+        parts += [html.paragraph(f"{title}{note}"), html.table(header, cells, bad)]
+    parts.append(
+        _figure(
+            folder,
+            "data_vector",
+            "The measured visibilities, product by product",
+            "The data as they were measured.",
+        )
+    )
+    return parts
+
+
+def _group_row(found: xr.Dataset, row: int) -> tuple[str, ...]:
+    others = float(found["group_others_p"].values[row])
+    return (
+        str(found["group_name"].values[row]),
+        str(int(found["group_n"].values[row])),
+        f"{float(found['group_chi2'].values[row]):.1f}",
+        probability(float(found["group_p"].values[row])).removeprefix("= "),
+        "no others" if np.isnan(others) else probability(others).removeprefix("= "),
+    )
+
+
+def _numbers(folder: Path, summary: dict) -> list[str]:
+    rows = [
+        ("ln evidence", f"{summary['log_evidence']:.2f}"),
+        ("information about the sky", f"{summary['information_bits']:.0f} bits"),
+        ("data", f"{summary['n_data']} ({summary['n_missing']} missing)"),
+        ("modes", str(summary["n_modes"])),
+        (
+            "chi² of the residuals about the map",
+            f"{summary['chi2']:.1f}, expected {summary['chi2_expected']:.1f}",
+        ),
+        ("last refinement of the mean", f"{summary['mean_refinement_sigma']:.1g} sigma"),
+    ]
+    if summary["beam_rms_difference"] is not None:
+        off = f"{summary['beam_rms_difference']:.2%}"
+        rows.append(("difference of true and modelled beams", off))
+    parts = [html.table(("", ""), rows)]
+    sources = folder / "sources.csv"
+    if sources.is_file():
+        with sources.open(newline="") as file:
+            lines = list(csv.DictReader(file))
+        cells = [
+            (s["source"], s["block"], f"{float(s['flux_jy']):.4g}", f"{float(s['std_jy']):.2g}")
+            for s in lines
+        ]
+        parts += [
+            html.paragraph("Point sources beside the map"),
+            html.table(("source", "block", "flux [Jy]", "+- [Jy]"), cells),
+        ]
+    parts.append(
+        _figure(
+            folder,
+            "beams",
+            "Beams of an auto and two crosses seen from above, North up",
+            "Beams that the map was made with.",
+        )
+    )
+    return parts

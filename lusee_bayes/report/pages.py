@@ -1,0 +1,59 @@
+"""report.html: one file that says of a run what a person wants to know of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.files import read_manifest, recover, replacing
+from lusee_bayes.report.cube_page import cube_page
+from lusee_bayes.report.map_page import map_page
+from lusee_bayes.report.sample_page import sample_page
+
+REPORT = "report.html"
+# by the kind of run: the page as text, of a folder and the run's name
+PAGES: dict[str, Callable[[Path, str], str]] = {
+    "map": map_page,
+    "cube": cube_page,
+    "sample": sample_page,
+    "validate": sample_page,
+}
+
+
+def write_report(folder: str | Path) -> Path:
+    """Write report.html of the results in a folder anew, whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If the folder does not hold the results of ``map``, ``sample`` or ``validate``.
+    """
+    folder = Path(folder)
+    recover(folder)
+    kind = _kind(folder)
+    if kind not in PAGES:
+        raise InputError(
+            f"'{folder}' holds neither posterior.nc (lusee-bayes map) nor samples.nc (lusee-bayes "
+            "sample, validate); give the folder of a finished run"
+        )
+    path = folder / REPORT
+    with replacing(path) as partial:
+        partial.write_text(PAGES[kind](folder, folder.resolve().name))
+    return path
+
+
+def _kind(folder: Path) -> str | None:
+    """The kind of run whose results a folder holds."""
+    manifest = read_manifest(folder)
+    if manifest is not None:
+        return manifest["kind"]
+    # folders that were written before there were manifests
+    if (folder / "samples.nc").is_file():
+        return "sample"
+    if not (folder / "posterior.nc").is_file():
+        return None
+    summary = folder / "summary.json"
+    several = summary.is_file() and "frequencies_mhz" in json.loads(summary.read_text())
+    return "cube" if several else "map"

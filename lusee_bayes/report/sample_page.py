@@ -1,0 +1,119 @@
+"""The report of a sampled run, or of a validation, out of what it has left in its folder."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.report import html
+from lusee_bayes.report.run_details import details
+
+# name, text for those who do not see it, caption
+FIGURES = {
+    "uncertainty": (
+        "Galactic maps of the draws: mean, standard deviation, width and asymmetry of intervals",
+        "What the draws say of the sky.",
+    ),
+    "traces": (
+        "Draws of each quantity over time for every chain, with histograms",
+        "Draws over time: chains should look alike, and like noise.",
+    ),
+    "ranks": (
+        "Differences of the distribution of ranks from an even one, a curve for each chain",
+        "Ranks of each chain's draws among all: the curves stay within the grey band if the chains "
+        "agree.",
+    ),
+    "energy": (
+        "BFMI of each chain, and densities of the energy of the draws and of its changes",
+        "Energies and their changes from draw to draw: where changes are much narrower, chains "
+        "move slowly.",
+    ),
+    "pairs": (
+        "Draws of pairs of quantities against each other",
+        "Pairs of quantities: what cannot be sampling apart lies along lines.",
+    ),
+    "against_analytic": (
+        "Means and standard deviations of the draws against the analytic posterior, mode by mode",
+        "The draws against the analytic posterior of the scenario with its marginalised terms: "
+        "equal for a Gaussian program, and different where sampling matters.",
+    ),
+    "comparison": (
+        "HMC against the analytic posterior: means, variances, covariance, effective sizes",
+        "HMC against the analytic posterior.",
+    ),
+    "calibration": (
+        "Rank histograms over simulated data sets and coverage of intervals",
+        "Calibration over simulated data sets.",
+    ),
+}
+
+
+def sample_page(folder: Path, name: str) -> str:
+    """The page as text.
+
+    Parameters
+    ----------
+    folder : Path
+        With the files of a run.
+    name : str
+        Of the run, for the title.
+
+    Raises
+    ------
+    InputError
+        If something is missing in the folder.
+    """
+    for needed in ("summary.csv", "sampling.json", "scenario.yaml"):
+        if not (folder / needed).is_file():
+            raise InputError(
+                f"'{folder}' has no {needed}; make the results anew with lusee-bayes sample"
+            )
+    sampling = json.loads((folder / "sampling.json").read_text())
+    with (folder / "summary.csv").open(newline="") as file:
+        header, *rows = list(csv.reader(file))
+    worst = max(float(row[header.index("r_hat")]) for row in rows)
+    verdict = (
+        f"{sampling['chains']} x {sampling['draws']} draws of {sampling['program']}: R-hat at most "
+        f"{worst:.4f}, {sampling['divergences']} divergences, mean acceptance "
+        f"{sampling['mean_acceptance']:.2f}."
+    )
+    bad = worst > 1.01 or sampling["divergences"] > 0
+    sections = [("summary", "Summary"), ("pictures", "Pictures"), ("run", "The run")]
+    parts = [html.section("summary", "Summary", html.table(header, map(_short, rows)))]
+    validation = folder / "validation.json"
+    if validation.is_file():
+        sections.insert(1, ("checks", "Checks"))
+        parts.append(html.section("checks", "Checks", _checks(json.loads(validation.read_text()))))
+    present = [
+        html.figure(folder / "figures" / f"{figure}.png", *texts)
+        for figure, texts in FIGURES.items()
+        if (folder / "figures" / f"{figure}.png").is_file()
+    ]
+    return html.page(
+        f"{name}: draws of {sampling['program']}",
+        [
+            html.contents(sections),
+            html.paragraph(verdict, "verdict bad" if bad else "verdict"),
+            *parts,
+            html.section("pictures", "Pictures", *present),
+            html.section("run", "The run", *details(folder, sampling)),
+        ],
+    )
+
+
+def _checks(validation: dict) -> str:
+    rows, bad = [], []
+    for check in validation["checks"]:
+        bounds = [check["lower"], check["upper"]]
+        allowed = " to ".join("any" if b is None else f"{b:.4g}" for b in bounds)
+        verdict = "ok" if check["passed"] else "failed"
+        rows.append((check["name"], f"{check['value']:.4g}", allowed, verdict, check["meaning"]))
+        bad.append(not check["passed"])
+    return html.table(("check", "value", "allowed", "", "what it is"), rows, bad)
+
+
+def _short(row: list[str]) -> list[str]:
+    """Numbers of a row to five digits."""
+    return [row[0], *(f"{float(cell):.5g}" for cell in row[1:])]

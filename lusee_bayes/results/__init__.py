@@ -1,0 +1,1 @@
+"""What runs have found, as objects and as files."""

@@ -1,0 +1,332 @@
+"""The posterior over the sky at one frequency: what every kind of run has in common.
+
+A map is one channel, a cube several; samples and the paper's cases stand beside one. It is made
+here and nowhere else: of a posterior with its model, or of an information with its covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array, Float, PRNGKeyArray, Shaped
+
+from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.harmonics import modes_to_map, power_spectrum, sum_over_m
+from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.experiment.inference import Inference
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.metrics import (
+    correlation,
+    ell_cross,
+    expected_chi2,
+    highest_altitude,
+    prior_fraction_per_ell,
+    signal_to_noise,
+    whitened_residuals,
+)
+from lusee_bayes.linear.pixel_variance import pixel_std
+
+# what the scenario's seed is folded with for posterior draws and for perturbations of information
+DRAWS, PERTURBATIONS = 1, 7
+# numbers of a channel that a file keeps as attributes
+NUMBERS = (
+    "log_evidence",
+    "information_bits",
+    "chi2",
+    "chi2_expected",
+    "refinement",
+    "n_data",
+    "n_missing",
+    "rounds",
+)
+
+
+def draw_key(scenario: Scenario) -> PRNGKeyArray:
+    """The key of a scenario's posterior draws."""
+    return jax.random.fold_in(jax.random.key(scenario.seed), DRAWS)
+
+
+@dataclass(frozen=True)
+class ChannelResult:
+    """The posterior over the sky at one frequency, and what judges it. Skies in K, Galactic.
+
+    Attributes
+    ----------
+    frequency_mhz : float
+    mean, std, prior_std : (modes,) array
+        Of the real harmonic coefficients.
+    prior_fraction : (ells,) array
+        Share of the variance that the prior supplies, mean over m.
+    pixel_std : (pixels,) array
+        Standard deviation of HEALPix RING pixels.
+    highest_altitude : (pixels,) array
+        sin of the highest altitude that each pixel reached.
+    draws : (n, modes) array
+        Of the posterior; none, if none were asked for.
+    truth : (modes,) array or None
+        The sky behind simulated data.
+    independent : (modes,) array or None
+        Mean given this channel's data alone, where ``mean`` is given those of all.
+    log_evidence, information_bits : float
+        NaN for a channel of a joint posterior, where only those of all channels are known.
+    chi2, chi2_expected : float
+        Of the residuals about the mean, and its mean if the model holds (NaN if not known).
+    refinement : float
+        Last correction of the mean, in standard deviations.
+    n_data, n_missing, rounds : int
+        Data, samples left out, and how often the gain term was built.
+    """
+
+    frequency_mhz: float
+    mean: Float[np.ndarray, " modes"]
+    std: Float[np.ndarray, " modes"]
+    prior_std: Float[np.ndarray, " modes"]
+    prior_fraction: Float[np.ndarray, " ells"]
+    pixel_std: Float[np.ndarray, " pixels"]
+    highest_altitude: Float[np.ndarray, " pixels"]
+    draws: Float[np.ndarray, "n modes"]
+    truth: Float[np.ndarray, " modes"] | None
+    independent: Float[np.ndarray, " modes"] | None
+    log_evidence: float
+    information_bits: float
+    chi2: float
+    chi2_expected: float
+    refinement: float
+    n_data: int
+    n_missing: int
+    rounds: int
+
+    @property
+    def nside(self) -> int:
+        """NSIDE of the maps."""
+        return round(np.sqrt(self.pixel_std.size / 12))
+
+    @property
+    def never_observed(self) -> float:
+        """Share of the sky that was never above the horizon."""
+        return float((self.highest_altitude < 0).mean())
+
+    def snr(self, mean: Float[np.ndarray, " modes"] | None = None) -> np.ndarray | None:
+        """SNR_ell of the map, or of another mean; None where the truth is not known."""
+        if self.truth is None:
+            return None
+        return signal_to_noise(self.mean if mean is None else mean, self.truth)
+
+    @property
+    def ell_cross(self) -> int | None:
+        """First ell >= 1 with SNR < 1; None if there is none, or no truth."""
+        snr = self.snr()
+        return None if snr is None else ell_cross(snr)
+
+    def spectra(self) -> dict[str, Shaped[np.ndarray, " ells"]]:
+        """Columns of spectra.csv; rho, snr and cl_truth only where the truth is known."""
+        columns: dict[str, np.ndarray] = {"ell": np.arange(len(self.prior_fraction))}
+        if self.truth is not None:
+            columns["rho"] = correlation(self.mean, self.truth)
+            columns["snr"] = self.snr()
+        columns["cl_prior"] = power_spectrum(self.prior_std)
+        columns["cl_mean"] = power_spectrum(self.mean)
+        if self.truth is not None:
+            columns["cl_truth"] = power_spectrum(self.truth)
+        columns["cl_posterior_variance"] = power_spectrum(self.std)
+        columns["prior_fraction"] = self.prior_fraction
+        if self.truth is not None and self.independent is not None:
+            columns["snr_independent"] = self.snr(self.independent)
+        return columns
+
+    def maps(self) -> dict[str, Float[np.ndarray, " pixels"]]:
+        """HEALPix RING maps by name, in K: mean, std and, where known, truth and residual."""
+        maps = {"mean": modes_to_map(self.mean, self.nside), "std": self.pixel_std}
+        if self.truth is not None:
+            truth = modes_to_map(self.truth, self.nside)
+            maps |= {"truth": truth, "residual": maps["mean"] - truth}
+        return maps
+
+    def variables(self) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
+        """What posterior.nc holds of a channel, on dims ``mode`` and ``draw``; in K."""
+        variables = {
+            "mean": (("mode",), self.mean),
+            "std": (("mode",), self.std),
+            "prior_std": (("mode",), self.prior_std),
+        }
+        if self.truth is not None:
+            variables["truth"] = (("mode",), self.truth)
+        if self.independent is not None:
+            variables["independent_mean"] = (("mode",), self.independent)
+        if len(self.draws):
+            variables["draws"] = (("draw", "mode"), self.draws)
+        return variables
+
+    def to_dataset(self) -> xr.Dataset:
+        """All of it, for :meth:`from_dataset`."""
+        variables = dict(self.variables())
+        variables["draws"] = (("draw", "mode"), self.draws)
+        variables["prior_fraction"] = (("ell",), self.prior_fraction)
+        variables["pixel_std"] = (("pixel",), self.pixel_std)
+        variables["highest_altitude"] = (("pixel",), self.highest_altitude)
+        numbers = {name: getattr(self, name) for name in ("frequency_mhz", *NUMBERS)}
+        return xr.Dataset(variables, attrs=numbers)
+
+    @classmethod
+    def from_dataset(cls, dataset: xr.Dataset) -> ChannelResult:
+        """The inverse of :meth:`to_dataset`."""
+        arrays = {str(name): np.asarray(v) for name, v in dataset.data_vars.items()}
+        independent = arrays.pop("independent_mean", None)
+        numbers = {name: float(dataset.attrs[name]) for name in NUMBERS}
+        counts = {name: int(numbers.pop(name)) for name in ("n_data", "n_missing", "rounds")}
+        return cls(
+            frequency_mhz=float(dataset.attrs["frequency_mhz"]),
+            truth=arrays.pop("truth", None),
+            independent=independent,
+            **arrays,
+            **numbers,
+            **counts,
+        )
+
+
+def channel_of_posterior(
+    experiment: Experiment,
+    inference: Inference,
+    *,
+    n_draws: int = 0,
+    judged: Inference | None = None,
+) -> ChannelResult:
+    """The channel of a posterior over harmonic coefficients.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    inference : Inference
+        The posterior, and the model of the data.
+    n_draws : int
+        How many draws of the posterior to keep.
+    judged : Inference, optional
+        The model that predicts the data and its posterior, where earlier data were there.
+    """
+    scenario, data, posterior = experiment.scenario, experiment.data, inference.posterior
+    judged = inference if judged is None else judged
+    residuals = np.asarray(whitened_residuals(inference.model, posterior, data.data))
+    return ChannelResult(
+        frequency_mhz=scenario.frequency_mhz,
+        mean=np.asarray(posterior.mean),
+        std=np.asarray(posterior.std()),
+        prior_std=np.sqrt(np.asarray(inference.model.prior.variance())),
+        prior_fraction=prior_fraction_per_ell(posterior),
+        pixel_std=pixel_std(posterior.covariance(), scenario.map_nside),
+        highest_altitude=highest_altitude(data.observation, scenario.map_nside),
+        draws=np.asarray(posterior.sample(draw_key(scenario), n_draws)),
+        truth=_array(data.truth),
+        independent=None,
+        log_evidence=float(posterior.log_evidence),
+        information_bits=float(posterior.information_bits()),
+        chi2=float(residuals @ residuals),
+        chi2_expected=expected_chi2(judged.posterior, inference.model.n_data),
+        refinement=float(posterior.refinement),
+        n_data=inference.model.n_data,
+        n_missing=data.n_missing,
+        rounds=inference.rounds,
+    )
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What is known of a channel besides its posterior: for :func:`channel_of_information`.
+
+    Attributes
+    ----------
+    frequency_mhz : float
+    spectrum : (ells,) array
+        C_ell of the channel's own prior, in K^2.
+    truth : (modes,) array or None
+    highest_altitude : (pixels,) array
+    n_missing, rounds : int
+    """
+
+    frequency_mhz: float
+    spectrum: Float[np.ndarray, " ells"]
+    truth: Float[np.ndarray, " modes"] | None
+    highest_altitude: Float[np.ndarray, " pixels"]
+    n_missing: int
+    rounds: int
+
+    @classmethod
+    def of(cls, experiment: Experiment, rounds: int) -> Observed:
+        """Of an experiment."""
+        data, nside = experiment.data, experiment.scenario.map_nside
+        return cls(
+            experiment.scenario.frequency_mhz,
+            power_spectrum(np.sqrt(np.asarray(experiment.setup.prior.variance()))),
+            _array(data.truth),
+            highest_altitude(data.observation, nside),
+            data.n_missing,
+            rounds,
+        )
+
+
+def channel_of_information(
+    observed: Observed,
+    information: Information,
+    mean: Float[Array, " modes"],
+    covariance: Float[Array, "modes modes"] | None,
+    draws: Float[Array, "n modes"],
+    *,
+    independent: Float[Array, " modes"] | None = None,
+    log_evidence: float = np.nan,
+    information_bits: float = np.nan,
+    refinement: float = np.nan,
+) -> ChannelResult:
+    """The channel of a mean and a covariance; where that is not known, of draws.
+
+    Parameters
+    ----------
+    observed : Observed
+    information : Information
+        What the channel's own data say.
+    mean : (modes,) array
+        In K.
+    covariance : (modes, modes) array or None
+        In K^2; None if only the draws tell.
+    draws : (n, modes) array
+        In K.
+    independent, log_evidence, information_bits, refinement
+        See :class:`ChannelResult`.
+    """
+    expected = np.nan
+    if covariance is None:
+        spread = np.asarray(draws) - np.asarray(mean)
+        std = np.sqrt((spread**2).mean(0))
+        covariance = jnp.asarray(spread.T @ spread / len(spread))
+    else:
+        std = np.sqrt(np.diagonal(np.asarray(covariance)))
+        expected = float(information.n_data - (information.matrix * covariance).sum())
+    n_per_ell = 2 * np.arange(len(observed.spectrum)) + 1
+    prior_std = np.sqrt(np.repeat(observed.spectrum, n_per_ell))
+    return ChannelResult(
+        frequency_mhz=observed.frequency_mhz,
+        mean=np.asarray(mean),
+        std=std,
+        prior_std=prior_std,
+        prior_fraction=sum_over_m(std**2 / prior_std**2) / n_per_ell,
+        pixel_std=pixel_std(covariance, round(np.sqrt(observed.highest_altitude.size / 12))),
+        highest_altitude=observed.highest_altitude,
+        draws=np.asarray(draws),
+        truth=observed.truth,
+        independent=_array(independent),
+        log_evidence=log_evidence,
+        information_bits=information_bits,
+        chi2=float(information.chi2(mean)),
+        chi2_expected=expected,
+        refinement=refinement,
+        n_data=int(information.n_data),
+        n_missing=observed.n_missing,
+        rounds=observed.rounds,
+    )
+
+
+def _array(values: Float[AnyArray, " modes"] | None) -> Float[np.ndarray, " modes"] | None:
+    return None if values is None else np.asarray(values)

@@ -1,0 +1,84 @@
+"""What the data of a channel say, in a file: for the channels of a joint posterior."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+
+from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.experiment.inference import Inference
+from lusee_bayes.linear.information import Information
+from lusee_bayes.results.channel import Observed
+
+# numbers that a file keeps as attributes
+OF_INFORMATION = ("misfit", "log_det", "n_data")
+OF_CHANNEL = ("frequency_mhz", "n_missing", "rounds")
+
+
+@dataclass(frozen=True)
+class ChannelInformation:
+    """What a channel's data say, with what it takes to make a posterior of it and to judge it.
+
+    Attributes
+    ----------
+    information : Information
+    observed : Observed
+    sky : (modes,) array
+        The scenario's model sky, in K.
+    """
+
+    information: Information
+    observed: Observed
+    sky: Float[np.ndarray, " modes"]
+
+    @classmethod
+    def of(
+        cls, experiment: Experiment, information: Information, inference: Inference
+    ) -> ChannelInformation:
+        """Of an experiment and what was inferred from its data."""
+        sky = np.asarray(experiment.setup.sky.modes)
+        return cls(information, Observed.of(experiment, inference.rounds), sky)
+
+    def to_dataset(self) -> xr.Dataset:
+        """All of it, for :meth:`from_dataset`."""
+        information, observed = self.information, self.observed
+        variables = {
+            "matrix": (("mode", "mode_2"), np.asarray(information.matrix)),
+            "vector": ("mode", np.asarray(information.vector)),
+            "reference": ("mode", np.asarray(information.reference)),
+            "sky": ("mode", self.sky),
+            "spectrum": ("ell", observed.spectrum),
+            "highest_altitude": ("pixel", observed.highest_altitude),
+        }
+        if observed.truth is not None:
+            variables["truth"] = ("mode", observed.truth)
+        if information.perturbations is not None:
+            perturbations = np.asarray(information.perturbations)
+            variables["perturbations"] = (("draw", "mode"), perturbations)
+        numbers = {name: float(getattr(information, name)) for name in OF_INFORMATION}
+        numbers |= {name: getattr(observed, name) for name in OF_CHANNEL}
+        return xr.Dataset(variables, attrs=numbers)
+
+    @classmethod
+    def from_dataset(cls, dataset: xr.Dataset) -> ChannelInformation:
+        """The inverse of :meth:`to_dataset`."""
+        arrays = {str(name): np.asarray(values) for name, values in dataset.data_vars.items()}
+        noise = arrays.get("perturbations")
+        information = Information(
+            *(jnp.asarray(arrays[name]) for name in ("matrix", "vector", "reference")),
+            *(jnp.asarray(float(dataset.attrs[name])) for name in OF_INFORMATION),
+            None if noise is None else jnp.asarray(noise),
+        )
+        observed = Observed(
+            float(dataset.attrs["frequency_mhz"]),
+            arrays["spectrum"],
+            arrays.get("truth"),
+            arrays["highest_altitude"],
+            int(dataset.attrs["n_missing"]),
+            int(dataset.attrs["rounds"]),
+        )
+        return cls(information, observed, arrays["sky"])

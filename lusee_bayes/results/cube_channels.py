@@ -1,0 +1,147 @@
+"""The channels of a cube, each by itself or in one posterior; a stopped run goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.process_group import ProcessGroup
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.experiment import build, with_truth
+from lusee_bayes.experiment.inference import inform
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.linear.joint_skies import channel_sky
+from lusee_bayes.results.channel import (
+    PERTURBATIONS,
+    ChannelResult,
+    channel_of_information,
+    draw_key,
+)
+from lusee_bayes.results.channel_files import ChannelFiles, identity_of
+from lusee_bayes.results.channel_information import ChannelInformation
+from lusee_bayes.results.channel_threads import each_channel
+from lusee_bayes.results.cube import CubeResult
+from lusee_bayes.results.joint_components import (
+    LEAST_DRAWS,
+    Components,
+    is_iterative,
+    solve_components,
+)
+
+
+def cube_result(
+    scenario: Scenario,
+    folder: Path,
+    *,
+    data: Path | None = None,
+    truth: bool = False,
+    group: ProcessGroup | None = None,
+    stages: Stages | None = None,
+) -> CubeResult:
+    """Work out all channels, going on from what an interrupted run has left in ``folder``.
+
+    Every process of ``group`` has to call it; all of them return the whole cube.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of several frequencies.
+    folder : Path
+        Of the run; unfinished work is kept in it.
+    data : Path, optional
+        File of measured data; without it the scenario's own are simulated.
+    truth : bool
+        The data are of the scenario's own sky.
+    group : ProcessGroup, optional
+        The processes that share the channels.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        For a scenario without frequencies, and as :func:`infer` for a channel.
+    """
+    group, stages = group or ProcessGroup(), stages or Stages()
+    if not scenario.frequencies_mhz:
+        raise InputError("the scenario names no frequencies_mhz; give --frequencies")
+    iterative = scenario.joint and is_iterative(scenario)
+    n_draws = max(scenario.output.draws, LEAST_DRAWS if iterative else 0)
+    files = ChannelFiles(folder, identity_of(scenario, data, truth, n_draws))
+    channels = scenario.channels()
+    wanted = "information" if scenario.joint else "result"
+
+    def observe(channel: Scenario) -> None:
+        if files.has(channel, wanted):
+            return
+        measured = None if data is None else read_data(data, channel)
+        experiment = build(channel, measured)
+        if truth:
+            experiment = with_truth(experiment)
+        key = jax.random.fold_in(jax.random.key(channel.seed), PERTURBATIONS)
+        information, inference = inform(experiment, key, n_draws if iterative else 0)
+        known = ChannelInformation.of(experiment, information, inference)
+        if scenario.joint:
+            files.write(channel, wanted, known.to_dataset())
+            return
+        posterior = inference.posterior
+        found = channel_of_information(
+            known.observed,
+            information,
+            posterior.mean,
+            posterior.covariance(),
+            posterior.sample(draw_key(channel), n_draws),
+            log_evidence=float(posterior.log_evidence),
+            information_bits=float(posterior.information_bits()),
+            refinement=float(posterior.refinement),
+        )
+        files.write(channel, wanted, found.to_dataset())
+
+    each_channel(observe, channels, group, stages, "channels")
+    group.barrier("channels")
+    components = None
+    if scenario.joint:
+        components = solve_components(scenario, files, n_draws, group, stages)
+        each_channel(
+            lambda channel: _write_joint_sky(channel, channels, components, scenario, files),
+            channels,
+            group,
+            stages,
+            "joint skies",
+        )
+        group.barrier("joint")
+    found = tuple(ChannelResult.from_dataset(files.read(c, "result")) for c in channels)
+    return CubeResult(scenario, found, components, stages.seconds)
+
+
+def _write_joint_sky(
+    channel: Scenario,
+    channels: tuple[Scenario, ...],
+    components: Components,
+    scenario: Scenario,
+    files: ChannelFiles,
+) -> None:
+    if files.has(channel, "result"):
+        return
+    known = ChannelInformation.from_dataset(files.read(channel, "information"))
+    sky = channel_sky(
+        components.prior,
+        channels.index(channel),
+        known.information,
+        components.mean,
+        components.spread,
+        components.draws,
+        draw_key(scenario),
+    )
+    found = channel_of_information(
+        known.observed,
+        known.information,
+        sky.mean,
+        sky.covariance,
+        sky.draws,
+        independent=known.information.reference,
+    )
+    files.write(channel, "result", found.to_dataset())

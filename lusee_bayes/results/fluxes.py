@@ -1,0 +1,72 @@
+"""Fluxes of the point sources beside a map."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.experiment.inference import Inference, prediction, rebuilds_gains
+from lusee_bayes.experiment.model import model_with_fluxes
+from lusee_bayes.experiment.simulate import true_values
+from lusee_bayes.experiment.terms import Around, point_sources
+from lusee_bayes.sky import kelvin_steradian
+
+
+def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
+    """Posterior of every source's flux in Jy and in K sr, with its prior and, if known, its truth.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        With sources that are not ignored.
+    inference : Inference
+        The map, around which the gain term is built where the scenario says so.
+
+    Returns
+    -------
+    DataFrame
+        A row for each source, or block of it. ``above_horizon``: whether it is ever up; if not,
+        its flux is known from the prior only.
+    """
+    setup, data = experiment.setup, experiment.data
+    sources = point_sources(setup)
+    around = Around(data)
+    if rebuilds_gains(setup):
+        around = Around(data, prediction(setup, inference.posterior))
+    posterior = model_with_fluxes(setup, around).condition(data.data)
+    n = sources.mean().shape[0]
+    mean = np.asarray(sources.mean() + posterior.mean[-n:])
+    std = np.asarray(posterior.std())[-n:]
+    jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
+    truth = true_values(setup) if data.truth is not None else {}
+    rows, at = [], 0
+    for source in sources.sources:
+        true = np.broadcast_to(truth.get(source.site, np.nan), source.n_blocks)
+        for block, up in enumerate(source.seen()):
+            row = {
+                "source": source.name,
+                "block": block,
+                "above_horizon": bool(up),
+                "flux_jy": mean[at] * jansky,
+                "std_jy": std[at] * jansky,
+                "flux_k_sr": mean[at],
+                "std_k_sr": std[at],
+                "prior_jy": float(source.mean) * jansky,
+                "prior_std_jy": float(source.std) * jansky,
+            }
+            rows.append(row if data.truth is None else row | {"true_jy": true[block] * jansky})
+            at += 1
+    return pd.DataFrame(rows)
+
+
+def flux_lines(fluxes: pd.DataFrame) -> list[str]:
+    """One line for every source, or block of it."""
+    lines = []
+    for row in fluxes.to_dict("records"):
+        name = row["source"] if row["block"] == 0 else f"{row['source']} ({row['block']})"
+        text = f"{name}: {row['flux_jy']:.4g} +- {row['std_jy']:.2g} Jy"
+        if not row["above_horizon"]:
+            text += ", the prior's: it is never above the horizon"
+        lines.append(text)
+    return lines

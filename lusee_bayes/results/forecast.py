@@ -1,0 +1,200 @@
+"""What an observation would tell, from the posterior covariance alone: no data are needed.
+
+C = Lambda^-1 does not depend on d. Three numbers are taken from it:
+
+- information, ln|S C^-1| / 2 = ln|Lambda| / 2 of the white posterior: the mean of
+  ln p(m | d) / p(m) over skies and data of the model;
+- modes with SNR > 1: independent directions of the sky of which (S - C) / C > 1, that is whose
+  posterior variance is less than half of the prior's. They are eigenvectors of C relative to S, so
+  that their number does not depend on the basis in which m is written;
+- the expected SNR_ell. Over skies and data of the model, S = Cov(mean) + C: the mean map has
+  covariance S - C and its error C. What :func:`metrics.signal_to_noise` divides, sum_m mean^2 by
+  sum_m (mean - m)^2, has the expectations sum_m (S - C) and sum_m C.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.harmonics import sum_over_m
+from lusee_bayes.core.linalg import solve_lower
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.setup import Setup, set_up
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.products import all_products
+from lusee_bayes.linear.metrics import effective_resolution_deg, ell_cross, prior_fraction_per_ell
+from lusee_bayes.linear.posterior import Posterior
+
+AS_GIVEN = "as given"
+
+
+@dataclass(frozen=True)
+class Variation:
+    """A scenario to be weighed against others.
+
+    source : what it is a variation of; family, name : what differs; lost : ports that are dead,
+    of which every product is flagged
+    """
+
+    source: str
+    family: str
+    name: str
+    scenario: Scenario
+    lost: tuple[int, ...] = ()
+
+    def obstacle(self) -> str | None:
+        """Why its samples cannot be taken (a run without any night, ...); None if they can."""
+        try:
+            self.scenario.observation.observation()
+        except InputError as error:
+            return str(error)
+        return None
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a variation would tell.
+
+    days : of observing; n_data : samples of all products; information_bits : about the whole sky;
+    modes : how many have SNR > 1; snr_squared : (ells,) expected SNR_ell^2 for ell = 0..lmax;
+    resolution_deg : as in a map's summary, 180 degrees / ell_cross, None if there is none
+    """
+
+    variation: Variation
+    days: float
+    n_data: int
+    information_bits: float
+    modes: int
+    snr_squared: Float[np.ndarray, " ells"]
+    resolution_deg: float | None
+
+    @property
+    def ell_cross(self) -> int | None:
+        """The first ell >= 1 with an expected SNR_ell below 1; None if there is none."""
+        return ell_cross(self.snr_squared)
+
+
+def expected_snr_squared(posterior: Posterior) -> Float[np.ndarray, " ells"]:
+    """sum_m (S - C) / sum_m C for each ell, of a posterior over harmonic coefficients.
+
+    NaN at an ell where the prior has no power.
+    """
+    prior = sum_over_m(posterior.prior.variance())
+    left = sum_over_m(posterior.std() ** 2)
+    ratio = np.divide(prior, left, out=np.full_like(prior, np.nan), where=left > 0)
+    return ratio - 1.0
+
+
+def informed_modes(posterior: Posterior) -> int:
+    """How many eigen-directions of C relative to S keep less than half of the prior's variance.
+
+    Counted on the covariance of the whitened sky, whose eigenvalues lie between 0 and 1: on
+    Lambda, whose largest is 1e13, rounding would blur the threshold.
+    """
+    lower = jnp.tril(posterior.lower)
+    half = np.asarray(solve_lower(lower, jnp.eye(lower.shape[0]), transpose=False))
+    return int((np.linalg.eigvalsh(half.T @ half) < 0.5).sum())
+
+
+def without_ports(setup: Setup, lost: Sequence[int]) -> Setup:
+    """The setup with every product of the ``lost`` ports flagged at all times.
+
+    Raises
+    ------
+    InputError
+        For a port that does not exist, or if none is left.
+    """
+    layout = setup.layout
+    n_ports = round(np.sqrt(layout.n_products))
+    for port in lost:
+        if not 0 <= port < n_ports:
+            raise InputError(f"there is no port {port} to lose; ports are 0 to {n_ports - 1}")
+    dead = np.array([p.i in lost or p.j in lost for p in all_products(n_ports)])
+    left = DataLayout.from_flags(~np.asarray(layout.present) | dead[:, None])
+    instrument = replace(setup.instrument, layout=left)
+    coupling = instrument.coupling_of(setup.beams)
+    return replace(setup, instrument=instrument, coupling=coupling)
+
+
+def forecast(variation: Variation) -> Forecast:
+    """Build A, S and N of a variation and take the numbers from its posterior covariance.
+
+    N is the model's, with marginalised systematics and noise levels from the modelled sky.
+
+    Raises
+    ------
+    InputError
+        With the variation's name, for whatever is wrong with its scenario.
+    """
+    try:
+        setup = set_up(variation.scenario)
+        if variation.lost:
+            setup = without_ports(setup, variation.lost)
+        model = full_model(setup)
+        # the covariance is that of any data; these are the shortest to write
+        posterior = model.factorise().condition(jnp.zeros(model.n_data))
+        return Forecast(
+            variation=variation,
+            days=setup.observation.n_times * setup.observation.step_s / 86400.0,
+            n_data=model.n_data,
+            information_bits=float(posterior.information_bits()),
+            modes=informed_modes(posterior),
+            snr_squared=expected_snr_squared(posterior),
+            resolution_deg=effective_resolution_deg(prior_fraction_per_ell(posterior)),
+        )
+    except InputError as error:
+        raise InputError(f"{variation.source}, {variation.name}: {error}") from error
+
+
+def forecasts_of(variations: Iterable[Variation], stages: Stages | None = None) -> list[Forecast]:
+    """A forecast of every variation, in their order; what is there twice is computed once."""
+    variations, stages = list(variations), stages or Stages()
+    known: dict[tuple[str, tuple[int, ...]], Forecast] = {}
+    forecasts = []
+    with stages.progress("planning", len(variations)) as report:
+        for number, variation in enumerate(variations):
+            report(number, f"{variation.source}, {variation.name}")
+            key = variation.scenario.to_yaml(), variation.lost
+            if key not in known:
+                known[key] = forecast(variation)
+            forecasts.append(replace(known[key], variation=variation))
+            report(number + 1, "")
+    return forecasts
+
+
+def baseline(forecasts: Sequence[Forecast], source: str) -> Forecast:
+    """The first forecast of a source: the scenario that the others vary."""
+    return next(f for f in forecasts if f.variation.source == source)
+
+
+def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
+    """Rows of plan.csv; ``difference_bits`` is that to the same source's first variation."""
+    rows = []
+    for row in forecasts:
+        it = row.variation
+        more = row.information_bits - baseline(forecasts, it.source).information_bits
+        rows.append(
+            {
+                "scenario": it.source,
+                "family": it.family,
+                "variation": it.name,
+                "days": f"{row.days:.2f}",
+                "n_data": row.n_data,
+                "information_bits": f"{row.information_bits:.2f}",
+                "difference_bits": f"{more:.2f}",
+                "modes_snr_above_1": row.modes,
+                "ell_cross": "none" if row.ell_cross is None else row.ell_cross,
+                "resolution_deg": "none"
+                if row.resolution_deg is None
+                else f"{row.resolution_deg:.2f}",
+            }
+        )
+    return rows

@@ -1,0 +1,96 @@
+"""Maps as HEALPix FITS files whose headers say where they come from."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import healpy
+import numpy as np
+from astropy.io import fits
+from jaxtyping import Float
+
+from lusee_bayes.core.version import __version__, versions
+from lusee_bayes.experiment.scenario import Scenario
+
+# FITS keys have eight letters
+VERSION_KEYS = {
+    "lusee_bayes": "V_LUSEE",
+    "jax": "V_JAX",
+    "numpyro": "V_NPYRO",
+    "arviz-stats": "V_ARVIZ",
+    "numpy": "V_NUMPY",
+    "scipy": "V_SCIPY",
+    "healpy": "V_HEALPY",
+    "astropy": "V_ASTRO",
+    "lunarsky": "V_LUNAR",
+}
+
+
+def cards(name: str, scenario: Scenario) -> dict[str, object]:
+    """Header cards of a result: what it is, of which frequency, beam, site and scenario.
+
+    Values are (value, comment), or for text that would not fit a value alone.
+    """
+    beam, site = scenario.beam, scenario.observation
+    return {
+        "CONTENT": (name, "of the posterior over the sky"),
+        "FREQ": (scenario.frequency_mhz, "frequency in MHz"),
+        "LMAX": (scenario.lmax, "highest ell that is covered"),
+        "FRAME": ("galactic", "of directions"),
+        "BEAM": (beam.label, "the antennas"),
+        "SITELON": (site.lon_deg, "selenographic longitude in degrees"),
+        "SITELAT": (site.lat_deg, "selenographic latitude in degrees"),
+        "SCENHASH": scenario_hash(scenario),
+        "CREATOR": f"lusee_bayes {__version__}",
+        **{VERSION_KEYS[package]: (v, package) for package, v in versions().items()},
+    }
+
+
+def scenario_hash(scenario: Scenario) -> str:
+    """SHA-256 of the resolved scenario, as ``scenario.yaml`` holds it."""
+    return hashlib.sha256(scenario.to_yaml().encode()).hexdigest()
+
+
+def write_map(
+    path: Path, name: str, pixels: Float[np.ndarray, " pixels"], scenario: Scenario
+) -> None:
+    """Write one map of a scenario: HEALPix RING, Galactic, K, float64, for healpy.read_map."""
+    extra = [
+        (key, *value) if isinstance(value, tuple) else (key, value)
+        for key, value in cards(name, scenario).items()
+    ]
+    healpy.write_map(
+        path,
+        pixels,
+        coord="G",
+        column_names=[name.upper()],
+        column_units="K",
+        dtype=np.float64,
+        extra_header=extra,
+    )
+
+
+def write_cube(
+    path: Path, name: str, pixels: Float[np.ndarray, "frequencies pixels"], scenario: Scenario
+) -> None:
+    """Write maps of all of a scenario's frequencies in the layout of sky cubes (``sky.cubes``).
+
+    One image (frequency, pixel), HEALPix RING, Galactic, K, float64; the frequencies, which its
+    header can only give in even steps, are in a table behind it.
+    """
+    image = fits.PrimaryHDU(np.asarray(pixels, dtype=np.float64))
+    header, frequencies = image.header, np.array(scenario.frequencies_mhz)
+    for key, value in cards(name, scenario).items():
+        if key != "FREQ":
+            header[key] = value
+    header["BUNIT"], header["COORDSYS"], header["ORDERING"] = "K", "G", "RING"
+    header["NSIDE"] = scenario.map_nside
+    steps = np.diff(frequencies)
+    if not len(steps) or np.allclose(steps, steps[0], rtol=1e-9):
+        header["HIERARCH FREQ_START"] = (frequencies[0], "MHz")
+        header["FREQ_END"] = (frequencies[-1], "MHz")
+        header["HIERARCH FREQ_STEP"] = (steps[0] if len(steps) else 1.0, "MHz")
+    column = fits.Column("FREQUENCY", "D", unit="MHz", array=frequencies)
+    table = fits.BinTableHDU.from_columns([column], name="FREQUENCIES")
+    fits.HDUList([image, table]).writeto(path)

@@ -1,0 +1,179 @@
+"""A posterior map at one frequency, with what is needed to judge it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import jax
+import pandas as pd
+import xarray as xr
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.progress import Stages, peak_memory_gb
+from lusee_bayes.core.version import versions
+from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.experiment.inference import Inference, infer
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.terms import beam_rms_difference
+from lusee_bayes.linear.metrics import effective_resolution_deg
+from lusee_bayes.linear.updating import composed, deviation_model
+from lusee_bayes.results.channel import ChannelResult, channel_of_posterior
+from lusee_bayes.results.diagnostics import diagnostics, require_judgeable
+from lusee_bayes.results.fluxes import flux_lines, flux_table
+from lusee_bayes.results.updatable import Updatable, read_updatable
+
+
+@dataclass(frozen=True)
+class MapResult:
+    """A posterior map at one frequency: a cube of one channel, with its model at hand.
+
+    Attributes
+    ----------
+    experiment : Experiment
+    inference : Inference
+        The model and its posterior, given all data.
+    judged : Inference
+        The model that predicts the data: given the earlier ones, where there are any.
+    channel : ChannelResult
+    diagnostics : xarray.Dataset
+        What a report shows beyond the map (:func:`.diagnostics`).
+    fluxes : DataFrame or None
+        Of the point sources beside the map, a row each, if there are any.
+    digests : tuple of str
+        Of all data behind the posterior.
+    seconds : dict
+        By stage.
+    """
+
+    experiment: Experiment
+    inference: Inference
+    judged: Inference
+    channel: ChannelResult
+    diagnostics: xr.Dataset
+    fluxes: pd.DataFrame | None
+    digests: tuple[str, ...]
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def scenario(self) -> Scenario:
+        """The resolved scenario."""
+        return self.experiment.scenario
+
+    @property
+    def channels(self) -> tuple[ChannelResult, ...]:
+        """The one channel."""
+        return (self.channel,)
+
+    def summary(self) -> dict[str, object]:
+        """Figures of summary.json; null where a truth would be needed and is not known."""
+        channel = self.channel
+        return {
+            "frequency_mhz": channel.frequency_mhz,
+            "ell_cross": channel.ell_cross,
+            "effective_resolution_deg": effective_resolution_deg(channel.prior_fraction),
+            "log_evidence": channel.log_evidence,
+            "information_bits": channel.information_bits,
+            "chi2": channel.chi2,
+            "chi2_expected": channel.chi2_expected,
+            "n_data": channel.n_data,
+            "n_missing": channel.n_missing,
+            "n_modes": len(channel.mean),
+            "rounds": channel.rounds,
+            "beam_rms_difference": beam_rms_difference(self.experiment.setup),
+            "mean_refinement_sigma": channel.refinement,
+            "never_observed_fraction": channel.never_observed,
+            "seconds": {name: round(s, 3) for name, s in self.seconds.items()},
+            "peak_memory_gb": round(peak_memory_gb(), 3),
+            "versions": versions(),
+        }
+
+    def verdict(self) -> str:
+        """What the residuals say, in a sentence."""
+        return str(self.diagnostics.attrs["verdict"])
+
+    def headline(self) -> str:
+        """The few figures that matter, in one line."""
+        summary = self.summary()
+        parts = []
+        if self.channel.truth is not None:
+            cross = summary["ell_cross"]
+            parts.append(
+                "SNR > 1 at every ell" if cross is None else f"SNR < 1 first at ell {cross}"
+            )
+        resolution = summary["effective_resolution_deg"]
+        if resolution is not None:
+            parts.append(f"resolution {resolution:.1f} deg")
+        parts.append(f"chi2 {summary['chi2']:.0f} (expected {summary['chi2_expected']:.0f})")
+        parts.append(f"ln evidence {summary['log_evidence']:.1f}")
+        parts.append(f"{summary['information_bits']:.0f} bits")
+        return ", ".join(parts)
+
+    def lines(self) -> list[str]:
+        """What a terminal shows: headline, fluxes, verdict."""
+        fluxes = [] if self.fluxes is None else flux_lines(self.fluxes)
+        return [self.headline(), *fluxes, self.verdict()]
+
+
+def map_result(
+    experiment: Experiment, *, onto: Path | None = None, stages: Stages | None = None
+) -> MapResult:
+    """Condition an experiment's model on its data, and work out the uncertainties.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    onto : Path, optional
+        Folder of an updatable run, to whose data these are added.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        For data that the earlier run holds already, and as :func:`infer`.
+    """
+    stages = stages or Stages()
+    scenario, data = experiment.scenario, experiment.data
+    require_judgeable(experiment)
+    earlier = None if onto is None else read_updatable(onto, scenario)
+    digests = (data.digest(),)
+    with stages("posterior"):
+        found = judged = infer(experiment)
+        if earlier is not None:
+            found, judged = _updated(earlier, found, experiment)
+            digests = (*earlier.digests, *digests)
+        elif scenario.output.updatable:
+            posterior = found.model.condition(data.data, form="root")
+            found = judged = Inference(found.model, posterior, found.rounds, found.around)
+        jax.block_until_ready(found.posterior.white_mean)
+    with stages("standard deviations"):
+        channel = channel_of_posterior(
+            experiment, found, n_draws=scenario.output.draws, judged=judged
+        )
+    fluxes = None
+    if experiment.setup.responses and scenario.sources.treatment != "ignored":
+        with stages("fluxes"):
+            fluxes = flux_table(experiment, found)
+    with stages("diagnostics"):
+        page = diagnostics(experiment, found, judged, channel)
+    return MapResult(experiment, found, judged, channel, page, fluxes, digests, stages.seconds)
+
+
+def _updated(
+    earlier: Updatable, alone: Inference, experiment: Experiment
+) -> tuple[Inference, Inference]:
+    """The posterior given earlier data and these, and the model of these given the earlier ones."""
+    data = experiment.data
+    if data.digest() in earlier.digests:
+        raise InputError(
+            "these data are behind the earlier posterior already; a second time they would count "
+            "double"
+        )
+    deviations = deviation_model(earlier.posterior, alone.model)
+    deviation = deviations.condition(data.data, form="root")
+    posterior = composed(earlier.posterior, deviation)
+    return (
+        Inference(alone.model, posterior, alone.rounds, alone.around),
+        Inference(deviations, deviation, alone.rounds, alone.around),
+    )

@@ -1,0 +1,64 @@
+"""A comparison: finished map runs side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.tables import write_csv
+from lusee_bayes.report.comparison_page import comparison_page
+from lusee_bayes.report.figures import comparison as comparison_figures
+from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, read_runs
+from lusee_bayes.runs.folder import FIGURES, Output, RunKind, run_folder, write_run
+
+
+@dataclass(frozen=True)
+class ComparisonRun:
+    """A finished comparison: the runs that were compared, the folder and the files in it."""
+
+    runs: list[FinishedRun]
+    folder: Path
+    files: list[Path]
+
+
+def run_compare(
+    folders: Sequence[str | Path], folder: str | Path, *, stages: Stages | None = None
+) -> ComparisonRun:
+    """Set finished map runs side by side, and write page, table and figures in one transaction.
+
+    Parameters
+    ----------
+    folders : sequence of paths
+        Of finished map runs, two or more.
+    folder : path
+        Of the results.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        For fewer than two folders, or one that is not of a finished map run.
+    """
+    stages = stages or Stages()
+    with run_folder(folder) as place:
+        runs = read_runs(folders)
+        return ComparisonRun(runs, place, write_run(place, runs, COMPARISON, stages))
+
+
+def _write_page(runs: list[FinishedRun], folder: Path) -> None:
+    (folder / "comparison.html").write_text(comparison_page(runs, folder / FIGURES))
+
+
+# what the folder of a comparison holds; a new file is one line here
+COMPARISON = RunKind(
+    "compare",
+    outputs=(
+        Output(_write_page),
+        Output(lambda runs, folder: write_csv(folder / "comparison.csv", comparison_rows(runs))),
+    ),
+    figures={"maps": comparison_figures.maps, "curves": comparison_figures.curves},
+    dpi=100,
+)

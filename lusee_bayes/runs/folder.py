@@ -1,0 +1,153 @@
+"""The folder of a run: written in one transaction, and what it holds if that does not happen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.files import MANIFEST, recover, require_folder, transaction
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.report.pages import PAGES, REPORT
+
+FIGURES = "figures"
+
+
+class RunInterrupted(KeyboardInterrupt):
+    """A run was interrupted; the message says what its folder holds."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """A file, or several, of a run's folder.
+
+    Attributes
+    ----------
+    write : callable
+        ``write(result, folder)`` writes into a folder.
+    wanted : callable
+        ``wanted(result)``: whether the run has it.
+    """
+
+    write: Callable[[Any, Path], None]
+    wanted: Callable[[Any], bool] = lambda result: True
+
+
+@dataclass(frozen=True)
+class RunKind:
+    """What the folder of one kind of run holds.
+
+    Attributes
+    ----------
+    name : str
+        Kept in ``manifest.json``; a page of this name in ``PAGES`` becomes ``report.html``.
+    outputs : sequence of Output
+    figures : mapping
+        ``draw(result)`` by the name of its PNG in ``figures/``.
+    unfinished : str
+        The folder that holds unfinished work, removed when the results are there.
+    dpi : int
+        Of the figures.
+    """
+
+    name: str
+    outputs: Sequence[Output]
+    figures: Mapping[str, Callable[[Any], Figure]]
+    unfinished: str = ""
+    dpi: int = 110
+
+
+@contextmanager
+def run_folder(folder: str | Path, unfinished: str = "", resume: str = "") -> Iterator[Path]:
+    """Open a folder for a run, and say what it holds if the run is interrupted.
+
+    Parameters
+    ----------
+    folder : path
+    unfinished : str
+        The folder in it that holds unfinished work.
+    resume : str
+        How the run is gone on with.
+
+    Yields
+    ------
+    Path
+        The folder; an interrupted transaction of an earlier run is completed.
+
+    Raises
+    ------
+    InputError
+        If ``folder``, or what it would lie in, is a file.
+    RunInterrupted
+        Instead of KeyboardInterrupt.
+    """
+    folder = Path(folder)
+    require_folder(folder)
+    recover(folder)
+    before = _written_at(folder)
+    try:
+        yield folder
+    except KeyboardInterrupt as interrupt:
+        raise RunInterrupted(_state(folder, before, unfinished, resume)) from interrupt
+
+
+def _written_at(folder: Path) -> int | None:
+    manifest = folder / MANIFEST
+    return manifest.stat().st_mtime_ns if manifest.is_file() else None
+
+
+def _state(folder: Path, before: int | None, unfinished: str, resume: str) -> str:
+    recover(folder)
+    now = _written_at(folder)
+    if now is not None and now != before:
+        return f"the new results in '{folder}' are complete"
+    earlier = "nothing has been written" if now is None else "the earlier results are as they were"
+    if unfinished and any((folder / unfinished).glob("*")):
+        return f"{earlier} in '{folder}'; {resume}"
+    return f"{earlier} in '{folder}'"
+
+
+def write_run(folder: Path, result: Any, kind: RunKind, stages: Stages) -> list[Path]:
+    """Draw all figures and write all files of a run, in one transaction.
+
+    Parameters
+    ----------
+    folder : Path
+    result : object
+        What the outputs and figures of ``kind`` take.
+    kind : RunKind
+    stages : Stages
+        Told what is being done.
+
+    Returns
+    -------
+    list of Path
+        The files, in the folder.
+    """
+    discard = [kind.unfinished] if kind.unfinished else []
+    with transaction(folder, kind.name, discard) as stage:
+        if kind.figures:
+            (stage / FIGURES).mkdir()
+            with stages("figures"):
+                for name, draw in kind.figures.items():
+                    draw(result).savefig(stage / FIGURES / f"{name}.png", dpi=kind.dpi)
+        with stages("files"):
+            for output in kind.outputs:
+                if output.wanted(result):
+                    output.write(result, stage)
+            if kind.name in PAGES:
+                page = PAGES[kind.name](stage, folder.resolve().name)
+                (stage / REPORT).write_text(page)
+        files = sorted(path.relative_to(stage) for path in stage.rglob("*") if path.is_file())
+    return [folder / name for name in files]
+
+
+def require_single_frequency(name: str, given: bool) -> None:
+    """InputError where an option of single maps is given for several frequencies."""
+    if given:
+        raise InputError(f"{name} is for a single frequency; leave out frequencies_mhz")

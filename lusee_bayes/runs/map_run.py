@@ -1,0 +1,212 @@
+"""A map run: the posterior over the sky at one frequency, or at several."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.process_group import ProcessGroup
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.tables import rows_of, write_csv
+from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.experiment import build, with_truth
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.linear.compact import CompactPosterior
+from lusee_bayes.report.figures import channel as channel_figures
+from lusee_bayes.report.figures import cube as cube_figures
+from lusee_bayes.report.figures import diagnostics as diagnostic_figures
+from lusee_bayes.results.channel_files import CHANNELS
+from lusee_bayes.results.cube import CubeResult
+from lusee_bayes.results.cube_channels import cube_result
+from lusee_bayes.results.diagnostics import write_diagnostics
+from lusee_bayes.results.map_files import cards, write_cube, write_map
+from lusee_bayes.results.map_result import MapResult, map_result
+from lusee_bayes.results.posterior_file import about, write_posterior
+from lusee_bayes.runs.folder import (
+    Output,
+    RunKind,
+    require_single_frequency,
+    run_folder,
+    write_run,
+)
+from lusee_bayes.sky import write_alms
+
+
+@dataclass(frozen=True)
+class MapRun:
+    """A finished map run.
+
+    Attributes
+    ----------
+    result : MapResult or CubeResult
+        Of one frequency, or of several.
+    folder : Path
+    files : list of Path
+        What was written.
+    """
+
+    result: MapResult | CubeResult
+    folder: Path
+    files: list[Path]
+
+
+def run_map(
+    scenario: Scenario,
+    folder: str | Path,
+    *,
+    data: Path | None = None,
+    truth: bool = False,
+    onto: Path | None = None,
+    group: ProcessGroup | None = None,
+    stages: Stages | None = None,
+) -> MapRun:
+    """Make a posterior map of a scenario, or of given data, and write its folder.
+
+    The folder is written in one transaction. A run of several frequencies that was stopped goes on
+    with the same call.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of one frequency or of several; ``output`` says what is written besides the maps.
+    folder : path
+        Of the results.
+    data : Path, optional
+        Visibilities to map; without them the scenario's own are simulated.
+    truth : bool
+        The given data are of the scenario's own sky: compare the map with it.
+    onto : Path, optional
+        Folder of an updatable run, to whose data these are added.
+    group : ProcessGroup, optional
+        The processes that share the channels; only the first one writes.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        If the scenario samples something, or for whatever is wrong with scenario, data or folder.
+    """
+    group, stages = group or ProcessGroup(), stages or Stages()
+    if scenario.samples:
+        raise InputError(
+            "the scenario says that something is to be sampled, and a map can only marginalise; "
+            "use: lusee-bayes sample"
+        )
+    if not scenario.frequencies_mhz:
+        return _run_single(scenario, folder, data, truth, onto, stages)
+    output = scenario.output
+    require_single_frequency("--covariance", output.covariance)
+    require_single_frequency("--compact", output.compact)
+    require_single_frequency("--updatable", output.updatable)
+    require_single_frequency("--onto", onto is not None)
+    resume = "the same command goes on from the channels that are done"
+    with run_folder(folder, CHANNELS, resume) as place:
+        cube = cube_result(scenario, place, data=data, truth=truth, group=group, stages=stages)
+        files = write_run(place, cube, CUBE, stages) if group.is_first else []
+        return MapRun(cube, place, files)
+
+
+def _run_single(
+    scenario: Scenario,
+    folder: str | Path,
+    data: Path | None,
+    truth: bool,
+    onto: Path | None,
+    stages: Stages,
+) -> MapRun:
+    with run_folder(folder) as place:
+        measured = None if data is None else read_data(data, scenario)
+        experiment = build(scenario, measured, stages)
+        if truth:
+            experiment = with_truth(experiment)
+        result = map_result(experiment, onto=onto, stages=stages)
+        return MapRun(result, place, write_run(place, result, MAP, stages))
+
+
+def _write_maps(result: MapResult, folder: Path) -> None:
+    for name, pixels in result.channel.maps().items():
+        write_map(folder / f"{name}.fits", name, pixels, result.scenario)
+
+
+def _write_coefficients(result: MapResult, folder: Path) -> None:
+    header = cards("mean", result.scenario)
+    write_alms(folder / "mean_alm.fits", result.channel.mean, header)
+
+
+def _write_compact(result: MapResult, folder: Path) -> None:
+    compact = CompactPosterior.of(result.inference.posterior)
+    compact.write(folder / "posterior_compact.npz", about(result.scenario))
+
+
+def _write_cubes(result: CubeResult, folder: Path) -> None:
+    for name, pixels in result.maps().items():
+        write_cube(folder / f"{name}.fits", name, pixels, result.scenario)
+
+
+def _write_scenario(result: MapResult | CubeResult, folder: Path) -> None:
+    (folder / "scenario.yaml").write_text(result.scenario.to_yaml())
+
+
+def _write_summary(result: MapResult | CubeResult, folder: Path) -> None:
+    (folder / "summary.json").write_text(json.dumps(result.summary(), indent=2) + "\n")
+
+
+# what the folder of a map holds; a new file is one line here
+MAP = RunKind(
+    "map",
+    outputs=(
+        Output(lambda result, folder: write_posterior(result, folder / "posterior.nc")),
+        Output(_write_maps),
+        Output(_write_coefficients),
+        Output(_write_compact, wanted=lambda result: result.scenario.output.compact),
+        Output(
+            lambda result, folder: write_csv(
+                folder / "spectra.csv", rows_of(result.channel.spectra())
+            )
+        ),
+        Output(
+            lambda result, folder: result.fluxes.to_csv(folder / "sources.csv", index=False),
+            wanted=lambda result: result.fluxes is not None,
+        ),
+        Output(
+            lambda result, folder: write_diagnostics(result.diagnostics, folder / "diagnostics.nc")
+        ),
+        Output(_write_scenario),
+        Output(_write_summary),
+    ),
+    figures={
+        "maps": lambda result: channel_figures.maps(result.channel),
+        "data_vector": lambda result: channel_figures.data_vector(result.experiment.data),
+        "beams": lambda result: channel_figures.beams(result.experiment.setup),
+        "fidelity": lambda result: channel_figures.fidelity(result.channel),
+        "spectra": lambda result: channel_figures.spectra(result.channel),
+        "draws": lambda result: diagnostic_figures.draws(result.diagnostics),
+        "residuals": lambda result: diagnostic_figures.residuals(result.diagnostics),
+    },
+)
+
+CUBE = RunKind(
+    "cube",
+    outputs=(
+        Output(
+            lambda result, folder: result.to_dataset().to_netcdf(
+                folder / "posterior.nc", engine="h5netcdf"
+            )
+        ),
+        Output(_write_cubes),
+        Output(lambda result, folder: write_csv(folder / "spectra.csv", result.spectra())),
+        Output(_write_scenario),
+        Output(_write_summary),
+    ),
+    figures={
+        "maps": cube_figures.maps,
+        "spectra": cube_figures.spectra,
+        "fidelity": cube_figures.fidelity,
+        "chi2": cube_figures.chi2,
+    },
+    unfinished=CHANNELS,
+    dpi=100,
+)

@@ -1,0 +1,132 @@
+"""The reference paper in one run: cases computed once and kept, then figures and judged claims."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lusee_bayes.core.files import replacing
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.tables import write_csv
+from lusee_bayes.paper.cases import case_table, compute_case, paper_scenarios, read_case
+from lusee_bayes.paper.claim_table import claim_table, claims_as_markdown
+from lusee_bayes.paper.claims import Cases, cross
+from lusee_bayes.paper.figures import FIGURES
+from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
+
+CASES, UNFINISHED = "cases", "unfinished-cases"
+RESUME = "the same command goes on from the cases that are done"
+
+
+@dataclass(frozen=True)
+class PaperRun:
+    """The paper's cases.
+
+    Attributes
+    ----------
+    cases : mapping
+        Datasets (:func:`.compute_case`) by name.
+    claims : list of dict
+        The paper's claims with their verdicts, a row each.
+    folder : Path
+    files : list of Path
+        What was written.
+    """
+
+    cases: Cases
+    claims: list[dict[str, object]]
+    folder: Path
+    files: list[Path]
+
+
+@dataclass(frozen=True)
+class _Computed:
+    """The cases, and the file in which each is."""
+
+    cases: Cases
+    paths: dict[str, Path]
+
+
+def run_paper(
+    folder: str | Path,
+    overrides: Sequence[str] = (),
+    skies: Sequence[str | Path] = (),
+    stages: Stages | None = None,
+) -> PaperRun:
+    """Compute what is missing of the paper's cases, then draw the figures and judge the claims.
+
+    Cases that were computed before with the same scenario and version are kept. The folder changes
+    in one transaction, when all are there.
+
+    Parameters
+    ----------
+    folder : path
+        Of the results.
+    overrides : sequence of str
+        ``key.path=value``, applied to every case.
+    skies : sequence of paths
+        ULSA HDF5 files whose names tell the frequency; each case scales the nearest one.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        For skies whose names do not tell, and for overrides that do not fit.
+    """
+    stages = stages or Stages()
+    scenarios = paper_scenarios(overrides, skies)
+    with run_folder(folder, UNFINISHED, RESUME) as place:
+        cases, paths = {}, {}
+        with stages.progress("cases", len(scenarios)) as report:
+            for number, (name, scenario) in enumerate(scenarios.items()):
+                report(number, name)
+                paths[name] = place / UNFINISHED / f"{name}.nc"
+                case = read_case(paths[name], scenario)
+                if case is None:
+                    case = read_case(place / CASES / f"{name}.nc", scenario)
+                    paths[name] = paths[name] if case is None else place / CASES / f"{name}.nc"
+                if case is None:
+                    case = compute_case(scenario)
+                    with replacing(paths[name]) as partial:
+                        case.to_netcdf(partial, engine="h5netcdf")
+                cases[name] = case
+                report(number + 1, f"{name}: first SNR < 1 at ell {cross(case)}")
+        files = write_run(place, _Computed(cases, paths), PAPER, stages)
+        return PaperRun(cases, claim_table(cases), place, files)
+
+
+def _write_cases(computed: _Computed, folder: Path) -> None:
+    (folder / CASES).mkdir()
+    for name, path in computed.paths.items():
+        target = folder / CASES / f"{name}.nc"
+        try:
+            os.link(path, target)
+        except OSError:  # not every file system has links
+            shutil.copy2(path, target)
+
+
+def _write_claims(computed: _Computed, folder: Path) -> None:
+    claims = claim_table(computed.cases)
+    write_csv(folder / "claims.csv", claims)
+    (folder / "claims.md").write_text(claims_as_markdown(claims))
+
+
+# what the folder of the paper's run holds; a new file is one line here
+PAPER = RunKind(
+    "paper",
+    outputs=(
+        Output(_write_cases),
+        Output(
+            lambda computed, folder: write_csv(folder / "cases.csv", case_table(computed.cases))
+        ),
+        Output(_write_claims),
+    ),
+    figures={
+        name: lambda computed, draw=draw: draw(computed.cases) for name, draw in FIGURES.items()
+    },
+    unfinished=UNFINISHED,
+)

@@ -1,0 +1,57 @@
+"""A plan: what observations would tell, without data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.tables import write_csv
+from lusee_bayes.report.figures import plan as plan_figures
+from lusee_bayes.results.forecast import Forecast, Variation, forecast_rows, forecasts_of
+from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
+
+
+@dataclass(frozen=True)
+class PlanRun:
+    """A finished plan: a forecast for every variation, the folder and the files in it."""
+
+    forecasts: list[Forecast]
+    folder: Path
+    files: list[Path]
+
+
+def run_plan(
+    variations: Sequence[Variation], folder: str | Path, *, stages: Stages | None = None
+) -> PlanRun:
+    """Forecast what every variation would tell, and write table and figure in one transaction.
+
+    Parameters
+    ----------
+    variations : sequence of Variation
+        Such as those of :func:`.default_variations`.
+    folder : path
+        Of the results.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        With the variation's name, for whatever is wrong with its scenario.
+    """
+    stages = stages or Stages()
+    with run_folder(folder) as place:
+        forecasts = forecasts_of(variations, stages)
+        return PlanRun(forecasts, place, write_run(place, forecasts, PLAN, stages))
+
+
+# what the folder of a plan holds; a new file is one line here
+PLAN = RunKind(
+    "plan",
+    outputs=(
+        Output(lambda forecasts, folder: write_csv(folder / "plan.csv", forecast_rows(forecasts))),
+    ),
+    figures={"plan": plan_figures.forecasts},
+)

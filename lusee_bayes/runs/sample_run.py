@@ -1,0 +1,161 @@
+"""A sampling run: draws from the posterior of a NumPyro program."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.files import transaction
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.report.figures import chains as chain_figures
+from lusee_bayes.report.figures import samples as sample_figures
+from lusee_bayes.results.map_files import write_cube, write_map
+from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult, sample_result
+from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
+from lusee_bayes.sampling.datatree import write_datatree
+from lusee_bayes.sampling.hmc import Sampler
+from lusee_bayes.sampling.programs import Program, load_program
+
+RESUME = "go on with --resume"
+
+
+@dataclass(frozen=True)
+class SampleRun:
+    """A finished sampling run.
+
+    Attributes
+    ----------
+    results : tuple of SampleResult
+        One for each frequency.
+    folder : Path
+    files : list of Path
+        What was written.
+    """
+
+    results: tuple[SampleResult, ...]
+    folder: Path
+    files: list[Path]
+
+
+def default_program(scenario: Scenario) -> Program:
+    """``systematics`` where the scenario says that something is to be sampled, else ``sky``."""
+    return load_program("systematics" if scenario.samples else "sky")
+
+
+def run_sample(
+    scenario: Scenario,
+    folder: str | Path,
+    *,
+    program: Program | None = None,
+    sampler: Sampler | None = None,
+    data: Path | None = None,
+    resume: bool = False,
+    stages: Stages | None = None,
+) -> SampleRun:
+    """Sample the posterior of a program, and write the folder in one transaction.
+
+    Several frequencies are sampled one after the other, each in a folder of its own, and their maps
+    are put together in cubes.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    folder : path
+        Of the results; draws are kept in it as they come.
+    program : Program, optional
+        By default :func:`default_program`.
+    sampler : Sampler, optional
+        By default with the scenario's seed.
+    data : Path, optional
+        Visibilities to use; without them the scenario's own are simulated.
+    resume : bool
+        Go on with the unfinished run in the folder, or take over a finished one.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        For a joint scenario, an unfinished run in the folder that is not to be resumed, and for
+        whatever is wrong with scenario, program, data or folder.
+    """
+    if scenario.joint:
+        raise InputError(
+            "channels are sampled one by one; the joint posterior is Gaussian, and lusee-bayes map "
+            "--joint --draws N draws from it exactly"
+        )
+    program = program or default_program(scenario)
+    sampler = sampler or Sampler(seed=scenario.seed)
+    folder = Path(folder)
+    if not scenario.frequencies_mhz:
+        return _run_single(scenario, folder, program, sampler, data, resume, stages)
+    runs = []
+    for channel in scenario.channels():
+        where = folder / f"{channel.frequency_mhz:g}MHz"
+        own = Stages(stages.console, verbose=stages.verbose) if stages else Stages()
+        runs.append(_run_single(channel, where, program, sampler, data, resume, own))
+    results = tuple(result for run in runs for result in run.results)
+    with run_folder(folder) as place, transaction(place, "sampled cubes") as stage:
+        for name in ("mean", "std"):
+            pixels = np.stack([result.maps[name] for result in results])
+            write_cube(stage / f"{name}.fits", name, pixels, scenario)
+        (stage / "scenario.yaml").write_text(scenario.to_yaml())
+    files = [folder / name for name in ("mean.fits", "std.fits", "scenario.yaml")]
+    return SampleRun(results, folder, [*(f for run in runs for f in run.files), *files])
+
+
+def _run_single(
+    scenario: Scenario,
+    folder: Path,
+    program: Program,
+    sampler: Sampler,
+    data: Path | None,
+    resume: bool,
+    stages: Stages | None,
+) -> SampleRun:
+    stages = stages or Stages()
+    with run_folder(folder, CHAINS, RESUME) as place:
+        measured = None if data is None else read_data(data, scenario)
+        experiment = build(scenario, measured, stages)
+        result = sample_result(experiment, program, sampler, place, resume=resume, stages=stages)
+        return SampleRun((result,), place, write_run(place, result, SAMPLE, stages))
+
+
+def _write_maps(result: SampleResult, folder: Path) -> None:
+    for name, pixels in result.maps.items():
+        write_map(folder / f"{name}.fits", name, pixels, result.experiment.scenario)
+
+
+def _write_summaries(result: SampleResult, folder: Path) -> None:
+    result.summary_table().to_csv(folder / "summary.csv", index_label="quantity")
+    (folder / "scenario.yaml").write_text(result.experiment.scenario.to_yaml())
+    (folder / "sampling.json").write_text(json.dumps(result.figures(), indent=2) + "\n")
+
+
+SAMPLE_OUTPUTS = (
+    Output(lambda result, folder: write_datatree(result.tree, folder / SAMPLES)),
+    Output(_write_maps),
+    Output(_write_summaries),
+)
+
+# what the folder of a sampled program holds; a new file is one line here
+SAMPLE = RunKind(
+    "sample",
+    outputs=SAMPLE_OUTPUTS,
+    figures={
+        "uncertainty": sample_figures.uncertainty,
+        "traces": sample_figures.traces,
+        "ranks": lambda result: chain_figures.ranks(result.quantities()),
+        "energy": lambda result: chain_figures.energy(result.tree["sample_stats"].dataset),
+        "pairs": lambda result: chain_figures.pairs(result.quantities()),
+        "against_analytic": lambda result: chain_figures.against_analytic(result.tree),
+    },
+    unfinished=CHAINS,
+)

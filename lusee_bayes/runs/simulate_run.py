@@ -1,0 +1,73 @@
+"""A simulation: visibilities of a scenario in a file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.instrument.waterfalls import write_waterfall
+
+
+def run_simulate(
+    scenario: Scenario,
+    path: str | Path,
+    *,
+    frequencies_mhz: Sequence[float] = (),
+    stages: Stages | None = None,
+) -> list[Visibilities]:
+    """Simulate the visibilities of a scenario, and write them whole or not at all.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    path : path
+        The file: netCDF, or luseepy's waterfall if the name ends in ``.fits``.
+    frequencies_mhz : sequence of float
+        Channels of a waterfall; the noise of each has a seed of its own, one more than that of the
+        channel before. None for the scenario's frequency alone.
+    stages : Stages, optional
+        Told what is being done.
+
+    Returns
+    -------
+    list of Visibilities
+        One for each channel.
+
+    Raises
+    ------
+    InputError
+        For several channels in a netCDF file, and for what a waterfall cannot hold.
+    """
+    path, channels = Path(path), (scenario,)
+    stages = stages or Stages()
+    if frequencies_mhz:
+        if path.suffix != ".fits":
+            raise InputError(
+                f"'{path}': netCDF files hold one frequency; with --frequencies, give -o a name "
+                "that ends in .fits"
+            )
+        several = scenario.model_copy(update={"frequencies_mhz": tuple(frequencies_mhz)})
+        channels = several.channels()
+    experiments = [
+        build(channel, stages=Stages(stages.console, verbose=stages.verbose))
+        for channel in channels
+    ]
+    data = [experiment.data for experiment in experiments]
+    if path.suffix != ".fits":
+        data[0].write(path, {"scenario": scenario.to_yaml()})
+        return data
+    unknown = complex(np.nan, np.nan)
+    impedance = [
+        experiment.setup.beam_source.impedance(experiment.scenario.frequency_mhz)
+        for experiment in experiments
+    ]
+    ohm = np.array([unknown if z is None else z for z in impedance])
+    write_waterfall(path, data, ohm, scenario.to_yaml())
+    return data

@@ -1,0 +1,112 @@
+"""A validation: HMC and simulated data sets against the analytic posterior."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.report.figures import samples as sample_figures
+from lusee_bayes.results.sample_result import CHAINS, sample_result
+from lusee_bayes.results.validation_result import ValidationResult
+from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
+from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS
+from lusee_bayes.sampling.calibration import calibrate_sky, require_simulations
+from lusee_bayes.sampling.hmc import Sampler
+from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.sampling.validation import require_draws, validate_draws
+
+
+@dataclass(frozen=True)
+class ValidationRun:
+    """A finished validation: its result, its folder and the files in it."""
+
+    result: ValidationResult
+    folder: Path
+    files: list[Path]
+
+
+def run_validate(
+    scenario: Scenario,
+    folder: str | Path,
+    *,
+    name: str = "the scenario",
+    sampler: Sampler | None = None,
+    simulations: int = 500,
+    data: Path | None = None,
+    resume: bool = False,
+    stages: Stages | None = None,
+) -> ValidationRun:
+    """Check the analytic posterior of a scenario by HMC and by simulated data sets.
+
+    The folder is written in one transaction.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    folder : path
+        Of the results; draws are kept in it as they come.
+    name : str
+        Of the scenario, for the title.
+    sampler : Sampler, optional
+        By default with the scenario's seed.
+    simulations : int
+        Data sets for simulation-based calibration.
+    data : Path, optional
+        Visibilities to use; without them the scenario's own are simulated.
+    resume : bool
+        Go on with the unfinished run in the folder, or judge the finished one again.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        For too few draws or simulations, and as :func:`run_sample`.
+    """
+    stages = stages or Stages()
+    sampler = sampler or Sampler(seed=scenario.seed)
+    program = load_program("sky")
+    require_simulations(simulations)
+    require_draws(sampler.draws)
+    with run_folder(folder, CHAINS, RESUME) as place:
+        measured = None if data is None else read_data(data, scenario)
+        experiment = build(scenario, measured, stages)
+        sampled = sample_result(experiment, program, sampler, place, resume=resume, stages=stages)
+        posterior, model = sampled.inference.posterior, sampled.inference.model
+        with stages("comparison"):
+            stats = sampled.tree["sample_stats"]
+            found = validate_draws(
+                sampled.skies, posterior, stats["diverging"].values, stats["energy"].values
+            )
+        with stages.progress("calibration", simulations) as update:
+            ranks = calibrate_sky(
+                model, model, n_simulations=simulations, seed=scenario.seed, report=update
+            )
+        result = ValidationResult(name, sampled, found, ranks)
+        return ValidationRun(result, place, write_run(place, result, VALIDATION, stages))
+
+
+def _of_sampled(output: Output) -> Output:
+    return Output(lambda result, folder: output.write(result.sampled, folder))
+
+
+def _write_verdict(result: ValidationResult, folder: Path) -> None:
+    (folder / "validation.json").write_text(json.dumps(result.as_json(), indent=2) + "\n")
+    (folder / "validation.md").write_text(result.as_markdown())
+
+
+# what the folder of a validation holds; a new file is one line here
+VALIDATION = RunKind(
+    "validate",
+    outputs=(*map(_of_sampled, SAMPLE_OUTPUTS), Output(_write_verdict)),
+    figures={
+        "comparison": lambda result: sample_figures.comparison(result.comparison),
+        "calibration": lambda result: sample_figures.calibration(result.ranks),
+    },
+    unfinished=CHAINS,
+)

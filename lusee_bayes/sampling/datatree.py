@@ -1,0 +1,166 @@
+"""Draws as an ArviZ DataTree: every group that belongs to a sampled model, on netCDF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import arviz_base
+import jax
+import numpy as np
+import xarray as xr
+from numpyro.infer import Predictive
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.harmonics import lmax_of, mode_numbers
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.sampling.chains import Chains
+from lusee_bayes.sampling.programs import Program, collapsed_skies, is_collapsed, replicated_data
+from lusee_bayes.sampling.promotion import numpyro_promotion
+from lusee_bayes.systematics.base import SKY
+
+FORMAT = "lusee_bayes samples 1"
+DATA = "data"
+
+
+def to_datatree(
+    chains: Chains,
+    program: Program,
+    model: LinearGaussian,
+    posterior: Posterior,
+    data: Visibilities,
+    *,
+    seed: int = 0,
+    n_predictive: int = 100,
+    arguments: dict[str, Any] | None = None,
+    truth: dict[str, float | np.ndarray] | None = None,
+    attributes: dict[str, object] | None = None,
+) -> xr.DataTree:
+    """Collect draws and everything that belongs to them.
+
+    The groups are posterior, sample_stats, prior, prior and posterior predictive, data and
+    constants. Skies are on dims (chain, draw, mode) with coords ell and m, in K; data on (datum)
+    with coords product and time. Skies of programs that integrate them out are drawn.
+
+    Parameters
+    ----------
+    chains : Chains
+        Draws of the program's sites.
+    program : Program
+        The program.
+    model : LinearGaussian
+        The model with all systematics in N.
+    posterior : Posterior
+        Its analytic posterior, kept among the constants.
+    data : Visibilities
+        The data.
+    seed : int
+        Of the predictive draws.
+    n_predictive : int
+        Number of draws of the prior and of each predictive group.
+    arguments : dict, optional
+        The program's arguments without the data, if they are not those of ``model``.
+    truth : dict, optional
+        True values of sites, kept among the constants as true_NAME.
+    attributes : dict, optional
+        Further attributes of the tree.
+    """
+    arguments = program.arguments(model) if arguments is None else arguments
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1), 3)
+    sites = dict(chains.sites)
+    collapsed = is_collapsed(program, arguments, data.data)
+    n_chains, n_draws = next(iter(sites.values())).shape[:2]
+    step = max(1, n_chains * n_draws // n_predictive)
+    with numpyro_promotion():
+        if collapsed:
+            sites[SKY] = collapsed_skies(program, arguments, data.data, sites, keys[0])
+        prior = Predictive(program.model, num_samples=n_predictive)(keys[1], **arguments)
+        thinned = {name: values[:, ::step] for name, values in sites.items()}
+        if collapsed:
+            skies = thinned.pop(SKY)
+            replicated = replicated_data(program, arguments, data.data, thinned, skies, keys[2])
+        else:
+            again = Predictive(program.model, thinned, batch_ndims=2, return_sites=["data"])
+            replicated = np.asarray(again(keys[2], **arguments)["data"])
+    prior = {name: np.asarray(values)[None] for name, values in prior.items()}
+    constants = {
+        "prior_std": np.sqrt(np.asarray(model.prior.variance())),
+        "analytic_mean": np.asarray(posterior.mean),
+        "analytic_std": np.asarray(posterior.std()),
+    }
+    if data.truth is not None:
+        constants["truth"] = np.asarray(data.truth)
+    dims = {SKY: ["mode"], "data": ["datum"], "gains": ["antenna", "sample"]}
+    dims |= {name: ["mode"] for name in constants}
+    for name, value in (truth or {}).items():
+        if name in sites:
+            constants[f"true_{name}"] = np.asarray(value)
+    groups = {
+        "posterior": sites,
+        "sample_stats": chains.statistics,
+        "prior": {name: v for name, v in prior.items() if name in sites},
+        "prior_predictive": {"data": prior["data"]},
+        "posterior_predictive": {"data": replicated},
+        "observed_data": {"data": np.asarray(data.data)},
+        "constant_data": constants,
+    }
+    tree = arviz_base.from_dict(
+        groups,
+        dims=dims,
+        check_conventions=False,  # more chains than draws is unusual, not wrong
+        attrs={"/": {"format": FORMAT, "program": program.name, **(attributes or {})}},
+    )
+    tree["posterior_predictive"] = tree["posterior_predictive"].dataset.assign_coords(
+        draw=np.arange(n_draws)[::step]
+    )
+    return _with_coordinates(tree, model, data)
+
+
+def _with_coordinates(tree: xr.DataTree, model: LinearGaussian, data: Visibilities) -> xr.DataTree:
+    """ell and m of every mode, product and time of every sample, and units."""
+    ell, m = mode_numbers(lmax_of(model.prior.size))
+    times = data.observation.times.isot
+    labels = np.asarray(data.labels)
+    mode = {"ell": ("mode", ell), "m": ("mode", m)}
+    sample = {
+        "product": ("datum", labels[data.layout.product]),
+        "time": ("datum", np.asarray(times)[data.layout.time]),
+    }
+
+    def labelled(dataset: xr.Dataset) -> xr.Dataset:
+        for dimension, coordinates in [("mode", mode), ("datum", sample)]:
+            if dimension in dataset.dims:
+                dataset = dataset.assign_coords(coordinates)
+        for name in dataset.data_vars:
+            if {"mode", "datum"} & set(dataset[name].dims):
+                dataset[name].attrs["units"] = "K"
+        return dataset
+
+    return tree.map_over_datasets(labelled)
+
+
+def write_datatree(tree: xr.DataTree, path: Path) -> None:
+    """Write every group to one netCDF file."""
+    tree.to_netcdf(path, engine="h5netcdf")
+
+
+def read_datatree(path: str | Path) -> xr.DataTree:
+    """Read a file of :func:`write_datatree`.
+
+    Raises
+    ------
+    InputError
+        For any other file.
+    """
+    try:
+        tree = xr.load_datatree(path, engine="h5netcdf")
+    except (OSError, ValueError) as error:
+        raise InputError(f"'{path}' cannot be read as samples: {error}") from error
+    if tree.attrs.get("format") != FORMAT:
+        raise InputError(
+            f"'{path}' is not a file of samples: its format is '{tree.attrs.get('format')}', "
+            f"expected '{FORMAT}' (lusee-bayes sample writes one)"
+        )
+    return tree

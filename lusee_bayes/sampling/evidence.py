@@ -1,0 +1,222 @@
+"""Which program suits the data better: evidences, and ArviZ's comparison of predictions.
+
+Evidence: importance sampling from the Gaussian about the posterior's mode (heavier in the tails),
+with its error. Prediction: ln p(d_i | all other data) of every datum with full N, which Pareto
+smoothed importance sampling turns into the expected log density of data left out (``compare``).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import arviz_base
+import arviz_stats
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import xarray as xr
+from jaxtyping import Array, Float
+from numpyro import distributions as dist
+from numpyro import handlers
+from numpyro.infer.util import potential_energy
+
+from lusee_bayes.core.checks import AnyArray, InputError
+from lusee_bayes.sampling.mode import LaplaceApproximation, laplace_approximation
+from lusee_bayes.sampling.programs import Program
+from lusee_bayes.sampling.promotion import numpyro_promotion
+
+# degrees of freedom of the proposal, whose tails are heavier than a Gaussian's
+TAILS = 7.0
+DATA = "data"
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The evidence of a program.
+
+    Attributes
+    ----------
+    log_evidence : float
+        ln p(d).
+    error : float
+        Its standard error.
+    effective : float
+        Effective number of draws.
+    laplace : LaplaceApproximation
+        The Gaussian that the draws were proposed from.
+    """
+
+    log_evidence: float
+    error: float
+    effective: float
+    laplace: LaplaceApproximation
+
+
+def estimate_evidence(
+    program: Program,
+    arguments: Mapping[str, Any],
+    data: Float[AnyArray, " data"],
+    *,
+    n: int = 400,
+    seed: int = 0,
+) -> Evidence:
+    """Estimate ln p(d) with everything that the program samples integrated out.
+
+    Meant for programs of few sites, the sky integrated out. Trust it if the effective number of
+    draws is a good share of ``n``.
+
+    Parameters
+    ----------
+    program : Program
+        The program.
+    arguments : mapping
+        What it asks for, without the data.
+    data : (data,) array
+        d, in K.
+    n : int
+        Number of draws.
+    seed : int
+        Of the draws.
+
+    Raises
+    ------
+    InputError
+        If the mode of the posterior is not found.
+    """
+    arguments = {**arguments, DATA: jnp.asarray(data)}
+    laplace = laplace_approximation(program.model, arguments).require_converged()
+    with numpyro_promotion():
+        weights = np.asarray(_log_weights(program, arguments, laplace, n, jax.random.key(seed)))
+    relative = np.exp(weights - weights.max())
+    log_mean = weights.max() + np.log(relative.mean())
+    effective = relative.sum() ** 2 / (relative**2).sum()
+    error = relative.std(ddof=1) / relative.mean() / np.sqrt(n)
+    return Evidence(float(log_mean), float(error), float(effective), laplace)
+
+
+@eqx.filter_jit
+def _log_weights(
+    program: Program, arguments: dict[str, Any], laplace: LaplaceApproximation, n: int, key
+) -> Float[Array, " draws"]:
+    """ln of density over proposal, a Student t in the white coordinates."""
+    whitening = laplace.whitening
+    size = whitening.root.shape[1]
+    proposal = dist.MultivariateStudentT(TAILS, jnp.zeros(size), jnp.eye(size))
+    z = proposal.sample(key, (n,))
+
+    def one(z):
+        x = whitening.split(whitening.mean + whitening.root @ z)
+        return whitening.log_det - potential_energy(program.model, (), arguments, x)
+
+    return jax.lax.map(one, z) - proposal.log_prob(z)
+
+
+def pointwise(
+    program: Program,
+    arguments: Mapping[str, Any],
+    data: Float[AnyArray, " data"],
+    sites: Mapping[str, np.ndarray],
+) -> Float[np.ndarray, "chains draws data"]:
+    """Compute ln p(d_i | all other data, sites) of every datum and draw.
+
+    Parameters
+    ----------
+    program : Program
+        The program.
+    arguments : mapping
+        What it asks for, without the data.
+    data : (data,) array
+        d, in K.
+    sites : mapping of (chains, draws, ...) array
+        Draws by site.
+
+    Raises
+    ------
+    InputError
+        If the program's data are not at a site Marginal or CorrelatedNormal.
+    """
+    shape = next(iter(sites.values())).shape[:2]
+    flat = {
+        name: jnp.asarray(v).reshape(shape[0] * shape[1], *v.shape[2:]) for name, v in sites.items()
+    }
+    with numpyro_promotion():
+        rows = _pointwise(program, {**arguments, DATA: jnp.asarray(data)}, flat)
+    return np.asarray(rows).reshape(*shape, -1)
+
+
+@eqx.filter_jit
+def _pointwise(
+    program: Program, arguments: dict[str, Any], sites: dict[str, Array]
+) -> Float[Array, "draws data"]:
+    def one(values):
+        model = handlers.substitute(handlers.seed(program.model, 0), values)
+        fn = handlers.trace(model).get_trace(**arguments)[DATA]["fn"]
+        if not hasattr(fn, "leave_one_out"):
+            raise InputError(
+                f"the data of the program '{program.name}' follow {type(fn).__name__}; a "
+                "comparison needs Marginal or CorrelatedNormal"
+            )
+        return fn.leave_one_out(arguments[DATA])
+
+    return jax.lax.map(one, sites)
+
+
+def with_log_likelihood(
+    tree: xr.DataTree,
+    program: Program,
+    arguments: Mapping[str, Any],
+    *,
+    most: int = 400,
+) -> xr.DataTree:
+    """Make a tree of some of the draws, with a group log_likelihood (chain, draw, datum).
+
+    Parameters
+    ----------
+    tree : DataTree
+        From :func:`~lusee_bayes.sampling.datatree.to_datatree`.
+    program : Program
+        The program that was sampled.
+    arguments : mapping
+        What it asks for, without the data.
+    most : int
+        Use this many draws at most, but one of each chain at least.
+
+    Returns
+    -------
+    DataTree
+        Its posterior has these draws only.
+    """
+    posterior = tree["posterior"].dataset
+    each = max(1, most // posterior.sizes["chain"])
+    step = -(-posterior.sizes["draw"] // each)
+    few = posterior.isel(draw=slice(None, None, step))
+    data = tree["observed_data"]["data"].values
+    sites = {str(name): value.values for name, value in few.data_vars.items()}
+    rows = pointwise(program, arguments, data, sites)
+    return arviz_base.from_dict(
+        {"posterior": sites, "log_likelihood": {DATA: rows}},
+        dims={DATA: ["datum"]},
+        check_conventions=False,
+    )
+
+
+def compare_programs(trees: Mapping[str, xr.DataTree]) -> pd.DataFrame:
+    """Make ArviZ's table of expected log predictive densities, the best program first.
+
+    Programs that sample the sky predict given the sky, collapsed ones without it: do not compare
+    one with the other.
+
+    Parameters
+    ----------
+    trees : mapping of DataTree
+        By name, from :func:`with_log_likelihood`, all of the same data.
+    """
+    with warnings.catch_warnings():
+        # of how ArviZ calls pandas
+        warnings.filterwarnings("ignore", message="The inplace keyword in")
+        return arviz_stats.compare(dict(trees))

@@ -1,0 +1,269 @@
+"""Probabilistic programs: files with a NumPyro ``model``, and what they can ask for."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key, PRNGKeyArray
+from numpyro import handlers
+
+from lusee_bayes.core.checks import AnyArray, InputError, nearest
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.sampling.promotion import numpyro_promotion
+
+# the programs that come along: beside the package in a checkout, inside it once installed
+PACKAGE = Path(__file__).parents[1]
+FOLDERS = (PACKAGE / "models", PACKAGE.parent / "models")
+
+# what a program's arguments may be called: pieces of the model with all systematics in N, ...
+PIECES: dict[str, Callable[[LinearGaussian], Any]] = {
+    "coupling": lambda model: model.coupling,
+    "prior": lambda model: model.prior,
+    "noise": lambda model: model.noise,
+    "fixed_noise": lambda model: model.noise.factor(),
+}
+
+# ... and of the experiment: the model without those that are to be sampled, and they themselves
+EXPERIMENT_PIECES = ("gaussian", "systematics", "gain_drifts", "instrument", "sources")
+
+
+@dataclass(frozen=True)
+class Program:
+    """A NumPyro model whose arguments are ``data`` and pieces of a model or an experiment.
+
+    Called with ``data=None`` it is the prior predictive. If it returns a LinearGaussian, it has
+    integrated the sky out; :func:`collapsed_skies` then draws it.
+
+    Attributes
+    ----------
+    name : str
+        Name of its file, without suffix.
+    model : callable
+        The NumPyro model.
+    digest : str
+        SHA-256 of its text.
+    path : str
+        Its file.
+    """
+
+    name: str
+    model: Callable
+    digest: str
+    path: str = ""
+
+    def arguments(
+        self, model: LinearGaussian, more: Mapping[str, Callable[[], Any]] | None = None
+    ) -> dict[str, Any]:
+        """Collect what the program asks for; all but the data.
+
+        Parameters
+        ----------
+        model : LinearGaussian
+            With all systematics in N; its pieces are ``PIECES``.
+        more : mapping of callable, optional
+            What makes the pieces of an experiment, by name
+            (:func:`lusee_bayes.experiment.pieces.program_pieces`).
+
+        Raises
+        ------
+        InputError
+            If the program asks for a piece that is not there.
+        """
+        found = {}
+        for name in inspect.signature(self.model).parameters:
+            if name in PIECES:
+                found[name] = PIECES[name](model)
+            elif name != "data":
+                if more is None or name not in more:
+                    raise InputError(
+                        f"the program '{self.name}' asks for '{name}', a piece of an experiment; "
+                        "give arguments() the experiment's pieces"
+                    )
+                found[name] = more[name]()
+        return found
+
+
+def program_names() -> list[str]:
+    """Return the names of the programs that come with the package."""
+    return sorted({path.stem for folder in FOLDERS for path in folder.glob("*.py")})
+
+
+def load_program(source: str | Path) -> Program:
+    """Load a program.
+
+    Parameters
+    ----------
+    source : str or Path
+        Name of a program that comes with the package, or path of a Python file.
+
+    Raises
+    ------
+    InputError
+        If there is none, if it cannot be run, or if it asks for something unknown.
+    """
+    path = _find(source)
+    text = path.read_bytes()
+    module = ModuleType(f"lusee_bayes_program_{path.stem}")
+    module.__file__ = str(path)
+    # compiled from the text that is hashed, never from a cache of an earlier one; dataclasses look
+    # their module up by name
+    sys.modules[module.__name__] = module
+    try:
+        exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
+    except Exception as error:  # whatever a user's file may raise: it is not our failure
+        del sys.modules[module.__name__]
+        kind = type(error).__name__
+        raise InputError(f"the program '{path}' does not run: {kind}: {error}") from error
+    model = getattr(module, "model", None)
+    if not callable(model):
+        raise InputError(
+            f"'{path}' has no function 'model'; a program is def model(..., data=None)"
+        )
+    asked = inspect.signature(model).parameters
+    if "data" not in asked:
+        raise InputError(f"model in '{path}' has no argument 'data'; the data could not enter it")
+    if asked["data"].default is not None:
+        raise InputError(
+            f"model in '{path}' has no data=None; without data, data are drawn from it"
+        )
+    for name in asked:
+        known = [*PIECES, *EXPERIMENT_PIECES]
+        if name != "data" and name not in known:
+            raise InputError(
+                f"model in '{path}' asks for '{name}', which is neither data nor a piece; "
+                f"{nearest(name, known)}"
+            )
+    return Program(path.stem, model, hashlib.sha256(text).hexdigest(), str(path))
+
+
+def _find(source: str | Path) -> Path:
+    if str(source) in program_names():
+        return next(f / f"{source}.py" for f in FOLDERS if (f / f"{source}.py").exists())
+    path = Path(source)
+    if path.suffix == ".py" and path.is_file():
+        return path
+    raise InputError(
+        f"no program '{source}': give the path of a Python file, or one of "
+        f"{', '.join(program_names())}"
+    )
+
+
+@numpyro_promotion()
+def is_collapsed(program: Program, arguments: dict[str, Any], data: AnyArray) -> bool:
+    """Tell whether the program integrates the sky out: its model returns a LinearGaussian."""
+    found = []
+
+    def run(dynamic):
+        result = handlers.seed(program.model, 0)(**eqx.combine(dynamic, static), data=data)
+        found.append(isinstance(result, LinearGaussian))
+
+    dynamic, static = eqx.partition(arguments, eqx.is_array)
+    jax.eval_shape(run, dynamic)
+    return found[0]
+
+
+def collapsed_skies(
+    program: Program,
+    arguments: dict[str, Any],
+    data: Float[AnyArray, " data"],
+    sites: dict[str, np.ndarray],
+    key: PRNGKeyArray,
+) -> Float[np.ndarray, "chains draws modes"]:
+    """Draw the sky exactly, given each draw of the other sites.
+
+    Parameters
+    ----------
+    program : Program
+        One that integrates the sky out.
+    arguments : dict
+        What it asks for, without the data.
+    data : (data,) array
+        d, in K.
+    sites : dict of (chains, draws, ...) array
+        Draws by site.
+    key : PRNG key
+        Of the skies.
+
+    Returns
+    -------
+    (chains, draws, modes) array
+        In K.
+    """
+    return _map_draws(program, arguments, data, sites, None, key)
+
+
+def replicated_data(
+    program: Program,
+    arguments: dict[str, Any],
+    data: Float[AnyArray, " data"],
+    sites: dict[str, np.ndarray],
+    skies: Float[np.ndarray, "chains draws modes"],
+    key: PRNGKeyArray,
+) -> Float[np.ndarray, "chains draws data"]:
+    """Simulate data of a collapsed program again: of the drawn skies, with new noise.
+
+    Parameters
+    ----------
+    program : Program
+        One that integrates the sky out.
+    arguments : dict
+        What it asks for, without the data.
+    data : (data,) array
+        d, in K.
+    sites : dict of (chains, draws, ...) array
+        Draws by site.
+    skies : (chains, draws, modes) array
+        From :func:`collapsed_skies`, in K.
+    key : PRNG key
+        Of the noise.
+
+    Returns
+    -------
+    (chains, draws, data) array
+        In K.
+    """
+    return _map_draws(program, arguments, data, sites, skies, key)
+
+
+@numpyro_promotion()
+def _map_draws(program, arguments, data, sites, skies, key) -> np.ndarray:
+    shape = next(iter(sites.values())).shape[:2]
+    per_draw = jax.tree.map(
+        lambda v: jnp.asarray(v).reshape(shape[0] * shape[1], *v.shape[2:]), (sites, skies)
+    )
+    keys = jax.random.split(key, shape[0] * shape[1])
+    rows = _draw(program, arguments, jnp.asarray(data), *per_draw, keys)
+    return np.asarray(rows).reshape(*shape, -1)
+
+
+@eqx.filter_jit
+def _draw(
+    program: Program,
+    arguments: dict[str, Any],
+    data: Float[Array, " data"],
+    sites: dict[str, Array],
+    skies: Float[Array, "draws modes"] | None,
+    keys: Key[Array, " draws"],
+) -> Float[Array, "draws n"]:
+    """Skies, or data where skies are given, one draw after the other."""
+
+    def one(inputs):
+        values, sky, key = inputs
+        model = handlers.substitute(handlers.seed(program.model, 0), values)
+        gaussian = model(**arguments, data=data)
+        if sky is None:
+            return gaussian.condition(data).sample(key)
+        return gaussian.predict(sky) + gaussian.noise.sample(key)
+
+    return jax.lax.map(one, (sites, skies, keys))

@@ -1,0 +1,262 @@
+"""The prior on skies of several frequencies: few maps with known spectra, and a residual of each.
+
+::
+
+    m_f = sum_c s_fc a_c + r_f,    a_c ~ N(0, C^c_ell),    r_f ~ N(0, R^f_ell),
+
+so S = sum_c s_c s_c^T (x) C^c + diag(R^f). The spectra are those of a power law, its curvature and
+its turnover, or the principal ones of a kernel in ln frequency; the residual is what they leave.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lusee_bayes.core.checks import (
+    AnyArray,
+    InputError,
+    nearest,
+    require_finite,
+    require_float64,
+    require_positive,
+    require_shape,
+)
+from lusee_bayes.core.harmonics import per_mode, power_spectrum
+from lusee_bayes.sky.priors import HarmonicPrior
+
+# spectra over the power law: x is frequency / reference, y frequency / turnover; ionised gas takes
+# 1 - exp(-tau) away, and tau goes as nu^-2.1 (Altenhoff et al. 1960)
+SPECTRA = {
+    "power_law": lambda x, y: np.ones_like(x),
+    "curvature": lambda x, y: np.log(x),
+    "turnover": lambda x, y: -np.expm1(-(y**-2.1)),
+}
+# principal spectra of a kernel with a smaller share of the variance are left out
+KERNEL_TOLERANCE = 1e-10
+
+
+class SpectralPrior(eqx.Module):
+    """N(0, S) over the skies of all channels; see the module's equations.
+
+    Attributes
+    ----------
+    frequencies_mhz : (channels,) array
+        Frequencies in MHz.
+    mixing : (channels, components) array
+        s_fc.
+    spectra : (components, ells) array
+        C^c_ell, in K^2.
+    residual : (channels, ells) array, optional
+        R^f_ell, in K^2; None for no residual.
+    names : tuple of str
+        Names of the components.
+
+    Raises
+    ------
+    InputError
+        If shapes do not fit, or numbers are not finite or not positive.
+    """
+
+    frequencies_mhz: Float[Array, " channels"]
+    mixing: Float[Array, "channels components"]
+    spectra: Float[Array, "components ells"]
+    residual: Float[Array, "channels ells"] | None = None
+    names: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self):
+        channels, components = self.mixing.shape
+        for name, values, shape in (
+            ("the frequencies", self.frequencies_mhz, (channels,)),
+            ("the mixing", self.mixing, (None, None)),
+            ("the components' spectra", self.spectra, (components, None)),
+        ):
+            require_float64(name, values)
+            require_shape(name, values, shape)
+            require_finite(name, values)
+        require_positive("the components' C_ell", self.spectra)
+        if self.residual is not None:
+            require_float64("the residual spectra", self.residual)
+            require_shape("the residual spectra", self.residual, (channels, self.spectra.shape[1]))
+            require_positive(
+                "the residual spectra", self.residual, "leave them out if there is no residual"
+            )
+
+    @classmethod
+    def components(
+        cls,
+        frequencies_mhz: Float[AnyArray, " channels"],
+        skies: Float[AnyArray, "channels modes"],
+        names: tuple[str, ...] = tuple(SPECTRA),
+        *,
+        index: float = -2.5,
+        reference_mhz: float = 20.0,
+        turnover_mhz: float = 5.0,
+        residual: float | None = None,
+    ) -> SpectralPrior:
+        """Fit components of ``SPECTRA`` times a power law to model skies.
+
+        The components' C_ell are those of the fit.
+
+        Parameters
+        ----------
+        frequencies_mhz : (channels,) array
+            Frequencies in MHz.
+        skies : (channels, modes) array
+            Model skies, in K.
+        names : tuple of str
+            Keys of ``SPECTRA``.
+        index : float
+            Spectral index of the power law.
+        reference_mhz, turnover_mhz : float
+            Frequencies of ``SPECTRA`` in MHz.
+        residual : float, optional
+            Rms of each channel's residual over that of its sky. 0 is no residual; None takes
+            what the fit leaves.
+
+        Raises
+        ------
+        InputError
+            For unknown names, and for fewer channels than the components need.
+        """
+        for name in names:
+            if name not in SPECTRA:
+                raise InputError(f"unknown component '{name}'; {nearest(name, SPECTRA)}")
+        frequencies, skies = np.asarray(frequencies_mhz), np.asarray(skies)
+        if not names or len(frequencies) < len(names):
+            raise InputError(
+                f"{len(names)} spectral components need at least as many channels, got "
+                f"{len(frequencies)}"
+            )
+        if residual is None and len(frequencies) == len(names):
+            raise InputError(
+                f"{len(names)} spectral components fit the skies of {len(frequencies)} channels "
+                "exactly, whatever these are; give a residual, or fewer components"
+            )
+        x, y = frequencies / reference_mhz, frequencies / turnover_mhz
+        power_law = x**index
+        shapes = np.stack([SPECTRA[name](x, y) for name in names], axis=1)
+        # in units of the power law, so that no channel rules the fit
+        maps, *_ = np.linalg.lstsq(shapes, skies / power_law[:, None], rcond=None)
+        mixing = shapes * power_law[:, None]
+        # the fit has taken its share of the residuals' variance
+        free = len(frequencies) / max(len(frequencies) - len(names), 1)
+        left_over = np.sqrt(free) * (skies - mixing @ maps)
+        return cls(
+            jnp.asarray(frequencies),
+            jnp.asarray(mixing),
+            jnp.asarray(power_spectrum(maps)),
+            _residual_spectra(skies, left_over, residual),
+            names,
+        )
+
+    @classmethod
+    def kernel(
+        cls,
+        frequencies_mhz: Float[AnyArray, " channels"],
+        skies: Float[AnyArray, "channels modes"],
+        *,
+        length: float = 1.0,
+        index: float = -2.5,
+        reference_mhz: float = 20.0,
+        residual: float = 0.01,
+    ) -> SpectralPrior:
+        """Use the principal spectra of a kernel in ln frequency.
+
+        S = C_ell (x) K with K = (x x')^index exp(-ln^2(x / x') / 2 length^2), x = nu / reference.
+        C_ell is the mean over channels of the model skies' over the power law's square. Principal
+        spectra below ``KERNEL_TOLERANCE`` of the first are left out.
+
+        Parameters
+        ----------
+        frequencies_mhz : (channels,) array
+            Frequencies in MHz.
+        skies : (channels, modes) array
+            Model skies, in K.
+        length : float
+            Correlation length in ln frequency.
+        index : float
+            Spectral index of the power law.
+        reference_mhz : float
+            Its reference frequency in MHz.
+        residual : float
+            Rms of each channel's residual over that of its sky; 0 is no residual.
+
+        Raises
+        ------
+        InputError
+            For a length that is not positive, and a negative residual.
+        """
+        require_positive("the kernel's length in ln frequency", length)
+        frequencies, skies = np.asarray(frequencies_mhz), np.asarray(skies)
+        log_x = np.log(frequencies / reference_mhz)
+        power_law = np.exp(index * log_x)
+        correlation = np.exp(-((log_x[:, None] - log_x[None]) ** 2) / (2.0 * length**2))
+        values, vectors = np.linalg.eigh(correlation)
+        kept = values > KERNEL_TOLERANCE * values[-1]
+        values, vectors = values[kept][::-1], vectors[:, kept][:, ::-1]
+        spectrum = power_spectrum(skies / power_law[:, None]).mean(0)
+        return cls(
+            jnp.asarray(frequencies),
+            jnp.asarray(power_law[:, None] * vectors),
+            jnp.asarray(values[:, None] * spectrum),
+            _residual_spectra(skies, None, residual),
+            tuple(f"principal {k}" for k in range(len(values))),
+        )
+
+    @property
+    def n_channels(self) -> int:
+        """Number of frequencies."""
+        return self.mixing.shape[0]
+
+    @property
+    def n_components(self) -> int:
+        """Number of component maps."""
+        return self.mixing.shape[1]
+
+    @property
+    def lmax(self) -> int:
+        """Highest ell."""
+        return self.spectra.shape[1] - 1
+
+    @property
+    def roots(self) -> Float[Array, "components modes"]:
+        """Prior standard deviations of the component maps, in K."""
+        return jnp.sqrt(per_mode(self.spectra))
+
+    def residual_root(self, channel: int) -> Float[Array, " modes"] | None:
+        """Return prior standard deviations of a channel's residual, in K; None if it has none."""
+        return None if self.residual is None else jnp.sqrt(per_mode(self.residual[channel]))
+
+    def of_channel(self, channel: int) -> HarmonicPrior:
+        """Return the prior of one channel by itself."""
+        spectrum = self.mixing[channel] ** 2 @ self.spectra
+        if self.residual is not None:
+            spectrum = spectrum + self.residual[channel]
+        return HarmonicPrior(spectrum)
+
+    def sample(self, key: PRNGKeyArray) -> Float[Array, "channels modes"]:
+        """Draw skies of all channels from the prior, in K."""
+        roots = self.roots
+        first, second = jax.random.split(key)
+        skies = self.mixing @ (roots * jax.random.normal(first, roots.shape, dtype=jnp.float64))
+        if self.residual is None:
+            return skies
+        std = jnp.sqrt(per_mode(self.residual))
+        return skies + std * jax.random.normal(second, std.shape, dtype=jnp.float64)
+
+
+def _residual_spectra(
+    skies: np.ndarray, left_over: np.ndarray | None, residual: float | None
+) -> Float[Array, "channels ells"] | None:
+    """R^f_ell: of what a fit left over of the skies, or of a share of them."""
+    if residual is None:
+        if left_over is None:
+            raise InputError("give the rms of the residual over that of the sky")
+        return jnp.asarray(power_spectrum(left_over))
+    if residual < 0:
+        raise InputError(f"the residual must not be negative, got {residual}")
+    return None if residual == 0 else jnp.asarray(residual**2 * power_spectrum(skies))

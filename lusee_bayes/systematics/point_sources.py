@@ -1,0 +1,139 @@
+"""Point sources of known place and unknown flux: columns of A with a prior of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+from jaxtyping import Array, Float
+from numpyro import distributions as dist
+
+from lusee_bayes.core.checks import require_finite, require_positive, require_shape
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.noise.covariance import LowRankCovariance
+from lusee_bayes.sky.priors import IndependentPrior
+from lusee_bayes.systematics.base import Systematic, scalar
+
+
+class Source(eqx.Module):
+    """The response of the data to one source, and the prior of its flux.
+
+    Attributes
+    ----------
+    columns : (data, blocks) array
+        Response to 1 K sr in each block of time, in K per K sr.
+    mean, std : () array
+        Of the flux's Gaussian prior, in K sr.
+    name : str
+        The source's name.
+
+    Raises
+    ------
+    InputError
+        If the response is not finite or no matrix, or if ``std`` is not positive.
+    """
+
+    columns: Float[Array, "data blocks"]
+    mean: Float[Array, ""] = eqx.field(converter=scalar)
+    std: Float[Array, ""] = eqx.field(converter=scalar)
+    name: str = eqx.field(static=True)
+
+    def __check_init__(self):
+        require_finite(f"the response to {self.name}", self.columns)
+        require_shape(f"the response to {self.name}", self.columns, (None, None))
+        require_positive(f"the prior standard deviation of {self.name}'s flux", self.std)
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of amplitudes."""
+        return self.columns.shape[1]
+
+    @property
+    def site(self) -> str:
+        """Name of its site: ``flux_Cas_A``."""
+        return f"flux_{self.name.replace(' ', '_')}"
+
+    def seen(self) -> np.ndarray:
+        """Tell for each block whether the source is ever above the horizon: (blocks,) booleans.
+
+        If not, only the prior says how bright it is.
+        """
+        return np.asarray(jnp.abs(self.columns).max(0) > 0)
+
+
+class PointSources(Systematic):
+    """Sources with independent Gaussian priors of their fluxes.
+
+    The map is then the sky without them.
+
+    Attributes
+    ----------
+    sources : tuple of Source
+        The sources.
+    """
+
+    sources: tuple[Source, ...]
+
+    @property
+    def changes_coupling(self) -> bool:
+        return False
+
+    def columns(self) -> Float[Array, "data amplitudes"]:
+        """Return the responses of all sources and blocks side by side, in K per K sr."""
+        return jnp.concatenate([source.columns for source in self.sources], axis=1)
+
+    def mean(self) -> Float[Array, " amplitudes"]:
+        """Return the prior means in K sr."""
+        return jnp.concatenate([jnp.full(s.n_blocks, s.mean) for s in self.sources])
+
+    def std(self) -> Float[Array, " amplitudes"]:
+        """Return the prior standard deviations in K sr."""
+        return jnp.concatenate([jnp.full(s.n_blocks, s.std) for s in self.sources])
+
+    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
+        """Add T P T^T to N, and the mean fluxes to the offset."""
+        columns = self.columns()
+        noise = model.noise + LowRankCovariance(columns * self.std()[None], "the sources")
+        return _with_added(replace(model, noise=noise), columns @ self.mean())
+
+    def sampled(self, model: LinearGaussian) -> LinearGaussian:
+        """Sample one site for each source: ``flux_NAME`` in K sr, (blocks,) or a number."""
+        signal = jnp.zeros(model.n_data)
+        for source in self.sources:
+            prior = dist.Normal(jnp.full(source.n_blocks, source.mean), source.std)
+            if source.n_blocks == 1:
+                flux = numpyro.sample(source.site, dist.Normal(source.mean, source.std))
+                signal = signal + source.columns[:, 0] * flux
+            else:
+                signal = signal + source.columns @ numpyro.sample(source.site, prior.to_event(1))
+        return _with_added(model, signal)
+
+    def joint(self, model: LinearGaussian) -> LinearGaussian:
+        """Make sky and fluxes one vector of unknowns: d = [A, T] (m, f - mean) + ... .
+
+        Parameters
+        ----------
+        model : LinearGaussian
+            The model without the sources.
+
+        Returns
+        -------
+        LinearGaussian
+            Its ``condition`` gives the posterior of both. The last unknowns are the fluxes minus
+            their prior means, in K sr.
+        """
+        columns, response = self.columns(), model.coupling.response
+        if response is not None:
+            columns = columns * response[:, None]
+        prior = IndependentPrior(jnp.concatenate([model.prior.diagonal_root(), self.std()]))
+        both = replace(
+            model, coupling=jnp.concatenate([model.coupling.dense(), columns], axis=1), prior=prior
+        )
+        return _with_added(both, columns @ self.mean())
+
+
+def _with_added(model: LinearGaussian, signal: Float[Array, " data"]) -> LinearGaussian:
+    return replace(model, offset=signal if model.offset is None else model.offset + signal)

@@ -1,0 +1,247 @@
+"""The commands as a user meets them: files, figures, exit codes, messages."""
+
+import csv
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+
+import healpy
+import jax
+import matplotlib.image
+import numpy as np
+import pytest
+import xarray as xr
+from astropy.io import fits
+
+import lusee_bayes
+from lusee_bayes.cli import map_command
+from lusee_bayes.cli.main import main
+from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
+from lusee_bayes.experiment.schema import OutputSection
+from lusee_bayes.results.map_result import MapResult
+from lusee_bayes.runs import map_run as runs
+
+SMALL = [
+    argument
+    for override in ["lmax=6", "observation.runs.0.cycles=0.1"]
+    for argument in ("--set", override)
+]
+
+
+def run(*arguments) -> int:
+    return main([str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def folder(small_map):
+    """Of a finished map run, shared: to be read."""
+    return small_map.folder
+
+
+def test_map_writes_what_it_promises(folder):
+    assert {p.name for p in folder.iterdir()} == {
+        "posterior.nc", "mean.fits", "mean_alm.fits", "std.fits", "truth.fits", "residual.fits",
+        "spectra.csv", "summary.json", "scenario.yaml", "diagnostics.nc", "report.html", "figures",
+        "manifest.json",
+    }  # fmt: skip
+    for figure in ("maps", "data_vector", "beams", "fidelity", "spectra", "draws", "residuals"):
+        image = matplotlib.image.imread(folder / "figures" / f"{figure}.png")
+        assert image.std() > 0.01  # not blank
+
+
+def test_the_files_agree_with_each_other(folder):
+    posterior = xr.open_dataset(folder / "posterior.nc", engine="h5netcdf")
+    mean, std = posterior["mean"].values, posterior["std"].values
+    np.testing.assert_array_equal(
+        posterior["ell"].values ** 2 + posterior["ell"].values + posterior["m"].values,
+        np.arange(81),
+    )
+    covariance = posterior["covariance"].values
+    # rounding of products of numbers that span 1e10 in the covariance
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std, rtol=1e-7)
+    nside = 8
+    kelvin = healpy.read_map(folder / "mean.fits", dtype=np.float64)
+    np.testing.assert_allclose(kelvin, modes_to_map(mean, nside), rtol=1e-12)
+    y = pixel_matrix(nside, 8)
+    expected = np.sqrt(np.einsum("pi,ij,pj->p", y, covariance, y))
+    got = healpy.read_map(folder / "std.fits", dtype=np.float64)
+    np.testing.assert_allclose(got, expected, rtol=1e-6)
+    # 400 draws: each variance to 5 sigma of sqrt(2 / 400), 81 of them
+    ratio = posterior["draws"].values.var(axis=0, ddof=1) / std**2
+    assert np.abs(ratio - 1).max() < 5 * np.sqrt(2 / 400)
+    # sqrt(2) there and back again
+    alm = healpy.read_alm(folder / "mean_alm.fits")
+    np.testing.assert_allclose(from_healpy(alm), mean, rtol=4e-16)
+    with (folder / "spectra.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0])[:7] == [
+        "ell", "rho", "snr", "cl_prior", "cl_mean", "cl_truth", "cl_posterior_variance",
+    ]  # fmt: skip
+    assert float(rows[2]["cl_posterior_variance"]) == pytest.approx(np.mean(std[4:9] ** 2))
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["n_data"], summary["n_modes"]) == (16 * 64, 81)
+
+
+def test_headers_say_where_the_numbers_come_from(folder):
+    text = (folder / "scenario.yaml").read_text()
+    for name in ("mean", "std", "truth", "residual", "mean_alm"):
+        with fits.open(folder / f"{name}.fits") as hdus:
+            header = hdus[1].header
+        said = {key: header[key] for key in ("CONTENT", "FREQ", "LMAX", "FRAME", "BEAM")}
+        content = name.removesuffix("_alm")
+        assert list(said.values()) == [content, 25.0, 8, "galactic", "monopole"]
+        assert (header["SITELON"], header["SITELAT"]) == (182.258, -23.814)
+        assert header["SCENHASH"] == hashlib.sha256(text.encode()).hexdigest()
+        assert header["CREATOR"] == f"lusee_bayes {lusee_bayes.__version__}"
+        assert header["V_JAX"] == jax.__version__ and header["V_NUMPY"] == np.__version__
+        if name != "mean_alm":
+            assert (header["COORDSYS"], header["ORDERING"], header["TUNIT1"]) == ("G", "RING", "K")
+            assert header["NSIDE"] == 8
+            # every bit of the pixels
+            assert healpy.read_map(folder / f"{name}.fits", dtype=None).dtype.itemsize == 8
+
+
+@pytest.mark.long
+def test_the_resolved_scenario_gives_the_same_numbers(folder, tmp_path):
+    assert run("map", folder / "scenario.yaml", "-o", tmp_path, "-q") == 0
+    first, again = (
+        xr.open_dataset(f / "posterior.nc", engine="h5netcdf")["mean"].values
+        for f in (folder, tmp_path)
+    )
+    np.testing.assert_array_equal(first, again)
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
+    data, scenario = tmp_path / "data.nc", folder / "scenario.yaml"
+    assert run("simulate", scenario, "-o", data) == 0
+    assert "1024 visibilities of 16 products" in capsys.readouterr().out
+    options = ["--draws", 3, "--set", "output.covariance=false", "-o", tmp_path / "out"]
+    assert run("map", scenario, "--data", data, *options) == 0
+    said = capsys.readouterr().out
+    for path in (tmp_path / "out").rglob("*"):
+        assert path.is_dir() or path.name == "manifest.json" or str(path) in said
+    assert said.strip().splitlines()[-1] == f"look at {tmp_path}/out/report.html"
+    first, again = (
+        xr.open_dataset(f / "posterior.nc", engine="h5netcdf") for f in (folder, tmp_path / "out")
+    )
+    np.testing.assert_array_equal(first["mean"].values, again["mean"].values)
+    np.testing.assert_array_equal(first["truth"].values, again["truth"].values)
+    assert again.sizes["draw"] == 3 and "covariance" in first and "covariance" not in again
+
+
+@pytest.mark.parametrize("flag", ["covariance", "compact", "updatable"])
+def test_options_of_the_output_reach_the_scenario(flag, monkeypatch):
+    """What they make is tested beside run_map."""
+    given = []
+    monkeypatch.setattr(map_command, "run_map", lambda *a, **_: given.append(a) or _stop())
+    assert run("map", "fiducial", f"--{flag}", "--draws", 7, "-o", "x", "-q") == 130
+    assert given[0][0].output == OutputSection(draws=7, **{flag: True})
+
+
+def _stop():
+    raise KeyboardInterrupt
+
+
+def test_info_recognises_its_files(folder, tmp_path, capsys):
+    run("simulate", "fiducial", *SMALL, "-o", tmp_path / "data.nc", "-q")
+    for path, words in [
+        (tmp_path / "data.nc", "visibilities at 25 MHz"),
+        (folder / "posterior.nc", "posterior over 81 modes"),
+        (folder / "mean.fits", "HEALPix sky map, NSIDE 8"),
+        (folder / "mean.fits", "mean at 25 MHz up to ell = 8, beam monopole, site 182.258"),
+        (folder / "diagnostics.nc", "residuals by 16 products, 6 days, 2 angles"),
+        (folder / "mean_alm.fits", "coefficients of 1 skies up to ell = 8"),
+    ]:
+        assert run("info", path) == 0
+        assert words in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_data_without_truth(folder, tmp_path):
+    run("simulate", "fiducial", *SMALL, "-o", tmp_path / "sim.nc", "-q")
+    xr.load_dataset(tmp_path / "sim.nc", engine="h5netcdf", decode_times=False).drop_vars(
+        "truth"
+    ).to_netcdf(tmp_path / "real.nc", engine="h5netcdf")
+    out = tmp_path / "out"
+    assert run("map", "fiducial", *SMALL, "--data", tmp_path / "real.nc", "-o", out, "-q") == 0
+    assert not (out / "truth.fits").exists()
+    assert json.loads((out / "summary.json").read_text())["ell_cross"] is None
+    assert "rho" not in (out / "spectra.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["map", "nonsense"], "no scenario 'nonsense'"),
+        (["map", "fiducial", "--set", "sky.file=gone.fits"], "no sky map at 'gone.fits'"),
+        (["map", "fiducial", "--set", "sky.fil=x"], "unknown key 'sky.fil'; did you mean 'file'?"),
+        (["map", "fiducial", "--data", "gone.nc"], "no data at 'gone.nc'"),
+        (["map", "fiducial", "--set", "observation.start=2051-01-01"], "outside the ephemeris"),
+        (["map", "fiducial", "--set", "observation.start=soon"], "'soon' is not a date"),
+        (["map", "fiducial", "--set", "noise.radiometer.factor=-1"], "greater than 0"),
+        (["map", "fiducial", "--set", "observation.runs.0.cycles=0.0001"], "holds no sample"),
+        (["info", "gone.fits"], "no file at 'gone.fits'"),
+        (["mapp", "fiducial"], "mapp"),
+        (["map"], "scenario"),
+        (["map", "fiducial", "--draws", "many"], "many"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_exit_code_2(tmp_path, capsys, arguments, message):
+    out = tmp_path / "out"
+    if arguments[0] == "map" and len(arguments) > 1:
+        arguments = [*arguments, "-o", str(out)]
+    assert run(*arguments) == 2
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert error.startswith("lusee-bayes: ")
+    assert "\n" not in error
+    assert not out.exists()
+
+
+def content(folder):
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_an_interrupted_write_leaves_the_previous_result_whole(
+    small_map, tmp_path, monkeypatch, capsys
+):
+    out = shutil.copytree(small_map.folder, tmp_path / "out")
+    before = content(out)
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    # the last file but the page
+    monkeypatch.setattr(MapResult, "summary", interrupt)
+    monkeypatch.setattr(runs, "map_result", lambda *_, **__: small_map.result)
+    monkeypatch.setattr(runs, "MAP", replace(runs.MAP, figures={}))
+    assert run("map", "fiducial", *SMALL, "--set", "seed=2", "-o", out, "-q") == 130
+    said = capsys.readouterr().err.strip()
+    assert said == f"lusee-bayes: interrupted; the earlier results are as they were in '{out}'"
+    assert content(out) == before
+    assert not list(out.glob(".*"))
+    assert run("map", "fiducial", *SMALL, "-o", tmp_path / "new", "-q") == 130
+    assert "interrupted; nothing has been written in" in capsys.readouterr().err
+    assert content(tmp_path / "new") == {}
+
+
+def test_a_file_as_folder_is_refused(tmp_path, capsys):
+    (tmp_path / "x").write_text("")
+    for out in (tmp_path / "x", tmp_path / "x" / "y"):
+        assert run("map", "fiducial", *SMALL, "-o", out, "-q") == 2
+        assert "x' is a file; give a folder for the results" in capsys.readouterr().err
+
+
+def test_help_and_version_do_not_load_the_heavy_libraries():
+    code = (
+        "import sys; from lusee_bayes.cli.main import main; main(['--help']); "
+        "sys.exit(any(m in sys.modules for m in ('healpy', 'lunarsky', 'xarray', 'matplotlib')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "map" in done.stdout

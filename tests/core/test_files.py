@@ -1,0 +1,329 @@
+"""Transactions: a folder is wholly old or wholly new, whenever the process that writes it dies."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+import lusee_bayes
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.files import (
+    COMMITTED,
+    MANIFEST,
+    SCRATCH,
+    read_manifest,
+    recover,
+    replacing,
+    transaction,
+)
+
+OLD = {
+    "mean.fits": "old mean", "only_old.csv": "1", "figures/maps.png": "old", "gone/deep/x": "2",
+    "kept.fits": "kept",
+}  # fmt: skip
+NEW = {"mean.fits": "new mean", "only_new.csv": "3", "figures/maps.png": "new", "cases/a/b.nc": "4"}
+PACKAGE = str(Path(lusee_bayes.__file__).parent)
+OWN = {"notes.txt": "a user's own", "figures/own.png": "and another"}
+WORK = {"chains/chunk-1.npz": "draws", "chains/run.json": "{}"}
+
+# a process for every k that dies before the k-th event that changes the folder (audit events see
+# every call): what each death left, and what recovery makes of it
+EVENTS = """
+import json, os, sys, types
+from pathlib import Path
+
+base, old, new, own, work, root = json.loads(sys.argv[1])
+# without JAX a fork takes a millisecond; what is tested takes one class of what needs JAX
+for name in ("lusee_bayes", "lusee_bayes.core.checks"):
+    sys.modules[name] = types.ModuleType(name)
+sys.modules["lusee_bayes"].__path__ = [root]
+sys.modules["lusee_bayes.core.checks"].InputError = ValueError
+from lusee_bayes.core.files import recover, transaction
+
+CHANGES = {"os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.link"}
+left = None
+
+def before(event, arguments):
+    global left
+    writes = event == "open" and arguments[1] is not None and set(arguments[1]) & set("wxa+")
+    if left is not None and (event in CHANGES or writes):
+        if left == 0:
+            os._exit(9)
+        left -= 1
+
+sys.addaudithook(before)
+
+def write(folder, files):
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+def content(folder):
+    return {str(p.relative_to(folder)): p.read_text() if p.is_file() else None
+            for p in sorted(folder.rglob("*"))}
+
+def run(folder, files):
+    with transaction(folder, "test", ["chains"]) as stage:
+        write(stage, files)
+        # a file that is kept: a second link to the one that is there
+        if (folder / "kept.fits").exists():
+            os.link(folder / "kept.fits", stage / "kept.fits")
+
+def dies(action, after):
+    global left
+    child = os.fork()
+    if child == 0:
+        left = after
+        action()
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+
+def prepared(folder, earlier):
+    write(folder, own)
+    if earlier:
+        run(folder, old)
+    write(folder, work)
+    return folder
+
+def deaths(base, earlier):
+    start, found, died, again = content(prepared(base / "start", earlier)), [], True, 0
+    while died:
+        folder = prepared(base / str(len(found)), earlier)
+        died = dies(lambda: run(folder, new), len(found))
+        hit = content(folder)
+        if ".committed" in hit and not again:
+            # whoever recovers dies as well, each time one event later
+            while dies(lambda: recover(folder), again):
+                again += 1
+        recover(folder)
+        found.append([hit, content(folder)])
+    return start, found, again
+
+print(json.dumps([deaths(Path(base) / str(earlier), earlier) for earlier in (False, True)]))
+"""
+
+
+def content(folder: Path) -> dict[str, str]:
+    return {str(p.relative_to(folder)): p.read_text() for p in folder.rglob("*") if p.is_file()}
+
+
+def write(folder: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+
+def finished(folder: Path, files: dict[str, str]) -> None:
+    with transaction(folder, "test") as stage:
+        write(stage, files)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A user's own files, and the results of an earlier run."""
+    write(tmp_path, OWN)
+    finished(tmp_path, OLD)
+    return tmp_path
+
+
+def with_folders(files: dict[str, str]) -> dict[str, str | None]:
+    """The files, and None for every folder that they lie in."""
+    parents = {str(p) for name in files for p in Path(name).parents if p != Path(".")}
+    return dict.fromkeys(parents) | files
+
+
+def test_a_death_at_any_step_leaves_the_old_or_the_new(tmp_path):
+    """Until the rename the old results with the unfinished work, from it on only the new ones."""
+    done = subprocess.run(
+        [sys.executable, "-c", EVENTS, json.dumps([str(tmp_path), OLD, NEW, OWN, WORK, PACKAGE])],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    scenes = json.loads(done.stdout)
+    for (start, found, again), earlier in zip(scenes, ({}, OLD), strict=True):
+        old = with_folders(OWN | WORK | earlier)
+        assert {name: text for name, text in start.items() if name != MANIFEST} == old
+        files = NEW | ({"kept.fits": OLD["kept.fits"]} if earlier else {})
+        manifest = {"kind": "test", "files": sorted(files), "discard": ["chains"]}
+        new = with_folders(OWN | files) | {MANIFEST: json.dumps(manifest, indent=2) + "\n"}
+        committed = [COMMITTED in hit or hit.get(MANIFEST) == new[MANIFEST] for hit, _ in found]
+        assert committed == sorted(committed)
+        for is_new, (_, after) in zip(committed, found, strict=True):
+            assert after == (new if is_new else start)
+        # every step was hit: each file's writing, and behind the rename each file's move
+        assert committed.count(False) > len(files) + 2
+        assert committed.count(True) > len(files) + len(WORK) + 2
+        assert again > 4
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
+def test_a_failure_leaves_the_folder_as_it_was(error, folder):
+    before = content(folder)
+    with pytest.raises(error), transaction(folder, "test", ["figures"]) as stage:
+        write(stage, NEW)
+        raise error
+    assert content(folder) == before
+    assert not list(folder.glob(f"{SCRATCH}*"))
+
+
+def test_a_failing_rename_leaves_the_folder_as_it_was(folder, monkeypatch):
+    before = content(folder)
+
+    def fail(*_):
+        raise OSError("the disk is full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="full"):
+        finished(folder, NEW)
+    assert content(folder) == before
+    assert not list(folder.glob(".*"))
+
+
+def test_own_files_stay_and_those_of_the_earlier_run_go(folder):
+    finished(folder, NEW)
+    manifest = {"kind": "test", "files": sorted(NEW), "discard": []}
+    assert read_manifest(folder) == manifest
+    assert content(folder) == OWN | NEW | {MANIFEST: json.dumps(manifest, indent=2) + "\n"}
+    assert not (folder / "gone").exists()
+    # without a manifest nobody knows whose the files are
+    (folder / MANIFEST).unlink()
+    finished(folder, {"mean.fits": "newer"})
+    assert content(folder).keys() == {*OWN, *NEW, MANIFEST}
+
+
+def test_unfinished_work_is_removed_with_the_commit(folder):
+    write(folder, WORK)
+    with transaction(folder, "test", ["chains"]) as stage:
+        write(stage, NEW)
+        assert content(folder / "chains").keys() == {"chunk-1.npz", "run.json"}
+    assert not (folder / "chains").exists()
+
+
+def test_scratch_folders_of_the_dead_go_and_of_the_living_stay(folder):
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    living = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    try:
+        names = {pid: f"{SCRATCH}{pid}-abc" for pid in (ended.pid, living.pid, os.getpid(), "x")}
+        for name in names.values():
+            write(folder, {f"{name}/figures/maps.png": "half"})
+        recover(folder)
+        left = {path.name for path in folder.glob(f"{SCRATCH}*")}
+        assert left == {names[living.pid], names[os.getpid()]}
+    finally:
+        living.communicate()
+    recover(folder)
+    assert {path.name for path in folder.glob(f"{SCRATCH}*")} == {names[os.getpid()]}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signals_wait_until_the_results_are_in_place(number, folder, monkeypatch):
+    """Sent before every move: none is heard until the last is done, then all are."""
+    heard, replace = [], os.replace
+
+    def handler(_number, _frame):
+        heard.append(content(folder).keys())
+
+    def replace_with_a_signal(*paths):
+        os.kill(os.getpid(), number)
+        replace(*paths)
+
+    earlier = signal.signal(number, handler)
+    try:
+        with transaction(folder, "test") as stage:
+            write(stage, NEW)
+            monkeypatch.setattr(os, "replace", replace_with_a_signal)
+        assert signal.getsignal(number) is handler
+    finally:
+        monkeypatch.undo()
+        signal.signal(number, earlier)
+    # the rename, each file and the manifest
+    assert heard == [{*OWN, *NEW, MANIFEST}] * (len(NEW) + 2)
+
+
+def test_an_interrupt_during_the_commit_comes_behind_it(folder, monkeypatch):
+    replace = os.replace
+
+    def interrupted(*paths):
+        signal.raise_signal(signal.SIGINT)
+        replace(*paths)
+
+    earlier = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), transaction(folder, "test") as stage:
+            write(stage, NEW)
+            monkeypatch.setattr(os, "replace", interrupted)
+    finally:
+        monkeypatch.undo()
+        signal.signal(signal.SIGINT, earlier)
+    assert content(folder).keys() == {*OWN, *NEW, MANIFEST}
+
+
+def test_a_thread_commits_too(folder):
+    """Signals are the main thread's."""
+    thread = threading.Thread(target=finished, args=(folder, NEW))
+    thread.start()
+    thread.join()
+    assert content(folder).keys() == {*OWN, *NEW, MANIFEST}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{", "[]", "3", '{"kind": "map"}', '{"kind": "map", "files": 3, "discard": []}',
+        '{"kind": "map", "files": [1], "discard": []}', "\0",
+    ],
+)  # fmt: skip
+def test_a_damaged_manifest_is_one_sentence_before_anything_is_written(text, folder):
+    (folder / MANIFEST).write_text(text)
+    before = content(folder)
+    for action in (lambda: read_manifest(folder), lambda: recover(folder)):
+        with pytest.raises(InputError, match="manifest.json' cannot be read .* delete it") as error:
+            action()
+        assert "\n" not in str(error.value)
+    with pytest.raises(InputError, match="cannot be read"), transaction(folder, "test"):
+        pytest.fail("it began")
+    assert content(folder) == before
+    (folder / MANIFEST).unlink()
+    finished(folder, NEW)
+    assert content(folder).keys() == {*OWN, *OLD, *NEW, MANIFEST}
+
+
+def test_what_is_in_the_way_is_refused_before_the_commit(folder, tmp_path):
+    before = content(folder)
+    for name, words in {
+        "figures": "'.*figures' is a folder, and a file of the results has its name",
+        "mean.fits/x": "'.*mean.fits' is a file",
+    }.items():
+        with pytest.raises(InputError, match=words):
+            finished(folder, {name: "x"})
+        assert content(folder) == before
+    for place in ("notes.txt", "notes.txt/below"):
+        with pytest.raises(InputError, match="notes.txt' is a file; give a folder"):
+            finished(folder / place, NEW)
+    assert content(folder) == before
+
+
+def test_folders_are_made(tmp_path):
+    finished(tmp_path / "a" / "b", NEW)
+    assert content(tmp_path / "a" / "b").keys() == {*NEW, MANIFEST}
+    recover(tmp_path / "nowhere")
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "a" / "page.html"
+    with replacing(path) as partial:
+        partial.write_text("first")
+        assert not path.exists()
+    with pytest.raises(KeyboardInterrupt), replacing(path) as partial:
+        partial.write_text("half")
+        raise KeyboardInterrupt
+    assert content(tmp_path) == {"a/page.html": "first"}

@@ -1,0 +1,159 @@
+import healpy
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference import real_harmonics
+
+from lusee_bayes.core import harmonics as h
+from lusee_bayes.core.checks import InputError
+
+LMAX = 9
+
+
+def random_alm(rng, lmax, *batch):
+    """Complex coefficients of a real field in healpy's packing."""
+    n = healpy.Alm.getsize(lmax)
+    alm = rng.standard_normal((*batch, n)) + 1j * rng.standard_normal((*batch, n))
+    alm[..., : lmax + 1] = alm[..., : lmax + 1].real  # m = 0 comes first
+    return alm
+
+
+def test_packing_is_ell_squared_plus_ell_plus_m():
+    ell, m = h.mode_numbers(LMAX)
+    assert [(le, mm) for le in range(LMAX + 1) for mm in range(-le, le + 1)] == list(
+        zip(ell, m, strict=True)
+    )
+    np.testing.assert_array_equal(ell**2 + ell + m, np.arange(h.n_modes(LMAX)))
+    assert [h.lmax_of(h.n_modes(lmax)) for lmax in (0, 1, 47)] == [0, 1, 47]
+
+
+@pytest.mark.parametrize("n", [0, 2, 3, 2303])
+def test_a_number_that_is_no_square_is_refused(n):
+    with pytest.raises(InputError, match=f"{n} coefficients"):
+        h.lmax_of(n)
+
+
+def test_coefficients_are_the_parts_of_healpys():
+    alm = random_alm(np.random.default_rng(0), LMAX)
+    modes = h.from_healpy(alm)
+    for ell in range(LMAX + 1):
+        centre = ell * (ell + 1)
+        assert modes[centre] == alm[healpy.Alm.getidx(LMAX, ell, 0)].real
+        for m in range(1, ell + 1):
+            a = alm[healpy.Alm.getidx(LMAX, ell, m)]
+            np.testing.assert_allclose(modes[centre + m], np.sqrt(2) * a.real, rtol=1e-15)
+            np.testing.assert_allclose(modes[centre - m], np.sqrt(2) * a.imag, rtol=1e-15)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_from_healpy_keeps_leading_axes(batch):
+    alm = random_alm(np.random.default_rng(1), LMAX, *batch)
+    modes = h.from_healpy(alm)
+    for index in np.ndindex(batch):
+        back = h.to_healpy(jnp.asarray(modes[index]))
+        np.testing.assert_allclose(back, alm[index], rtol=1e-15)
+
+
+def test_synthesis_agrees_with_scipy_and_healpy():
+    rng = np.random.default_rng(2)
+    alm = random_alm(rng, LMAX)
+    modes = h.from_healpy(alm)
+    theta, phi = np.arccos(rng.uniform(-1, 1, 60)), rng.uniform(-4, 8, 60)
+    # recursions over ell <= 9 lose a few bits
+    np.testing.assert_allclose(
+        h.synthesis_matrix(theta, phi, LMAX), real_harmonics(theta, phi, LMAX), rtol=0, atol=1e-13
+    )
+    field = healpy.alm2map(alm, 8, lmax=LMAX)
+    # healpy's transforms are good to 1e-13 of the field
+    atol = 1e-12 * np.abs(field).max()
+    np.testing.assert_allclose(h.pixel_matrix(8, LMAX) @ modes, field, rtol=0, atol=atol)
+    np.testing.assert_allclose(h.modes_to_map(jnp.asarray(modes), 8), field, rtol=0, atol=atol)
+
+
+def test_dipoles_point_along_their_axes():
+    theta, phi = np.array([0.3, 1.2, 2.5]), np.array([0.1, 2.0, 5.0])
+    x, y, z = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)
+    got = h.synthesis_matrix(theta, phi, 1) / np.sqrt(3 / (4 * np.pi))
+    # Condon-Shortley: Y_11 = -sqrt(3/8pi) sin(theta) exp(i phi)
+    np.testing.assert_allclose(got[:, 1:], np.stack([y, z, -x], axis=1), rtol=0, atol=1e-15)
+
+
+def sphere(lmax):
+    """Directions and weights that integrate products of two fields up to lmax exactly."""
+    x, w = np.polynomial.legendre.leggauss(lmax + 1)
+    n_phi = 2 * lmax + 1
+    theta, phi = np.meshgrid(np.arccos(x), 2 * np.pi * np.arange(n_phi) / n_phi, indexing="ij")
+    return theta.ravel(), phi.ravel(), np.repeat(w, n_phi) * 2 * np.pi / n_phi
+
+
+def test_harmonics_are_orthonormal():
+    theta, phi, weight = sphere(16)
+    y = h.synthesis_matrix(theta, phi, 16)
+    # the quadrature is exact; rounding over 561 points
+    np.testing.assert_allclose((y.T * weight) @ y, np.eye(h.n_modes(16)), rtol=0, atol=1e-12)
+
+
+def test_parseval():
+    a = np.random.default_rng(3).standard_normal(h.n_modes(12))
+    theta, phi, weight = sphere(12)
+    f = h.synthesis_matrix(theta, phi, 12) @ a
+    np.testing.assert_allclose(np.sum(weight * f**2), np.sum(a**2), rtol=1e-12)
+
+
+def test_a_map_gives_back_its_coefficients():
+    alm = random_alm(np.random.default_rng(4), LMAX)
+    modes = h.map_to_modes(healpy.alm2map(alm, 16, lmax=LMAX), LMAX)
+    # ten Jacobi iterations of healpy's quadrature (error 1e-3 each at this ell) reach rounding
+    np.testing.assert_allclose(modes, h.from_healpy(alm), rtol=0, atol=1e-11)
+
+
+def test_a_smaller_lmax_is_a_slice():
+    theta, phi = np.array([0.4, 2.0]), np.array([1.0, -3.0])
+    large, small = h.synthesis_matrix(theta, phi, 12), h.synthesis_matrix(theta, phi, 5)
+    np.testing.assert_allclose(large[:, : h.n_modes(5)], small, rtol=0, atol=1e-14)
+    modes = h.from_healpy(random_alm(np.random.default_rng(5), 12))
+    low = h.to_healpy(jnp.asarray(modes[: h.n_modes(5)]))
+    full = h.to_healpy(jnp.asarray(modes))
+    ell, m = healpy.Alm.getlm(5)
+    np.testing.assert_array_equal(low, full[healpy.Alm.getidx(12, ell, m)])
+
+
+def test_spectrum_is_healpys():
+    alm = random_alm(np.random.default_rng(6), LMAX, 2)
+    modes = jnp.asarray(h.from_healpy(alm))
+    expected = np.stack([healpy.alm2cl(a) for a in alm])
+    np.testing.assert_allclose(h.power_spectrum(modes), expected, rtol=1e-14)
+    by_loop = [np.sum(np.asarray(modes)[:, e**2 : (e + 1) ** 2], axis=1) for e in range(LMAX + 1)]
+    np.testing.assert_allclose(h.sum_over_m(modes), np.stack(by_loop, axis=1), rtol=1e-13)
+    spread = h.per_mode(jnp.arange(LMAX + 1.0))
+    np.testing.assert_array_equal(spread, h.mode_numbers(LMAX)[0])
+
+
+def test_an_isotropic_sky_has_the_same_variance_in_every_coefficient():
+    cl, draws = np.array([3.0, 2.0, 0.5, 0.1]), 4000
+    np.random.seed(0)  # noqa: NPY002 (healpy draws from numpy's global state)
+    modes = np.stack([h.from_healpy(healpy.synalm(cl, lmax=3, new=True)) for _ in range(draws)])
+    ratio = modes.var(axis=0) / np.asarray(h.per_mode(jnp.asarray(cl)))
+    # a variance from n Gaussian draws scatters by sqrt(2 / n); five of these over 16 modes.
+    # A lost factor two of the m > 0 modes would be 1.0 away
+    np.testing.assert_allclose(ratio, 1.0, rtol=0, atol=5 * np.sqrt(2 / draws))
+
+
+def test_addition_theorem():
+    theta, phi = np.array([0.0, 0.7, np.pi / 2, 3.0]), np.array([0.0, 2.0, 4.0, 6.0])
+    squares = jnp.asarray(h.synthesis_matrix(theta, phi, LMAX) ** 2)
+    expected = (2 * np.arange(LMAX + 1) + 1) / (4 * np.pi)
+    np.testing.assert_allclose(h.sum_over_m(squares), np.tile(expected, (4, 1)), rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "lmax", "message"),
+    [
+        (np.ones(100), 2, "100 pixels are not a HEALPix map"),
+        (np.where(np.arange(48) == 5, np.nan, 1.0), 2, r"1 of 48 entries, first at \(5,\)"),
+        (np.ones(48), 6, "holds lmax <= 5"),
+    ],
+)
+def test_bad_maps_are_refused(pixels, lmax, message):
+    with pytest.raises(InputError, match=message):
+        h.map_to_modes(pixels, lmax)

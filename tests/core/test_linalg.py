@@ -1,0 +1,84 @@
+"""Products, factors and inverses of symmetric matrices against numpy."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.linalg import (
+    MAX_SUBSTITUTED,
+    N_BLOCKS,
+    checked_cholesky,
+    gram_matrix,
+    inverse_from_cholesky,
+    invert_lower,
+    solve_lower,
+    symmetric_product,
+)
+
+
+def spd(n: int, *batch: int) -> np.ndarray:
+    """Symmetric positive definite matrices of full rank."""
+    a = np.random.default_rng(n).standard_normal((*batch, n, 2 * n + 3))
+    return a @ a.swapaxes(-1, -2) / n
+
+
+# as many columns as blocks, fewer, and numbers that do not split evenly
+@pytest.mark.parametrize("columns", [1, N_BLOCKS - 1, N_BLOCKS, N_BLOCKS + 1, 31])
+@pytest.mark.parametrize("rows", [1, 20])
+def test_gram_matrix(rows, columns):
+    w = np.random.default_rng(columns).normal(size=(rows, columns))
+    got = np.asarray(jax.jit(gram_matrix)(jnp.asarray(w)))
+    np.testing.assert_array_equal(got, got.T)
+    # a sum of `rows` products of order one: rounding below rows x eps x |w|^2 = 20 x 2e-16 x 10
+    np.testing.assert_allclose(got, w.T @ w, rtol=0, atol=1e-13)
+
+
+def test_symmetric_product():
+    """A B with B = S A^T, which is symmetric without either being the other's transpose."""
+    a, s = np.random.default_rng(1).normal(size=(13, 7)), spd(7)
+    got = np.asarray(symmetric_product(jnp.asarray(a), jnp.asarray(s @ a.T)))
+    np.testing.assert_array_equal(got, got.T)
+    np.testing.assert_allclose(got, a @ s @ a.T, rtol=0, atol=1e-13 * np.abs(got).max())
+
+
+@pytest.mark.parametrize("n", [1, 7, MAX_SUBSTITUTED + 1, 4 * MAX_SUBSTITUTED + 3])
+def test_inverses_of_triangles(n):
+    matrix = spd(n)
+    lower = np.linalg.cholesky(matrix)
+    inverse = invert_lower(jnp.asarray(lower + np.triu(np.ones((n, n)), 1)))
+    np.testing.assert_allclose(np.asarray(inverse) @ lower, np.eye(n), rtol=0, atol=1e-11)
+    whole = np.asarray(inverse_from_cholesky(jnp.asarray(lower)))
+    np.testing.assert_array_equal(whole, whole.T)
+    np.testing.assert_allclose(whole @ matrix, np.eye(n), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+@pytest.mark.parametrize("transpose", [False, True])
+def test_solve_lower(batch, transpose):
+    lower = np.linalg.cholesky(spd(6, *batch))
+    x = np.random.default_rng(2).normal(size=(*batch, 6, 2))
+    got = np.asarray(solve_lower(jnp.asarray(lower), jnp.asarray(x), transpose=transpose))
+    matrix = lower.swapaxes(-1, -2) if transpose else lower
+    np.testing.assert_allclose(matrix @ got, x, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_checked_cholesky(batch):
+    matrix = spd(6, *batch)
+    got = checked_cholesky("N", jnp.asarray(matrix))
+    np.testing.assert_allclose(np.tril(got), np.linalg.cholesky(matrix), rtol=0, atol=1e-13)
+
+
+def test_checked_cholesky_names_what_has_no_factor():
+    """One of a stack is enough; its lowest eigenvalue is 1 - 2."""
+    bad = np.array([[1.0, 2.0], [2.0, 1.0]])
+    stack = jnp.asarray(np.stack([np.eye(2), bad]))
+    expected = "the noise is not positive definite: its lowest eigenvalue is -1 .largest entry 2."
+    with pytest.raises(InputError, match=expected):
+        checked_cholesky("the noise", stack)
+    # values are not known there
+    assert np.isnan(jax.jit(lambda m: checked_cholesky("the noise", m))(stack)[1]).any()

@@ -1,0 +1,164 @@
+"""From a scenario to data, and from data to a map that recovers a sky."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from experiments import small_experiment as make_small_experiment
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.model import full_model, radiometer
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.experiment.simulate import simulate
+from lusee_bayes.experiment.terms import Around, measured_visibilities
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.noise.covariance import DiagonalCovariance
+from lusee_bayes.results.map_result import map_result
+from lusee_bayes.testing import small_scenario
+
+
+def flagged(whole: Visibilities, flags: np.ndarray) -> Visibilities:
+    """The same data without the samples that are flagged."""
+    layout = DataLayout.from_flags(flags)
+    data = layout.gather(whole.layout.scatter(whole.data))
+    return Visibilities(data, layout, whole.observation, whole.frequency_mhz)
+
+
+def variances(setup) -> np.ndarray:
+    """Diagonal of N."""
+    return np.asarray(full_model(setup).noise.diagonal())
+
+
+def test_an_experiment_holds_its_data(tiny_experiment):
+    """Simulated ones, unless measured ones are given, which it keeps as they are."""
+    simulated = tiny_experiment.data
+    assert simulated.layout is tiny_experiment.setup.layout
+    np.testing.assert_array_equal(simulated.truth, tiny_experiment.setup.sky.modes)
+    np.testing.assert_array_equal(simulated.data, simulate(tiny_experiment.setup).data)
+    assert tiny_experiment.scenario == small_scenario()
+    measured = replace(simulated, data=simulated.data + 1.0, truth=None)
+    experiment = build(tiny_experiment.scenario, measured)
+    assert experiment.data is measured
+    assert experiment.setup.layout is measured.layout
+
+
+def test_the_seed_decides_the_noise(small_experiment):
+    first, again = (simulate(small_experiment.setup) for _ in range(2))
+    np.testing.assert_array_equal(first.data, again.data)
+    other = make_small_experiment("seed=2", cycles=0.2).data
+    assert (np.asarray(first.data) != np.asarray(other.data)).all()
+
+
+@pytest.mark.parametrize(
+    "override", ["seed=3", "noise={gain: {sigma: 0.02}, beam: {parameters: {length_m: 0.1}}}"]
+)
+def test_neither_noise_nor_seed_enter_a_setup(override, tiny_experiment):
+    experiment = build(small_scenario(override))
+    for name in ("coupling", "prior", "beams", "background", "signal", "sky", "responses"):
+        built, shared = (
+            jax.tree.leaves(getattr(e.setup, name)) for e in (experiment, tiny_experiment)
+        )
+        assert len(built) == len(shared)
+        for one, other in zip(built, shared, strict=True):
+            np.testing.assert_array_equal(one, other)
+    setup = replace(tiny_experiment.setup, scenario=experiment.scenario)
+    np.testing.assert_array_equal(experiment.data.data, simulate(setup).data)
+
+
+def test_noise_of_the_simulation_has_the_level_of_n(small_experiment):
+    setup, data = small_experiment.setup, small_experiment.data
+    residual = np.asarray(data.data - setup.layout.gather(setup.signal))
+    chi2 = float((residual**2 / variances(setup)).sum())
+    n = residual.shape[0]
+    assert abs(chi2 - n) < 5 * np.sqrt(2 * n)  # chi^2 with n degrees of freedom, 5 sigma
+
+
+def test_flagged_data_are_left_out_of_a_and_n(small_experiment):
+    setup, whole = small_experiment.setup, small_experiment.data
+    flags = np.zeros((16, setup.observation.n_times), dtype=bool)
+    flags[3, 5] = flags[:, 10] = True
+    gapped = build(small_experiment.scenario, flagged(whole, flags))
+    keep = ~flags.ravel()
+    np.testing.assert_array_equal(
+        gapped.setup.coupling.dense(), np.asarray(setup.coupling.dense())[keep]
+    )
+    np.testing.assert_array_equal(variances(gapped.setup), variances(setup)[keep])
+    # leaving a sample out is the limit of giving it no weight
+    heavy = np.where(keep, variances(setup), 1e30)
+    limit = LinearGaussian(
+        setup.coupling, setup.prior, DiagonalCovariance(jnp.asarray(heavy))
+    ).condition(whole.data)
+    posterior = full_model(gapped.setup).condition(gapped.data.data)
+    shift = (posterior.mean - limit.mean) / posterior.std()
+    assert float(jnp.abs(shift).max()) < 1e-6
+
+
+def test_measured_temperatures(small_experiment):
+    setup, data = small_experiment.setup, small_experiment.data
+    sigma = np.sqrt(variances(setup)).reshape(16, -1)
+    measured = measured_visibilities(data, setup.signal)
+    np.testing.assert_array_equal(measured, data.layout.scatter(data.data))
+    assert np.abs(measured - setup.signal).max() < 6 * sigma.max()
+    flags = np.zeros(measured.shape, dtype=bool)
+    flags[2, 4] = True
+    with pytest.raises(InputError, match="time 4 lacks some of its products"):
+        measured_visibilities(flagged(data, flags), setup.signal)
+
+
+def test_the_radiometer_is_built_around_measured_temperatures_if_asked(tiny_experiment):
+    """Paper's form: sigma_ij^2 = d_ii d_jj / (bandwidth x time), so autos follow d^2."""
+    scenario = small_scenario("noise.radiometer.temperature=measured")
+    setup = replace(tiny_experiment.setup, scenario=scenario)
+    data = replace(tiny_experiment.data, data=2.0 * tiny_experiment.data.data)
+    autos = [0, 7, 12, 15]
+    measured = np.asarray(radiometer(setup, data).diagonal()).reshape(16, -1)[autos]
+    modelled = np.asarray(radiometer(setup).diagonal()).reshape(16, -1)[autos]
+    signal = np.asarray(setup.signal)[autos]
+    expected = modelled * (np.asarray(data.data).reshape(16, -1)[autos] / signal) ** 2
+    np.testing.assert_allclose(measured, expected, rtol=1e-12)
+    np.testing.assert_array_equal(
+        full_model(setup, Around(data)).noise.diagonal(), radiometer(setup, data).diagonal()
+    )
+
+
+def test_data_of_another_frequency_are_refused(small_experiment):
+    other = small_scenario("frequency_mhz=10", cycles=0.2)
+    with pytest.raises(InputError, match="data are at 25.0 MHz, the scenario at 10.0"):
+        build(other, small_experiment.data)
+
+
+@pytest.mark.parametrize("form", ["paper", "exact"])
+def test_the_map_recovers_the_sky(form):
+    experiment = make_small_experiment(f"noise.radiometer.form={form}", cycles=0.2)
+    result = map_result(experiment)
+    channel = result.channel
+    # z^2 of the truth averaged over 49 modes: a sky that is no Gaussian draw but has the
+    # prior's spectrum stays well below twice its expectation
+    z = (channel.mean - np.asarray(experiment.data.truth)) / channel.std
+    assert np.mean(z**2) < 2.0
+    assert result.summary()["chi2"] == pytest.approx(
+        result.summary()["chi2_expected"], abs=5 * np.sqrt(2 * experiment.data.layout.size)
+    )
+
+
+@pytest.mark.long
+def test_the_main_job_on_ulsa(test_data):
+    # thresholds from the first attempt on record: rho > 0.9 to ell 10, > 0.5 to 28, cross >= 20
+    path = test_data / "ulsa" / "exp10.0MHz_sky_map_with_absorption.hdf5"
+    scenario = load_scenario("fiducial", [f"sky.file={path}", "frequency_mhz=10"])
+    result = map_result(build(scenario))
+    channel = result.channel
+    spectra, summary = channel.spectra(), result.summary()
+    assert spectra["rho"][1:11].min() > 0.9
+    assert spectra["rho"][1:29].min() > 0.5
+    assert summary["ell_cross"] >= 20
+    # residuals at the few per cent level away from the cap that never rises
+    maps = channel.maps()
+    away = channel.highest_altitude > np.sin(np.radians(10.0))
+    residual = np.median(np.abs(maps["residual"][away])) / maps["truth"].mean()
+    assert residual < 0.05

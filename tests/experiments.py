@@ -1,0 +1,37 @@
+"""Small experiments that the tests share: what was built once is there for all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+from lusee_bayes.experiment.experiment import Experiment, build
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.pieces import program_pieces
+from lusee_bayes.experiment.simulate import simulate
+from lusee_bayes.experiment.terms import Around
+from lusee_bayes.sampling.programs import Program
+from lusee_bayes.testing import small_scenario
+
+# nothing of these enters a setup (test_experiment.py checks it), only the data and N
+NOT_IN_SETUP = ("noise.", "seed=")
+
+
+@lru_cache
+def small_experiment(*overrides: str, lmax: int = 6, cycles: float = 0.02) -> Experiment:
+    """The experiment of :func:`small_scenario`, with simulated data."""
+    scenario = small_scenario(*overrides, lmax=lmax, cycles=cycles)
+    in_setup = tuple(o for o in overrides if not o.startswith(NOT_IN_SETUP))
+    if in_setup == overrides:
+        return build(scenario)
+    built = small_experiment(*in_setup, lmax=lmax, cycles=cycles).setup
+    setup = replace(built, scenario=scenario)
+    return Experiment(setup, simulate(setup))
+
+
+def program_arguments(program: Program, experiment: Experiment) -> dict[str, Any]:
+    """All that a program asks for, and the data."""
+    model = full_model(experiment.setup, Around(experiment.data))
+    arguments = program.arguments(model, program_pieces(experiment))
+    return arguments | {"data": experiment.data.data}

@@ -1,0 +1,333 @@
+"""Beams from luseepy's files, against what luseepy itself made of them, and synthetic files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import astropy.units as u
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+from astropy.io import fits
+from astropy.time import Time
+from fits_files import write_images
+
+import lusee_bayes as lb
+from lusee_bayes.cli.main import main
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.harmonics import from_healpy
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.pieces import program_pieces
+from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.simulate import true_signal, true_values
+from lusee_bayes.experiment.terms import beam_directions, beam_rms_difference, true_beams
+from lusee_bayes.instrument.beams import HemisphereGrid, ScalarBeam, read_beam
+from lusee_bayes.instrument.beams.scalar_file import FIELDS
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.pointing import Pointing
+from lusee_bayes.instrument.products import labels, to_matrix
+from lusee_bayes.instrument.waterfalls import read_waterfall
+from lusee_bayes.testing import small_scenario
+
+LMAX, PORTS = 47, 4
+
+
+# --- luseepy's own waterfall --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def luseepy(test_data):
+    """(beam, waterfall by frequency, sky by frequency, pointing)."""
+    folder = test_data / "luseepy"
+    with fits.open(folder / "waterfall_exact_engine.fits") as hdus:
+        data, frequencies = hdus["data"].data.astype(float), hdus["freq"].data
+    with np.load(folder / "sky_alm.npz") as file:
+        sky = dict(file)
+    start = Time("2025-02-01 00:00:00", scale="utc")
+    times = start + 7200.0 * np.arange(len(data)) * u.s
+    observation = Observation(182.258, -23.814, times, np.zeros(len(data), int), (0.0,), 7200.0)
+    return (
+        read_beam(folder / "synthetic_monopole_beam.fits"),
+        {f: data[:, :, k].T for k, f in enumerate(frequencies)},
+        {f: from_healpy(alm) for f, alm in zip(sky["freq"], sky["alm"], strict=True)},
+        Pointing.of(observation, LMAX, order=6),
+    )
+
+
+def visibilities(luseepy, frequency, **options) -> np.ndarray:
+    beam, _, sky, pointing = luseepy
+    beams = beam.beams(frequency, LMAX, **options)
+    seen = lb.CouplingMatrix.build(beams, pointing) @ jnp.asarray(sky[frequency])
+    return np.asarray(seen).reshape(16, -1)
+
+
+def off(got, expected) -> float:
+    return np.abs(got - expected).max() / np.abs(expected).max()
+
+
+@pytest.mark.parametrize("frequency", [5.0, 10.0, 25.0, 50.0])
+def test_all_products_of_luseepys_waterfall(luseepy, frequency):
+    """With luseepy's rule both are one sum, in another order; 1e-10 of the peak is asked for."""
+    got = visibilities(luseepy, frequency, grid=luseepy[0].luseepy_grid)
+    assert off(got, luseepy[1][frequency]) < 1e-11
+
+
+def test_the_waterfall_of_luseepys_default_engine(luseepy, test_data):
+    """It turns the sky about the first sample's axis, and patterns in single precision."""
+    with fits.open(test_data / "luseepy" / "waterfall_fixed_axis_engine.fits") as hdus:
+        expected = hdus["data"].data[:, :, list(hdus["freq"].data).index(25.0)].T
+    beam, _, sky, _ = luseepy
+    observation = read_waterfall(test_data / "luseepy" / "waterfall_fixed_axis_engine.fits")
+    observation = replace(observation.observation, fixed_axis=True)
+    beams = beam.beams(25.0, LMAX, grid=beam.luseepy_grid)
+    seen = lb.CouplingMatrix.observe(beams, observation) @ jnp.asarray(sky[25.0])
+    assert off(np.asarray(seen).reshape(16, -1), expected) < 1e-7
+
+
+def test_azimuth_the_other_way_conjugated_crosses_and_permuted_ports_are_noticed(luseepy):
+    beam, waterfall, _, _ = luseepy
+    grid, expected = beam.luseepy_grid, waterfall[25.0]
+    mirrored = np.r_[0, -1:-180:-1]
+    other = ScalarBeam(
+        "mirrored",
+        beam.frequencies_mhz,
+        beam.theta,
+        beam.e_theta[:, :, mirrored],
+        -beam.e_phi[:, :, mirrored],
+        beam.gain,
+    )
+    turned = (0.0, -90.0, -180.0, -270.0)
+    wrong = [
+        visibilities((other, *luseepy[1:]), 25.0, grid=grid),
+        visibilities(luseepy, 25.0, grid=grid, rotations_deg=turned),
+        visibilities(luseepy, 25.0, grid=grid, taper=False),
+    ]
+    right = visibilities(luseepy, 25.0, grid=grid)
+    signs = np.array([-1.0 if label[-1] == "I" else 1.0 for label in labels(PORTS)])
+    wrong.append(signs[:, None] * right)
+    wrong.append(right[::-1])
+    for case in wrong:
+        assert off(case, expected) > 1e-4
+
+
+def test_what_the_rectangle_rule_costs(luseepy):
+    """h^2 / 12 times the slopes of the beam at zenith and horizon (Euler and Maclaurin): 1.6e-4 of
+    the peak for steps of 1 degree, a quarter of it for half a degree.
+
+    Between nodes that integrate across the cut nothing changes when their number doubles.
+    """
+    beam = luseepy[0]
+    ours = visibilities(luseepy, 25.0)
+    cost = off(luseepy[1][25.0], ours)
+    assert 1e-4 < cost < 2e-4
+    more = HemisphereGrid.gauss_legendre(4 * len(beam.theta), 360)
+    assert off(visibilities(luseepy, 25.0, grid=more), ours) < 1e-8
+    theta = np.linspace(0.0, np.pi / 2, 2 * len(beam.theta) - 1)
+    finer = HemisphereGrid(theta, np.sin(theta) * theta[1], beam.n_phi)
+    assert off(visibilities(luseepy, 25.0, grid=finer), ours) == pytest.approx(cost / 4, rel=0.1)
+
+
+def test_the_embedded_antennas_agree_with_the_file_in_shape(luseepy):
+    """Both are a 3 m arm, 75 degrees from the zenith, 2 m over ground; that of the file has one
+    layer of permittivity 3.7."""
+    ground = lb.Regolith(3.7, 3.7, 0.01)
+    ours = lb.monopole_beams(10.0, 12, lb.Monopoles(ground)).modes
+    # ports of luseepy: North, West, South, East; ours: North, East, South, West
+    theirs = luseepy[0].beams(10.0, 12, taper=False, rotations_deg=(0.0, -90.0, 180.0, 90.0)).modes
+    a, b = np.asarray(ours), np.asarray(theirs)
+    assert (a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum()) > 0.99
+
+
+# --- synthetic files --------------------------------------------------------------------------
+
+
+def pattern(theta, phi, f):
+    """A smooth complex pattern that is no symmetric one."""
+    t, p = theta[:, None], phi[None]
+    e_theta = (np.cos(t) * np.cos(p - 0.3) + 0.2 * np.sin(2 * t)) * np.exp(1j * f / 20 * np.cos(t))
+    e_phi = -np.sin(p - 0.3) * (1 + 0.1j * np.sin(t)) * np.ones_like(t)
+    return e_theta, e_phi
+
+
+def write(path, *, without=(), change=None, header=None):
+    frequencies = (10.0, 20.0, 30.0, 40.0, 50.0)
+    theta, phi = np.radians(np.linspace(0, 90, 46)), np.radians(np.linspace(0, 360, 61))
+    fields = np.array([pattern(theta, phi, f) for f in frequencies]).swapaxes(0, 1)
+    images = {
+        "Etheta_real": fields[0].real,
+        "Etheta_imag": fields[0].imag,
+        "EPhi_real": fields[1].real,
+        "EPhi_imag": fields[1].imag,
+        "gain_conv": 100.0 / np.array(frequencies),
+        "freq": np.array(frequencies),
+    }
+    if change is not None:
+        change(images)
+    head = {"THETA_MIN": 0.0, "THETA_MAX": 90.0, "THETA_N": 46}
+    head |= {"PHI_MIN": 0.0, "PHI_MAX": 360.0, "PHI_N": 61} | (header or {})
+    kept = {name: image for name, image in images.items() if name not in without}
+    return write_images(path, kept, head)
+
+
+def test_between_frequencies_and_directions(tmp_path):
+    """Cubic splines over steps of 10 MHz and 2 degrees of a pattern known everywhere."""
+    beam = read_beam(write(tmp_path / "beam.fits"))
+    assert beam.n_phi == 60
+    fields = beam.fields(27.0, taper=False, rotations_deg=(0.0, 33.0))
+    grid = fields.grid
+    scale = np.sqrt(2 * (100.0 / 27.0) / (4 * np.pi))
+    for port, angle in enumerate((0.0, 33.0)):
+        e_theta, e_phi = pattern(grid.theta, grid.phi - np.radians(angle), 27.0)
+        # (h f)^4 / 100 of a phase of f / 20, and of 100 / f
+        np.testing.assert_allclose(fields.e_theta[port], scale * e_theta, rtol=0, atol=3e-2)
+        np.testing.assert_allclose(fields.e_phi[port], scale * e_phi, rtol=0, atol=3e-2)
+    # (2 degrees)^4 / 384 of the fourth derivative, a few times that at the ends
+    exact = beam.fields(30.0, taper=False, rotations_deg=(0.0, 33.0))
+    e_theta, e_phi = pattern(grid.theta, grid.phi - np.radians(33.0), 30.0)
+    scale = np.sqrt(2 * (100.0 / 30.0) / (4 * np.pi))
+    np.testing.assert_allclose(exact.e_theta[1], scale * e_theta, rtol=0, atol=5e-6)
+    np.testing.assert_allclose(exact.e_phi[1], scale * e_phi, rtol=0, atol=5e-6)
+    # quarter turns by moving columns, or by the Fourier sum on another number of azimuths
+    few = beam.fields(30.0)
+    many = beam.fields(30.0, grid=HemisphereGrid(few.grid.theta, few.grid.weights, 120))
+    np.testing.assert_allclose(many.e_theta[:, :, ::2], few.e_theta, rtol=0, atol=1e-13)
+
+
+def test_kelvin_in_kelvin_out(tmp_path):
+    """T = g / 4 pi int |E|^2 of a sky of one Kelvin, by a sum over the sphere."""
+    beam = read_beam(write(tmp_path / "beam.fits"))
+    beams = beam.beams(30.0, 4, taper=False)
+    got = np.asarray(beams.modes)[:, 0] * np.sqrt(4 * np.pi)
+    x, w = np.polynomial.legendre.leggauss(200)
+    theta, phi = np.arccos((x + 1) / 2), 2 * np.pi * np.arange(400) / 400
+    fields = [pattern(theta, phi - np.radians(a), 30.0) for a in (0, 90, 180, 270)]
+    expected = np.zeros((PORTS, PORTS), complex)
+    for i, a in enumerate(fields):
+        for j, b in enumerate(fields):
+            power = a[0] * b[0].conj() + a[1] * b[1].conj()
+            expected[i, j] = (w / 2) @ power.mean(1) * 0.5 * (100.0 / 30.0)
+    got = np.asarray(to_matrix(jnp.asarray(got)[:, None])[..., 0])
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+def break_shape(images):
+    images["EPhi_imag"] = images["EPhi_imag"][:, :-1]
+
+
+def break_order(images):
+    images["freq"] = images["freq"][::-1].copy()
+
+
+def break_numbers(images):
+    images["EPhi_real"] = images["EPhi_real"].copy()
+    images["EPhi_real"][1, 2, 3] = np.nan
+
+
+def break_gain(images):
+    images["gain_conv"] = images["gain_conv"][:-1]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"without": ("EPhi_imag",)}, "has no image 'EPhi_imag'"),
+        ({"change": break_shape}, r"EPhi_imag has shape \(5, 45, 61\), expected \(5, 46, 61\)"),
+        ({"change": break_order}, "do not grow"),
+        ({"change": break_numbers}, "EPhi_real"),
+        ({"change": break_gain}, "gain_conv has 4 values for 5"),
+        ({"header": {"THETA_MAX": 180.0}}, "theta 0.0 to 180.0"),
+    ],
+)
+def test_files_that_cannot_be_used(tmp_path, options, message):
+    with pytest.raises(InputError, match=message):
+        read_beam(write(tmp_path / "beam.fits", **options))
+
+
+def test_missing_and_truncated_files(tmp_path):
+    with pytest.raises(InputError, match=r"no beam file at .*check beam\.file"):
+        read_beam(tmp_path / "none.fits")
+    path = write(tmp_path / "beam.fits")
+    path.write_bytes(path.read_bytes()[:200_000])
+    with pytest.raises(InputError, match="cut short"):
+        read_beam(path)
+    path.write_text("no FITS at all")
+    with pytest.raises(InputError, match="cannot be read as FITS"):
+        read_beam(path)
+
+
+def test_no_extrapolation(tmp_path):
+    beam = read_beam(write(tmp_path / "beam.fits"))
+    for frequency in (9.9, 50.1):
+        with pytest.raises(InputError, match=f"from 10 to 50 MHz, not at {frequency}"):
+            beam.fields(frequency)
+
+
+# --- in a scenario ----------------------------------------------------------------------------
+
+
+def test_a_scenario_with_a_file(tmp_path):
+    path = write(tmp_path / "beam.fits")
+    setup = set_up(small_scenario(f"beam.file={path}", "beam.turntable_offset_deg=7"))
+    expected = read_beam(path).beams(25.0, 6, rotations_deg=(7.0, 97.0, 187.0, 277.0))
+    np.testing.assert_array_equal(setup.beams.modes, expected.modes)
+    # the resolved scenario is one that can be read again
+    again = tmp_path / "resolved.yaml"
+    again.write_text(setup.scenario.to_yaml())
+    assert lb.load_scenario(again) == setup.scenario
+
+
+def test_a_second_file_as_the_true_beams(tmp_path):
+    def brighter(images):
+        for name in FIELDS:
+            images[name] = 1.01 * images[name]
+
+    path, other = write(tmp_path / "a.fits"), write(tmp_path / "b.fits", change=brighter)
+    setup = set_up(small_scenario(f"beam.file={path}", f"noise.beam.file={other}"))
+    assert beam_rms_difference(setup) == pytest.approx(1.01**2 - 1, rel=1e-9)
+    (direction,) = beam_directions(setup)
+    more = (1.01**2 - 1) * np.asarray(setup.beams.modes)
+    np.testing.assert_allclose(direction.modes, more, rtol=0, atol=1e-12)
+    signal = np.asarray(true_signal(setup, true_values(setup)))
+    modelled = np.asarray(setup.signal)
+    np.testing.assert_allclose(signal, 1.01**2 * modelled, rtol=0, atol=1e-9 * modelled.max())
+    # against the embedded antennas, and a shift in frequency of a file
+    setup = set_up(small_scenario(f"noise.beam.file={other}"))
+    np.testing.assert_array_equal(true_beams(setup).modes, read_beam(other).beams(25.0, 6).modes)
+    setup = set_up(small_scenario(f"beam.file={path}", "noise.beam.shift_mhz=5"))
+    np.testing.assert_array_equal(true_beams(setup).modes, read_beam(path).beams(30.0, 6).modes)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["beam.length_m=2"], "length_m is an entry of model monopole, not of luseepy"),
+        (["noise.beam={parameters: {length_m: 0.1}}"], "which beam.file replaces"),
+        (["sky.sources=false", "sources.list=[{name: Cas A}]"], "exact beams of the embedded"),
+    ],
+)
+def test_what_a_file_does_not_have(overrides, message):
+    with pytest.raises(InputError, match=message):
+        lb.load_scenario("fiducial", ["beam.file=some.fits", *overrides])
+
+
+def test_two_beam_errors_at_once():
+    with pytest.raises(InputError, match="give either shift_mhz, file or parameters"):
+        lb.load_scenario("fiducial", ["noise.beam={shift_mhz: 1, file: some.fits}"])
+
+
+def test_the_program_of_the_instrument_needs_the_embedded_antennas(tmp_path):
+    experiment = build(small_scenario(f"beam.file={write(tmp_path / 'beam.fits')}"))
+    with pytest.raises(InputError, match="leave out beam.file"):
+        program_pieces(experiment)["instrument"]()
+
+
+@pytest.mark.long
+def test_two_ports_from_a_file_make_a_map(tmp_path):
+    path = write(tmp_path / "beam.fits")
+    given = ["lmax=6", "observation.runs.0.cycles=0.02"]
+    given += [f"beam.file={path}", "beam.rotations_deg=[0,90]"]
+    arguments = [a for override in given for a in ("--set", override)]
+    assert main(["map", "fiducial", *arguments, "-o", str(tmp_path / "map"), "--quiet"]) == 0
+    with xr.open_dataset(tmp_path / "map" / "diagnostics.nc", engine="h5netcdf") as found:
+        assert list(found["product"].values) == ["00R", "01R", "01I", "11R"]

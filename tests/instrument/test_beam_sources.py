@@ -1,0 +1,127 @@
+"""The sources of beams: the embedded antennas, scalar files and four-port responses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.instrument.beams import (
+    BeamSource,
+    EmbeddedBeams,
+    Monopoles,
+    ResponseBeams,
+    ScalarFileBeams,
+    read_beam,
+)
+from lusee_bayes.testing import check_beam_source
+
+FREQUENCY, LMAX, TURNED_DEG = 25.0, 6, 30.0
+
+
+@pytest.fixture(scope="module")
+def scalar(test_data):
+    """The beam of one arm: synthetic, in steps of 1 degree."""
+    return read_beam(test_data / "luseepy" / "synthetic_monopole_beam.fits")
+
+
+@pytest.fixture(scope="module")
+def response(test_data):
+    """Short dipoles with luseepy's receivers, in steps of 2 degrees."""
+    return read_beam(test_data / "luseepy" / "synthetic_response_v3.fits")
+
+
+def further(source: BeamSource, angle_deg: float) -> BeamSource:
+    """The same antennas, turned from East towards North."""
+    if isinstance(source, EmbeddedBeams):
+        offset = source.antennas.turntable_offset_deg + angle_deg
+        return EmbeddedBeams(eqx.tree_at(lambda m: m.turntable_offset_deg, source.antennas, offset))
+    return replace(source, turntable_offset_deg=source.turntable_offset_deg + angle_deg)
+
+
+# nodes between the files' directions see splines: 1e-10 measured. luseepy's rule for scalar beams
+# costs h^2 / 12 of the slopes at zenith and horizon (1.7e-4 measured), its rule for responses
+# counts the horizon half (4.8e-4)
+SPLINES, LUSEEPY = 1e-9, 1e-3
+
+
+def check(source: BeamSource, quadrature: float) -> None:
+    check_beam_source(
+        source,
+        further(source, TURNED_DEG),
+        turned_deg=TURNED_DEG,
+        frequency_mhz=FREQUENCY,
+        lmax=LMAX,
+        quadrature=quadrature,
+    )
+
+
+def test_embedded_beams():
+    source = EmbeddedBeams(Monopoles(turntable_offset_deg=4.0))
+    check(source, 1e-12)
+    assert not source.emits
+    assert source.impedance(FREQUENCY) is None
+    assert source.per_kelvin(FREQUENCY) is None
+
+
+@pytest.mark.parametrize(
+    ("options", "quadrature"),
+    [
+        ({}, SPLINES),
+        ({"moon_k": 250.0, "rotations_deg": (0.0, 90.0), "taper": False}, SPLINES),
+        ({"moon_k": 250.0, "luseepy_quadrature": True, "turntable_offset_deg": 7.0}, LUSEEPY),
+    ],
+)
+def test_scalar_file_beams(scalar, options, quadrature):
+    source = ScalarFileBeams(scalar, **options)
+    check(source, quadrature)
+    assert source.impedance(FREQUENCY) == scalar.impedance[scalar.frequencies_mhz == FREQUENCY]
+    assert source.per_kelvin(FREQUENCY) is None
+
+
+@pytest.mark.parametrize(
+    ("options", "quadrature"),
+    [
+        ({"antenna_k": 300.0}, SPLINES),
+        ({"moon_k": 250.0, "luseepy_quadrature": True, "turntable_offset_deg": 7.0}, LUSEEPY),
+    ],
+)
+def test_response_beams(response, options, quadrature):
+    lossy = replace(response, loss_resistance=np.tile(0.5 * np.eye(4, dtype=complex), (4, 1, 1)))
+    source = ResponseBeams(lossy, **options)
+    check(source, quadrature)
+    assert source.impedance(FREQUENCY) is None
+    np.testing.assert_array_equal(source.per_kelvin(FREQUENCY), response.per_kelvin(FREQUENCY))
+
+
+def test_files_are_placed_and_integrated_as_asked(scalar, response):
+    """The same numbers as the files' own methods give."""
+    f = FREQUENCY
+    source = ScalarFileBeams(
+        scalar, 7.0, taper=False, rotations_deg=(0.0, 90.0), luseepy_quadrature=True, moon_k=250.0
+    )
+    placed = {"grid": scalar.luseepy_grid, "taper": False, "rotations_deg": (7.0, 97.0)}
+    np.testing.assert_array_equal(
+        source.beams(f, LMAX).modes, scalar.beams(f, LMAX, **placed).modes
+    )
+    np.testing.assert_array_equal(source.background(f), scalar.background(f, 250.0, **placed))
+
+    source = ResponseBeams(response, 7.0, luseepy_quadrature=True, moon_k=250.0, antenna_k=300.0)
+    expected = response.beams(f, LMAX, grid=response.luseepy_grid, turn_deg=7.0)
+    np.testing.assert_array_equal(source.beams(f, LMAX).modes, expected.modes)
+    np.testing.assert_array_equal(source.background(f), response.background(f, 250.0, 300.0))
+
+
+def test_a_file_has_no_embedded_antennas_and_no_other_frequencies(scalar, response):
+    for source in (ScalarFileBeams(scalar, moon_k=250.0), ResponseBeams(response, moon_k=250.0)):
+        with pytest.raises(InputError, match=r"embedded antennas, which beam\.file replaces"):
+            _ = source.monopoles
+        for ask in (lambda f, s=source: s.beams(f, 2), source.background):
+            with pytest.raises(InputError, match="to 50 MHz, not at 51"):
+                ask(51.0)
+    with pytest.raises(InputError, match="to 50 MHz, not at 51"):
+        ScalarFileBeams(scalar).impedance(51.0)
+    assert ScalarFileBeams(replace(scalar, impedance=None)).impedance(51.0) is None

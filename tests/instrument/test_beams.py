@@ -1,0 +1,235 @@
+"""Grid, fields and product beams against closed forms and brute force."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.polynomial import Polynomial
+from numpy.polynomial.legendre import Legendre
+from reference import SPEED_OF_LIGHT, hemisphere, real_harmonics
+from scipy.special import eval_legendre, factorial
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
+from lusee_bayes.instrument.beams import (
+    AntennaFields,
+    HemisphereGrid,
+    ProductBeams,
+    displaced,
+    product_beams,
+    stokes_beam,
+)
+from lusee_bayes.instrument.beams.fields import unit_vectors
+from lusee_bayes.instrument.beams.product_beams import STOKES, mean_auto_integral
+from lusee_bayes.instrument.products import auto_indices, to_matrix, to_real
+
+LMAX = 16
+GRID = HemisphereGrid.for_lmax(LMAX)
+
+
+def legendre(ell):
+    return Legendre.basis(ell).convert(kind=Polynomial)
+
+
+def over_half(polynomial):
+    """Integral over cos theta = 0..1."""
+    return polynomial.integ()(1.0)
+
+
+def short_dipole(axis):
+    """Field of a short dipole along a unit vector, in free space above the horizon."""
+    axis = np.asarray(axis, dtype=float)
+    theta, phi = np.meshgrid(GRID.theta, GRID.phi, indexing="ij")
+    e_theta = np.stack(
+        [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)], axis=-1
+    )
+    e_phi = np.stack([-np.sin(phi), np.cos(phi), np.zeros_like(phi)], axis=-1)
+    return AntennaFields(*(jnp.asarray((e @ axis)[None] + 0j) for e in (e_theta, e_phi)), GRID)
+
+
+def random_fields(seed, n_antennas, grid):
+    """Smooth fields: polynomials of degree two in the components of n with random weights."""
+    rng = np.random.default_rng(seed)
+    x, y, z = unit_vectors(grid)
+    basis = np.stack([np.ones_like(x), x, y, z, x * y, z * z, x * x - y * y])
+
+    def one():
+        weights = rng.standard_normal((2, n_antennas, len(basis)))
+        return jnp.asarray(np.einsum("ab,btp->atp", weights[0] + 1j * weights[1], basis))
+
+    return AntennaFields(one(), one(), grid)
+
+
+def test_the_grid_integrates_over_the_hemisphere():
+    x, _, z = unit_vectors(GRID)
+    fields = jnp.asarray(np.stack([np.ones_like(x), z, x * x, x]))
+    expected = [2 * np.pi, np.pi, 2 * np.pi / 3, 0.0]
+    np.testing.assert_allclose(GRID.integrate(fields), expected, rtol=0, atol=1e-13)
+    assert (np.diff(GRID.theta) > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(unit_vectors(GRID), axis=0), 1.0, rtol=1e-14)
+
+
+def test_uniform_hemisphere():
+    one = jnp.ones((len(GRID.theta), GRID.n_phi))
+    got = np.asarray(GRID.modes(one, LMAX))
+    expected = np.zeros(n_modes(LMAX))
+    for ell in range(LMAX + 1):
+        # int_0^1 P_l = (P_{l-1}(0) - P_{l+1}(0)) / (2 l + 1)
+        half = 1.0 if ell == 0 else (eval_legendre(ell - 1, 0.0) - eval_legendre(ell + 1, 0.0)) / (
+            2 * ell + 1
+        )  # fmt: skip
+        expected[ell * (ell + 1)] = 2 * np.pi * np.sqrt((2 * ell + 1) / (4 * np.pi)) * half
+    # polynomials within the rule's degree: only rounding is left
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
+
+
+def test_short_vertical_dipole():
+    fields = short_dipole([0, 0, 1])
+    got = np.asarray(product_beams(fields, 10.0, LMAX, normalise=False).modes)[0]
+    power = Polynomial([1.0, 0.0, -1.0]) / 2  # sin^2 theta / 2
+    expected = np.zeros(n_modes(LMAX))
+    for ell in range(LMAX + 1):
+        norm = 2 * np.pi * np.sqrt((2 * ell + 1) / (4 * np.pi))
+        expected[ell * (ell + 1)] = norm * over_half(power * legendre(ell))
+    # the oracle's monomials of degree 18 cancel to 1e-11
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize(("axis", "sign"), [([1, 0, 0], -1.0), ([0, 1, 0], 1.0)])
+def test_short_horizontal_dipole(axis, sign):
+    got = np.asarray(product_beams(short_dipole(axis), 10.0, LMAX, normalise=False).modes)[0]
+    # |E|^2 = 1 - sin^2 theta cos^2 phi (East) = (1 + z^2)/2 - (1 - z^2)/2 cos 2 phi
+    even, odd = Polynomial([0.25, 0.0, 0.25]), sign * Polynomial([0.25, 0.0, -0.25])
+    expected = np.zeros(n_modes(LMAX))
+    for ell in range(LMAX + 1):
+        norm = np.sqrt((2 * ell + 1) / (4 * np.pi))
+        expected[ell * (ell + 1)] = 2 * np.pi * norm * over_half(even * legendre(ell))
+        if ell >= 2:
+            # P_l^2 = (1 - z^2) P_l''; int cos^2 2 phi = pi; sqrt(2) of the real harmonics
+            p_l2 = Polynomial([1.0, 0.0, -1.0]) * legendre(ell).deriv(2)
+            norm *= np.sqrt(2.0 * factorial(ell - 2) / factorial(ell + 2))
+            expected[ell * (ell + 1) + 2] = np.pi * norm * over_half(odd * p_l2)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10)
+
+
+def test_only_the_sky_above_the_horizon_answers():
+    beams = product_beams(random_fields(0, 2, GRID), 10.0, LMAX, normalise=False)
+    sky = np.random.default_rng(1).standard_normal(n_modes(LMAX))
+    theta, phi = (a.ravel() for a in np.meshgrid(GRID.theta, GRID.phi, indexing="ij"))
+    above = (synthesis_matrix(theta, phi, LMAX) @ sky).reshape(len(GRID.theta), -1)
+    patterns = to_real(stokes_beam(random_fields(0, 2, GRID)))
+    expected = GRID.integrate(patterns * jnp.asarray(above)[None])
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(np.asarray(beams.modes) @ sky, expected, rtol=0, atol=1e-12 * scale)
+    # and by an independent rule with scipy's harmonics, above the horizon alone
+    theta, phi, solid_angle = hemisphere(40, 90)
+    one = product_beams(short_dipole([0, 0, 1]), 10.0, 4, normalise=False).modes[0]
+    temperature = real_harmonics(theta, phi, 4) @ sky[:25]
+    brute = np.sum(solid_angle * np.sin(theta) ** 2 / 2 * temperature)
+    np.testing.assert_allclose(np.asarray(one) @ sky[:25], brute, rtol=1e-12)
+
+
+def test_a_fully_polarised_wave_gives_the_product_of_the_voltages():
+    fields = random_fields(2, 3, GRID)
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        e = rng.standard_normal(2) + 1j * rng.standard_normal(2)
+        coherency = np.outer(e, e.conj())  # [[I + Q, U + i V], [U - i V, I - Q]] / 2
+        stokes = {
+            "I": np.trace(coherency).real,
+            "Q": (coherency[0, 0] - coherency[1, 1]).real,
+            "U": 2 * coherency[0, 1].real,
+            "V": 2 * coherency[0, 1].imag,
+        }
+        got = sum(np.asarray(stokes_beam(fields, s)) * value for s, value in stokes.items())
+        voltage = np.asarray(fields.e_theta) * e[0] + np.asarray(fields.e_phi) * e[1]
+        expected = voltage[:, None] * voltage[None].conj()
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("stokes", STOKES)
+def test_pairs_are_hermitian(stokes):
+    b = np.asarray(stokes_beam(random_fields(4, 3, GRID), stokes))
+    np.testing.assert_allclose(b, b.conj().swapaxes(0, 1), rtol=0, atol=1e-13)
+
+
+def test_power_is_positive():
+    fields = random_fields(5, 4, GRID)
+    b = np.moveaxis(np.asarray(stokes_beam(fields)), (0, 1), (2, 3))
+    assert np.linalg.eigvalsh(b).min() > -1e-12 * np.abs(b).max()
+    # a sky of positive temperature: T_sky = 1 + 0.9 z is one
+    sky = jnp.zeros(n_modes(LMAX)).at[0].set(np.sqrt(4 * np.pi))
+    sky = sky.at[2].set(0.9 * np.sqrt(4 * np.pi / 3))
+    v = to_matrix(product_beams(fields, 10.0, LMAX).modes @ sky)
+    assert np.linalg.eigvalsh(np.asarray(v)).min() > 0.0
+
+
+def test_displaced_copies_are_an_interferometer():
+    frequency = 20.0
+    positions = np.array([[0.0, 0.0, 0.0], [3.0, -1.0, 0.5], [-2.0, 4.0, 1.0]])
+    fields = displaced(short_dipole([1, 0, 0]), positions, frequency)
+    beams = product_beams(fields, frequency, LMAX, normalise=False)
+    sky = np.random.default_rng(6).standard_normal(n_modes(6))
+    theta, phi, solid_angle = hemisphere(60, 121)
+    temperature = real_harmonics(theta, phi, 6) @ sky
+    n = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    power = (1 - n[0] ** 2) / 2
+    k = 2 * np.pi * frequency * 1e6 / SPEED_OF_LIGHT
+    got = np.asarray(to_matrix(jnp.asarray(np.asarray(beams.modes)[:, : n_modes(6)] @ sky)))
+    for i in range(3):
+        for j in range(3):
+            fringe = np.exp(1j * k * (positions[i] - positions[j]) @ n)
+            expected = np.sum(solid_angle * power * temperature * fringe)
+            # two converged rules, baselines of a third of a wavelength
+            np.testing.assert_allclose(got[i, j], expected, rtol=0, atol=1e-12)
+
+
+def test_normalised_autos_average_to_one():
+    fields = random_fields(7, 3, GRID)
+    uniform = np.sqrt(4 * np.pi)  # the monopole coefficient of a sky of 1 K
+    raw = product_beams(fields, 10.0, 4, normalise=False)
+    scaled = product_beams(fields, 10.0, 4)
+    autos = auto_indices(3)
+    mean = np.mean(np.asarray(raw.modes)[autos, 0]) * uniform
+    np.testing.assert_allclose(mean, mean_auto_integral(fields), rtol=1e-13)
+    assert np.mean(np.asarray(scaled.modes)[autos, 0]) * uniform == pytest.approx(1.0, rel=1e-13)
+    np.testing.assert_allclose(scaled.modes, np.asarray(raw.modes) / mean, rtol=1e-12)
+    # Q is scaled by the same Stokes I integral, which keeps |Q| <= I
+    q = product_beams(fields, 10.0, 4, stokes="Q").modes
+    q_raw = product_beams(fields, 10.0, 4, stokes="Q", normalise=False).modes
+    np.testing.assert_allclose(q, np.asarray(q_raw) / mean, rtol=1e-12)
+
+
+def test_a_smaller_lmax_is_a_slice():
+    fields = random_fields(8, 2, GRID)
+    large, small = (product_beams(fields, 10.0, lmax).modes for lmax in (LMAX, 5))
+    np.testing.assert_allclose(large[:, : n_modes(5)], small, rtol=0, atol=1e-14)
+    assert product_beams(fields, 10.0, 5).labels == ("00R", "01R", "01I", "11R")
+    assert product_beams(fields, 10.0, 5).lmax == 5
+
+
+def test_modes_keep_leading_axes_and_refuse_a_coarse_azimuth():
+    patterns = to_real(stokes_beam(random_fields(9, 2, GRID)))
+    both = GRID.modes(patterns.reshape(2, 2, *patterns.shape[1:]), 4)
+    np.testing.assert_allclose(both[1, 0], GRID.modes(patterns[2], 4), rtol=0, atol=1e-14)
+    coarse = HemisphereGrid.gauss_legendre(10, 8)
+    with pytest.raises(InputError, match="8 azimuths cannot resolve lmax = 4"):
+        coarse.modes(jnp.ones((10, 8)), 4)
+
+
+def test_fields_are_checked():
+    good = short_dipole([0, 0, 1])
+    with pytest.raises(InputError, match="e_theta must be a complex128 array, got complex64"):
+        AntennaFields(good.e_theta.astype(jnp.complex64), good.e_phi, GRID)
+    with pytest.raises(InputError, match=r"e_theta has shape \(1, 127, 128\), expected"):
+        AntennaFields(good.e_theta[:, 1:], good.e_phi[:, 1:], GRID)
+    with pytest.raises(InputError, match="give the pattern of one antenna, got 2"):
+        displaced(random_fields(0, 2, GRID), np.zeros((2, 3)), 10.0)
+
+
+def test_unknown_stokes_and_products_are_refused():
+    with pytest.raises(InputError, match="unknown Stokes parameter 'W'; known: I, Q, U, V"):
+        stokes_beam(short_dipole([0, 0, 1]), "W")
+    with pytest.raises(InputError, match="3 products do not come from any number of antennas"):
+        ProductBeams(jnp.zeros((3, 4)), 10.0)
+    with pytest.raises(InputError, match="5 coefficients do not fill any lmax"):
+        ProductBeams(jnp.zeros((4, 5)), 10.0)

@@ -1,0 +1,312 @@
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference import arm_response, hemisphere, visibilities
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.harmonics import mode_numbers, n_modes
+from lusee_bayes.core.rotations import Rotation, turn_about_z
+from lusee_bayes.instrument.beams import Monopoles, ProductBeams, monopole_beams
+from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, as_coupling
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.observation import Observation, Run
+from lusee_bayes.instrument.pointing import Pointing
+from lusee_bayes.instrument.products import auto_indices, labels, to_matrix
+from lusee_bayes.testing import check_coupling
+
+LMAX = 8
+SITE = {"lon_deg": 182.258, "lat_deg": -23.814}
+
+
+def steep_sky(lmax, seed=0, monopole=1e4):
+    """A sky as steep as the Galaxy's: C_ell ~ (1 + ell)^-2.5 around a monopole, in K."""
+    ell, _ = mode_numbers(lmax)
+    a = np.random.default_rng(seed).standard_normal(n_modes(lmax))
+    a *= 0.5 * monopole * (1.0 + ell) ** -1.25
+    a[0] = monopole * np.sqrt(4 * np.pi)
+    return jnp.asarray(a)
+
+
+def random_beams(seed, lmax=LMAX, n_products=16):
+    modes = np.random.default_rng(seed).standard_normal((n_products, n_modes(lmax)))
+    return ProductBeams(jnp.asarray(modes), 25.0)
+
+
+def two_runs():
+    return Observation.from_runs([Run(0.3), Run(0.2, 30.0)], step_s=30000.0)
+
+
+@pytest.fixture(scope="module")
+def coupling():
+    return CouplingMatrix.observe(random_beams(1), two_runs())
+
+
+@pytest.mark.parametrize(
+    ("lmax", "turntable"), [pytest.param(16, 0.0, marks=pytest.mark.long), (8, 35.0)]
+)
+def test_visibilities_agree_with_an_integral_over_the_sky_in_lunartopo(lmax, turntable):
+    frequency = 25.0
+    o = Observation.from_runs([Run(1.0, turntable)])
+    sky = steep_sky(lmax)
+    got = CouplingMatrix.observe(monopole_beams(frequency, lmax), o) @ sky
+    got = np.asarray(got).reshape(16, -1)
+    grid = theta, phi, solid_angle = hemisphere(32, 64)
+    # the antennas one direction at a time, reflection included
+    s, p = Monopoles().regolith.reflection(np.cos(theta), frequency)
+    tilt, voltages = np.radians(75.0), []
+    for azimuth in np.radians([90.0, 0.0, 270.0, 180.0]):  # North, East, South, West
+        arm = np.array(
+            [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)]
+        )
+        voltages.append(
+            [
+                arm_response(
+                    theta[k],
+                    phi[k],
+                    frequency_mhz=frequency,
+                    length=3.0,
+                    arm=arm,
+                    height=2.0,
+                    reflection=(complex(s[k]), complex(p[k])),
+                    steps=121,
+                )
+                for k in range(len(theta))
+            ]
+        )
+    e = np.array(voltages)  # (antenna, direction, component)
+    power = np.einsum("idc,jdc->ijd", e, e.conj()) / 2
+    power /= np.mean([np.sum(power[i, i].real * solid_angle) for i in range(4)])
+    response = np.array(
+        [getattr(power[int(x[0]), int(x[1])], {"R": "real", "I": "imag"}[x[2]]) for x in labels()]
+    )
+    for k in np.random.default_rng(2).integers(0, o.n_times, 3):
+        expected = visibilities(
+            response, grid, np.asarray(sky), o.times[k], **SITE, turntable_deg=turntable
+        )
+        # Simpson with 120 steps along the arm, (k h)^4 / 180 = 1e-10, and the neglected tilts
+        np.testing.assert_allclose(got[:, k], expected, rtol=0, atol=5e-9 * np.abs(expected).max())
+
+
+def flagged_coupling():
+    """Two runs of random beams with three samples in ten missing."""
+    o = two_runs()
+    layout = DataLayout.from_flags(np.random.default_rng(6).random((16, o.n_times)) < 0.3)
+    return CouplingMatrix.build(random_beams(5), Pointing.of(o, LMAX), layout)
+
+
+def by_rows(coupling):
+    """The matrix row by row, which neither products nor ``dense`` use."""
+    return np.asarray(coupling.rows(coupling.layout.product, coupling.layout.time))
+
+
+def structured(coupling):
+    return coupling, by_rows(coupling)
+
+
+def given(n_data, n_unknowns):
+    matrix = np.random.default_rng(n_data).standard_normal((n_data, n_unknowns))
+    return DenseCoupling(matrix), matrix
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        pytest.param(lambda: structured(flagged_coupling()), id="structured"),
+        pytest.param(lambda: given(9, 16), id="dense"),
+        pytest.param(lambda: given(30, 5), id="tall"),
+    ],
+)
+def test_contract(made):
+    check_coupling(*made())
+
+
+def test_arrays_are_wrapped_and_couplings_left_alone(coupling):
+    matrix = jnp.eye(3)
+    assert isinstance(as_coupling(matrix), DenseCoupling)
+    assert as_coupling(coupling) is coupling
+    value = jax.jit(jax.grad(lambda a: (as_coupling(a) @ jnp.ones(3)).sum()))(matrix)
+    np.testing.assert_array_equal(value, np.ones((3, 3)))
+
+
+def test_bad_matrices_are_refused():
+    with pytest.raises(InputError, match=r"the coupling matrix holds NaN .*\(1, 2\)"):
+        DenseCoupling(jnp.eye(3).at[1, 2].set(jnp.nan))
+    with pytest.raises(InputError, match="the coupling matrix must be a float64 array"):
+        DenseCoupling(jnp.eye(3, dtype=jnp.float32))
+    with pytest.raises(InputError, match="the direction has shape"):
+        DenseCoupling(jnp.eye(3)).plus(jnp.ones(()), DenseCoupling(jnp.ones((3, 2))))
+
+
+@pytest.mark.long
+def test_rows_are_those_of_the_matrix(coupling):
+    dense = np.asarray(coupling.dense())
+    assert dense.shape == coupling.shape == (16 * two_runs().n_times, n_modes(LMAX))
+    rng = np.random.default_rng(4)
+    product, time = rng.integers(0, 16, 40), rng.integers(0, two_runs().n_times, 40)
+    rows = coupling.rows(product, time)
+    np.testing.assert_allclose(rows, dense[product * two_runs().n_times + time], rtol=0, atol=1e-12)
+
+
+def test_dense_rows_are_each_times_own_rotation(coupling):
+    """V = b . D(topocentric <- galactic at t) a, with one dense rotation for every time."""
+    o = two_runs()
+    dense = np.asarray(coupling.dense()).reshape(16, o.n_times, -1)
+    a = steep_sky(LMAX, monopole=1.0)
+    beams = random_beams(1).modes
+    topocentric = o.topocentric_from_mcmf() @ o.mcmf_from_galactic()
+    for k in (0, 5, o.n_times - 1):
+        seen = Rotation.from_matrix(topocentric[k], LMAX)(a)
+        turned = turn_about_z(beams, np.radians(o.turntable_deg[o.run[k]]))
+        expected = np.asarray(turned @ seen)
+        # the neglected third order of the tilts: (1e-3)^3 of low modes
+        np.testing.assert_allclose(
+            dense[:, k] @ np.asarray(a), expected, rtol=0, atol=1e-8 * np.abs(expected).max()
+        )
+
+
+def test_flagged_samples_are_left_out(coupling):
+    o = two_runs()
+    flags = np.random.default_rng(8).random((16, o.n_times)) < 0.3
+    some = CouplingMatrix.build(random_beams(1), Pointing.of(o, LMAX), DataLayout.from_flags(flags))
+    keep = ~flags.ravel()
+    assert some.shape == (keep.sum(), n_modes(LMAX))
+    np.testing.assert_array_equal(some.dense(), np.asarray(coupling.dense())[keep])
+    a = steep_sky(LMAX)
+    np.testing.assert_allclose(some @ a, np.asarray(coupling @ a)[keep], rtol=1e-14)
+    # rows stay addressed by product and time, flagged or not
+    product, time = np.nonzero(flags)
+    rows = some.rows(product[:5], time[:5])
+    full = np.asarray(coupling.dense())[product[:5] * o.n_times + time[:5]]
+    np.testing.assert_allclose(rows, full, rtol=0, atol=1e-12)
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_a_quarter_turn_of_the_turntable_permutes_the_products():
+    lmax = 12
+    beams, sky = monopole_beams(25.0, lmax), steep_sky(lmax)
+    straight, turned = (
+        CouplingMatrix.observe(beams, Observation.from_runs([Run(0.1, angle)])) @ sky
+        for angle in (0.0, 90.0)
+    )
+    v, w = (np.asarray(to_matrix(x.reshape(16, -1))) for x in (straight, turned))
+    # the North arm (0) now points West, where 3 was; East (1) points North, where 0 was; ...
+    was = (np.arange(4) - 1) % 4
+    scale = np.abs(v).max()
+    np.testing.assert_allclose(w, v[was][:, was], rtol=0, atol=1e-12 * scale)
+    assert np.abs(w - v).max() > 1e-2 * scale
+
+
+def test_a_second_run_is_an_observation_of_its_own(coupling):
+    o = two_runs()
+    a = steep_sky(LMAX)
+    both = np.asarray(coupling @ a).reshape(16, -1)
+    for run in (0, 1):
+        keep = o.run == run
+        alone = Observation(
+            o.lon_deg,
+            o.lat_deg,
+            o.times[keep],
+            np.zeros(keep.sum(), dtype=int),
+            (o.turntable_deg[run],),
+            o.step_s,
+        )
+        # each has its own mean pole, so only the neglected third order of the series differs
+        got = np.asarray(CouplingMatrix.observe(random_beams(1), alone) @ a).reshape(16, -1)
+        np.testing.assert_allclose(got, both[:, keep], rtol=0, atol=2e-6 * np.abs(both).max())
+
+
+def test_a_smaller_lmax_is_a_slice(coupling):
+    low = 5
+    beams = ProductBeams(random_beams(1).modes[:, : n_modes(low)], 25.0)
+    pointing = Pointing.of(two_runs(), low, order=coupling.pointing.order)
+    small = CouplingMatrix.build(beams, pointing)
+    full = np.asarray(coupling.dense())
+    np.testing.assert_allclose(small.dense(), full[:, : n_modes(low)], rtol=0, atol=1e-12)
+
+
+def test_linearity(coupling):
+    a, b = steep_sky(LMAX, 1), steep_sky(LMAX, 2)
+    both = coupling @ (2.0 * a - 3.0 * b)
+    apart = 2.0 * (coupling @ a) - 3.0 * (coupling @ b)
+    np.testing.assert_allclose(both, apart, rtol=0, atol=1e-12 * np.abs(both).max())
+
+
+def test_a_uniform_sky_of_one_kelvin_gives_autos_of_one_kelvin():
+    o = Observation.from_runs([Run(0.1, 20.0)])
+    c = CouplingMatrix.observe(monopole_beams(10.0, LMAX), o)
+    sky = jnp.zeros(n_modes(LMAX)).at[0].set(np.sqrt(4 * np.pi))
+    v = np.asarray(c @ sky).reshape(16, -1)
+    np.testing.assert_allclose(v[auto_indices()].mean(axis=0), 1.0, rtol=1e-13)
+    # four arms in one place, alike up to turns: each auto by itself, too
+    np.testing.assert_allclose(v[auto_indices()], 1.0, rtol=1e-12)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("cycles", "lmax"), [pytest.param(1, 47, marks=pytest.mark.long), (3, 12)])
+def test_the_moons_axis_is_not_fixed(cycles, lmax):
+    """Orders of the tilt expansion in units of the fiducial radiometer noise (DESIGN 5)."""
+    o = Observation.from_runs([Run(1.0)] * cycles, step_s=20000.0)
+    beams, sky = monopole_beams(25.0, lmax), steep_sky(lmax)
+
+    pointing = Pointing.of(o, lmax)
+
+    def visibilities_at(order):
+        return np.asarray(CouplingMatrix.build(beams, replace(pointing, order=order)) @ sky)
+
+    exact = visibilities_at(3)  # itself good to 1e-7 sigma
+    v = exact.reshape(16, -1)
+    autos = v[auto_indices()]
+    first, second = (np.array([int(x[i]) for x in labels()]) for i in (0, 1))
+    sigma = np.sqrt((autos[first] * autos[second] + v**2) / (2 * 1e6 * 7200.0)).ravel()
+
+    def off(order):
+        return np.abs((visibilities_at(order) - exact) / sigma)
+
+    growth = (0.083 / 0.044) if cycles == 3 else 1.0  # the wander of the axis
+    assert off(0).max() > 1.0
+    assert np.sqrt(np.mean(off(0) ** 2)) > 0.3
+    assert off(1).max() < 0.02 * growth**2
+    assert off(2).max() < 1e-5 * growth**3
+    assert pointing.order == 2
+    assert off(pointing.order).max() < 1e-4
+
+
+def test_differentiable_in_the_beams():
+    o = two_runs()
+    pointing, sky = Pointing.of(o, LMAX), steep_sky(LMAX, monopole=1.0)
+    weights = jnp.asarray(np.random.default_rng(9).standard_normal(16 * o.n_times))
+
+    def f(modes):
+        return weights @ (CouplingMatrix.build(ProductBeams(modes, 25.0), pointing) @ sky)
+
+    modes, direction = random_beams(1).modes, random_beams(2).modes
+    slope = jnp.sum(jax.grad(f)(modes) * direction)
+    # V is linear in the beams: its derivative along a direction is its value there
+    np.testing.assert_allclose(slope, f(direction), rtol=1e-10)
+
+
+def test_bad_input_is_refused(coupling):
+    pointing = Pointing.of(two_runs(), LMAX)
+    with pytest.raises(InputError, match=r"the beam coefficients has shape \(16, 36\), expected"):
+        CouplingMatrix.build(random_beams(0, lmax=5), pointing)
+    with pytest.raises(InputError, match="the data layout has 4 products x 7 times"):
+        CouplingMatrix.build(random_beams(0), pointing, DataLayout(4, 7))
+    with pytest.raises(InputError, match=r"the sky has shape \(80,\), expected \(81,\)"):
+        coupling @ jnp.zeros(80)
+    with pytest.raises(InputError, match=r"the data has shape \(3,\)"):
+        coupling.transpose_mv(jnp.zeros(3))
+    with pytest.raises(InputError, match="the sky must be a float64 array, got an array of float"):
+        coupling @ jnp.zeros(81, dtype=jnp.float32)
+
+
+@pytest.mark.parametrize(
+    ("product", "time", "message"),
+    [(16, 0, r"product numbers must lie in 0..15"), (0, -1, r"time numbers must lie in 0\.\.")],
+)
+def test_rows_that_do_not_exist_are_refused(coupling, product, time, message):
+    with pytest.raises(InputError, match=message):
+        coupling.rows(np.array([product]), np.array([time]))

@@ -1,0 +1,206 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference import SPEED_OF_LIGHT, arm_response
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.rotations import turn_about_z
+from lusee_bayes.instrument.beams import (
+    HemisphereGrid,
+    Monopoles,
+    Regolith,
+    monopole_beams,
+    product_beams,
+    stokes_beam,
+)
+from lusee_bayes.instrument.beams.monopoles import PORT_AZIMUTHS_DEG
+from lusee_bayes.instrument.products import to_matrix
+
+GRID = HemisphereGrid.gauss_legendre(6, 8)
+NO_GROUND = Regolith(1.0, 1.0, 0.0)
+CONDUCTOR = Regolith(4.0, 4.0, 1e16)
+
+
+def arms(zenith_angle_deg, azimuths_deg=PORT_AZIMUTHS_DEG):
+    tilt = np.radians(zenith_angle_deg)
+    return [
+        np.array([np.sin(tilt) * np.cos(a), np.sin(tilt) * np.sin(a), np.cos(tilt)])
+        for a in np.radians(azimuths_deg)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("frequency", "options"),
+    [
+        (1.0, {}),
+        (25.0, {}),
+        (50.0, {"zenith_angle_deg": 100.0, "height_m": 0.7, "length_m": 2.5}),
+    ],
+)
+def test_fields_agree_with_a_sum_along_the_arms(frequency, options):
+    m = Monopoles(**options)
+    fields = m.fields(frequency, GRID)
+    s, p = m.regolith.reflection(np.cos(GRID.theta), frequency)
+    scale = np.abs(fields.e_theta).max()
+    for port, arm in enumerate(arms(float(m.zenith_angle_deg))):
+        for t in range(len(GRID.theta)):
+            for f in range(0, GRID.n_phi, 3):
+                expected = arm_response(
+                    GRID.theta[t],
+                    GRID.phi[f],
+                    frequency_mhz=frequency,
+                    length=float(m.length_m),
+                    arm=arm,
+                    height=float(m.height_m),
+                    reflection=(complex(s[t]), complex(p[t])),
+                )
+                got = fields.e_theta[port, t, f], fields.e_phi[port, t, f]
+                # Simpson's rule with 4000 steps of k h < 1e-3: 1e-13 of the integral
+                np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * scale)
+
+
+def test_a_short_arm_in_free_space_is_a_short_dipole():
+    frequency, length = 1.0, 1e-3
+    m = Monopoles(NO_GROUND, length_m=length)
+    fields = m.fields(frequency, GRID)
+    moment = np.pi * frequency * 1e6 / SPEED_OF_LIGHT * length**2  # int sin k(L - s) ds
+    theta, phi = np.meshgrid(GRID.theta, GRID.phi, indexing="ij")
+    for port, arm in enumerate(arms(75.0)):
+        e_theta = (arm[0] * np.cos(phi) + arm[1] * np.sin(phi)) * np.cos(theta)
+        e_theta -= arm[2] * np.sin(theta)
+        e_phi = arm[1] * np.cos(phi) - arm[0] * np.sin(phi)
+        # the phase along the arm, k L = 2e-5
+        np.testing.assert_allclose(fields.e_theta[port] / moment, e_theta, rtol=0, atol=2e-5)
+        np.testing.assert_allclose(fields.e_phi[port] / moment, e_phi, rtol=0, atol=2e-5)
+
+
+def test_a_vertical_arm_over_a_conductor_has_its_image():
+    frequency, height = 30.0, 1.5
+    m = Monopoles(CONDUCTOR, length_m=1e-4, zenith_angle_deg=0.0, height_m=height)
+    k = 2e6 * np.pi * frequency / SPEED_OF_LIGHT
+    e_theta = np.asarray(m.fields(frequency, GRID).e_theta[2])
+    array_factor = 2 * np.cos(k * height * np.cos(GRID.theta))
+    expected = np.abs(np.sin(GRID.theta) * array_factor) * k * 1e-8 / 2
+    # the arm itself is k L = 6e-5 radians long
+    np.testing.assert_allclose(
+        np.abs(e_theta), np.tile(expected[:, None], (1, 8)), rtol=0, atol=1e-4 * expected.max()
+    )
+
+
+def test_ports_point_north_east_south_west():
+    # a short arm in free space sees least along itself
+    m = Monopoles(NO_GROUND, length_m=1e-3, zenith_angle_deg=90.0)
+    grid = HemisphereGrid(np.array([np.pi / 2 - 1e-5]), np.ones(1), 4)  # E, N, W, S
+    power = np.asarray(stokes_beam(m.fields(1.0, grid)))[range(4), range(4), 0].real
+    horizon = {"E": 0, "N": 1, "W": 2, "S": 3}
+    for port, (along, across) in enumerate(["NE", "EN", "SE", "WN"]):
+        assert power[port, horizon[along]] < 1e-8 * power[port, horizon[across]]
+    # and the tip side: the arm's phase centre lies towards its tip, the wave from there is ahead
+    phase = np.asarray(Monopoles(NO_GROUND, length_m=1.0).fields(25.0, grid).e_theta)[:, 0]
+    for port, tip in enumerate("NESW"):
+        angles = np.angle(phase[port] / phase[port].sum())
+        assert np.argmax(angles) == horizon[tip]
+
+
+def test_a_quarter_turn_moves_each_port_to_the_next():
+    beams = monopole_beams(25.0, 8).modes
+    # from East towards North: N -> W, E -> N, S -> E, W -> S, so i -> i - 1
+    turned = np.asarray(to_matrix(turn_about_z(beams, np.pi / 2)))
+    here = np.asarray(to_matrix(beams))
+    previous = (np.arange(4) - 1) % 4
+    np.testing.assert_allclose(
+        turned, here[previous][:, previous], rtol=0, atol=1e-13 * here.real.max()
+    )
+    # a uniform sky sees no difference between the ports, and one between the autos and the crosses
+    assert np.ptp(here[range(4), range(4), 0].real) < 1e-15
+    assert np.abs(here[0, 1] - here[0, 0]).max() > 0.01
+
+
+def test_opposite_arms_answer_alike_after_half_a_turn():
+    fields = Monopoles().fields(25.0, GRID)
+    for name in ("e_theta", "e_phi"):
+        e = np.asarray(getattr(fields, name))
+        for one, other in ((0, 2), (1, 3)):
+            np.testing.assert_allclose(
+                np.roll(e[one], GRID.n_phi // 2, axis=1),
+                e[other],
+                rtol=0,
+                atol=1e-14 * np.abs(e).max(),
+            )
+
+
+def test_the_cross_of_opposite_arms_has_the_parities_of_the_cross():
+    # half a turn swaps the arms: B_02(phi + pi) = conj B_02(phi). So Re B_02 holds even m only,
+    # Im B_02 odd m only; the mirror East <-> West keeps both arms, so that both are even in x
+    modes = monopole_beams(25.0, 8)
+    ell = np.repeat(np.arange(9), 2 * np.arange(9) + 1)
+    m = np.arange(81) - ell * (ell + 1)
+    real, imag = (np.asarray(modes.modes[modes.labels.index(label)]) for label in ("02R", "02I"))
+    scale = np.abs(real).max()
+    assert np.abs(real[m % 2 == 1]).max() < 1e-14 * scale
+    assert np.abs(imag[m % 2 == 0]).max() < 1e-14 * scale
+    # x -> -x is phi -> pi - phi: cos m phi -> (-1)^m cos, sin -> -(-1)^m sin
+    flipped = np.where(m >= 0, 1.0, -1.0) * (-1.0) ** m
+    np.testing.assert_allclose(real * flipped, real, rtol=0, atol=1e-14 * scale)
+    np.testing.assert_allclose(imag * flipped, imag, rtol=0, atol=1e-14 * scale)
+    assert np.abs(imag).max() > 1e-2 * scale  # "the crosses are complex"
+
+
+@pytest.mark.long
+def test_gradients_agree_with_finite_differences():
+    names = ["surface_permittivity", "loss_tangent", "zenith_angle_deg", "length_m", "height_m"]
+    weights = jnp.asarray(np.random.default_rng(0).standard_normal((16, 25)))
+    grid = HemisphereGrid.gauss_legendre(12, 24)
+
+    @jax.jit
+    def f(x):
+        ground = Regolith(surface_permittivity=x[0], loss_tangent=x[1])
+        m = Monopoles(ground, zenith_angle_deg=x[2], length_m=x[3], height_m=x[4])
+        return jnp.sum(weights * product_beams(m.fields(25.0, grid), 25.0, 4).modes)
+
+    x = np.array([3.7, 0.01, 75.0, 3.0, 2.0])
+    slopes = np.asarray(jax.grad(f)(jnp.asarray(x)))
+    for k, name in enumerate(names):
+        step = 1e-3 * x * (np.arange(5) == k)
+        five_point = sum(
+            c * float(f(jnp.asarray(x + n * step)))
+            for c, n in ((1 / 12, -2), (-8 / 12, -1), (8 / 12, 1), (-1 / 12, 2))
+        )
+        # error of five points: (1e-3)^4 of a few; rounding: 1e-15 / 1e-3 of f, which is order one
+        assert slopes[k] * x[k] == pytest.approx(five_point / 1e-3, rel=1e-7, abs=1e-10), name
+        assert abs(slopes[k] * x[k]) > 1e-4, name
+
+
+@pytest.mark.parametrize(("frequency", "lmax"), [(50.0, 16), (25.0, 47)])
+def test_coefficients_do_not_change_when_the_nodes_double(frequency, lmax):
+    grid = HemisphereGrid.for_lmax(lmax)
+    finer = 2 * len(grid.theta), 2 * grid.n_phi
+    # a smaller lmax is a slice, so that both cases share two programs
+    coarse, fine = (
+        np.asarray(monopole_beams(frequency, 47, nodes=nodes).modes)[:, : (lmax + 1) ** 2]
+        for nodes in ((len(grid.theta), grid.n_phi), finer)
+    )
+    # from 25 MHz to 50 the echoes of layers 14 m apart vary twice as fast over the 64 nodes
+    tolerance = 1e-12 if frequency < 50.0 else 1e-11
+    np.testing.assert_allclose(coarse, fine, rtol=0, atol=tolerance * np.abs(fine).max())
+
+
+@pytest.mark.long
+def test_monopole_beams_are_the_product_beams_of_the_fields():
+    m = Monopoles(height_m=1.0)
+    fields = m.fields(25.0, HemisphereGrid.for_lmax(8))
+    for stokes in ("I", "V"):
+        got = monopole_beams(25.0, 8, m, stokes=stokes)
+        expected = product_beams(fields, 25.0, 8, stokes=stokes)
+        np.testing.assert_allclose(got.modes, expected.modes, rtol=0, atol=1e-13)
+        assert got.frequency_mhz == 25.0
+
+
+def test_bad_parameters_are_refused():
+    with pytest.raises(InputError, match=r"length_m must be positive, got 0.0"):
+        Monopoles(length_m=0.0)
+    with pytest.raises(InputError, match=r"height_m must be positive, got -1.0"):
+        Monopoles(height_m=-1.0)
+    with pytest.raises(InputError, match=r"frequency_mhz must be positive, got 0.0"):
+        Monopoles().fields(0.0, GRID)

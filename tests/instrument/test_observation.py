@@ -1,0 +1,199 @@
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import (
+    GCRS,
+    ICRS,
+    CartesianRepresentation,
+    Galactic,
+    get_body_barycentric,
+    get_sun,
+)
+from astropy.time import Time
+from lunarsky import MCMF, LunarTopo, MoonLocation
+from reference import galactic_directions
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.instrument.observation import CYCLE_DAYS, Observation, Run
+
+# the leap seconds of years far ahead are unknown; astropy says so whenever it converts them
+
+
+def test_the_fiducial_cycle_and_three_of_them():
+    one = Observation.from_runs()
+    assert one.n_times == 327
+    assert one.times[0].isot == "2027-01-15T00:00:00.000"
+    np.testing.assert_allclose(
+        one.hours, 2.0 * np.arange(327), rtol=0, atol=1e-6
+    )  # a double JD: 20 ns
+    three = Observation.from_runs([Run(1.0, angle) for angle in (0.0, 30.0, 60.0)])
+    assert (three.n_times, three.n_runs) == (981, 3)
+    np.testing.assert_array_equal(np.bincount(three.run), [327, 327, 327])
+    starts = three.hours[np.searchsorted(three.run, [0, 1, 2])]
+    np.testing.assert_allclose(starts, 24 * CYCLE_DAYS * np.arange(3), rtol=0, atol=1e-6)
+
+
+def test_runs_of_any_length_follow_one_another():
+    runs = [Run(0.25, 10.0), Run(0.5, -20.0)]
+    o = Observation.from_runs(runs, start="2026-06-01", step_s=3600.0)
+    np.testing.assert_array_equal(np.bincount(o.run), [163, 327])  # floor(cycles 655.72)
+    assert o.turntable_deg == (10.0, -20.0)
+    assert o.hours[163] == pytest.approx(0.25 * CYCLE_DAYS * 24, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_directions_agree_with_lunartopo(seed):
+    rng = np.random.default_rng(seed)
+    o = Observation.from_runs(
+        [Run(0.6), Run(0.5)],
+        start=["2027-01-15T00:00:00", "1999-03-04T05:06:07"][seed],
+        lon_deg=rng.uniform(-180, 360),
+        lat_deg=rng.uniform(-90, 90),
+    )
+    to_topo = o.topocentric_from_mcmf() @ o.mcmf_from_galactic()
+    theta, phi = np.arccos(rng.uniform(-1, 1, 40)), rng.uniform(0, 2 * np.pi, 40)
+    topo = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    for k in rng.integers(0, o.n_times, 5):
+        colatitude, longitude = galactic_directions(theta, phi, o.times[k], o.lon_deg, o.lat_deg)
+        there = np.stack(
+            [
+                np.sin(colatitude) * np.cos(longitude),
+                np.sin(colatitude) * np.sin(longitude),
+                np.cos(colatitude),
+            ]
+        )
+        # lunarsky goes through the same kernel; what is left is rounding of three rotations
+        np.testing.assert_allclose(to_topo[k] @ there, topo, rtol=0, atol=1e-10)
+
+
+def test_the_rotations_are_rotations_and_the_moon_turns():
+    o = Observation.from_runs([Run(1.0)])
+    r = o.mcmf_from_galactic()
+    np.testing.assert_allclose(
+        r @ r.swapaxes(1, 2), np.tile(np.eye(3), (327, 1, 1)), rtol=0, atol=1e-13
+    )
+    np.testing.assert_allclose(np.linalg.det(r), 1.0, rtol=0, atol=1e-13)
+    # after one sidereal month the Moon is back where it was, to 0.1 degrees (its rotation is
+    # uniform to that: physical libration); the last of 327 samples is 1.86 steps before that
+    turn = np.degrees(np.arccos((np.trace(r[-1] @ r[0].T) - 1) / 2))
+    assert turn == pytest.approx(360.0 * (1 - 326 * 7200 / (CYCLE_DAYS * 86400)), abs=0.1)
+    # it turns from x towards y, so the sky turns the other way, 360 degrees in 327.86 steps
+    step = r[1] @ r[0].T
+    assert np.degrees(np.arctan2(step[0, 1], step[0, 0])) == pytest.approx(1.098, abs=0.01)
+
+
+def test_zenith():
+    o = Observation.from_runs([Run(0.3)])
+    for k in (0, 50):
+        zero = np.zeros(1)
+        colatitude, longitude = galactic_directions(zero, zero, o.times[k], o.lon_deg, o.lat_deg)
+        expected = [
+            np.sin(colatitude[0]) * np.cos(longitude[0]),
+            np.sin(colatitude[0]) * np.sin(longitude[0]),
+            np.cos(colatitude[0]),
+        ]
+        np.testing.assert_allclose(o.zenith_galactic()[k], expected, rtol=0, atol=1e-10)
+
+
+def test_sun_altitude_agrees_with_lunarsky_and_with_the_sun_seen_from_the_earth():
+    o = Observation.from_runs([Run(1.0)], step_s=40000.0)
+    got = o.sun_altitude_deg()
+    site = MoonLocation.from_selenodetic(lon=o.lon_deg, lat=o.lat_deg)
+    sun, moon = (get_body_barycentric(b, o.times, ephemeris="builtin") for b in ("sun", "moon"))
+    away = (sun - moon).xyz.to_value(u.km)
+    direction = ICRS(CartesianRepresentation(away / np.linalg.norm(away, axis=0)))
+    by_frame = [direction[k].transform_to(LunarTopo(obstime=o.times[k], location=site)).alt.deg
+                for k in range(o.n_times)]  # fmt: skip
+    np.testing.assert_allclose(got, by_frame, rtol=0, atol=1e-7)
+    # the Earth lies 0.147 degrees of solar parallax away, aberration adds 0.006
+    seen = get_sun(o.times).cartesian.xyz.value
+    assert isinstance(get_sun(o.times).frame, GCRS)
+    galactic = ICRS(CartesianRepresentation(seen)).transform_to(Galactic()).cartesian.xyz.value
+    galactic = galactic / np.linalg.norm(galactic, axis=0)
+    from_earth = np.degrees(np.arcsin(np.sum(o.zenith_galactic() * galactic.T, axis=1)))
+    np.testing.assert_allclose(got, from_earth, rtol=0, atol=0.16)
+
+
+def test_night_only_keeps_the_samples_with_the_sun_down():
+    everything = Observation.from_runs([Run(1.0), Run(1.0)])
+    mixed = Observation.from_runs([Run(1.0), Run(1.0, night_only=True)])
+    site = MoonLocation.from_selenodetic(lon=everything.lon_deg, lat=everything.lat_deg)
+    sun, moon = (
+        get_body_barycentric(b, everything.times, ephemeris="builtin") for b in ("sun", "moon")
+    )
+    vector = (sun - moon).xyz.to_value(u.km)
+    icrs = ICRS(CartesianRepresentation(vector / np.linalg.norm(vector, axis=0)))
+    mcmf = icrs.transform_to(MCMF(obstime=everything.times)).cartesian.xyz.value
+    up = np.array([x.to_value(u.m) for x in (site.x, site.y, site.z)])
+    dark = up @ mcmf < 0
+    keep = (everything.run == 0) | dark
+    np.testing.assert_array_equal(mixed.times.jd, everything.times[keep].jd)
+    np.testing.assert_array_equal(mixed.run, everything.run[keep])
+    # half of a synodic month is 14.77 days: 177 samples of two hours
+    nights = np.sum(mixed.run == 1)
+    assert 140 < nights < 180
+
+
+def test_select():
+    o = Observation.from_runs([Run(0.1), Run(0.1, 30.0)])
+    keep = np.arange(o.n_times) % 3 == 0
+    some = o.select(keep)
+    np.testing.assert_array_equal(some.times.jd, o.times.jd[keep])
+    np.testing.assert_array_equal(some.run, o.run[keep])
+    np.testing.assert_array_equal(some.mcmf_from_galactic(), o.mcmf_from_galactic()[keep])
+
+
+@pytest.mark.parametrize(
+    ("start", "at"),
+    [
+        ("1899-12-31T12:00:00", "1899-12-31T12:00:00"),
+        ("2051-03-01T00:00:00", "2051-03-01T00:00:00"),
+        ("2049-12-20T00:00:00", "2050-01-16T0"),  # begins inside, ends outside
+    ],
+)
+def test_times_outside_the_ephemeris_are_refused(start, at):
+    with pytest.raises(InputError, match=rf"outside the ephemeris \(1900-2050\): {at}"):
+        Observation.from_runs([Run(1.0)], start=start)
+
+
+@pytest.mark.parametrize("start", ["1900-01-02T00:00:00", "2049-11-20T00:00:00"])
+def test_times_inside_the_ephemeris_work(start):
+    r = Observation.from_runs([Run(0.1)], start=start).mcmf_from_galactic()
+    np.testing.assert_allclose(np.linalg.det(r), 1.0, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"start": "next tuesday"}, "'next tuesday' is not a date; write it as 2027-01-15"),
+        ({"step_s": 0.0}, "step_s must be positive, got 0.0"),
+        ({"lat_deg": 95.0}, r"lat_deg must lie in -90..90, got 95.0"),
+        ({"runs": [Run(), Run(1e-3)]}, "run 1 of 0.001 cycles holds no sample of 7200.0 s"),
+        ({"runs": []}, "at least one run"),
+        ({"runs": [Run(turntable_deg=float("nan"))]}, "turntable_deg holds NaN"),
+        ({"runs": [Run(-1.0)]}, "length in cycles of run 0 must be positive, got -1.0"),
+        # the Sun is up for two weeks from 1 February 2027 at this site
+        (
+            {"runs": [Run(0.1, night_only=True)], "start": "2027-02-05T00:00:00"},
+            "run 0 holds no lunar night",
+        ),
+    ],
+)
+def test_bad_input_is_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        Observation.from_runs(**options)
+
+
+@pytest.mark.parametrize(
+    ("run", "turntable", "message"),
+    [
+        ([0, 1, 0], (0.0, 1.0), "run must count"),
+        ([0, 2, 2], (0.0, 1.0, 2.0), "run must count"),
+        ([0, 0, 1], (0.0,), "run must count 0, 1, ... up to 0"),
+        ([0, 0], (0.0,), r"times \(3,\) and run \(2,\)"),
+    ],
+)
+def test_inconsistent_samples_are_refused(run, turntable, message):
+    times = Time("2027-01-15") + np.arange(3.0) * u.hour
+    with pytest.raises(InputError, match=message):
+        Observation(0.0, 0.0, times, np.array(run), turntable, 3600.0)

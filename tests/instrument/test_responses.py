@@ -1,0 +1,356 @@
+"""Four-port responses from luseepy's files, against luseepy's own simulation and by hand."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from astropy.io import fits
+from fits_files import write_images
+from scipy.constants import Boltzmann, c, physical_constants
+
+import lusee_bayes as lb
+from lusee_bayes.cli.main import main
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.harmonics import from_healpy
+from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.instrument.beams import Receiver, read_beam
+from lusee_bayes.instrument.beams.receiver import loading_matrix
+from lusee_bayes.instrument.products import labels, to_matrix
+from lusee_bayes.instrument.waterfalls import read_waterfall
+from lusee_bayes.testing import small_scenario
+
+VACUUM = physical_constants["characteristic impedance of vacuum"][0]
+LMAX, MOON = 47, 250.0
+
+
+# --- luseepy's own simulation -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def luseepy(test_data):
+    """(response, path of the waterfall, its images by name)."""
+    folder = test_data / "luseepy"
+    path = folder / "four_port_covariance.fits"
+    with fits.open(path) as hdus:
+        images = {hdu.name.lower(): np.array(hdu.data) for hdu in hdus}
+    return read_beam(folder / "synthetic_response_v3.fits"), path, images
+
+
+def matrix(images, name, channel) -> np.ndarray:
+    return images[f"{name}_real"][channel] + 1j * images[f"{name}_imag"][channel]
+
+
+FREQUENCIES = (5.0, 10.0, 25.0, 50.0)
+
+
+@pytest.mark.parametrize("channel", range(4))
+def test_loads_and_scales_are_luseepys(luseepy, channel):
+    response, _, images = luseepy
+    f = FREQUENCIES[channel]
+    np.testing.assert_allclose(Receiver().load(f), matrix(images, "zl", channel), rtol=1e-13)
+    loading = response.loading(f)
+    np.testing.assert_allclose(loading, matrix(images, "m", channel), rtol=0, atol=1e-14)
+    enclosure = matrix(images, "blackbody_normalization", channel).diagonal().real
+    np.testing.assert_allclose(response.per_kelvin(f), enclosure, rtol=1e-13)
+
+
+def simulated(luseepy, test_data, frequency, times, *, fixed_axis=False) -> np.ndarray:
+    """V^2/Hz of these samples."""
+    response, path, _ = luseepy
+    with np.load(test_data / "luseepy" / "sky_alm.npz") as file:
+        sky = dict(file)
+    modes = from_healpy(sky["alm"][list(sky["freq"]).index(frequency)])
+    observation = replace(read_waterfall(path).observation.select(times), fixed_axis=fixed_axis)
+    beams = response.beams(frequency, LMAX, grid=response.luseepy_grid, unit="V2/Hz")
+    seen = np.asarray(lb.CouplingMatrix.observe(beams, observation) @ jnp.asarray(modes))
+    moon = np.asarray(response.background(frequency, MOON, unit="V2/Hz"))
+    return seen.reshape(16, -1) + moon[:, None]
+
+
+def off(got, expected) -> float:
+    return np.abs(got - expected).max() / np.abs(expected).max()
+
+
+@pytest.mark.parametrize(
+    "channel", [0, 3, *(pytest.param(k, marks=pytest.mark.long) for k in (1, 2))]
+)
+def test_all_products_in_volts(luseepy, test_data, channel):
+    """luseepy transforms the patterns in single precision (6e-8 each)."""
+    frequency = FREQUENCIES[channel]
+    expected = luseepy[2]["data"][:, :, channel].T
+    every = np.ones(expected.shape[1], dtype=bool)
+    # the first sample, where a fixed axis is no approximation, and all about the first one's axis
+    assert off(simulated(luseepy, test_data, frequency, ~every | (np.arange(328) == 0)),
+               expected[:, :1]) < 5e-8  # fmt: skip
+    fixed = simulated(luseepy, test_data, frequency, every, fixed_axis=True)
+    assert off(fixed, expected) < 1e-7
+    # the Moon's axis wanders
+    true = simulated(luseepy, test_data, frequency, every)
+    assert 5e-5 < off(true, expected) < 5e-4
+
+
+def test_other_conventions_are_noticed(luseepy, test_data):
+    response, _, images = luseepy
+    first = np.arange(328) == 0
+    expected = images["data"][0, :, 2]
+    right = simulated(luseepy, test_data, 25.0, first)[:, 0]
+    signs = np.array([-1.0 if label[-1] == "I" else 1.0 for label in labels()])
+    mirrored = np.r_[0, -1 : -response.n_phi : -1]
+    flipped = replace(
+        response, h_theta=response.h_theta[..., mirrored], h_phi=-response.h_phi[..., mirrored]
+    )
+    unloaded = replace(response, receiver=None)
+    moonless = right - np.asarray(response.background(25.0, MOON, unit="V2/Hz"))
+    wrong = [
+        signs * right,
+        right[::-1],
+        moonless,
+        simulated((flipped, *luseepy[1:]), test_data, 25.0, first)[:, 0],
+        simulated((unloaded, *luseepy[1:]), test_data, 25.0, first)[:, 0],
+    ]
+    assert off(right, expected) < 3e-8
+    for case in wrong:
+        assert off(case, expected) > 1e-4
+
+
+def test_kelvin_and_volts_are_one_thing(luseepy):
+    response = luseepy[0]
+    root = np.sqrt(response.per_kelvin(25.0))
+    kelvin = np.asarray(to_matrix(response.beams(25.0, 8).modes))
+    volts = np.asarray(to_matrix(response.beams(25.0, 8, unit="V2/Hz").modes))
+    np.testing.assert_allclose(
+        kelvin * (root[:, None] * root[None])[..., None], volts, rtol=0, atol=1e-12 * volts.max()
+    )
+    moon = np.asarray(response.background(25.0, MOON)) / np.asarray(response.background(25.0, 1.0))
+    np.testing.assert_allclose(moon, MOON, rtol=1e-12)
+
+
+def test_sky_and_moon_of_one_temperature_are_an_enclosure(luseepy):
+    """Short dipoles over a half-space: 1 K of both gives autos of 1 K. The file's Rsky is luseepy's
+    quadrature (half a ring at the horizon), 2 degrees between samples."""
+    response = luseepy[0]
+    for grid, tolerance in ((response.luseepy_grid, 1e-6), (None, 1e-3)):
+        sky = np.asarray(response.beams(10.0, 4, grid=grid).modes)[:, 0] * np.sqrt(4 * np.pi)
+        total = np.asarray(to_matrix(jnp.asarray(sky + response.background(10.0, 1.0))[:, None]))
+        np.testing.assert_allclose(total[..., 0].diagonal().real, 1.0, rtol=tolerance)
+
+
+# --- by hand ------------------------------------------------------------------------------------
+
+
+def short_dipoles(theta, phi, length):
+    """Effective lengths of four arms, 75 degrees from the zenith, in m; (port, theta, phi)."""
+    t, p = theta[:, None], phi[None]
+    unit_theta = np.stack([np.cos(t) * np.cos(p), np.cos(t) * np.sin(p), -np.sin(t) + 0 * p])
+    unit_phi = np.stack([-np.sin(p) + 0 * t, np.cos(p) + 0 * t, 0 * t * p])
+    z, az = np.radians(75.0), np.radians([0.0, 90.0, 180.0, 270.0])
+    arms = length * np.stack([np.sin(z) * np.cos(az), np.sin(z) * np.sin(az), np.cos(z) + 0 * az])
+    return (
+        np.einsum("xi,xtp->itp", arms, unit_theta),
+        np.einsum("xi,xtp->itp", arms, unit_phi),
+        arms,
+    )
+
+
+def write(path, *, without=(), change=None, frequencies=(10.0, 20.0, 40.0)):
+    theta, phi = np.linspace(0, 90, 31), np.linspace(0, 360, 121)
+    h_theta, h_phi, arms = short_dipoles(np.radians(theta), np.radians(phi), 1.5)
+    # over a hemisphere dipoles radiate half as much as over the sphere: 2 pi / 3 arm.arm'
+    sky = [VACUUM / (4 * (c / (1e6 * f)) ** 2) * 4 * np.pi / 3 * arms.T @ arms for f in frequencies]
+    sky = np.array(sky)
+    reactance = -100j * np.eye(4)[None] * (10.0 / np.array(frequencies))[:, None, None]
+    images = {
+        "H_theta": np.repeat(h_theta[:, None], len(frequencies), 1) * (1 + 0.3j),
+        "H_phi": np.repeat(h_phi[:, None], len(frequencies), 1) * (1 + 0.3j),
+        "ZA": (1.09 * 2 * sky) + reactance,
+        "Rsky": 1.09 * sky,
+        "Rmoon": 1.09 * sky,
+        "Rloss": 0.0 * sky,
+    }
+    if change is not None:
+        change(images)
+    flat = {}
+    for name, values in images.items():
+        flat[f"{name}_real"] = np.real(values).astype(np.float32)
+        flat[f"{name}_imag"] = np.imag(values).astype(np.float32)
+    flat |= {"freq": np.array(frequencies), "theta": theta, "phi": phi}
+    if change is not None:
+        change(flat)
+    return write_images(path, {k: v for k, v in flat.items() if k not in without}, {"VERSION": 3})
+
+
+def test_volts_of_short_dipoles(tmp_path):
+    """V^2 = 4 k T R with R = eta0 / (4 lambda^2) int |h|^2, and M by hand; T = 1 K everywhere."""
+    response = read_beam(write(tmp_path / "response.fits"))
+    f, wavelength = 20.0, c / 20e6
+    _, _, arms = short_dipoles(np.zeros(1), np.zeros(1), 1.5)
+    open_ = Boltzmann * VACUUM / wavelength**2 * 1.09 * 4 * np.pi / 3 * arms.T @ arms
+    za, zl = response.impedance[1], Receiver().load(f)
+    m = zl @ np.linalg.inv(za + zl)
+    np.testing.assert_allclose(response.loading(f), m, rtol=1e-12)
+    expected = m @ open_ @ m.conj().T
+    beams = response.beams(f, 2, unit="V2/Hz")
+    got = np.asarray(to_matrix(beams.modes))[..., 0] * np.sqrt(4 * np.pi)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    # half sky, half Moon
+    np.testing.assert_allclose(
+        np.asarray(to_matrix(response.background(f, 1.0, unit="V2/Hz")[:, None]))[..., 0],
+        expected,
+        rtol=0,
+        atol=1e-6 * np.abs(expected).max(),
+    )
+
+
+def test_losses_emit_at_the_antennas_temperature(tmp_path):
+    def lossy(images):
+        if "Rloss" in images:
+            images["Rloss"] = np.tile(0.5 * np.eye(4), (3, 1, 1))
+            images["ZA"] = images["ZA"] + images["Rloss"]
+
+    response = read_beam(write(tmp_path / "response.fits", change=lossy))
+    m = response.loading(20.0)
+    expected = 4 * Boltzmann * 300.0 * 0.5 * m @ m.conj().T
+    got = np.asarray(to_matrix(response.background(20.0, 0.0, 300.0, unit="V2/Hz")[:, None]))
+    np.testing.assert_allclose(got[..., 0], expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+def test_open_ports_and_turns(tmp_path):
+    response = read_beam(write(tmp_path / "response.fits"))
+    np.testing.assert_array_equal(loading_matrix(response.impedance[0], None), np.eye(4))
+    open_ = replace(response, receiver=None)
+    # a quarter turn makes East North: each port takes the place of the next
+    plain = np.asarray(to_matrix(open_.beams(20.0, 5, unit="V2/Hz").modes))
+    turned = np.asarray(to_matrix(open_.beams(20.0, 5, turn_deg=90.0, unit="V2/Hz").modes))
+    place = [1, 2, 3, 0]
+    expected = plain[np.ix_(place, place)]
+    np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-6 * np.abs(plain).max())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"without": ("H_phi_imag",)}, "has no image 'H_phi_imag'"),
+        ({"without": ("Rmoon_real",)}, "has no image 'Rmoon_real'"),
+        ({"change": lambda i: i.update(freq=i["freq"][::-1].copy()) if "freq" in i else None},
+         "do not grow"),
+        ({"change": lambda i: i.update(ZA_real=i["ZA_real"][:, :3]) if "ZA_real" in i else None},
+         r"ZA_real has shape \(3, 3, 4\), expected \(3, 4, 4\)"),
+        ({"change": lambda i: i.update(Rmoon=2 * i["Rmoon"]) if "Rmoon" in i else None},
+         "Rsky . Rmoon . Rloss differ"),
+        ({"change": lambda i: i.update(theta=2 * i["theta"]) if "theta" in i else None},
+         "theta goes from 0 to 180 degrees"),
+        ({"change": lambda i: i.update(H_phi=np.nan * i["H_phi"]) if "H_phi" in i else None},
+         "H_phi_real"),
+    ],
+)  # fmt: skip
+def test_files_that_cannot_be_used(tmp_path, options, message):
+    with pytest.raises(InputError, match=message):
+        read_beam(write(tmp_path / "response.fits", **options))
+
+
+def test_no_extrapolation_and_no_other_unit(tmp_path):
+    response = read_beam(write(tmp_path / "response.fits"))
+    with pytest.raises(InputError, match="from 10 to 40 MHz, not at 50"):
+        response.beams(50.0, 4)
+    with pytest.raises(InputError, match="unknown unit 'mK'"):
+        response.fields.__wrapped__(response, 20.0, unit="mK")
+
+
+# --- in scenarios -------------------------------------------------------------------------------
+
+
+def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
+    path = write(tmp_path / "response.fits")
+    given = ["frequency_mhz=20", f"beam.file={path}", "beam.moon_temperature_k=5e4"]
+    cold_scenario = small_scenario(*given[:-1], cycles=0.05)
+    warm, cold = build(small_scenario(*given, cycles=0.05)), build(cold_scenario)
+    setup, data = warm.setup, warm.data
+    np.testing.assert_array_equal(setup.beams.modes, read_beam(path).beams(20.0, 6).modes)
+    moon = np.asarray(read_beam(path).background(20.0, 5e4))
+    np.testing.assert_array_equal(setup.background, moon)
+    np.testing.assert_array_equal(cold.setup.background, 0.0)
+    added = np.asarray(setup.signal) - np.asarray(cold.setup.signal)
+    np.testing.assert_allclose(added, np.tile(moon[:, None], added.shape[1]), rtol=1e-9, atol=1e-6)
+    assert cold.setup.offset is None
+    # the Moon's radiation is taken off the data again, and is part of the noise level
+    assert data.data.mean() > cold.data.data.mean()
+    levels = [float(radiometer(e.setup).diagonal().sum()) for e in (warm, cold)]
+    assert levels[0] > levels[1]
+    sky, posterior = np.asarray(setup.sky.modes), infer(warm).posterior
+    off_by = (np.asarray(posterior.mean) - sky) / np.asarray(posterior.std())
+    assert np.sqrt((off_by**2).mean()) < 1.5
+    wrong = infer(build(cold_scenario, data)).posterior
+    off_by = (np.asarray(wrong.mean) - sky) / np.asarray(wrong.std())
+    assert off_by[0] > 5.0  # a warm Moon looks like a warmer sky
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ([], "give its response as beam.file"),
+        (["beam.file={response}"], "use --set beam.moon_temperature_k=250"),
+        (["beam.file={response}", "beam.moon_temperature_k=250", "beam.receiver=open"],
+         "give the response and the receiver"),
+        (["frequency_mhz=11"], "no channel at 11 MHz"),
+    ],
+)  # fmt: skip
+def test_data_of_another_instrument(luseepy, overrides, message):
+    response, path, _ = luseepy
+    given = ["frequency_mhz=10", *(o.format(response=response.path) for o in overrides)]
+    with pytest.raises(InputError, match=message):
+        read_data(path, lb.load_scenario("fiducial", given))
+
+
+def test_luseepys_data_in_kelvin(luseepy):
+    response, path, images = luseepy
+    given = ["frequency_mhz=10", f"beam.file={response.path}", "beam.moon_temperature_k=250"]
+    data = read_data(path, lb.load_scenario("fiducial", given))
+    assert (data.n_missing, data.frequency_mhz) == (0, 10.0)
+    enclosure = matrix(images, "blackbody_normalization", 1).diagonal().real
+    for place, label in enumerate(labels()):
+        i, j = int(label[0]), int(label[1])
+        expected = images["data"][:, place, 1] / np.sqrt(enclosure[i] * enclosure[j])
+        np.testing.assert_allclose(data.grid()[place], expected, rtol=1e-14)
+
+
+def test_short_dipoles_see_no_even_ell_above_two(tmp_path):
+    """Their products are polynomials of degree 2 cut at the horizon: (P + P sign(z)) / 2, of which
+    the first part ends at ell = 2 and the second is odd."""
+    modes = np.asarray(read_beam(write(tmp_path / "response.fits")).beams(20.0, 9).modes)
+    ell = np.floor(np.sqrt(np.arange(100))).astype(int)
+    even, odd = (np.abs(modes[:, (ell > 2) & (ell % 2 == p)]).max() for p in (0, 1))
+    assert even < 1e-6 * odd
+
+
+@pytest.mark.long
+def test_the_map_from_luseepys_four_ports(luseepy, tmp_path, test_data):
+    """10 MHz, V^2/Hz, the Moon at 250 K, a fixed axis: what short dipoles can see comes back."""
+    response, path, _ = luseepy
+    overrides = [
+        "frequency_mhz=10",
+        f"beam.file={response.path}",
+        "beam.quadrature=luseepy",
+        "beam.moon_temperature_k=250",
+        "observation.fixed_axis=true",
+        f"sky.file={test_data / 'luseepy' / 'sky_alm.npz'}",
+    ]
+    arguments = [a for override in overrides for a in ("--set", override)]
+    out = tmp_path / "map"
+    command = ["map", "fiducial", "--data", str(path), "--truth", "-o", str(out), "--quiet"]
+    assert main([*command, *arguments]) == 0
+    with (out / "spectra.csv").open(newline="") as file:
+        rho = np.array([float(row["rho"]) for row in csv.DictReader(file)])
+    assert rho[[1, 2, 3, 5, 7]].min() > 0.9
+    assert rho[1::2].min() > 0.7
+    assert np.abs(rho[4::2]).mean() < 0.2
+    summary = json.loads((out / "summary.json").read_text())
+    # noiseless but for luseepy's single precision
+    assert summary["chi2"] < 0.01 * summary["chi2_expected"]

@@ -1,0 +1,357 @@
+"""Waterfalls of luseepy's simulator: its own file, and synthetic ones with gaps and odd orders."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+
+import astropy.units as u
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+from astropy.io import fits
+from astropy.time import Time, TimeDelta
+from fits_files import write_images
+
+from lusee_bayes.cli.main import main
+from lusee_bayes.cli.options import parse_frequencies
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.observation import Observation, Run
+from lusee_bayes.instrument.products import labels
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
+from lusee_bayes.report.describe import describe
+
+PAIRS = [[i, j] for i in range(4) for j in range(i, 4)]
+HEADER = {
+    "LUNAR_DAY": "2027-02-01 00:00:00 to 2027-02-02 00:00:00",
+    "DELTAT_SEC": 7200.0,
+    "LUN_LAT_DEG": -23.814,
+    "LUN_LONG_DEG": 182.258,
+}
+
+
+def write(path, data=None, pairs=PAIRS, header=HEADER, frequencies=(10.0, 20.0), without=()):
+    """A value for every product, time and channel: 100 product + time + channel / 10."""
+    if data is None:
+        n = sum(1 if i == j else 2 for i, j in pairs)
+        product, time, channel = np.arange(n), np.arange(12), np.arange(len(frequencies))
+        data = 100.0 * product[None, :, None] + time[:, None, None] + channel / 10.0
+    images = {"data": data, "freq": np.array(frequencies), "combinations": np.array(pairs)}
+    kept = {name: image for name, image in images.items() if name not in without}
+    return write_images(path, kept, header)
+
+
+def test_every_sample_is_in_its_place(tmp_path):
+    waterfall = read_waterfall(write(tmp_path / "w.fits"))
+    data = waterfall.at(20.0)
+    assert data.frequency_mhz == 20.0 and data.n_missing == 0
+    expected = 100.0 * np.arange(16)[:, None] + np.arange(12)[None] + 0.1
+    np.testing.assert_array_equal(data.grid(), expected)
+    observation = data.observation
+    assert observation.times[0].isot == "2027-02-01T00:00:00.000"
+    np.testing.assert_allclose(observation.hours, 2.0 * np.arange(12), rtol=0, atol=1e-7)
+    assert (observation.lat_deg, observation.lon_deg) == (-23.814, 182.258)
+    assert observation.step_s == 7200.0 and observation.turntable_deg == (0.0,)
+
+
+def test_any_subset_and_order_of_products(tmp_path):
+    """Columns follow the pairs; a pair the other way round is conjugated."""
+    data = read_waterfall(write(tmp_path / "w.fits", pairs=[[2, 2], [3, 1], [0, 0]])).at(10.0)
+    place = {label: k for k, label in enumerate(labels())}
+    grid, time = data.grid(), np.arange(12)
+    assert data.n_missing == 12 * 12
+    np.testing.assert_array_equal(grid[place["22R"]], time)
+    np.testing.assert_array_equal(grid[place["13R"]], 100.0 + time)
+    np.testing.assert_array_equal(grid[place["13I"]], -200.0 - time)
+    np.testing.assert_array_equal(grid[place["00R"]], 300.0 + time)
+    assert np.isnan(grid[place["11R"]]).all()
+
+
+def test_gaps_are_missing_samples_and_counted(tmp_path):
+    data = 100.0 + np.zeros((12, 16, 2))
+    data[3, :, 0], data[5, 7, 0], data[6, 7, 0] = np.nan, np.inf, -np.inf
+    waterfall = read_waterfall(write(tmp_path / "w.fits", data))
+    assert (waterfall.at(10.0).n_missing, waterfall.at(20.0).n_missing) == (18, 0)
+    assert "16 samples missing" in describe(tmp_path / "w.fits")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"without": ("combinations",)}, "has no image 'combinations'"),
+        ({"header": {k: v for k, v in HEADER.items() if k != "DELTAT_SEC"}}, "no DELTAT_SEC"),
+        ({"header": HEADER | {"LUNAR_DAY": "tomorrow"}}, "LUNAR_DAY is 'tomorrow'"),
+        ({"pairs": [[0, 0], [0, 4]]}, "the ports 0 and 4"),
+        ({"pairs": [[0, 1], [1, 0]]}, "the same pair of ports twice"),
+        ({"data": np.zeros((12, 15, 2))}, r"data has shape \(12, 15, 2\), expected \(times, 16"),
+        ({"header": HEADER | {"DELTAT_SEC": -7200.0}}, "step_s"),
+        ({"header": HEADER | {"LUN_LAT_DEG": 123.0}}, "lat_deg must lie in -90..90"),
+    ],
+)
+def test_files_that_cannot_be_used(tmp_path, options, message):
+    with pytest.raises(InputError, match=message):
+        read_waterfall(write(tmp_path / "w.fits", **options))
+
+
+def test_missing_channels_files_and_ends(tmp_path):
+    path, ten = write(tmp_path / "w.fits"), load_scenario("fiducial", ["frequency_mhz=10"])
+    with pytest.raises(InputError, match=r"no channel at 25 MHz \(it has 10, 20\)"):
+        read_data(path, load_scenario("fiducial"))
+    with pytest.raises(InputError, match="all 192 samples are flagged"):
+        read_data(write(tmp_path / "empty.fits", np.full((12, 16, 2), np.nan)), ten)
+    with pytest.raises(InputError, match="no data at"):
+        read_data(tmp_path / "none.fits", ten)
+    path.write_bytes(path.read_bytes()[:4000])
+    with pytest.raises(InputError, match="cut short"):
+        read_data(path, ten)
+
+
+def test_what_info_says_of_luseepys_files(test_data):
+    folder = test_data / "luseepy"
+    text = describe(folder / "waterfall_exact_engine.fits")
+    assert "channels at 5, 10, 15, 20, 25, 30, 35, 40, 45, 50 MHz" in text
+    assert "16 products (00R 01R" in text and "328 times of 7200 s, 0 samples missing" in text
+    text = describe(folder / "synthetic_monopole_beam.fits")
+    assert "50 frequencies from 1 to 50 MHz" in text and "91 angles" in text
+
+
+@pytest.mark.long
+def test_the_map_from_luseepys_waterfall(tmp_path, test_data):
+    """10 MHz, luseepy's beam, sky and noiseless data, the noise of a fiducial observation in N."""
+    folder = test_data / "luseepy"
+    overrides = [
+        "frequency_mhz=10",
+        f"beam.file={folder / 'synthetic_monopole_beam.fits'}",
+        "beam.quadrature=luseepy",
+        f"sky.file={folder / 'sky_alm.npz'}",
+    ]
+    arguments = [a for override in overrides for a in ("--set", override)]
+    waterfall = folder / "waterfall_exact_engine.fits"
+    out = tmp_path / "map"
+    command = ["map", "fiducial", "--data", str(waterfall), "--truth", "-o", str(out), "--quiet"]
+    assert main([*command, *arguments]) == 0
+    with (out / "spectra.csv").open(newline="") as file:
+        rho = np.array([float(row["rho"]) for row in csv.DictReader(file)])
+    assert rho[1:9].min() > 0.9
+    assert rho[1:27].min() > 0.5
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["ell_cross"] is None or summary["ell_cross"] >= 18
+    # nothing but the model's own noise is missing from the data: chi^2 falls short of its mean
+    assert summary["chi2"] < summary["chi2_expected"]
+
+
+# --- writing ------------------------------------------------------------------------------------
+
+
+def as_luseepy_reads(path):
+    """Data, times and products the way luseepy's own class walks through a file: by counting."""
+    with fits.open(path) as hdus:
+        header = hdus[0].header
+        images = {hdu.name.upper(): np.array(hdu.data) for hdu in hdus}
+    column, places = 0, {}
+    for i, j in images["COMBINATIONS"]:
+        places[int(i), int(j)] = column
+        column += 1 if i == j else 2
+    assert i == j, "luseepy fails on a file whose last product is a cross"
+    assert column == images["DATA"].shape[1]
+    assert float(header["VERSION"]) < 3.0
+    start, end = (Time(t) for t in header["LUNAR_DAY"].split(" to "))
+    step = TimeDelta(header["DELTAT_SEC"] * u.s)
+    times = np.arange(start, end + step, step).astype(Time)
+    assert len(times) == len(images["DATA"])
+    assert len(images["FREQ"]) == images["DATA"].shape[2]
+    for port in range(4):
+        assert images[f"ZRE_{port}"].shape == images[f"ZIM_{port}"].shape == images["FREQ"].shape
+    return images["DATA"], Time(list(times)), places
+
+
+def random_channel(runs, frequency_mhz=25.0):
+    """Visibilities of one frequency that are random numbers."""
+    observation = Observation.from_runs(runs)
+    layout = DataLayout(16, observation.n_times)
+    values = np.random.default_rng(int(frequency_mhz)).normal(3e3, 1e3, layout.size)
+    return Visibilities(jnp.asarray(values), layout, observation, frequency_mhz)
+
+
+def test_what_is_written_is_read_back_bit_by_bit(tmp_path):
+    one, two = (random_channel([Run(0.05)], frequency) for frequency in (25.0, 30.0))
+    flags = np.zeros((16, one.layout.n_times), dtype=bool)
+    flags[3, 2], flags[:, 5] = True, True
+    layout = DataLayout.from_flags(flags)
+    two = replace(two, layout=layout, data=layout.gather(two.layout.scatter(two.data)))
+    path = write_waterfall(tmp_path / "w.fits", [one, two], np.array([3.0 - 40j, 4.0 - 30j]))
+    waterfall = read_waterfall(path)
+    for given in (one, two):
+        back = waterfall.at(given.frequency_mhz)
+        np.testing.assert_array_equal(back.grid(), given.grid())
+        assert back.layout.size == given.layout.size
+        here, there = back.observation, given.observation
+        # two parts of a Julian date, from text to the nanosecond
+        assert np.abs((here.times - there.times).to_value(u.s)).max() < 2e-9
+        assert (here.lon_deg, here.lat_deg, here.step_s) == (182.258, -23.814, 7200.0)
+    data, times, places = as_luseepy_reads(path)
+    np.testing.assert_array_equal(data[:, places[2, 3], 0], one.grid()[13])
+    np.testing.assert_array_equal(data[:, places[3, 3], 1], two.grid()[15])
+    assert np.abs((times - one.observation.times).to_value(u.s)).max() < 1e-6
+    with fits.open(path) as hdus:
+        np.testing.assert_array_equal(hdus["ZIm_2"].data, [-40.0, -30.0])
+
+
+def test_luseepys_own_file_is_written_back(tmp_path, test_data):
+    original = test_data / "luseepy" / "waterfall_exact_engine.fits"
+    waterfall = read_waterfall(original)
+    path = write_waterfall(
+        tmp_path / "w.fits", [waterfall.at(f) for f in waterfall.frequencies_mhz]
+    )
+    ours, _, places = as_luseepy_reads(path)
+    with fits.open(original) as hdus:
+        np.testing.assert_array_equal(ours, hdus["data"].data)
+        np.testing.assert_array_equal(list(places), hdus["combinations"].data)
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        ((Run(0.02, turntable_deg=30.0),), r"turntable angles, the data have \(30.0,\)"),
+        ((Run(0.02), Run(0.02)), "turntable angles"),
+        ((Run(2.0, night_only=True),), "without gaps; write netCDF"),
+    ],
+)
+def test_what_luseepys_layout_cannot_hold(tmp_path, runs, message):
+    with pytest.raises(InputError, match=message):
+        write_waterfall(tmp_path / "w.fits", 2 * [random_channel(runs)])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.long
+def test_simulate_writes_it_and_map_reads_it(tmp_path):
+    path = tmp_path / "w.fits"
+    given = ["--set", "lmax=4", "--set", "observation.runs.0.cycles=0.1", "--quiet"]
+    channels = ["--frequencies", "20,25"]
+    assert main(["simulate", "fiducial", "-o", str(path), *channels, *given]) == 0
+    data, _, _ = as_luseepy_reads(path)
+    # each channel is what its own scenario gives, with a seed of its own
+    for k, (f, seed) in enumerate(((20, 1), (25, 2))):
+        alone = ["lmax=4", "observation.runs.0.cycles=0.1", f"frequency_mhz={f}", f"seed={seed}"]
+        expected = build(load_scenario("fiducial", alone)).data.grid()
+        np.testing.assert_array_equal(data[:, :, k].T, expected)
+    with fits.open(path) as hdus:
+        kept = hdus["scenario"].data.tobytes().decode()
+    assert yaml.safe_load(kept)["observation"]["runs"][0]["cycles"] == 0.1
+    assert main(["map", "fiducial", "--data", str(path), "-o", str(tmp_path / "map"), *given]) == 0
+    assert (tmp_path / "map" / "posterior.nc").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-o", "w.fits"], "at least two channels"),
+        (["-o", "data.nc", "--frequencies", "10,20"], "netCDF files hold one frequency"),
+        (["-o", "w.fits", "--frequencies", "20,10"], "expected growing MHz"),
+        (["-o", "w.fits", "--frequencies", "5:50:7"], "expected growing MHz"),
+        (["-o", "w.fits", "--frequencies", "ten"], "expected growing MHz"),
+        (["-o", "w.fits", "--frequencies", "5:50:0"], "expected growing MHz"),
+        (["-o", "w.fits", "--frequencies", "40:60:10"], "frequency_mhz"),
+    ],
+)
+def test_channels_that_cannot_be_written(tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    given = ["--set", "lmax=2", "--set", "observation.runs.0.cycles=0.02", "--quiet"]
+    assert main(["simulate", "fiducial", *arguments, *given]) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_ranges_of_frequencies():
+    assert parse_frequencies("5:50:5") == [5.0 * k for k in range(1, 11)]
+    assert parse_frequencies("10.1:10.4:0.1") == pytest.approx([10.1, 10.2, 10.3, 10.4])
+    assert parse_frequencies("10,25.5") == [10.0, 25.5]
+
+
+# --- data that do not fit -----------------------------------------------------------------------
+
+
+def test_another_site_and_other_ports(tmp_path):
+    path = write(tmp_path / "w.fits", header=HEADER | {"LUN_LAT_DEG": -20.0, "LUN_LONG_DEG": 10.0})
+    scenario = load_scenario("fiducial", ["frequency_mhz=10", "lmax=4"])
+    with pytest.raises(InputError, match="--set observation.lon_deg=10 --set observation.lat_deg="):
+        set_up(scenario, read_data(path, scenario))
+    # 182.258 degrees East is 177.742 West
+    path = write(tmp_path / "west.fits", header=HEADER | {"LUN_LONG_DEG": -177.742})
+    set_up(scenario, read_data(path, scenario))
+
+
+def test_products_that_the_beams_cannot_supply(tmp_path):
+    waterfall = read_waterfall(write(tmp_path / "w.fits"))
+    with pytest.raises(InputError, match="has the product 02R, but the beams are those of 2 ports"):
+        waterfall.at(10.0, n_ports=2)
+    few = read_waterfall(write(tmp_path / "few.fits", pairs=[[0, 0], [0, 1], [1, 1]]))
+    data = few.at(10.0, n_ports=2)
+    assert (data.layout.n_products, data.n_missing) == (4, 0)
+    np.testing.assert_array_equal(data.grid()[:, 3], 100.0 * np.arange(4) + 3.0)
+
+
+def four_port(path, **changes):
+    """luseepy's four-port layout with two products, and what is changed."""
+    jd = 2461000.5 + np.arange(5) / 12.0
+    images = {
+        "data": np.arange(20.0).reshape(5, 2, 2),
+        "freq": np.array([10.0, 20.0]),
+        "time": np.stack([np.floor(jd), jd % 1.0], axis=1),
+        "blackbody_normalization_real": np.tile(4.0 * np.eye(4), (2, 1, 1)),
+    } | changes.pop("images", {})
+    header = {
+        "BUNIT": "V^2/Hz",
+        "TIMESYS": "UTC",
+        "DELTAT_SEC": 7200.0,
+        "LUN_LAT_DEG": -23.814,
+        "LUN_LONG_DEG": 182.258,
+        "TMOON_K": 250.0,
+    } | changes.pop("header", {})
+    write_images(path, images, {k: v for k, v in header.items() if v is not None})
+    column = fits.Column("label", "8A", array=np.array(changes.pop("products", ["13I", "00R"])))
+    with fits.open(path, mode="append") as hdus:
+        hdus.append(fits.BinTableHDU.from_columns([column], name="products"))
+    return path
+
+
+def test_four_port_columns_are_where_the_table_says(tmp_path):
+    waterfall = read_waterfall(four_port(tmp_path / "w.fits"))
+    place = {label: k for k, label in enumerate(labels())}
+    np.testing.assert_array_equal(waterfall.grid[place["13I"], :, 1], np.arange(1, 20, 4) / 4.0)
+    np.testing.assert_array_equal(waterfall.grid[place["00R"], :, 0], np.arange(2, 20, 4) / 4.0)
+    assert np.isfinite(waterfall.grid).sum() == 20
+    assert (waterfall.moon_k, waterfall.antenna_k) == (250.0, 0.0)
+    np.testing.assert_allclose(waterfall.observation.hours, 2.0 * np.arange(5), atol=1e-6)
+
+
+backwards = np.array([[2461000.0, 0.5], [2461000.0, 0.7], [2461000.0, 0.6]])
+twice = np.array([[2461000.0, 0.5], [2461000.0, 0.5], [2461000.0, 0.6]])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"products": ["13I", "13X"]}, "no product '13X'"),
+        ({"products": ["13I", "13I"]}, "the same product twice"),
+        ({"products": ["13I", "31R"]}, "no product '31R'"),
+        ({"products": ["13I", "00R", "11R"]}, r"data has shape \(5, 2, 2\), expected 5 times, 3"),
+        ({"header": {"BUNIT": "K"}}, r"the unit \(BUNIT\) of data is K, expected V\^2/Hz"),
+        ({"header": {"TMOON_K": None}}, "the header has no TMOON_K"),
+        ({"header": {"TIMESYS": "LOCAL"}}, "TIMESYS is LOCAL"),
+        ({"images": {"time": np.arange(5.0)}}, "expected .times, 2.: JD1 and JD2"),
+        ({"images": {"time": backwards, "data": np.ones((3, 2, 2))}}, "times must grow"),
+        ({"images": {"time": twice, "data": np.ones((3, 2, 2))}}, "times must grow"),
+    ],
+)
+def test_four_port_files_that_cannot_be_used(tmp_path, changes, message):
+    with pytest.raises(InputError, match=message):
+        read_waterfall(four_port(tmp_path / "w.fits", **changes))

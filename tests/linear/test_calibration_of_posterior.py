@@ -1,0 +1,150 @@
+"""Data simulated from the prior: the posterior must cover the truth as often as it says.
+
+Skies and noise are drawn by numpy with the dense matrices, so nothing of the solver's own square
+roots enters. For the right model C^-1/2 (m - mean) are independent unit normals, and their summed
+squares follow chi^2 with n_modes degrees of freedom. There are 4000 draws, so that leaving out
+the correlations of one time of 32 (chi^2 per mode 1.018) is still seen.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference_linear import assert_draws_follow
+from scipy.stats import chi2, kstest
+
+from lusee_bayes.instrument.beams import monopole_beams
+from lusee_bayes.instrument.coupling import CouplingMatrix
+from lusee_bayes.instrument.observation import Observation, Run
+from lusee_bayes.linear.model import FORMS, LinearGaussian
+from lusee_bayes.noise import radiometer_noise
+from lusee_bayes.noise.covariance import Covariance, DenseCovariance, TimeBlockCovariance
+from lusee_bayes.sky.priors import HarmonicPrior
+
+LMAX, N_MODES, N_DRAWS, SEED = 8, 81, 4000, 20270115
+SPECTRUM = 1e8 * (1.0 + np.arange(LMAX + 1.0)) ** -2.5  # K^2; the monopole is 20000 K below
+PRIOR_STD = np.sqrt(np.repeat(SPECTRUM, 2 * np.arange(LMAX + 1) + 1))
+
+
+class Setup:
+    """A of a short run and the noise terms of a 20000 K sky."""
+
+    def __init__(self, beams, cycles: float):
+        observation = Observation.from_runs([Run(cycles)])
+        self.coupling = CouplingMatrix.observe(beams, observation)
+        layout = self.coupling.layout
+        monopole = jnp.zeros(N_MODES).at[0].set(2e4 * np.sqrt(4 * np.pi))
+        fiducial = self.coupling @ monopole
+        grid = layout.scatter(fiducial)
+        paper, exact = (radiometer_noise(grid, layout, form=form) for form in ("paper", "exact"))
+        # gains that drift together over 10 h, of the radiometer noise's own size
+        hours = observation.hours[layout.time]
+        kernel = np.exp(-((hours[:, None] - hours[None]) ** 2) / (2 * 10.0**2))
+        signal = np.asarray(fiducial)
+        gain = DenseCovariance(jnp.asarray(1e-10 * np.outer(signal, signal) * kernel), "gain")
+        self.noise = {
+            "paper": paper,
+            "exact": exact,
+            "dense": DenseCovariance(exact.dense() + gain.dense()),
+            "diagonal+dense": paper + gain,
+        }
+
+    def simulate(self, noise: Covariance):
+        """(skies, data) of N_DRAWS skies from the prior and noise from N, by numpy."""
+        rng = np.random.default_rng(SEED)
+        skies = rng.normal(size=(N_DRAWS, N_MODES)) * PRIOR_STD
+        root = np.linalg.cholesky(np.asarray(noise.dense()))
+        added = rng.normal(size=(N_DRAWS, noise.size)) @ root.T
+        return skies, skies @ np.asarray(self.coupling.dense()).T + added
+
+    def standardised(self, truth: Covariance, assumed: Covariance, form: str) -> np.ndarray:
+        """C^-1/2 (m - mean), shape (draws, modes), of data with noise ``truth``."""
+        skies, data = self.simulate(truth)
+        prior = HarmonicPrior(jnp.asarray(SPECTRUM))
+        solver = LinearGaussian(self.coupling, prior, assumed).factorise(form)
+        means = jax.jit(jax.vmap(lambda d: solver.condition(d).mean))(jnp.asarray(data))
+        covariance = np.asarray(solver.condition(jnp.asarray(data[0])).covariance())
+        # in units of the prior: the monopole's variance is 1e-10 of it, the rest of order one
+        root = np.linalg.cholesky(covariance / np.outer(PRIOR_STD, PRIOR_STD))
+        return np.linalg.solve(root, ((skies - np.asarray(means)) / PRIOR_STD).T).T
+
+
+def p_value(standardised: np.ndarray) -> float:
+    """Kolmogorov-Smirnov of chi^2 = (m - mean)^T C^-1 (m - mean) against chi^2(n_modes)."""
+    return kstest((standardised**2).sum(1), chi2(N_MODES).cdf).pvalue
+
+
+@pytest.fixture(scope="module")
+def beams():
+    return monopole_beams(25.0, LMAX)
+
+
+@pytest.fixture(scope="module")
+def long_run(beams):
+    setup = Setup(beams, 0.1)
+    assert setup.coupling.shape == (512, N_MODES)
+    return setup
+
+
+@pytest.fixture(scope="module")
+def short_run(beams):
+    setup = Setup(beams, 0.015)
+    assert setup.coupling.shape == (64, N_MODES)
+    return setup
+
+
+def assert_calibrated(z: np.ndarray):
+    assert p_value(z) > 0.01
+    # chi^2 per mode: 1 within five times its scatter sqrt(2 / (draws x modes)) = 0.0025
+    assert abs((z**2).mean() - 1.0) < 5 * np.sqrt(2 / z.size)
+    assert_draws_follow(z, np.zeros(N_MODES), np.eye(N_MODES))
+
+
+@pytest.mark.long
+@pytest.mark.essential
+@pytest.mark.parametrize("noise", ["paper", "exact", "dense", "diagonal+dense"])
+@pytest.mark.parametrize("form", FORMS)
+def test_more_data_than_modes(long_run, noise, form):
+    n = long_run.noise[noise]
+    assert_calibrated(long_run.standardised(n, n, form))
+
+
+@pytest.mark.parametrize(
+    ("form", "noise"), [("map", "exact"), ("data", "exact"), ("data", "diagonal+dense")]
+)
+def test_fewer_data_than_modes(short_run, form, noise):
+    n = short_run.noise[noise]
+    assert_calibrated(short_run.standardised(n, n, form))
+
+
+# --- the same check on wrong posteriors: it must fail ---------------------------------------------
+
+
+def test_notices_a_noise_of_half_the_variance(long_run):
+    exact = long_run.noise["exact"]
+    assert p_value(long_run.standardised(exact, exact.scaled(0.5), "map")) < 1e-100
+
+
+def test_notices_correlations_missing_at_one_time_of_32(long_run):
+    exact = long_run.noise["exact"]
+    blocks = np.array(exact.blocks)
+    blocks[3] = np.diag(np.diag(blocks[3]))
+    wrong = TimeBlockCovariance(jnp.asarray(blocks), exact.layout)
+    assert p_value(long_run.standardised(exact, wrong, "map")) < 1e-4
+
+
+def test_notices_a_missing_gain_term(long_run):
+    noise = long_run.noise
+    z = long_run.standardised(noise["diagonal+dense"], noise["paper"], "map")
+    assert p_value(z) < 1e-100
+
+
+@pytest.mark.long
+def test_notices_the_papers_form_on_voltages_noise(long_run):
+    """On average over the modes the two forms agree, so chi^2 alone would not tell them apart."""
+    z = long_run.standardised(long_run.noise["exact"], long_run.noise["paper"], "map")
+    assert abs((z**2).mean() - 1.0) < 0.02
+    with pytest.raises(AssertionError, match="sample covariance off"):
+        assert_draws_follow(z, np.zeros(N_MODES), np.eye(N_MODES))

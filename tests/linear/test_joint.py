@@ -1,0 +1,265 @@
+"""One posterior for several frequencies, against all data and skies as one big Gaussian."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference_linear import z_of
+from scipy import stats
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.conjugate_gradients import conjugate_gradients
+from lusee_bayes.linear.iterative_joint import solve_iteratively
+from lusee_bayes.linear.joint import solve_directly
+from lusee_bayes.linear.joint_skies import channel_sky, paired
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.noise.covariance import DiagonalCovariance
+from lusee_bayes.sky.spectral_prior import SpectralPrior
+
+FREQUENCIES = np.array([10.0, 17.0, 25.0, 40.0])
+LMAX, N_MODES = 2, 9
+
+
+def skies(seed=0):
+    """Power laws that bend, with a little of every channel's own; in K."""
+    rng = np.random.default_rng(seed)
+    x = np.log(FREQUENCIES / 20.0)[:, None]
+    tilt = -2.5 + 0.2 * rng.standard_normal(N_MODES) + 0.3 * x * rng.standard_normal(N_MODES)
+    own = 0.02 * rng.standard_normal((len(x), N_MODES))
+    return 100.0 * rng.standard_normal(N_MODES) * np.exp(tilt * x) * (1.0 + own)
+
+
+PRIORS = {
+    "components": lambda: SpectralPrior.components(FREQUENCIES, skies(), ("power_law", "turnover")),
+    "kernel": lambda: SpectralPrior.kernel(FREQUENCIES, skies(), length=0.8, residual=0.05),
+    "no rest": lambda: SpectralPrior.components(FREQUENCIES, skies(), residual=0.0),
+}
+
+
+def covariance_of(prior):
+    """S of all channels' skies, channel by channel, from the definition."""
+    n, components = len(FREQUENCIES) * N_MODES, np.asarray(prior.spectra)
+    ell = np.repeat(np.arange(LMAX + 1), 2 * np.arange(LMAX + 1) + 1)
+    s = np.zeros((n, n))
+    for column, spectrum in zip(np.asarray(prior.mixing).T, components, strict=True):
+        s += np.kron(np.outer(column, column), np.diag(spectrum[ell]))
+    if prior.residual is not None:
+        s += np.diag(np.concatenate([r[ell] for r in np.asarray(prior.residual)]))
+    return s
+
+
+def models(prior, seed=4):
+    """Channels with different numbers of data; noise ten times below the sky."""
+    rng = np.random.default_rng(seed)
+    made = []
+    for k in range(len(FREQUENCIES)):
+        n = 12 + 3 * k
+        a = jnp.asarray(rng.standard_normal((n, N_MODES)))
+        level = 0.1 * float(np.sqrt(np.asarray(prior.of_channel(k).variance()).mean()))
+        noise = DiagonalCovariance(jnp.asarray(level**2 * rng.uniform(0.5, 2.0, n)))
+        made.append(LinearGaussian(a, prior.of_channel(k), noise))
+    return made
+
+
+def big_gaussian(made):
+    """A and N of all channels together."""
+    a = [np.asarray(m.coupling.dense()) for m in made]
+    whole = np.zeros((sum(len(x) for x in a), len(a) * N_MODES))
+    at = 0
+    for k, x in enumerate(a):
+        whole[at : at + len(x), k * N_MODES : (k + 1) * N_MODES] = x
+        at += len(x)
+    return whole, np.concatenate([np.asarray(m.noise.variance) for m in made])
+
+
+def information_from(made, data, n_perturbations=0):
+    key = jax.random.key(8)
+    return [
+        m.inform(jnp.asarray(d), jax.random.fold_in(key, k), n_perturbations)[0]
+        for k, (m, d) in enumerate(zip(made, data, strict=True))
+    ]
+
+
+def drawn(prior, made, seed=2):
+    rng = np.random.default_rng(seed)
+    s = covariance_of(prior)
+    sky = np.linalg.cholesky(s + 1e-12 * np.diag(np.diag(s))) @ rng.standard_normal(len(s))
+    sky = sky.reshape(len(made), N_MODES)
+    return sky, [
+        np.asarray(m.coupling.dense()) @ m_sky
+        + np.sqrt(np.asarray(m.noise.variance)) * rng.standard_normal(m.n_data)
+        for m, m_sky in zip(made, sky, strict=True)
+    ]
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        "components",
+        *(pytest.param(p, marks=pytest.mark.long) for p in ("kernel", "no rest")),
+    ],
+)
+def case(request):
+    """Prior, models, data, what they tell, and the textbook's answer."""
+    prior = PRIORS[request.param]()
+    made = models(prior)
+    _, data = drawn(prior, made)
+    a, n = big_gaussian(made)
+    s, d = covariance_of(prior), np.concatenate(data)
+    k = a @ s @ a.T + np.diag(n)
+    gain = np.linalg.solve(k, a @ s).T
+    mean, covariance = gain @ d, s - gain @ a @ s
+    evidence = stats.multivariate_normal(np.zeros(len(d)), k).logpdf(d)
+    channels = information_from(made, data, 3000)
+    reference = np.stack([np.asarray(t.reference) for t in channels])
+    return prior, made, channels, reference, mean, covariance, evidence
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_the_direct_solution_is_the_textbooks(case):
+    prior, _, channels, reference, mean, covariance, evidence = case
+    posterior = solve_directly(prior, channels, reference)
+    np.testing.assert_allclose(posterior.log_evidence, evidence, rtol=1e-8)
+    std = np.sqrt(np.diag(covariance)).reshape(-1, N_MODES)
+    maps = posterior.mean.reshape(prior.n_components, N_MODES)
+    draws = posterior.sample(jax.random.key(3), 4000).reshape(4000, -1, N_MODES)
+    spread = paired(posterior.covariance(), prior)
+    for k, information in enumerate(channels):
+        rows = slice(k * N_MODES, (k + 1) * N_MODES)
+        sky = channel_sky(prior, k, information, maps, spread, draws, jax.random.key(5))
+        # the textbook's own subtraction of s leaves 1e-16 times (signal / noise)^2
+        assert np.abs((np.asarray(sky.mean) - mean[rows]) / std[k]).max() < 1e-6
+        np.testing.assert_allclose(
+            sky.covariance, covariance[rows, rows], rtol=0, atol=1e-7 * std[k].max() ** 2
+        )
+        lower = np.linalg.cholesky(np.asarray(sky.covariance))
+        z = np.linalg.solve(lower, (np.asarray(sky.draws) - np.asarray(sky.mean)).T)
+        assert np.abs(z @ z.T / 4000 - np.eye(N_MODES)).max() < z_of(81) * np.sqrt(2 / 4000)
+
+
+def test_conjugate_gradients_agree_with_the_direct_solution(case):
+    prior, _, channels, reference, *_ = case
+    direct = solve_directly(prior, channels, reference)
+    std = np.asarray(direct.std())
+    for leading in (1, prior.n_components):
+        found = solve_iteratively(prior, channels, reference, jax.random.key(0), leading=leading)
+        off = np.asarray(found.mean).ravel() - np.asarray(direct.mean)
+        assert np.abs(off / std).max() < 1e-6
+        assert found.distance <= 1e-7
+    assert found.iterations <= 2  # the preconditioner was the inverse
+    n = len(found.draws)
+    z = np.asarray(direct.whiten(jnp.asarray(found.draws).reshape(n, -1)))
+    assert np.abs(z.T @ z / n - np.eye(z.shape[1])).max() < z_of(z.shape[1] ** 2) * np.sqrt(2 / n)
+
+
+def test_what_does_not_converge_says_so(case):
+    prior, _, channels, reference, *_ = case
+    with pytest.raises(InputError, match="did not converge: after 1 iterations .* standard devia"):
+        solve_iteratively(prior, channels, reference, jax.random.key(0), leading=1, iterations=1)
+
+
+def test_the_gradients_of_a_matrix_that_is_not_positive_definite():
+    matrix = jnp.diag(jnp.array([1.0, -1.0, 2.0]))
+    right = jnp.array([[1.0, 2.0, 1.0]])
+    with pytest.raises(InputError, match=r"broke down after \d+ iterations|did not converge"):
+        conjugate_gradients(lambda x: x @ matrix, right, lambda x: x @ -matrix)
+
+
+def test_chi2_of_data_drawn_from_the_joint_prior():
+    """d^T K^-1 d, which is twice the fall of ln p(d), follows chi^2 with N_data."""
+    prior = PRIORS["components"]()
+    made = models(prior)
+    at_zero = [np.zeros(m.n_data) for m in made]
+
+    def evidence(data):
+        channels = information_from(made, data)
+        reference = np.stack([np.asarray(t.reference) for t in channels])
+        return float(solve_directly(prior, channels, reference).log_evidence)
+
+    highest = evidence(at_zero)
+    n_data = sum(m.n_data for m in made)
+    found = [2 * (highest - evidence(drawn(prior, made, seed)[1])) for seed in range(100, 160)]
+    assert stats.kstest(found, stats.chi2(n_data).cdf).pvalue > 1e-3
+
+
+def test_skies_that_do_not_obey_the_prior_are_told():
+    """Skies with a rest of their own, under a prior that has none: evidence and residuals fall."""
+    true = SpectralPrior.components(FREQUENCIES, skies(), ("power_law",), residual=0.2)
+    wrong = SpectralPrior.components(FREQUENCIES, skies(), ("power_law",), residual=1e-4)
+    made = models(true)
+    found = {}
+    for name, obeys in (("obeyed", wrong), ("not obeyed", true)):
+        _, data = drawn(obeys, made)
+        channels = information_from(made, data)
+        reference = np.stack([np.asarray(t.reference) for t in channels])
+        for prior_name, prior in (("true", true), ("wrong", wrong)):
+            posterior = solve_directly(prior, channels, reference)
+            maps = posterior.mean.reshape(prior.n_components, N_MODES)
+            spread = paired(posterior.covariance(), prior)
+            none = jnp.zeros((0, prior.n_components, N_MODES))
+            chi2 = [
+                channel_sky(prior, k, t, maps, spread, none, jax.random.key(0))
+                for k, t in enumerate(channels)
+            ]
+            far = [
+                float(c.chi2 - c.chi2_expected) / np.sqrt(2 * len(d))
+                for c, d in zip(chi2, data, strict=True)
+            ]
+            found[name, prior_name] = float(posterior.log_evidence), max(np.abs(far))
+    # where the sky does have a rest, the prior without it is refused by both
+    assert found["not obeyed", "true"][0] > found["not obeyed", "wrong"][0] + 20
+    assert found["not obeyed", "wrong"][1] > 6.0 > found["not obeyed", "true"][1]
+    # where it has none, the sharper prior is the better one, and its residuals fit
+    assert found["obeyed", "wrong"][0] > found["obeyed", "true"][0] + 3
+    assert found["obeyed", "wrong"][1] < 6.0
+
+
+def test_components_are_a_fit_to_the_skies():
+    x = FREQUENCIES / 20.0
+    a, b = np.random.default_rng(1).standard_normal((2, N_MODES))
+    exact = x[:, None] ** -2.5 * (a + b * np.log(x)[:, None])
+    prior = SpectralPrior.components(FREQUENCIES, exact, ("power_law", "curvature"), residual=0.0)
+    np.testing.assert_allclose(prior.spectra[0, 0], a[0] ** 2, rtol=1e-10)
+    np.testing.assert_allclose(prior.spectra[1, 1], (b[1:4] ** 2).mean(), rtol=1e-10)
+    np.testing.assert_allclose(prior.mixing[:, 1], x**-2.5 * np.log(x), rtol=1e-14)
+
+
+def test_the_kernel_is_its_formula():
+    prior = SpectralPrior.kernel(FREQUENCIES, skies(), length=0.7, index=-2.3, residual=0.05)
+    log_x = np.log(FREQUENCIES / 20.0)
+    kernel = np.exp(-2.3 * (log_x[:, None] + log_x[None]))
+    kernel *= np.exp(-((log_x[:, None] - log_x[None]) ** 2) / (2 * 0.7**2))
+    ell, scaled = 1, skies() / np.exp(-2.3 * log_x)[:, None]
+    power = (scaled[:, 1:4] ** 2).mean()
+    got = np.einsum("fc,c,gc->fg", prior.mixing, prior.spectra[:, ell], prior.mixing)
+    np.testing.assert_allclose(got, power * kernel, rtol=0, atol=1e-9 * (power * kernel).max())
+    expected = 0.05**2 * (skies()[:, 1:4] ** 2).mean(1)
+    np.testing.assert_allclose(prior.residual[:, ell], expected, rtol=1e-12)
+
+
+def test_draws_of_the_prior_have_its_covariance():
+    prior = PRIORS["components"]()
+    keys = jax.random.split(jax.random.key(0), 4000)
+    draws = np.asarray(jax.vmap(prior.sample)(keys)).reshape(4000, -1)
+    s = covariance_of(prior)
+    z = np.linalg.solve(np.linalg.cholesky(s), draws.T)
+    assert np.abs(z @ z.T / 4000 - np.eye(len(s))).max() < z_of(len(s) ** 2) * np.sqrt(2 / 4000)
+
+
+def test_bad_priors_and_channels_are_refused():
+    with pytest.raises(InputError, match="unknown component 'turnver'; did you mean 'turnover'"):
+        SpectralPrior.components(FREQUENCIES, skies(), ("turnver",))
+    with pytest.raises(InputError, match="3 spectral components need at least as many channels"):
+        SpectralPrior.components(FREQUENCIES[:2], skies()[:2])
+    with pytest.raises(InputError, match="fit the skies of 2 channels exactly"):
+        SpectralPrior.components(FREQUENCIES[:2], skies()[:2], ("power_law", "curvature"))
+    with pytest.raises(InputError, match="must not be negative"):
+        SpectralPrior.components(FREQUENCIES, skies(), residual=-0.1)
+    prior = PRIORS["kernel"]()
+    channels = information_from(models(prior), [np.zeros(m.n_data) for m in models(prior)])
+    reference = np.zeros((4, N_MODES))
+    with pytest.raises(InputError, match="there are 3 channels, the prior is for 4"):
+        solve_directly(prior, channels[:3], reference)
+    with pytest.raises(InputError, match="need information with perturbations"):
+        solve_iteratively(prior, channels, reference, jax.random.key(0))

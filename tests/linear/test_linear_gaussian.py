@@ -1,0 +1,519 @@
+"""The posterior and the evidence, by both forms, against textbook formulas and 60 digits."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import TypeCheckError
+from reference_linear import (
+    assert_draws_follow,
+    exact_posterior,
+    log_prob_slope,
+    posterior,
+    posterior_by_precision,
+    random_covariance,
+)
+from scipy.stats import multivariate_normal
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.instrument.beams import monopole_beams
+from lusee_bayes.instrument.coupling import CouplingMatrix
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.observation import Observation, Run
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.solver import CONVERGENCE, FORMS
+from lusee_bayes.noise import radiometer_noise
+from lusee_bayes.noise.covariance import DenseCovariance, DiagonalCovariance, TimeBlockCovariance
+from lusee_bayes.sky.priors import HarmonicPrior
+
+LMAX, N_MODES = 3, 16
+SPECTRUM = np.array([4.0, 1.0, 0.5, 0.25])
+WITH_ZERO = np.array([4.0, 0.0, 0.5, 0.0])
+
+# the accuracy that is promised, in posterior standard deviations, and for ln p absolutely
+PROMISED = 1e-6
+# well-scaled cases (condition below 1e4): 1e4 x 16 modes x eps = 4e-11 bounds oracle and package
+WELL_SCALED = 1e-10
+
+
+def per_mode(spectrum) -> np.ndarray:
+    return np.concatenate([np.full(2 * ell + 1, c) for ell, c in enumerate(spectrum)])
+
+
+def noise_terms(n_data: int):
+    """Every structure of N over 3 products x n_data / 3 times."""
+    rng = np.random.default_rng(11)
+    layout = DataLayout(3, n_data // 3)
+    diagonal = DiagonalCovariance(jnp.asarray(rng.uniform(0.5, 2.0, n_data)))
+    blocks = np.stack([random_covariance(rng, 3) for _ in range(layout.n_times)])
+    time_blocks = TimeBlockCovariance(jnp.asarray(blocks), layout)
+    dense = DenseCovariance(jnp.asarray(random_covariance(rng, n_data)))
+    return {
+        "diagonal": diagonal,
+        "blocks": time_blocks,
+        "dense": dense,
+        "diagonal+blocks": diagonal + time_blocks,
+    }
+
+
+def well_scaled(n_data: int, noise="diagonal", spectrum=SPECTRUM, offset=None):
+    """A model of order-one numbers and data drawn from it by numpy."""
+    rng = np.random.default_rng(n_data)
+    a = rng.normal(size=(n_data, N_MODES))
+    n = noise_terms(n_data)[noise]
+    sky = rng.normal(size=N_MODES) * np.sqrt(per_mode(spectrum))
+    d = a @ sky + rng.multivariate_normal(np.zeros(n_data), np.asarray(n.dense()))
+    if offset is not None:
+        d, offset = d + offset, jnp.asarray(offset)
+    model = LinearGaussian(jnp.asarray(a), HarmonicPrior(jnp.asarray(spectrum)), n, offset)
+    return model, jnp.asarray(d)
+
+
+def naive(model, d):
+    """The oracle's answer for a model with a dense A."""
+    offset = 0.0 if model.offset is None else np.asarray(model.offset)
+    s = np.diag(per_mode(np.asarray(model.prior.spectrum)))
+    return posterior(model.coupling.dense(), s, model.noise.dense(), d, offset)
+
+
+def assert_same(post, expected, tol=WELL_SCALED):
+    """Mean in posterior sigma, covariance in sigma_i sigma_j, std as a ratio, ln p."""
+    known = expected.std > 0
+    sigma = np.where(known, expected.std, 1.0)
+    assert np.abs((np.asarray(post.mean) - expected.mean) / sigma).max() < tol
+    error = np.asarray(post.covariance()) - expected.covariance
+    assert np.abs(error / np.outer(sigma, sigma)).max() < tol
+    assert np.abs(np.asarray(post.std()) / sigma - known).max() < tol
+    assert float(post.log_evidence) == pytest.approx(expected.log_prob, abs=100 * tol)
+
+
+# --- the oracle itself ---------------------------------------------------------------------------
+
+
+def test_oracle_of_one_number():
+    """a = 2, S = 3, N = 1, d = 5: K = 13, mean 30/13, variance 3/13."""
+    one = np.ones((1, 1))
+    for answer in (
+        posterior(2 * one, 3 * one, one, [5.0]),
+        posterior_by_precision(2 * one, 3 * one, one, [5.0]),
+        exact_posterior(2 * one, [3.0], one, [5.0]),
+    ):
+        assert answer.mean[0] == pytest.approx(30 / 13, rel=1e-15)
+        assert answer.covariance[0, 0] == pytest.approx(3 / 13, rel=2e-15)
+        log_prob = -0.5 * (25 / 13 + np.log(13) + np.log(2 * np.pi))
+        assert answer.log_prob == pytest.approx(log_prob, rel=1e-15)
+
+
+@pytest.mark.parametrize("n_data", [30, 9])
+def test_oracles_agree(n_data):
+    model, d = well_scaled(n_data, "dense")
+    a, n = np.asarray(model.coupling.dense()), np.asarray(model.noise.dense())
+    first = naive(model, d)
+    others = [
+        posterior_by_precision(a, np.diag(per_mode(SPECTRUM)), n, d),
+        exact_posterior(a, per_mode(SPECTRUM), n, d),
+    ]
+    for other in others:
+        np.testing.assert_allclose(other.mean, first.mean, atol=WELL_SCALED)
+        np.testing.assert_allclose(other.covariance, first.covariance, atol=WELL_SCALED)
+        assert other.log_prob == pytest.approx(first.log_prob, abs=WELL_SCALED)
+
+
+def test_oracle_slope_is_that_of_scipys_density():
+    rng = np.random.default_rng(0)
+    a, d = rng.normal(size=(6, 4)), rng.normal(size=6)
+    s, n, ds, dn = (random_covariance(rng, k) for k in (4, 6, 4, 6))
+    h = 1e-5
+
+    def value(x):
+        return posterior(a, s + x * ds, n + x * dn, d).log_prob
+
+    # central differences: h^2 times a third derivative of order 10, and 1e-15 / h of rounding
+    slope = (value(h) - value(-h)) / (2 * h)
+    assert log_prob_slope(a, s, n, d, ds, dn) == pytest.approx(slope, abs=1e-8)
+
+
+# --- agreement on well-scaled cases --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("n_data", [30, 9])
+@pytest.mark.parametrize("noise", noise_terms(3))
+def test_both_forms_equal_the_naive_oracle(noise, n_data, form):
+    model, d = well_scaled(n_data, noise)
+    assert_same(model.condition(d, form), naive(model, d))
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("n_data", [30, 9])
+def test_ell_without_power_is_known_to_be_zero(n_data, form):
+    model, d = well_scaled(n_data, spectrum=WITH_ZERO)
+    post = model.condition(d, form)
+    assert_same(post, naive(model, d))
+    zero = per_mode(WITH_ZERO) == 0
+    for values in (post.mean, post.std(), post.sample(jax.random.key(0)), post.prior_fraction()):
+        assert (np.asarray(values)[zero] == 0.0).all()
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_offset_is_what_the_data_hold_without_sky(form):
+    offset = np.linspace(-3.0, 5.0, 30)
+    model, d = well_scaled(30, "blocks", offset=offset)
+    assert_same(model.condition(d, form), naive(model, d))
+    without = LinearGaussian(model.coupling, model.prior, model.noise).condition(d - offset, form)
+    np.testing.assert_allclose(model.condition(d, form).mean, without.mean, atol=1e-13)
+
+
+@pytest.mark.parametrize("n_data", [30, 9])
+def test_log_prob_is_the_density_of_the_data(n_data):
+    model, d = well_scaled(n_data, "dense", offset=np.full(n_data, 0.5))
+    s = np.diag(per_mode(SPECTRUM))
+    a = np.asarray(model.coupling.dense())
+    k = a @ s @ a.T + np.asarray(model.noise.dense())
+    density = multivariate_normal(np.full(n_data, 0.5), k)
+    for data in (d, 3.0 * d, jnp.zeros(n_data)):
+        expected = density.logpdf(np.asarray(data))
+        assert float(model.log_prob(data)) == pytest.approx(expected, abs=1e-9)
+        assert float(model.condition(data).log_evidence) == pytest.approx(expected, abs=1e-9)
+        for form in FORMS:
+            assert float(model.factorise(form).log_prob(data)) == pytest.approx(expected, abs=1e-9)
+
+
+def test_evidence_integrates_to_one():
+    """Trapezia over d of a model with one datum: the normalisation, without any formula."""
+    noise = DiagonalCovariance(jnp.array([0.7]))
+    model = LinearGaussian(jnp.array([[1.5]]), HarmonicPrior(jnp.array([2.0])), noise)
+    solver = model.factorise()
+    d = jnp.linspace(-25.0, 25.0, 501)  # 11 sigma, step 0.05 sigma: exact for a Gaussian
+    density = jnp.exp(jax.vmap(lambda x: solver.log_prob(x[None]))(d))
+    assert float(jnp.trapezoid(density, d)) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_form_is_picked_from_the_sizes():
+    tall, wide = well_scaled(30)[0], well_scaled(9)[0]
+    assert tall.factorise().basis is None
+    assert tall.factorise().lower.shape == (16, 16)
+    assert wide.factorise().basis.shape == (16, 9)
+    assert wide.factorise().lower.shape == (9, 9)
+
+
+def test_prior_predictive_draws_follow_the_evidence():
+    model, _ = well_scaled(9, "blocks", offset=np.full(9, 2.0))
+    skies, data = jax.vmap(model.sample)(jax.random.split(jax.random.key(4), 20_000))
+    a, s = np.asarray(model.coupling.dense()), np.diag(per_mode(SPECTRUM))
+    k = a @ s @ a.T + np.asarray(model.noise.dense())
+    joint = np.block([[s, s @ a.T], [a @ s, k]])
+    mean = np.concatenate([np.zeros(16), np.full(9, 2.0)])
+    assert_draws_follow(np.concatenate([skies, data], axis=1), mean, joint)
+
+
+# --- the real coupling matrix --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def instrument():
+    """A short run of the real experiment: (A, exact noise, spectrum, data)."""
+    lmax = 8
+    beams = monopole_beams(25.0, lmax)
+    coupling = CouplingMatrix.observe(beams, Observation.from_runs([Run(0.015)]))
+    assert coupling.shape == (64, 81)
+    spectrum = jnp.asarray(1e8 * (1.0 + np.arange(lmax + 1.0)) ** -2.5)
+    monopole = jnp.zeros(81).at[0].set(2e4 * np.sqrt(4 * np.pi))  # 20000 K everywhere
+    fiducial = coupling.layout.scatter(coupling @ monopole)
+    noise = radiometer_noise(fiducial, coupling.layout, form="exact")
+    model = LinearGaussian(coupling, HarmonicPrior(spectrum), noise)
+    return model, model.sample(jax.random.key(3))[1]
+
+
+@pytest.mark.long
+@pytest.mark.essential
+@pytest.mark.parametrize("form", FORMS)
+def test_real_experiment_to_sixty_digits(instrument, form):
+    """Condition number of Lambda 1e10. Reached: mean 1e-11 sigma, std 3e-10, ln p 3e-9."""
+    model, d = instrument
+    a = np.asarray(model.coupling.dense())
+    variance = per_mode(np.asarray(model.prior.spectrum))
+    exact = exact_posterior(a, variance, np.asarray(model.noise.dense()), d)
+    post = model.condition(d, form)
+    assert np.abs((np.asarray(post.mean) - exact.mean) / exact.std).max() < 1e-9
+    assert np.abs(np.asarray(post.std()) / exact.std - 1.0).max() < 1e-7
+    assert float(post.log_evidence) == pytest.approx(exact.log_prob, abs=1e-6)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_structured_and_dense_coupling_agree(instrument, form):
+    model, d = instrument
+    dense = LinearGaussian(model.coupling.dense(), model.prior, model.noise)
+    # the same numbers through the same steps; compiled apart, so the Gram matrix may round apart:
+    # condition number 1e10 x eps = 2e-6 at worst
+    a, b = model.condition(d, form), dense.condition(d, form)
+    assert float(jnp.abs((a.mean - b.mean) / b.std()).max()) < PROMISED
+    np.testing.assert_allclose(a.std(), b.std(), rtol=PROMISED)
+    assert float(a.log_evidence) == pytest.approx(float(b.log_evidence), abs=PROMISED)
+
+
+# --- high signal-to-noise ------------------------------------------------------------------------
+
+
+def graded(n_data: int, largest: float, lmax=5, seed=1):
+    """A model in which singular values of W run from 1 to ``largest``, and data of it."""
+    rng = np.random.default_rng(seed)
+    spectrum = 10.0 * np.arange(1.0, lmax + 2.0) ** -2
+    prior = per_mode(spectrum)
+    rank = min(n_data, len(prior))
+    left = np.linalg.qr(rng.normal(size=(n_data, rank)))[0]
+    right = np.linalg.qr(rng.normal(size=(len(prior), rank)))[0]
+    w = left * np.logspace(0, np.log10(largest), rank) @ right.T
+    variance = rng.uniform(0.5, 2.0, n_data)
+    a = np.sqrt(variance)[:, None] * w / np.sqrt(prior)[None]
+    d = a @ (rng.normal(size=len(prior)) * np.sqrt(prior))
+    d = d + rng.normal(size=n_data) * np.sqrt(variance)
+    model = LinearGaussian(
+        jnp.asarray(a),
+        HarmonicPrior(jnp.asarray(spectrum)),
+        DiagonalCovariance(jnp.asarray(variance)),
+    )
+    return model, jnp.asarray(d), exact_posterior(a, prior, np.diag(variance), d)
+
+
+# What float64 reaches, with ten times to spare. The mean is refined, so both forms keep it to
+# eps x largest. The Cholesky factor of 1 + W^T W has absolute errors eps x largest^2 where Lambda
+# may be 1: the map form's std and ln p lose that much. The data form's triangle is graded, rows of
+# every size keep their own relative accuracy, and it loses only eps x largest.
+@pytest.mark.long
+@pytest.mark.essential
+@pytest.mark.parametrize("largest", [1e2, 1e4, 1e6])
+@pytest.mark.parametrize("n_data", [60, 24])
+@pytest.mark.parametrize("form", FORMS)
+def test_high_signal_to_noise_to_sixty_digits(form, n_data, largest):
+    model, d, exact = graded(n_data, largest)
+    post = model.condition(d, form)
+    eps = np.finfo(float).eps
+    linear, squared = 1e-13 + 10 * eps * largest, 1e-12 + 10 * eps * largest**2
+    lost = squared if form == "map" else linear
+    assert np.abs((np.asarray(post.mean) - exact.mean) / exact.std).max() < linear
+    assert np.abs(np.asarray(post.std()) / exact.std - 1.0).max() < lost
+    assert float(post.log_evidence) == pytest.approx(exact.log_prob, abs=10 * lost)
+    assert float(post.refinement) <= CONVERGENCE
+
+
+def test_refinement_is_needed_and_reported():
+    """Without refinement the normal equations' mean is off by more than is promised."""
+    model, d, exact = graded(60, 1e6)
+    solver = model.factorise("map")
+    w, lower = np.asarray(solver.whitened), np.tril(np.asarray(solver.lower))
+    white = np.asarray(d) / np.sqrt(np.asarray(model.noise.variance))
+    u = np.linalg.solve(lower.T, np.linalg.solve(lower, w.T @ white))
+    unrefined = u * np.sqrt(per_mode(np.asarray(model.prior.spectrum)))
+    assert np.abs((unrefined - exact.mean) / exact.std).max() > PROMISED
+    assert 0.0 <= float(model.condition(d, "map").refinement) <= CONVERGENCE
+
+
+def with_a_wrong_factor(n_data: int):
+    """A solver whose L is twice too large: the error shrinks by 3/4 per step, 0.06 after ten."""
+    model, d = well_scaled(n_data)
+    solver = model.factorise()
+    return eqx.tree_at(lambda s: s.lower, solver, 2.0 * solver.lower), d
+
+
+@pytest.mark.parametrize("n_data", [30, 9])
+def test_no_convergence_is_an_error(n_data):
+    solver, d = with_a_wrong_factor(n_data)
+    with pytest.raises(
+        InputError, match=r"did not converge: after 10 refinements .* noise is too small"
+    ):
+        solver.condition(d)
+
+
+def test_noise_too_small_for_float64_is_an_error():
+    """W from 1 to 1e9: Lambda holds 1 and 1e18, of which eps is 200."""
+    model, d, exact = graded(24, 1e9)
+    with pytest.raises(InputError, match="could not be factorised|did not converge"):
+        model.condition(d, "map")
+    post = model.condition(d, "data")  # the graded form still gets there
+    assert np.abs((np.asarray(post.mean) - exact.mean) / exact.std).max() < PROMISED
+
+
+# --- gradients and transformations ---------------------------------------------------------------
+
+
+def log_prob_of(model, d):
+    def value(spectrum, level):
+        noise = model.noise.scaled(level)
+        return LinearGaussian(model.coupling, HarmonicPrior(spectrum), noise).log_prob(d)
+
+    return value
+
+
+def expected_slopes(model, d):
+    """d ln p / d C_ell and d ln p / d (noise level) by the textbook formula."""
+    a, n = np.asarray(model.coupling.dense()), np.asarray(model.noise.dense())
+    spectrum = np.asarray(model.prior.spectrum)
+    s, y = np.diag(per_mode(spectrum)), np.asarray(d)
+    of_ell = [
+        log_prob_slope(a, s, n, y, np.diag(per_mode(np.arange(LMAX + 1.0) == ell) * 1.0), 0 * n)
+        for ell in range(LMAX + 1)
+    ]
+    return np.array(of_ell), log_prob_slope(a, s, n, y, 0 * s, n)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
+@pytest.mark.parametrize("n_data", [30, 9])
+def test_slopes_of_the_evidence(derivative, n_data):
+    model, d = well_scaled(n_data, "dense")
+    got = derivative(log_prob_of(model, d), argnums=(0, 1))(jnp.asarray(SPECTRUM), jnp.asarray(1.0))
+    of_ell, of_level = expected_slopes(model, d)
+    np.testing.assert_allclose(got[0], of_ell, rtol=1e-9, atol=1e-9)
+    assert float(got[1]) == pytest.approx(of_level, rel=1e-9)
+
+
+def test_slopes_are_those_of_finite_differences():
+    """The package's own values against ``log_prob_slope``: errors h^2 and eps |ln p| / h."""
+    model, d = well_scaled(30, "dense")
+    value, h = jax.jit(log_prob_of(model, d)), 1e-4
+    x, one = jnp.asarray(SPECTRUM), jnp.asarray(1.0)
+    of_ell, of_level = expected_slopes(model, d)
+    for ell in range(LMAX + 1):
+        step = h * jax.nn.one_hot(ell, LMAX + 1, dtype=jnp.float64)
+        difference = (value(x + step, one) - value(x - step, one)) / (2 * h)
+        assert float(difference) == pytest.approx(of_ell[ell], abs=1e-6)
+    difference = (value(x, one + h) - value(x, one - h)) / (2 * h)
+    assert float(difference) == pytest.approx(of_level, abs=1e-6)
+
+
+def test_one_factorisation_serves_many_data_vectors():
+    model, d = well_scaled(30, "blocks")
+    solver = model.factorise()
+    many = jnp.stack([d, 2.0 * d, jnp.zeros(30)])
+    means = jax.vmap(lambda x: solver.condition(x).mean)(many)
+    for data, mean in zip(many, means, strict=True):
+        np.testing.assert_allclose(mean, naive(model, data).mean, atol=WELL_SCALED)
+
+
+def test_evidence_inside_jit_and_vmap():
+    model, d = well_scaled(30)
+    value = log_prob_of(model, d)
+    levels = jnp.array([0.5, 1.0, 4.0])
+    got = jax.jit(jax.vmap(value, (None, 0)))(jnp.asarray(SPECTRUM), levels)
+    for level, log_prob in zip(levels, got, strict=True):
+        scaled = LinearGaussian(model.coupling, model.prior, model.noise.scaled(float(level)))
+        assert float(log_prob) == pytest.approx(naive(scaled, d).log_prob, abs=1e-9)
+
+
+# --- refusals ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small():
+    return well_scaled(9)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_bad_data_are_refused(small, form):
+    model, d = small
+    with pytest.raises(InputError, match=r"the data has shape \(8,\), expected \(9,?\)"):
+        model.condition(d[:-1], form)
+    with pytest.raises(InputError, match=r"the data holds NaN or infinity \(1 of 9 .*\(4,\)"):
+        model.condition(d.at[4].set(jnp.nan), form)
+    with pytest.raises(InputError, match=r"the data must be a float64 array, got .*float32"):
+        model.condition(d.astype(jnp.float32), form)
+
+
+@pytest.mark.parametrize(("word", "said"), [("dta", "did you mean 'data'"), ("x", "data, map")])
+def test_unknown_form_names_the_nearest(small, word, said):
+    with pytest.raises(InputError, match=f"unknown form '{word}'; .*{said}"):
+        small[0].condition(small[1], word)
+
+
+def test_sizes_must_fit(small):
+    model, _ = small
+    a, prior, noise = model.coupling.dense(), model.prior, model.noise
+    with pytest.raises(InputError, match="coupling matrix has 8 rows, the noise covariance 9"):
+        LinearGaussian(a[:8], prior, noise)
+    with pytest.raises(InputError, match=r"coupling matrix has 16 columns, the prior 9 .* lmax"):
+        LinearGaussian(a, HarmonicPrior(jnp.ones(3)), noise)
+    with pytest.raises((InputError, TypeCheckError), match="offset"):  # types are checked first
+        LinearGaussian(a, prior, noise, jnp.ones(8))
+    with pytest.raises(InputError, match="the offset must be a float64 array"):
+        LinearGaussian(a, prior, noise, jnp.ones(9, dtype=jnp.float32))
+
+
+def test_bad_coupling_is_refused(small):
+    model, _ = small
+    with pytest.raises(InputError, match=r"the coupling matrix holds NaN .*\(2, 3\)"):
+        LinearGaussian(model.coupling.dense().at[2, 3].set(jnp.nan), model.prior, model.noise)
+    with pytest.raises(InputError, match="the coupling matrix must be a float64 array"):
+        LinearGaussian(model.coupling.dense().astype(jnp.float32), model.prior, model.noise)
+
+
+def test_indefinite_noise_is_named(small):
+    model, d = small
+    matrix = jnp.eye(9).at[0, 0].set(-2.0)
+    noise = DenseCovariance(matrix, "the gain term")
+    with pytest.raises(InputError, match="the gain term is not positive definite.*is -2 "):
+        LinearGaussian(model.coupling, model.prior, noise).condition(d)
+
+
+# --- known problems of the package: remove the mark when they are mended --------------------------
+
+
+def test_log_prob_refuses_nan(small):
+    with pytest.raises(InputError, match="NaN"):
+        small[0].log_prob(small[1].at[4].set(jnp.nan))
+
+
+def test_log_prob_refuses_wrong_data(small):
+    with pytest.raises(InputError, match="float64"):
+        small[0].log_prob(small[1].astype(jnp.float32))
+
+
+def test_log_prob_without_convergence_is_an_error():
+    solver, d = with_a_wrong_factor(30)
+    with pytest.raises(InputError, match="did not converge"):
+        solver.log_prob(d)
+
+
+def test_offset_must_be_finite(small):
+    model, _ = small
+    with pytest.raises(InputError, match="the offset holds NaN"):
+        LinearGaussian(model.coupling, model.prior, model.noise, jnp.full(9, jnp.nan))
+
+
+def test_condition_inside_jit(small):
+    model, d = small
+    got = jax.jit(lambda x: model.condition(x).mean)(d)
+    np.testing.assert_allclose(got, naive(model, d).mean, atol=WELL_SCALED)
+
+
+def test_only_the_coupling_is_sampled(small):
+    model, d = small
+    value = jax.jit(lambda a: LinearGaussian(a, model.prior, model.noise).log_prob(d))
+    assert float(value(model.coupling.dense())) == pytest.approx(naive(model, d).log_prob, abs=1e-9)
+
+
+def test_slopes_with_fewer_data_and_an_ell_without_power():
+    spectrum = np.array([4.0, 1.0, 0.0, 0.0])  # 4 modes are left, fewer than the 9 data
+    model, d = well_scaled(9, spectrum=spectrum)
+    added = jnp.linspace(0.0, 1.0, 9)
+
+    def value(x):
+        noise = DiagonalCovariance(model.noise.variance + x * added)
+        return LinearGaussian(model.coupling, model.prior, noise).log_prob(d)
+
+    a, s, n = model.coupling.dense(), np.diag(per_mode(spectrum)), model.noise.dense()
+    a, n, added_n = np.asarray(a), np.asarray(n), np.diag(np.asarray(added))
+    expected = log_prob_slope(a, s, n, np.asarray(d), 0 * s, added_n)
+    assert float(jax.jacfwd(value)(jnp.asarray(0.0))) == pytest.approx(expected, rel=1e-9)
+
+
+def test_standard_deviations_are_right_or_refused():
+    model, d, exact = graded(24, 5e7)
+    try:
+        std = np.asarray(model.condition(d, "map").std())
+    except InputError:
+        return
+    assert np.abs(std / exact.std - 1.0).max() < 1e-3  # 3e-2 is what comes

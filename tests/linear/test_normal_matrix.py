@@ -1,0 +1,201 @@
+"""A^T N^-1 A without A, against A and N as matrices."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.harmonics import pixel_matrix
+from lusee_bayes.instrument.beams import ProductBeams
+from lusee_bayes.instrument.coupling import CouplingMatrix
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.observation import Observation, Run
+from lusee_bayes.instrument.pointing import Pointing
+from lusee_bayes.linear import information
+from lusee_bayes.linear import model as linear_gaussian
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.normal_matrix import normal_matrix
+from lusee_bayes.linear.pixel_variance import pixel_std
+from lusee_bayes.linear.time_sums import CHUNK, time_sums
+from lusee_bayes.noise.covariance import (
+    DenseCovariance,
+    DiagonalCovariance,
+    LowRankCovariance,
+    TimeBandedCovariance,
+    TimeBlockCovariance,
+)
+from lusee_bayes.sky.priors import HarmonicPrior
+
+LMAX, N_PRODUCTS = 5, 4
+# the first and the last run see the sky through the same beams
+RUNS = [Run(0.5), Run(0.3, 35.0), Run(0.4)]
+
+
+def setting(order=2, missing=True, step_s=40000.0):
+    """A coupling matrix of random beams; some samples, and all of one time, are missing."""
+    rng = np.random.default_rng(3)
+    o = Observation.from_runs(RUNS, step_s=step_s)
+    flags = np.zeros((N_PRODUCTS, o.n_times), dtype=bool)
+    if missing:
+        flags[1, 4], flags[:, 9], flags[0, -1] = True, True, True
+    layout = DataLayout.from_flags(flags)
+    beams = ProductBeams(jnp.asarray(rng.standard_normal((N_PRODUCTS, (LMAX + 1) ** 2))), 25.0)
+    # a pole that wanders a hundred times further than the Moon's: the tilt is not to be missed
+    pointing = Pointing.of(o, LMAX, order)
+    wandering = jnp.asarray(0.05 * rng.standard_normal(pointing.tilt.shape))
+    pointing = replace(pointing, tilt=wandering)
+    return CouplingMatrix.build(beams, pointing, layout)
+
+
+def noise_of(kind, layout):
+    rng = np.random.default_rng(5)
+    if kind == "diagonal":
+        return DiagonalCovariance(jnp.asarray(rng.uniform(0.5, 2.0, layout.size)))
+    roots = rng.standard_normal((layout.n_times, N_PRODUCTS, 2 * N_PRODUCTS))
+    blocks = jnp.asarray(roots @ np.swapaxes(roots, 1, 2))
+    if kind == "blocks":
+        return TimeBlockCovariance(blocks, layout)
+    # sums of what neighbouring times share: positive by construction
+    shared = 0.3 * rng.standard_normal((layout.n_times + 2, N_PRODUCTS, N_PRODUCTS))
+    band = np.zeros((layout.n_times, 3, N_PRODUCTS, N_PRODUCTS))
+    for w in range(3):
+        for t in range(w, layout.n_times):
+            band[t, w] = sum(shared[t - w + k] @ shared[t - w + k].T for k in range(w, 3)) * 0.3
+    band[:, 0] += np.asarray(blocks)
+    return TimeBandedCovariance(jnp.asarray(band), layout)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["diagonal", "blocks", "banded"])
+@pytest.mark.parametrize(
+    ("order", "missing"),
+    [
+        pytest.param(0, True, marks=pytest.mark.long),
+        pytest.param(1, True, marks=pytest.mark.long),
+        (2, True),
+        pytest.param(2, False, marks=pytest.mark.long),
+    ],
+)
+def test_equals_the_product_of_matrices(kind, order, missing):
+    coupling = setting(order, missing)
+    noise = noise_of(kind, coupling.layout)
+    a, n = np.asarray(coupling.dense()), np.asarray(noise.dense())
+    expected = a.T @ np.linalg.solve(n, a)
+    got = np.asarray(normal_matrix(coupling, noise))
+    np.testing.assert_array_equal(got, got.T)
+    # sums of some 500 terms, in another order
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    if order:
+        other = a.T @ np.linalg.solve(n, a) - np.asarray(setting(order - 1, missing).dense()).T @ (
+            np.linalg.solve(n, np.asarray(setting(order - 1, missing).dense()))
+        )
+        assert np.abs(other).max() > 1e-4 * np.abs(expected).max()  # the order does matter here
+
+
+def test_more_times_than_a_chunk():
+    rng = np.random.default_rng(0)
+    n = CHUNK + 37
+    weights, phi = rng.standard_normal((2, n)), rng.uniform(0, 9, n)
+    tilt = 0.1 * rng.standard_normal((n, 2))
+    got = np.asarray(time_sums(jnp.asarray(weights), jnp.asarray(phi), jnp.asarray(tilt), 1, 2))
+    factors = np.stack([np.ones(n), -tilt[:, 0], -tilt[:, 1]])
+    for q in range(-4, 5):
+        expected = np.einsum("ct,at,bt,t->cab", weights, factors, factors, np.exp(1j * q * phi))
+        np.testing.assert_allclose(got[..., q + 4], expected, rtol=0, atol=1e-11)
+
+
+def test_what_has_no_structure_is_refused():
+    coupling = setting()
+    layout = coupling.layout
+    diagonal = noise_of("diagonal", layout)
+    low_rank = diagonal + LowRankCovariance(jnp.ones((layout.size, 1)))
+    for noise in (DenseCovariance(diagonal.dense()), low_rank):
+        with pytest.raises(InputError, match="no structure in time"):
+            normal_matrix(coupling, noise)
+    with pytest.raises(InputError, match="response of its own"):
+        normal_matrix(coupling.with_response(jnp.ones(layout.size)), diagonal)
+    with pytest.raises(InputError, match="N has shape"):
+        normal_matrix(coupling, DiagonalCovariance(jnp.ones(7)))
+
+
+def model(kind="diagonal"):
+    coupling = setting()
+    prior = HarmonicPrior(jnp.asarray(10.0 / (1.0 + np.arange(LMAX + 1.0)) ** 2))
+    noise = noise_of("diagonal", coupling.layout)
+    if kind == "low rank":
+        noise = noise + LowRankCovariance(jnp.ones((coupling.layout.size, 1)))
+    offset = jnp.asarray(np.linspace(0, 1, coupling.layout.size)) if kind == "offset" else None
+    return LinearGaussian(coupling, prior, noise, offset)
+
+
+@pytest.mark.parametrize(
+    "kind", ["diagonal", *(pytest.param(k, marks=pytest.mark.long) for k in ("offset", "low rank"))]
+)
+def test_information_gives_the_posterior_of_the_dense_form(kind):
+    gaussian = model(kind)
+    rng = np.random.default_rng(11)
+    data = jnp.asarray(rng.standard_normal(gaussian.n_data))
+    expected = gaussian.condition(data, form="map")
+    found, got = gaussian.inform(data)
+    for posterior in (got, found.posterior(gaussian.prior), gaussian.condition(data, "structured")):
+        np.testing.assert_allclose(posterior.mean, expected.mean, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(posterior.std(), expected.std(), rtol=1e-11)
+        np.testing.assert_allclose(posterior.log_evidence, expected.log_evidence, rtol=1e-11)
+    sky = jnp.asarray(rng.standard_normal(gaussian.prior.size))
+    residual = np.asarray(data - gaussian.predict(sky))
+    chi2 = residual @ np.linalg.solve(np.asarray(gaussian.noise.dense()), residual)
+    np.testing.assert_allclose(found.chi2(sky), chi2, rtol=1e-10)
+
+
+def test_information_under_another_prior():
+    gaussian = model()
+    data = jnp.asarray(np.random.default_rng(2).standard_normal(gaussian.n_data))
+    found, _ = gaussian.inform(data)
+    spectrum = np.asarray(gaussian.prior.spectrum) * 0.1
+    spectrum[3] = 0.0  # an ell that is known to be zero
+    other = HarmonicPrior(jnp.asarray(spectrum))
+    expected = LinearGaussian(gaussian.coupling, other, gaussian.noise).condition(data, "map")
+    got = found.posterior(other)
+    np.testing.assert_allclose(got.mean, expected.mean, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(got.log_evidence, expected.log_evidence, rtol=1e-11)
+
+
+@pytest.mark.long
+def test_perturbations_are_draws_with_the_normal_matrix_as_covariance():
+    gaussian = model()
+    n = 4000
+    found, _ = gaussian.inform(jnp.zeros(gaussian.n_data), jax.random.key(1), n)
+    lower = np.linalg.cholesky(np.asarray(found.matrix))
+    z = np.linalg.solve(lower, np.asarray(found.perturbations).T)
+    # sample covariance of n draws: 1 / sqrt(n) off the diagonal, sqrt(2 / n) on it
+    assert np.abs(z @ z.T / n - np.eye(len(z))).max() < 5.5 * np.sqrt(2.0 / n)
+    with pytest.raises(InputError, match="give a key"):
+        gaussian.inform(jnp.zeros(gaussian.n_data), None, 2)
+
+
+def test_a_large_matrix_is_not_formed(monkeypatch):
+    gaussian = model()
+    data = jnp.asarray(np.random.default_rng(2).standard_normal(gaussian.n_data))
+    expected = np.asarray(gaussian.condition(data).mean)
+    monkeypatch.setattr(linear_gaussian, "DENSE_BYTES", 8 * gaussian.n_data)
+    monkeypatch.setattr(CouplingMatrix, "dense", None)
+    assert gaussian.too_large
+    np.testing.assert_allclose(gaussian.condition(data).mean, expected, rtol=0, atol=1e-11)
+
+
+def test_information_that_cannot_settle_says_so(monkeypatch):
+    monkeypatch.setattr(information, "CONVERGENCE", 0.0)
+    gaussian = model()
+    with pytest.raises(InputError, match="did not converge: its last step"):
+        gaussian.inform(jnp.ones(gaussian.n_data))
+
+
+@pytest.mark.parametrize(("lmax", "nside"), [(0, 1), (3, 2), (7, 4)])
+def test_pixel_variances_are_those_of_every_direction(lmax, nside):
+    n = (lmax + 1) ** 2
+    a = np.random.default_rng(lmax).standard_normal((n, n + 2))
+    expected = np.sqrt(((pixel_matrix(nside, lmax) @ a) ** 2).sum(1))
+    np.testing.assert_allclose(pixel_std(jnp.asarray(a @ a.T), nside), expected, rtol=1e-12)

@@ -1,0 +1,149 @@
+"""Data against the prediction of all others: by hand, and with something wrong on purpose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.linear.residuals import residuals
+
+RUNS = "observation.runs=[{cycles: 0.03}, {cycles: 0.03, turntable_deg: 40}, {cycles: 0.02}]"
+
+
+def simulated(*overrides, flags=None):
+    """Experiment, model and data of a sky drawn from the prior: only that fits it."""
+    # noise a thousand times larger than the telescope's: the sky's covariance, on which arithmetic
+    # by hand cancels, is then only 1e4 times that of the noise
+    given = ["lmax=4", "noise.radiometer.factor=1e6", RUNS, *overrides]
+    scenario = load_scenario("fiducial", given)
+    e = build(scenario)
+    if flags is not None:
+        e = build(scenario, flagged(e.data, flags))
+    model = full_model(e.setup)
+    rng = np.random.default_rng(8)
+    sky = np.sqrt(np.asarray(model.prior.variance())) * rng.standard_normal(model.prior.size)
+    noise = np.linalg.cholesky(np.asarray(model.noise.dense())) @ rng.standard_normal(model.n_data)
+    seen = np.asarray(model.coupling @ jnp.asarray(sky)) + noise
+    data = replace(e.data, data=jnp.asarray(seen), layout=e.setup.layout)
+    return model, data
+
+
+def flagged(data, flags):
+    layout = DataLayout.from_flags(flags)
+    return replace(data, layout=layout, data=layout.gather(data.layout.scatter(data.data)))
+
+
+def by_hand(model, data, index):
+    """chi^2 of some data given all others, by the textbook's conditional of a Gaussian."""
+    a = np.asarray(model.coupling.dense())
+    k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
+    d = np.asarray(data.data)
+    rest = np.setdiff1d(np.arange(len(d)), index)
+    gain = np.linalg.solve(k[np.ix_(rest, rest)], k[np.ix_(rest, index)]).T
+    off = d[index] - gain @ d[rest]
+    covariance = k[np.ix_(index, index)] - gain @ k[np.ix_(rest, index)]
+    return off, covariance, float(off @ np.linalg.solve(covariance, off))
+
+
+FLAGS = np.zeros((16, 24), dtype=bool)
+FLAGS[3, 5], FLAGS[:, 11] = True, True
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param({"overrides": ()}, id="diagonal"),
+        pytest.param({"overrides": ("noise.radiometer.form=exact",)}, id="blocks"),
+        pytest.param(
+            {"overrides": ("noise.gain={sigma: 0.01}", "noise.beam={shift_mhz: 4}")},
+            id="banded and low rank",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            {
+                "overrides": ("noise.radiometer.form=exact", "noise.gain={sigma: 0.01}"),
+                "flags": FLAGS,
+            },
+            id="banded with gaps",
+            marks=pytest.mark.long,
+        ),
+    ],
+)
+def test_groups_and_single_data_by_hand(case):
+    model, data = simulated(*case["overrides"], flags=case.get("flags"))
+    found = residuals(model, data)
+    layout, run = data.layout, data.observation.run
+    hours = data.observation.hours
+    assert [g.name for g in found.products] == list(data.labels)
+    assert [g.name for g in found.angles] == ["0", "40"]
+    angle = np.array(data.observation.turntable_deg)[run[layout.time]]
+    members = [layout.product == 7, hours[layout.time] // 24 == 1, angle == 40.0]
+    for group, member in zip(
+        (found.products[7], found.days[1], found.angles[1]), members, strict=True
+    ):
+        index = np.flatnonzero(member)
+        _, _, expected = by_hand(model, data, index)
+        assert group.n == len(index)
+        assert group.chi2 == pytest.approx(expected, rel=1e-8)
+        assert group.p == pytest.approx(chi2.sf(expected, len(index)), rel=1e-6)
+        assert group.others_p == pytest.approx(
+            chi2.sf(found.chi2 - expected, layout.size - len(index)), rel=1e-6
+        )
+    for datum in (0, 33, layout.size - 1):
+        off, covariance, _ = by_hand(model, data, np.array([datum]))
+        assert found.z[datum] == pytest.approx(off[0] / np.sqrt(covariance[0, 0]), abs=1e-8)
+    mean = model.condition(data.data).mean
+    predicted = np.asarray(model.predict(mean))
+    np.testing.assert_allclose(found.predicted, predicted, rtol=0, atol=1e-6 * predicted.max())
+    assert found.p > 1e-3 and found.suspects() == []
+    assert "fit the model" in found.verdict()
+
+
+def test_one_group_is_everything():
+    model, data = simulated("observation.runs=[{cycles: 0.02}]")
+    found = residuals(model, data)
+    (angle,) = found.angles
+    assert (angle.chi2, angle.n) == (found.chi2, data.layout.size)
+    assert np.isnan(angle.others_p)
+
+
+def corrupted(data, where, by):
+    grid = data.grid()
+    grid[where] += by
+    return replace(data, data=data.layout.gather(jnp.asarray(np.nan_to_num(grid))))
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [("product", "22R"), ("day", "1"), ("turntable angle", "40")]
+)
+def test_what_is_wrong_is_pointed_at(kind, name):
+    model, data = simulated()
+    where = {
+        "product": np.arange(16)[:, None] == 12,
+        "day": data.observation.hours[None] // 24 == 1,
+        "turntable angle": data.observation.run[None] == 1,
+    }[kind] & np.ones((16, 24), dtype=bool)
+    bad = corrupted(data, where, 40.0 * np.sqrt(float(model.noise.diagonal().mean())))
+    found = residuals(model, bad)
+    assert "do not fit" in found.verdict()
+    assert (kind, name) in [(k, group.name) for k, group in found.suspects()]
+    assert f"{kind} {name}" in found.verdict()
+    # and no other of its kind
+    assert len(found.suspects()) == len({k for k, _ in found.suspects()})
+
+
+def test_what_no_group_explains():
+    model, data = simulated()
+    rng = np.random.default_rng(1)
+    noise = 3.0 * np.sqrt(float(model.noise.diagonal().mean()))
+    found = residuals(model, corrupted(data, slice(None), noise * rng.standard_normal((16, 24))))
+    assert found.suspects() == []
+    assert "No single product, day or turntable angle" in found.verdict()

@@ -1,0 +1,169 @@
+"""Beam errors: dA S dA^T by hand, derivatives by differences, rms by quadrature."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference import real_harmonics
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.instrument.beams import Monopoles, ProductBeams, Regolith, monopole_beams, placed
+from lusee_bayes.instrument.coupling import CouplingMatrix
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.observation import Observation, Run
+from lusee_bayes.instrument.pointing import Pointing
+from lusee_bayes.noise import beam_error_noise, derivative, difference, rms_difference
+from lusee_bayes.sky.priors import HarmonicPrior, PixelPrior
+
+LMAX, FREQUENCY = 4, 25.0
+START = {
+    "length_m": 3.0,
+    "zenith_angle_deg": 75.0,
+    "height_m": 2.0,
+    "surface_permittivity": 3.7,
+    "deep_permittivity": 6.1,
+    "loss_tangent": 0.01,
+    "turntable_offset_deg": 10.0,
+}
+
+
+def antennas(**changes) -> Monopoles:
+    """Built from scratch with some parameters changed."""
+    p = START | changes
+    return Monopoles(
+        regolith=Regolith(p["surface_permittivity"], p["deep_permittivity"], p["loss_tangent"]),
+        length_m=p["length_m"],
+        zenith_angle_deg=p["zenith_angle_deg"],
+        height_m=p["height_m"],
+        turntable_offset_deg=p["turntable_offset_deg"],
+    )
+
+
+@pytest.fixture(scope="module")
+def beams():
+    return monopole_beams(FREQUENCY, LMAX, antennas())
+
+
+@pytest.fixture(scope="module")
+def shifted():
+    return monopole_beams(FREQUENCY + 4.0, LMAX, antennas())
+
+
+def test_the_term_is_da_s_da(beams, shifted):
+    pointing = Pointing.of(Observation.from_runs([Run(0.02)]), LMAX)
+    flags = np.zeros((16, pointing.n_times), dtype=bool)
+    flags[2, 1] = flags[:, 4] = True
+    layout = DataLayout.from_flags(flags)
+    a, b = (np.asarray(CouplingMatrix.build(x, pointing, layout).dense()) for x in (beams, shifted))
+    direction = CouplingMatrix.build(difference(shifted, beams), pointing, layout)
+    spectrum = 1e8 / (1.0 + np.arange(LMAX + 1.0)) ** 2
+    per_mode = np.repeat(spectrum, 2 * np.arange(LMAX + 1) + 1)
+    expected = np.zeros((layout.size,) * 2)
+    for mode in range(len(per_mode)):
+        error = b[:, mode] - a[:, mode]
+        expected += per_mode[mode] * np.outer(error, error)
+    got = beam_error_noise(direction, HarmonicPrior(jnp.asarray(spectrum)))
+    # the difference of two A of ten times its size, each good to a few eps
+    atol = 1e-13 * np.abs(expected).max()
+    np.testing.assert_allclose(got.dense(), expected, rtol=0, atol=atol)
+    np.testing.assert_allclose(got.diagonal(), np.diag(expected), rtol=0, atol=atol)
+    # a prior that is not diagonal, whose unknowns are pixels of the same skies
+    prior = PixelPrior(jnp.asarray(spectrum), 2)
+    on_pixels = prior.coupling(direction.dense())
+    full = np.asarray(on_pixels) @ np.asarray(prior.covariance()) @ np.asarray(on_pixels).T
+    np.testing.assert_allclose(full, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("parameter", START)
+def test_derivatives_are_those_of_finite_differences(parameter):
+    """Central differences with a relative step of 1e-5.
+
+    The deep layers' echoes turn by some 20 radians per unit of permittivity: (20 h)^2 / 6 = 2e-7
+    of the slope, and rounding leaves eps / h = 2e-11 of the beams.
+    """
+    got = derivative(parameter, FREQUENCY, LMAX, antennas())
+    assert got.frequency_mhz == FREQUENCY
+    step = 1e-5 * START[parameter]
+    up, down = (
+        monopole_beams(FREQUENCY, LMAX, antennas(**{parameter: START[parameter] + s})).modes
+        for s in (step, -step)
+    )
+    expected = (np.asarray(up) - np.asarray(down)) / (2.0 * step)
+    assert np.abs(expected).max() > 0
+    np.testing.assert_allclose(got.modes, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+def test_rms_difference_is_that_over_directions(beams, shifted):
+    """Both fields on a grid of the whole sphere that integrates products up to 2 lmax exactly."""
+    x, w = np.polynomial.legendre.leggauss(LMAX + 2)
+    phi = 2 * np.pi * np.arange(2 * LMAX + 2) / (2 * LMAX + 2)
+    theta, azimuth = (a.ravel() for a in np.meshgrid(np.arccos(x), phi, indexing="ij"))
+    weight = np.repeat(w, len(phi))
+    harmonics = real_harmonics(theta, azimuth, LMAX)
+    model, true = (np.asarray(b.modes) @ harmonics.T for b in (beams, shifted))
+    expected = np.sqrt(((true - model) ** 2 @ weight).sum() / (model**2 @ weight).sum())
+    got = rms_difference(shifted, beams)
+    assert got == pytest.approx(expected, rel=1e-12)
+    assert 0.02 < got < 0.5
+    assert rms_difference(beams, beams) == 0.0
+    double = ProductBeams(3.0 * beams.modes, FREQUENCY)
+    assert rms_difference(double, beams) == pytest.approx(2.0, rel=1e-14)
+    assert rms_difference(beams, double) == pytest.approx(2.0 / 3.0, rel=1e-14)
+
+
+def test_the_difference_is_true_minus_model(beams, shifted):
+    got = difference(shifted, beams)
+    np.testing.assert_array_equal(got.modes, np.asarray(shifted.modes) - np.asarray(beams.modes))
+    assert got.frequency_mhz == FREQUENCY  # of the model
+
+
+@pytest.mark.parametrize("shape", [(16, 36), (9, 25)])
+def test_beams_that_do_not_match_are_refused(beams, shape):
+    other = ProductBeams(jnp.ones(shape), FREQUENCY)
+    message = (
+        rf"the other beam's coefficients has shape \({shape[0]}, {shape[1]}\), expected \(16, 25\)"
+    )
+    for use in (difference, rms_difference):
+        with pytest.raises(InputError, match=message):
+            use(other, beams)
+
+
+def test_placed_antennas():
+    got = placed(antennas(), {"length_m": 3.2, "zenith_angle_deg": 72.0, "deep_permittivity": 6.6})
+    expected = antennas(length_m=3.2, zenith_angle_deg=72.0, deep_permittivity=6.6)
+    for value, other in [
+        (got.length_m, expected.length_m),
+        (got.zenith_angle_deg, expected.zenith_angle_deg),
+        (got.height_m, expected.height_m),
+        (got.regolith.surface_permittivity, expected.regolith.surface_permittivity),
+        (got.regolith.deep_permittivity, expected.regolith.deep_permittivity),
+        (got.regolith.loss_tangent, expected.regolith.loss_tangent),
+    ]:
+        assert float(value) == float(other)
+    assert float(placed(antennas(), {}).length_m) == 3.0
+
+
+def test_a_turntable_offset_is_an_angle_of_the_turntable():
+    observation = Observation.from_runs([Run(0.05, turntable_deg=30.0)])
+    offset = monopole_beams(FREQUENCY, LMAX, antennas(turntable_offset_deg=12.5))
+    turned = Observation.from_runs([Run(0.05, turntable_deg=42.5)])
+    plain = monopole_beams(FREQUENCY, LMAX, antennas(turntable_offset_deg=0.0))
+    got = CouplingMatrix.observe(offset, observation).dense()
+    expected = np.asarray(CouplingMatrix.observe(plain, turned).dense())
+    # the azimuth grid is exact to rounding, wherever it begins
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+    other = CouplingMatrix.observe(plain, observation).dense()
+    assert np.abs(np.asarray(other) - expected).max() > 1e-2 * np.abs(expected).max()
+
+
+def test_unknown_parameters_name_the_nearest():
+    for use in (
+        lambda: derivative("lenght_m", FREQUENCY, LMAX, antennas()),
+        lambda: placed(antennas(), {"lenght_m": 0.1}),
+    ):
+        with pytest.raises(
+            InputError, match="unknown beam parameter 'lenght_m'; did you mean 'length_m'"
+        ):
+            use()

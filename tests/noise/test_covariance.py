@@ -1,0 +1,457 @@
+"""Every covariance and every sum of two obeys one contract, checked against dense numpy."""
+
+from __future__ import annotations
+
+from itertools import permutations, product
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference_linear import random_covariance
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.noise.covariance import (
+    Covariance,
+    DenseCovariance,
+    DiagonalCovariance,
+    LowRankCovariance,
+    LowRankUpdate,
+    TimeBandedCovariance,
+    TimeBlockCovariance,
+    time_banded,
+)
+from lusee_bayes.testing import check_covariance
+from lusee_bayes.testing.covariance import TOL, close
+
+N_PRODUCTS, N_TIMES = 3, 4
+FLAGS = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
+FLAGS[:, 2] = True  # nothing at all at one time
+FLAGS[1, 0] = True
+
+
+@eqx.filter_jit
+def _square_root(cov: Covariance, x):
+    f, unit = cov.factor(), jnp.eye(cov.size)
+    root = f.colour(unit)
+    return cov.dense(), root, f.whiten(root), f.whiten_transpose(unit), f.solve(x), f.log_det()
+
+
+def check_square_root(cov: Covariance, dense: np.ndarray):
+    """The part of the contract that depends on how times are gathered into blocks."""
+    n = len(dense)
+    x = np.random.default_rng(1).normal(size=(n, 2))
+    same, root, unit, transpose, solved, log_det = _square_root(cov, jnp.asarray(x))
+    close(same, dense, 1e-15)
+    close(root @ root.T, dense)
+    close(unit, np.eye(n))
+    close(transpose, np.linalg.inv(np.asarray(root)).T)
+    close(solved, np.linalg.solve(dense, x))
+    assert float(log_det) == pytest.approx(np.linalg.slogdet(dense)[1], abs=TOL * n)
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    """Block rows of two times of three products, so that small matrices have several."""
+    monkeypatch.setattr(time_banded, "ROWS", 7)
+
+
+def _entries(flags):
+    """(product, time) of every datum, product by product with time running fastest."""
+    n_products, n_times = flags.shape
+    return [(k, t) for k in range(n_products) for t in range(n_times) if not flags[k, t]]
+
+
+def _banded(flags, width, seed=5):
+    """(time-banded covariance, the same matrix by hand): N = G G^T with G block banded."""
+    rng = np.random.default_rng(seed)
+    n_products, n_times = flags.shape
+    g = np.zeros((n_times, n_times, n_products, n_products))
+    for t in range(n_times):
+        for s in range(max(0, t - width), t + 1):
+            g[t, s] = rng.normal(size=(n_products, n_products)) / np.sqrt(
+                2 * n_products * (width + 1)
+            )
+        g[t, t] += np.eye(n_products)
+    full = np.einsum("arij,brkj->abik", g, g)  # blocks of rows a and columns b
+    # what lies before the first time is ignored, whatever it is
+    band = np.full((n_times, width + 1, n_products, n_products), np.nan)
+    for t in range(n_times):
+        for w in range(min(width, t) + 1):
+            band[t, w] = full[t, t - w]
+    entries = _entries(flags)
+    product_of, time_of = (np.array(x) for x in zip(*entries, strict=True))
+    by_hand = full[time_of[:, None], time_of[None], product_of[:, None], product_of[None]]
+    apart = np.abs(time_of[:, None] - time_of[None])
+    assert (by_hand[apart > width] == 0).all()
+    layout = DataLayout.from_flags(flags)
+    return TimeBandedCovariance(jnp.asarray(band), layout, "the memory"), by_hand
+
+
+def _directions(n, rank=2, seed=11):
+    """(U U^T, the same by hand, entry by entry)."""
+    u = np.random.default_rng(seed).normal(size=(n, rank))
+    by_hand = np.array([[sum(u[i] * u[j]) for j in range(n)] for i in range(n)])
+    return LowRankCovariance(jnp.asarray(u), "the templates"), by_hand
+
+
+def _terms(flags):
+    """kind: (covariance, the same matrix by hand) of every kind, for one layout."""
+    rng = np.random.default_rng(3)
+    layout = DataLayout.from_flags(flags)
+    entries = _entries(flags)
+    n = len(entries)
+    variance = rng.uniform(0.5, 2.0, n)
+    blocks = np.stack([random_covariance(rng, N_PRODUCTS) for _ in range(N_TIMES)])
+    by_hand = np.zeros((n, n))
+    for (a, (k, t)), (b, (j, s)) in product(enumerate(entries), repeat=2):
+        if t == s:
+            by_hand[a, b] = blocks[t, k, j]
+    matrix = random_covariance(rng, n)
+    updated = rng.uniform(0.5, 2.0, n)
+    directions, outer = _directions(n)
+    return {
+        "diagonal": (DiagonalCovariance(jnp.asarray(variance)), np.diag(variance)),
+        "blocks": (TimeBlockCovariance(jnp.asarray(blocks), layout), by_hand),
+        "dense": (DenseCovariance(jnp.asarray(matrix)), matrix),
+        "banded": _banded(flags, 2),
+        "low rank": (
+            LowRankUpdate(DiagonalCovariance(jnp.asarray(updated)), directions),
+            np.diag(updated) + outer,
+        ),
+    }
+
+
+KINDS = ["diagonal", "blocks", "dense", "banded", "low rank"]
+LAYOUTS = {"complete": np.zeros_like(FLAGS), "flagged": FLAGS}
+# flags change nothing in terms without a layout
+CASES = [*((kind, "flagged") for kind in KINDS), ("blocks", "complete"), ("banded", "complete")]
+
+
+@pytest.mark.parametrize(("kind", "layout"), CASES)
+def test_contract(kind, layout, small_blocks):
+    check_covariance(*_terms(LAYOUTS[layout])[kind], slopes=True, eager=True)
+
+
+@pytest.mark.long
+@pytest.mark.essential
+@pytest.mark.parametrize("second", KINDS)
+@pytest.mark.parametrize("first", KINDS)
+def test_contract_of_sums(first, second, small_blocks):
+    terms = _terms(FLAGS)
+    (cov_a, dense_a), (cov_b, dense_b) = terms[first], terms[second]
+    check_covariance(cov_a + cov_b, dense_a + dense_b, slopes=True)
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if k != "low rank"])
+def test_contract_of_low_rank_updates(kind, small_blocks):
+    cov, dense = _terms(FLAGS)[kind]
+    directions, outer = _directions(len(dense), seed=12)
+    check_covariance(LowRankUpdate(cov, directions), dense + outer, slopes=True)
+    for total in (cov + directions, directions + cov):
+        close(_dense(total), dense + outer)
+
+
+# blocks of two times: widths below, at and above a block, whole matrices; times no multiple of two
+@pytest.mark.long
+@pytest.mark.essential
+@pytest.mark.parametrize(
+    ("width", "flagged"), [*((w, False) for w in (0, 1, 2, 3, 6, 9)), *((w, True) for w in (2, 5))]
+)
+def test_bands_of_every_width(width, flagged, small_blocks):
+    flags = np.zeros((3, 7), dtype=bool)
+    if flagged:
+        flags[:, [0, 3]] = flags[1, 5] = flags[2, 6] = True
+    check_square_root(*_banded(flags, width))
+
+
+# 11 and 44 times make a block row; one gap hides more than a whole block row
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("n_products", "n_times", "width", "gap"),
+    [
+        (16, 25, 0, slice(0, 0)),
+        (16, 25, 11, slice(0, 0)),
+        (16, 27, 12, slice(9, 23)),
+        (16, 25, 40, slice(3, 4)),
+        (4, 95, 50, slice(60, 70)),
+    ],
+)
+def test_bands_at_the_blocks_own_size(n_products, n_times, width, gap):
+    flags = np.zeros((n_products, n_times), dtype=bool)
+    flags[:, gap] = True
+    check_square_root(*_banded(flags, width))
+
+
+def test_sums_keep_the_structure():
+    diagonal, blocks, dense, banded, low_rank = (_terms(FLAGS)[kind][0] for kind in KINDS)
+    directions, _ = _directions(diagonal.size)
+    assert isinstance(diagonal + diagonal, DiagonalCovariance)
+    for term in (diagonal + blocks, blocks + diagonal, blocks + blocks):
+        assert isinstance(term, TimeBlockCovariance)
+    for term in (dense + blocks, blocks + dense, diagonal + dense, dense + dense, banded + dense):
+        assert isinstance(term, DenseCovariance)
+    for other in (diagonal, blocks, banded):
+        for term in (banded + other, other + banded):
+            assert isinstance(term, TimeBandedCovariance)
+            assert term.width == 2
+        for term in (other + directions, directions + other, other + low_rank, low_rank + other):
+            assert isinstance(term, LowRankUpdate)
+            assert isinstance(term.base, type(other))
+    assert (low_rank + directions).update.root.shape[1] == 4
+    assert isinstance(directions + directions, LowRankCovariance)
+
+
+def test_bands_of_different_width_add_up(small_blocks):
+    (wide, dense_wide), (narrow, dense_narrow) = _banded(FLAGS, 3), _banded(FLAGS, 1, seed=6)
+    check_square_root(wide + narrow, dense_wide + dense_narrow)
+    close((narrow + wide).dense(), dense_wide + dense_narrow, 1e-15)
+    assert (narrow + wide).width == 3
+
+
+def test_as_many_directions_as_data_leave_no_structure():
+    cov, dense = _terms(FLAGS)["banded"]
+    for rank in (len(dense), len(dense) + 3):
+        directions, outer = _directions(len(dense), rank)
+        total = cov + directions
+        assert isinstance(total, DenseCovariance)
+        close(total.dense(), dense + outer)
+        ones = np.ones(len(dense))
+        close(total.solve(jnp.asarray(ones)), np.linalg.solve(dense + outer, ones))
+
+
+def test_low_rank_alone():
+    directions, outer = _directions(6, 2)
+    other, other_outer = _directions(6, 1, seed=13)
+    x = np.random.default_rng(0).normal(size=(6, 3))
+    for cov, dense in [
+        (directions, outer),
+        (directions + other, outer + other_outer),
+        (directions.scaled(2.5), 2.5 * outer),
+    ]:
+        assert cov.size == 6
+        close(cov.dense(), dense, 1e-15)
+        close(cov.diagonal(), np.diag(dense), 1e-15)
+        # sums of a few products
+        close(cov.mv(jnp.asarray(x)), dense @ x, 1e-14)
+        close(cov.mv(jnp.asarray(x[:, 0])), dense @ x[:, 0], 1e-14)
+    for use in (directions.factor, directions.log_det, lambda: directions.solve(jnp.ones(6))):
+        with pytest.raises(InputError, match="the templates has rank 2 .* 6 data.* add the radio"):
+            use()
+
+
+@pytest.mark.parametrize("kind", ["diagonal", "blocks", "banded", "dense"])
+def test_strong_directions_are_whitened_too(kind):
+    """U U^T of 1e8 times the base, the worst of the fiducial terms: W (N_0 + U U^T) W^T is 1.
+
+    The sum is never formed here: in float64 it would lose N_0. Along U, whitening cancels 1e4 of
+    the base's standard deviations down to 1: rounding 1e4 eps of each of some 10 operations.
+    """
+    base, dense = _terms(FLAGS)[kind]
+    directions, _ = _directions(len(dense), rank=3)
+    factor = LowRankUpdate(base, directions.scaled(1e8)).factor()
+    strong = factor.whiten(1e4 * directions.root)
+    weak = factor.whiten(jnp.asarray(np.linalg.cholesky(dense)))
+    unit = np.asarray(strong @ strong.T + weak @ weak.T)
+    np.testing.assert_allclose(unit, np.eye(len(dense)), rtol=0, atol=1e4 * 2.2e-16 * 10)
+    # ln|N_0 + s U U^T| = ln|N_0| + ln|1 + s U^T N_0^-1 U|, well conditioned in eigenvalues
+    u = np.asarray(directions.root)
+    small = np.eye(3) + 1e8 * u.T @ np.linalg.solve(dense, u)
+    expected = np.linalg.slogdet(dense)[1] + np.log(np.linalg.eigvalsh(small)).sum()
+    assert float(factor.log_det()) == pytest.approx(expected, abs=1e-10)
+
+
+_dense = eqx.filter_jit(lambda cov: cov.dense())
+
+
+def test_sums_of_three_do_not_depend_on_order():
+    terms = list(_terms(FLAGS).values())
+    for triple in [(0, 1, 2), (0, 1, 3), (0, 3, 4), (1, 3, 4), (2, 3, 4)]:
+        expected = sum(terms[i][1] for i in triple)
+        for a, b, c in permutations([terms[i][0] for i in triple]):
+            close(_dense(a + b + c), expected)
+            close(_dense(a + (b + c)), expected)
+
+
+def test_flagged_samples_change_nothing_whatever_their_blocks_hold():
+    cov, dense = _terms(FLAGS)["blocks"]
+    junk = np.asarray(cov.blocks).copy()
+    junk[FLAGS.T] = 1e6  # rows of samples that were never taken
+    again = TimeBlockCovariance(jnp.asarray(junk), cov.layout)
+    close(again.dense(), dense, 1e-15)
+    assert float(again.log_det()) == float(cov.log_det())
+
+
+def test_gradients_reach_the_entries():
+    """d (ln|N| + x^T N^-1 x) / dN = N^-1 - y y^T with y = N^-1 x, at every free entry."""
+    layout = DataLayout.from_flags(FLAGS)
+    x = jnp.linspace(-1.0, 1.0, layout.size)
+
+    def slope(build, entries):
+        def value(e):
+            n = build((e + jnp.swapaxes(e, -1, -2)) / 2.0 if e.ndim > 1 else e)
+            return n.log_det() + x @ n.solve(x)
+
+        return np.asarray(jax.jit(jax.grad(value))(entries))
+
+    def expected(matrix):
+        y = np.linalg.solve(matrix, np.asarray(x))
+        return np.linalg.inv(matrix) - np.outer(y, y)
+
+    terms = _terms(FLAGS)
+    (diagonal, d), (blocks, b), (dense, m) = (terms[k] for k in ("diagonal", "blocks", "dense"))
+    close(slope(DiagonalCovariance, diagonal.variance), np.diag(expected(d)))
+    close(slope(DenseCovariance, dense.matrix), expected(m))
+    by_block = np.zeros((N_TIMES, N_PRODUCTS, N_PRODUCTS))
+    product_of, time_of = np.nonzero(~FLAGS)
+    for i, j in product(range(layout.size), repeat=2):
+        if time_of[i] == time_of[j]:
+            by_block[time_of[i], product_of[i], product_of[j]] = expected(b)[i, j]
+    close(slope(lambda e: TimeBlockCovariance(e, layout), blocks.blocks), by_block)
+
+
+# --- refusals ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
+def test_variances_must_be_positive(bad):
+    with pytest.raises(InputError, match=r"noise variance must be positive, .* first at \(1,\)"):
+        DiagonalCovariance(jnp.array([1.0, bad, 2.0]))
+
+
+@pytest.mark.parametrize("bad", [0.0, -2.0])
+def test_a_variance_cannot_be_scaled_to_nothing(bad):
+    with pytest.raises(InputError, match="must be positive"):
+        DiagonalCovariance(jnp.ones(3)).scaled(bad)
+
+
+def test_float32_is_refused():
+    layout = DataLayout(2, 2)
+    with pytest.raises(InputError, match="noise variance must be a float64 array, got .*float32"):
+        DiagonalCovariance(jnp.ones(3, dtype=jnp.float32))
+    with pytest.raises(InputError, match="dense covariance must be a float64 array, got .*float32"):
+        DenseCovariance(jnp.eye(3, dtype=jnp.float32))
+    with pytest.raises(InputError, match="noise blocks must be a float64 array, got .*float32"):
+        TimeBlockCovariance(jnp.ones((2, 2, 2), dtype=jnp.float32), layout)
+
+
+def test_nan_is_refused():
+    with pytest.raises(InputError, match=r"the gain term holds NaN .*\(0, 2\)"):
+        DenseCovariance(jnp.eye(3).at[0, 2].set(jnp.nan), "the gain term")
+    blocks = jnp.ones((2, 3, 3)).at[1, 2, 0].set(jnp.inf)
+    with pytest.raises(InputError, match=r"noise blocks holds NaN .*\(1, 2, 0\)"):
+        TimeBlockCovariance(blocks, DataLayout(3, 2))
+
+
+def test_blocks_must_fit_the_layout():
+    with pytest.raises(InputError, match=r"shape \(2, 3, 3\), expected \(3, 2, 2\)"):
+        TimeBlockCovariance(jnp.ones((2, 3, 3)), DataLayout(2, 3))
+
+
+def test_asymmetric_matrices_are_refused():
+    with pytest.raises(
+        InputError, match=r"the gain term is not symmetric: .* up to 0\.01 .*N \+ N"
+    ):
+        DenseCovariance(jnp.eye(3).at[0, 1].set(0.01), "the gain term")
+    DenseCovariance(jnp.eye(3).at[0, 1].set(1e-14))  # rounding passes
+
+
+def _indefinite():
+    """A symmetric matrix whose lowest eigenvalue is -0.25, by construction."""
+    q = np.linalg.qr(np.random.default_rng(0).normal(size=(6, 6)))[0]
+    m = q @ np.diag([-0.25, 1.0, 2.0, 3.0, 4.0, 5.0]) @ q.T
+    return jnp.asarray((m + m.T) / 2)
+
+
+def test_indefinite_terms_are_named_with_their_lowest_eigenvalue():
+    cov = DenseCovariance(_indefinite(), "the gain term")
+    for use in (cov.factor, cov.log_det, lambda: cov.solve(jnp.ones(6))):
+        with pytest.raises(
+            InputError, match=r"the gain term is not positive definite: .* eigenvalue is -0\.25 "
+        ):
+            use()
+
+
+@pytest.mark.parametrize("update", [False, True])
+def test_indefinite_bands_are_named_with_their_lowest_eigenvalue(update):
+    # times 0 and 1 correlated by 1.25: eigenvalues 1 +- 1.25; the last time stands alone
+    band = jnp.zeros((3, 2, 4, 4)).at[:, 0].set(jnp.eye(4)).at[1, 1].set(1.25 * jnp.eye(4))
+    cov = TimeBandedCovariance(band, DataLayout(4, 3), "the gain term")
+    cov = LowRankUpdate(cov, LowRankCovariance(1e-3 * jnp.ones((12, 1)))) if update else cov
+    for use in (cov.factor, cov.log_det, lambda: cov.solve(jnp.ones(12))):
+        with pytest.raises(
+            InputError, match=r"the gain term is not positive definite: .* eigenvalue is -0\.25 "
+        ):
+            use()
+
+
+def test_bad_bands_are_refused():
+    layout = DataLayout(2, 3)
+    good = jnp.zeros((3, 2, 2, 2)).at[:, 0].set(jnp.eye(2))
+    for bad, message in [
+        (good.at[2, 0, 0, 1].set(0.5), "the gain term within one time is not symmetric: .* 0\\.5 "),
+        (good.at[1, 1, 0, 1].set(jnp.nan), r"the gain term holds NaN .* first at \(1, 1, 0, 1\)"),
+        (good[:2], r"the gain term has shape \(2, 2, 2, 2\), expected \(3, any, 2, 2\)"),
+        (good.astype(jnp.float32), "the gain term must be a float64 array, got .*float32"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            TimeBandedCovariance(bad, layout, "the gain term")
+    # blocks between times need not be symmetric
+    TimeBandedCovariance(good.at[1, 1, 0, 1].set(0.5), layout)
+
+
+def test_bad_directions_are_refused():
+    root = jnp.ones((4, 2))
+    for bad, message in [
+        (root.at[3, 1].set(jnp.inf), r"the beams holds NaN or infinity .*\(3, 1\)"),
+        (root.astype(jnp.float32), "the beams must be a float64 array, got .*float32"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            LowRankCovariance(bad, "the beams")
+
+
+def test_indefinite_blocks_are_refused():
+    blocks = jnp.stack([jnp.eye(6), _indefinite()])
+    with pytest.raises(InputError, match=r"not positive definite: .* eigenvalue is -0\.25 "):
+        TimeBlockCovariance(blocks, DataLayout(6, 2)).factor()
+
+
+def test_sizes_must_match_in_a_sum():
+    with pytest.raises(InputError, match="cannot add covariances of 3 and 4 data"):
+        DiagonalCovariance(jnp.ones(3)) + DiagonalCovariance(jnp.ones(4))
+    with pytest.raises(InputError, match="cannot add covariances of 4 and 3 data"):
+        DenseCovariance(jnp.eye(4)) + DiagonalCovariance(jnp.ones(3))
+    for kind in KINDS:
+        cov, dense = _terms(FLAGS)[kind]
+        directions, _ = _directions(len(dense) + 1)
+        for a, b in [(cov, directions), (directions, cov)]:
+            with pytest.raises(InputError, match=f"of {a.size} and {b.size} data; build both"):
+                a + b
+
+
+def test_blocks_with_other_flags_are_refused():
+    other = FLAGS[:, ::-1]  # as many samples, but not the same ones
+    for first, second in product(["blocks", "banded"], repeat=2):
+        a, b = _terms(FLAGS)[first][0], _terms(other)[second][0]
+        with pytest.raises(InputError, match="hold different samples; build both"):
+            a + b
+
+
+def test_asymmetric_blocks_are_refused():
+    blocks = jnp.tile(jnp.eye(3)[None], (2, 1, 1)).at[1, 0, 2].set(0.1)
+    with pytest.raises(InputError, match="not symmetric"):
+        TimeBlockCovariance(blocks, DataLayout(3, 2))
+
+
+def test_a_dense_term_can_be_built_inside_jit_from_known_numbers():
+    matrix = jnp.asarray(random_covariance(np.random.default_rng(0), 3))
+    got = jax.jit(lambda x: DenseCovariance(matrix).solve(x))(jnp.ones(3))
+    close(got, np.linalg.solve(np.asarray(matrix), np.ones(3)))
+
+
+def test_a_dense_term_is_a_pytree_of_arrays():
+    cov = DenseCovariance(jnp.eye(3))
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cov))
+    assert float(jax.jit(lambda c: c.log_det())(cov)) == 0.0

@@ -1,0 +1,287 @@
+"""Gain drifts: the paper's equation by loops, and 1e5 histories of gains that really drift."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference_linear import assert_draws_follow, z_of
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.observation import Observation, Run
+from lusee_bayes.noise import GainDrift, with_gains
+from lusee_bayes.noise.covariance import DiagonalCovariance, TimeBandedCovariance
+
+# a gap of 27 hours, and of 190, beyond which nothing is correlated
+HOURS = np.array([0.0, 2.0, 4.5, 31.5, 33.5, 223.5])
+N_TIMES = len(HOURS)
+
+
+def pairs(n_antennas):
+    """Antennas of 00R, 01R, 01I, 02R, ...: twice the same pair for a cross product."""
+    names = []
+    for i in range(n_antennas):
+        names.append((i, i))
+        for j in range(i + 1, n_antennas):
+            names += [(i, j), (i, j)]
+    return names
+
+
+def visibilities(n_antennas, n_times=N_TIMES, seed=0):
+    """No symmetry, both signs in the crosses, as a (products, times) array in K."""
+    rng = np.random.default_rng(seed)
+    grid = rng.normal(size=(n_antennas**2, n_times)) * 3e3
+    for k, (i, j) in enumerate(pairs(n_antennas)):
+        if i == j:
+            grid[k] = 2e4 + abs(grid[k])
+    return grid
+
+
+def c_g(hours, sigma, correlation):
+    lag = hours[:, None] - hours[None]
+    return sigma**2 * np.exp(-(lag**2) / (2.0 * correlation**2))
+
+
+def by_the_papers_equation(d, hours, sigma, correlation, flags):
+    """Appendix A, Eq. for Cov(e_ij(t), e_kl(t')), one entry at a time."""
+    names = pairs(round(np.sqrt(len(d))))
+    entries = [(p, t) for p in range(len(d)) for t in range(len(hours)) if not flags[p, t]]
+    kernel = c_g(hours, sigma, correlation)
+    cov = np.zeros((len(entries),) * 2)
+    for a, (p, t) in enumerate(entries):
+        for b, (q, s) in enumerate(entries):
+            (i, j), (k, m) = names[p], names[q]
+            c = kernel[t, s]
+            linear = (i == k) + (i == m) + (j == k) + (j == m)
+            quadratic = (i == k) * (j == m) + (i == m) * (j == k)
+            cov[a, b] = d[p, t] * d[q, s] * c * (linear + c * quadratic)
+    return cov
+
+
+def complete(n_antennas, n_times=N_TIMES):
+    return np.zeros((n_antennas**2, n_times), dtype=bool)
+
+
+def gappy(n_antennas):
+    flags = complete(n_antennas)
+    flags[:, 1] = flags[2, 3] = flags[0, 0] = True
+    return flags
+
+
+def term(drift, d, hours, flags, width=None) -> TimeBandedCovariance:
+    return drift.covariance(jnp.asarray(d), hours, DataLayout.from_flags(flags), width)
+
+
+def close(got, expected, relative):
+    expected = np.asarray(expected)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=relative * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("make_flags", [complete, gappy])
+@pytest.mark.parametrize("sigma", [0.3, 1e-3])
+@pytest.mark.parametrize("n_antennas", [2, 4])
+def test_every_entry_is_the_papers(n_antennas, sigma, make_flags):
+    flags = make_flags(n_antennas)
+    d = visibilities(n_antennas)
+    expected = by_the_papers_equation(d, HOURS, sigma, 10.0, flags)
+    got = term(GainDrift(sigma, 10.0), d, HOURS, flags)
+    # a few roundings; entries beyond the band are below eps of the largest by its definition
+    close(got.dense(), expected, 1e-15 * 4)
+    close(got.diagonal(), np.diag(expected), 1e-15 * 4)
+
+
+def gain_histories(rng, n, n_antennas, sigma, correlation=10.0):
+    """(n, antennas, times) draws of C_g, by its eigenvectors."""
+    value, vector = np.linalg.eigh(c_g(HOURS, sigma, correlation))
+    root = vector * np.sqrt(np.maximum(value, 0.0))
+    return rng.normal(size=(n, n_antennas, N_TIMES)) @ root.T
+
+
+@pytest.mark.parametrize(("n_antennas", "sigma"), [(2, 0.3), (4, 0.1)])
+def test_mean_and_covariance_of_simulated_histories(n_antennas, sigma):
+    """Entry by entry, 1e5 histories in chunks.
+
+    The sample mean of e scatters by its standard deviation over sqrt(n), the sample mean of the
+    product e_a e_b by that of the product, sqrt(<e_a^2 e_b^2> - <e_a e_b>^2) / sqrt(n), here taken
+    from the same draws: gains make e a second-order polynomial of normals, so Wick's theorem for
+    Gaussian e would not do.
+    """
+    n, chunk = 100_000, 20_000
+    rng = np.random.default_rng(20270115)
+    d = visibilities(n_antennas)
+    flags = gappy(n_antennas)
+    drift = GainDrift(sigma, 10.0)
+    response = np.array([1.0 + sigma**2 * (i == j) for i, j in pairs(n_antennas)])
+    np.testing.assert_allclose(drift.mean_response(n_antennas**2), response, rtol=1e-15)
+    keep = ~flags.ravel()
+    mean = (d * response[:, None]).ravel()[keep]
+    scale = np.abs(d).ravel()[keep] * sigma
+    many = jax.jit(jax.vmap(with_gains, (None, 0)))
+    first, second, fourth = 0.0, 0.0, 0.0
+    for _ in range(n // chunk):
+        gains = gain_histories(rng, chunk, n_antennas, sigma)
+        data = np.asarray(many(jnp.asarray(d), jnp.asarray(gains))).reshape(chunk, -1)[:, keep]
+        e = (data - mean) / scale
+        first = first + e.sum(0) / n
+        second = second + e.T @ e / n
+        fourth = fourth + (e**2).T @ e**2 / n
+    expected = np.asarray(term(drift, d, HOURS, flags).dense()) / np.outer(scale, scale)
+    off = np.abs(first) / np.sqrt(np.diag(second) / n)
+    assert off.max() < z_of(off.size), f"mean off by {off.max():.2f} sigma"
+    off = np.abs(second - expected) / np.sqrt((fourth - second**2) / n)
+    assert off.max() < z_of(off.size), f"covariance off by {off.max():.2f} sigma"
+
+    # what such a sample tells apart: the linear term alone, and the autos without their shift
+    names = [pairs(n_antennas)[k] for k in np.nonzero(~flags)[0]]
+    auto = np.array([i == j for i, j in names])
+    shift = (sigma**2 * np.abs(d).ravel()[keep] / scale)[auto]
+    assert (shift / np.sqrt(np.diag(second)[auto] / n)).min() > 8
+    if sigma >= 0.3:
+        quadratic = np.where(auto, 2.0, 1.0) * sigma**2
+        scatter = np.sqrt((np.diag(fourth) - np.diag(second) ** 2) / n)
+        assert (quadratic / scatter).max() > 1.5 * z_of(off.size)
+
+
+def test_with_gains_is_the_product_of_both_antennas():
+    d, gains = visibilities(3), np.random.default_rng(1).normal(size=(3, N_TIMES))
+    expected = np.zeros_like(d)
+    for k, (i, j) in enumerate(pairs(3)):
+        for t in range(N_TIMES):
+            expected[k, t] = (1.0 + gains[i, t]) * (1.0 + gains[j, t]) * d[k, t]
+    got = with_gains(jnp.asarray(d), jnp.asarray(gains))
+    np.testing.assert_allclose(got, expected, rtol=1e-15 * 2)
+
+
+# --- the sampler ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("correlation", [0.7, 10.0, 300.0])
+def test_the_samplers_covariance_is_c_g_exactly(monkeypatch, correlation):
+    """g is linear in the white noise: with unit vectors for it, the sampler shows its root."""
+    monkeypatch.setattr(jax.random, "normal", lambda key, shape, dtype: jnp.eye(shape[1]))
+    root = np.asarray(GainDrift(0.02, correlation).sample(jax.random.key(0), HOURS))
+    # the sum over the grid is the integral to exp(-8 pi^2); left: rounding
+    close(root.T @ root, c_g(HOURS, 0.02, correlation), 1e-14)
+
+
+def test_draws_of_the_sampler():
+    """The antennas are independent draws: 40000 of them, and two keys."""
+    drift = GainDrift(0.02, 10.0)
+    gains = drift.sample(jax.random.key(3), HOURS, 40_000)
+    assert_draws_follow(gains, np.zeros(N_TIMES), c_g(HOURS, 0.02, 10.0))
+    four = drift.sample(jax.random.key(3), HOURS)
+    assert four.shape == (4, N_TIMES)
+    assert (np.asarray(four) != np.asarray(drift.sample(jax.random.key(4), HOURS))).all()
+    np.testing.assert_array_equal(four, drift.sample(jax.random.key(3), HOURS))
+
+
+# --- runs, truncation, scaling ----------------------------------------------------------------
+
+
+def test_runs_with_gaps_between_them():
+    """Three runs of three samples; none begins on the grid of the one before."""
+    runs = [Run(0.01), Run(0.013, 30.0), Run(0.01, 60.0)]
+    observation = Observation.from_runs(runs).select(np.arange(10) != 4)
+    hours = 2.0 * np.array([0, 1, 2, 0, 2, 3, 0, 1, 2])
+    starts = np.repeat([0.0, 0.01, 0.023], [3, 3, 3]) * 27.321661 * 24
+    hours = hours + starts
+    np.testing.assert_allclose(observation.hours, hours, rtol=0, atol=1e-6)
+    d = visibilities(2, len(hours))
+    expected = by_the_papers_equation(d, hours, 0.1, 3.0, complete(2, len(hours)))
+    got = term(GainDrift(0.1, 3.0), d, observation.hours, complete(2, len(hours)))
+    assert np.abs(expected[2, 3]) > 1e-3 * expected[2, 2]  # across the border of two runs
+    # hours of UTC (leap seconds allowed for) are good to 1e-6 h: 1e-6 lag / correlation^2
+    close(got.dense(), expected, 1e-5)
+    expected = by_the_papers_equation(d, observation.hours, 0.1, 3.0, complete(2, len(hours)))
+    close(got.dense(), expected, 4e-15)
+
+
+def test_what_the_band_leaves_out_changes_nothing():
+    """50 samples over 16 h with a correlation of half an hour, against the kernel in full."""
+    hours = np.cumsum(np.random.default_rng(2).uniform(0.05, 0.6, 50))
+    drift, flags = GainDrift(0.1, 0.5), complete(2, 50)
+    d = visibilities(2, 50)
+    gain = term(drift, d, hours, flags)
+    assert 10 < gain.width < 49
+    # everything that is left out is below eps of the kernel's peak, and the band is no wider
+    beyond = [hours[t] - hours[t - gain.width - 1] for t in range(gain.width + 1, 50)]
+    assert np.exp(-(min(beyond) ** 2) / (2 * 0.5**2)) < np.finfo(float).eps
+    variance = np.full(d.size, 1e-3 * 2e4**2)
+    noise = DiagonalCovariance(jnp.asarray(variance)) + gain
+    full = by_the_papers_equation(d, hours, 0.1, 0.5, flags) + np.diag(variance)
+    x = d.ravel()
+    tolerance = 10 * np.finfo(float).eps * np.linalg.cond(full)  # of a backward stable solve
+    assert tolerance < 1e-7
+    factor = noise.factor()
+    close(factor.solve(jnp.asarray(x)), np.linalg.solve(full, x), tolerance)
+    assert float(factor.log_det()) == pytest.approx(np.linalg.slogdet(full)[1], abs=200 * tolerance)
+    # a band that is cut at one correlation time is not the same
+    cut = DiagonalCovariance(jnp.asarray(variance)) + term(drift, d, hours, flags, 1)
+    assert np.abs(np.asarray(cut.dense()) - full).max() > 0.01 * full.max()
+
+
+def test_scaling_with_sigma_and_the_signal():
+    """sigma^2 L + sigma^4 Q: two values of sigma predict a third; twice the signal, 4 times N."""
+    d, flags = visibilities(3), complete(3)
+
+    def dense(sigma, factor=1.0):
+        return np.asarray(term(GainDrift(sigma), factor * d, HOURS, flags).dense())
+
+    a, b = dense(0.1) / 0.1**2, dense(0.2) / 0.2**2
+    quadratic = (b - a) / (0.2**2 - 0.1**2)
+    linear = a - 0.1**2 * quadratic
+    close(dense(0.3), 0.3**2 * linear + 0.3**4 * quadratic, 1e-14)
+    assert np.abs(quadratic).max() > 0.1 * np.abs(linear).max()
+    close(dense(0.2, 2.0), 4 * dense(0.2), 1e-15)
+
+
+def test_derivatives_of_the_log_determinant():
+    d, layout = visibilities(2), DataLayout.from_flags(gappy(2))
+    radiometer = DiagonalCovariance(jnp.asarray(layout.gather(jnp.asarray(d**2)) * 1e-4))
+    hours = HOURS / 3.0
+
+    @jax.jit
+    def value(parameters):
+        drift = GainDrift(parameters[0], parameters[1])
+        return (radiometer + drift.covariance(jnp.asarray(d), hours, layout, 5)).log_det()
+
+    at = np.array([0.1, 10.0])  # sigma and correlation_h
+    slopes = jax.grad(value)(jnp.asarray(at))
+    for k in range(2):
+        step = 1e-4 * at * (np.arange(2) == k)
+        up, down = (float(value(jnp.asarray(at + s))) for s in (step, -step))
+        # central differences: step^2 f''' / 6 relative to f', 1e-8, and rounding 1e-12 / 1e-4
+        assert float(slopes[k]) == pytest.approx((up - down) / (2 * step[k]), rel=1e-6)
+
+
+# --- refusals ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [0.0, -0.01, np.nan, np.inf])
+def test_bad_parameters_are_refused(bad):
+    with pytest.raises(InputError, match="the gain drift's sigma must be positive, got"):
+        GainDrift(bad)
+    with pytest.raises(
+        InputError, match="the gain drift's correlation time in hours must be positive, got"
+    ):
+        GainDrift(0.01, bad)
+
+
+def test_bad_visibilities_are_refused():
+    drift, layout = GainDrift(0.01), DataLayout(4, N_TIMES)
+    d = jnp.asarray(visibilities(2))
+    with pytest.raises(InputError, match=r"the visibilities has shape \(4, 5\), expected \(4, 6\)"):
+        drift.covariance(d[:, :5], HOURS[:5], layout)
+    with pytest.raises(InputError, match=r"the visibilities holds NaN .* first at \(2, 1\)"):
+        drift.covariance(d.at[2, 1].set(jnp.nan), HOURS, layout)
+
+
+def test_the_term_alone_is_not_a_noise():
+    """It is singular: the Re and Im of a product drift together."""
+    gain = term(GainDrift(0.01), visibilities(2), HOURS, complete(2))
+    with pytest.raises(
+        InputError, match="the gain-drift covariance is not positive definite.*add the radiometer"
+    ):
+        gain.factor()

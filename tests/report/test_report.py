@@ -1,0 +1,275 @@
+"""Reports: complete, self-contained, in agreement with the files, and in a real browser."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import healpy
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+
+from lusee_bayes.cli.main import main
+from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.model import base_model
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.report.pages import write_report
+from lusee_bayes.results.diagnostics import read_diagnostics, region_of
+from lusee_bayes.runs.map_run import run_map
+from lusee_bayes.runs.sample_run import run_sample
+from lusee_bayes.sampling.hmc import Sampler
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+@pytest.fixture(scope="module")
+def folder(small_map):
+    """Of a finished map run, shared: to be read."""
+    return small_map.folder
+
+
+@pytest.fixture(scope="module")
+def cube(small_cube):
+    """Of a finished run of three frequencies, shared: to be read."""
+    return small_cube.folder
+
+
+@pytest.fixture(scope="module")
+def sampled(tmp_path_factory):
+    scenario = load_scenario("fiducial", ["lmax=2", "observation.runs.0.cycles=0.05"])
+    sampler = Sampler(draws=50, warmup=50, seed=scenario.seed)
+    return run_sample(scenario, tmp_path_factory.mktemp("run") / "s", sampler=sampler).folder
+
+
+def explorer_data(page: str) -> dict:
+    (text,) = re.findall(r'<script type="application/json" id="explorer-data">(.*?)</script>', page)
+    return json.loads(text)
+
+
+def layer(data: dict, key: str) -> np.ndarray:
+    (found,) = [one for one in data["layers"] if one["key"] == key]
+    return np.frombuffer(base64.b64decode(found["values"]), dtype="<f4")
+
+
+class Outline(HTMLParser):
+    """Tags that are open, links and pictures of a page."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.pictures, self.anchors, self.links = [], [], set(), []
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        if tag == "img":
+            self.pictures.append(attrs)
+        if "id" in attrs:
+            self.anchors.add(attrs["id"])
+        if tag == "a":
+            self.links.append(attrs["href"])
+        if tag not in ("img", "meta", "link", "input", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+SAMPLED = pytest.param("sampled", marks=pytest.mark.long)
+
+
+@pytest.mark.parametrize("which", ["folder", pytest.param("cube", marks=pytest.mark.long), SAMPLED])
+def test_pages_are_whole_and_need_nothing_else(which, request):
+    page = (request.getfixturevalue(which) / "report.html").read_text()
+    outline = Outline()
+    outline.feed(page)
+    assert outline.open == []
+    assert len(outline.pictures) >= (4 if which == "cube" else 6)
+    for picture in outline.pictures:
+        assert picture["src"].startswith("data:image/png;base64,")
+        assert len(picture["alt"]) > 20
+    assert all(link[0] == "#" and link[1:] in outline.anchors for link in outline.links)
+    assert "://" not in page  # which base64 never holds
+    assert len(page) < 8e6
+
+
+def test_a_pixels_posterior_is_that_of_the_file(folder):
+    data = explorer_data((folder / "report.html").read_text())
+    with xr.open_dataset(folder / "posterior.nc", engine="h5netcdf") as file:
+        mean, covariance = file["mean"].values, file["covariance"].values
+    nside = data["nside"]
+    y = pixel_matrix(nside, 8)
+    single = {"rtol": 2e-7, "atol": 0}
+    np.testing.assert_allclose(layer(data, "mean"), modes_to_map(mean, nside), **single)
+    expected = np.sqrt(np.einsum("pi,ij,pj->p", y, covariance, y))
+    np.testing.assert_allclose(layer(data, "std"), expected, rtol=1e-6)
+    # regions are means of their pixels
+    of = region_of(nside)
+    rows = np.stack([y[of == region].mean(0) for region in (0, 300, 767)])
+    for name, values in (
+        ("mean", rows @ mean),
+        ("std", np.sqrt(np.einsum("pi,ij,pj->p", rows, covariance, rows))),
+    ):
+        got = np.frombuffer(base64.b64decode(data["regions"][name]), dtype="<f4")
+        np.testing.assert_allclose(got[[0, 300, 767]], values, rtol=1e-6)
+    # what is left of the prior, the monopole apart
+    with xr.open_dataset(folder / "posterior.nc", engine="h5netcdf") as file:
+        prior = file["prior_std"].values[1:] ** 2
+    inner = np.einsum("pi,ij,pj->p", y[:, 1:], covariance[1:, 1:], y[:, 1:])
+    share = inner / (y[:, 1:] ** 2 @ prior)
+    np.testing.assert_allclose(layer(data, "prior_fraction"), share, rtol=1e-5)
+
+
+def test_the_point_spread_function_is_what_injected_sources_give(small_map, folder):
+    """Noiseless data of one source after the other, mapped; the page keeps bytes of the peak."""
+    data = explorer_data((folder / "report.html").read_text())
+    kernels = np.frombuffer(base64.b64decode(data["kernels"]), dtype=np.int8)
+    kernels = kernels.reshape(768, -1) / 127.0
+    peaks = np.frombuffer(base64.b64decode(data["kernel_peaks"]), dtype="<f4")
+    model = base_model(small_map.result.experiment.setup)
+    solver = model.factorise()
+    centres, sources = pixel_matrix(8, 8), pixel_matrix(data["kernel_nside"], 8)
+    region = 200
+    for source in (17, 800, 2200):
+        mapped = solver.condition(model.coupling @ jnp.asarray(sources[source])).mean
+        expected = centres[region] @ np.asarray(mapped)
+        # half a byte's step
+        assert kernels[region, source] * peaks[region] == pytest.approx(
+            expected, abs=0.51 / 127 * float(peaks[region])
+        )
+
+
+@pytest.mark.parametrize("manifest", [True, False], ids=["manifest", "an older folder without"])
+def test_report_makes_it_anew(folder, manifest, tmp_path, capsys):
+    # the title is the folder's name
+    mine = shutil.copytree(folder, tmp_path / folder.name)
+    page = (mine / "report.html").read_text()
+    (mine / "report.html").unlink()
+    if not manifest:
+        (mine / "manifest.json").unlink()
+    assert main(["report", str(mine)]) == 0
+    assert capsys.readouterr().out.split() == ["look", "at", f"{mine}/report.html"]
+    assert (mine / "report.html").read_text() == page
+    assert not list(mine.glob(".*"))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("which", ["cube", "sampled"])
+@pytest.mark.parametrize("manifest", [True, False], ids=["manifest", "an older folder without"])
+def test_the_other_pages_are_made_anew(which, manifest, request, tmp_path):
+    folder = request.getfixturevalue(which)
+    mine = shutil.copytree(folder, tmp_path / folder.name)
+    (mine / "report.html").unlink()
+    if not manifest:
+        (mine / "manifest.json").unlink()
+    assert write_report(mine) == mine / "report.html"
+    assert (mine / "report.html").read_text() == (folder / "report.html").read_text()
+
+
+def test_what_has_no_report_is_told(tmp_path, capsys):
+    assert main(["report", str(tmp_path)]) == 2
+    assert "neither posterior.nc" in capsys.readouterr().err
+    (tmp_path / "posterior.nc").write_text("")
+    assert main(["report", str(tmp_path)]) == 2
+    assert "has no summary.json" in capsys.readouterr().err
+    assert not (tmp_path / "report.html").exists()
+
+
+@pytest.mark.long
+def test_a_corrupted_product_is_pointed_at(tmp_path):
+    """One product of a gain run 2 % too large: the page says which."""
+    given = ["lmax=8", "observation.runs.0.cycles=0.2"]
+    scenario = load_scenario("gain_1e-3", given)
+    data = build(scenario).data
+    grid = data.grid()
+    grid[8] *= 1.02
+    replace(data, data=data.layout.gather(jnp.asarray(grid))).write(tmp_path / "bad.nc")
+    run_map(scenario, tmp_path / "out", data=tmp_path / "bad.nc")
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert re.search(r'class="verdict bad">The data do not fit.*without product 12R', page)
+    assert re.search(r"<tr class=bad><td>12R</td>", page)
+    found = read_diagnostics(tmp_path / "out" / "diagnostics.nc")
+    assert "product 12R" in np.atleast_1d(found.attrs["suspects"])
+
+
+@pytest.mark.long
+def test_summaries_of_sampled_runs(sampled):
+    page = (sampled / "report.html").read_text()
+    told = json.loads((sampled / "sampling.json").read_text())
+    assert f"{told['chains']} x 50 draws of sky" in page
+    for quantity in ("Galactic centre", "r_hat", "ess_bulk", "lusee_bayes", "observation:"):
+        assert quantity in page
+
+
+# --- in a browser -------------------------------------------------------------------------------
+
+CHECK = """<script>
+const beyond = (e) => e.getBoundingClientRect().right > innerWidth + 1;
+const shown = [...document.querySelectorAll("img, canvas, dl, p, h1, h2")];
+const found = {
+  errors: window.problems, width: innerWidth, needed: document.documentElement.scrollWidth,
+  cut: shown.filter((e) => beyond(e) && !e.closest(".scroll, figure")).length, pixels: []};
+if (window.explorer) for (const [l, b] of POINTS) found.pixels.push(explorer.at(l, b));
+if (window.explorer) { explorer.choose(POINTS[0][0], POINTS[0][1]);
+  found.values = document.getElementById("explorer-values").textContent; }
+const text = document.createElement("pre"); text.id = "found";
+text.textContent = JSON.stringify(found); document.body.append(text);
+</script>"""
+LISTEN = """<script>window.problems = [];
+addEventListener("error", (e) => problems.push(String(e.message)));
+for (const kind of ["error", "warn"]) console[kind] = (...a) => problems.push(a.join(" "));
+</script>"""
+
+
+def in_browser(page: str, tmp_path, width: int, points) -> dict:
+    """What a page says of itself in headless Chromium, at a width in pixels."""
+    check = CHECK.replace("POINTS", json.dumps([list(map(float, p)) for p in points]))
+    text = page.replace("<style>", LISTEN + "<style>", 1).replace("</body>", check + "</body>")
+    (tmp_path / "inner.html").write_text(text)
+    # a frame is as narrow as it is told, a window is not
+    outer = (
+        f'<iframe id="f" src="inner.html" style="width:{width}px;height:2000px;border:0"></iframe>'
+        '<pre id="out"></pre><script>onload = () => { document.getElementById("out").textContent = '
+        'document.getElementById("f").contentDocument.getElementById("found").textContent; };'
+        "</script>"
+    )
+    (tmp_path / "outer.html").write_text(outer)
+    flags = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run "
+    flags += "--disable-background-networking --disable-component-update --disable-sync "
+    flags += "--allow-file-access-from-files --virtual-time-budget=20000 --dump-dom "
+    command = [CHROMIUM, *flags.split(), f"--user-data-dir={tmp_path / 'profile'}"]
+    dom = subprocess.run(
+        [*command, f"file://{tmp_path / 'outer.html'}"], capture_output=True, text=True, timeout=120
+    ).stdout
+    (told,) = re.findall(r'<pre id="out">(.*?)</pre>', dom, re.DOTALL)
+    return json.loads(told)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("which", ["folder", SAMPLED])
+def test_in_a_browser(which, width, request, tmp_path):
+    folder = request.getfixturevalue(which)
+    rng = np.random.default_rng(3)
+    points = np.stack([rng.uniform(0, 360, 300), np.degrees(np.arcsin(rng.uniform(-1, 1, 300)))], 1)
+    page = (folder / "report.html").read_text()
+    found = in_browser(page, tmp_path, width, points)
+    assert found["errors"] == []
+    assert found["width"] == width
+    assert found["needed"] <= width
+    assert found["cut"] == 0
+    if which == "sampled":
+        return
+    # the page's own HEALPix is healpy's
+    nside = explorer_data(page)["nside"]
+    expected = healpy.ang2pix(nside, *points.T, lonlat=True)
+    np.testing.assert_array_equal([p["pixel"] for p in found["pixels"]], expected)
+    mean = healpy.read_map(folder / "mean.fits", dtype=np.float64)
+    np.testing.assert_allclose([p["mean"] for p in found["pixels"]], mean[expected], rtol=1e-7)
+    assert str(expected[0]) in found["values"]

@@ -1,0 +1,73 @@
+"""Finished runs side by side."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from lusee_bayes.cli.main import main
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.results.finished_runs import read_runs, same_data
+from lusee_bayes.runs.map_run import run_map
+from lusee_bayes.runs.simulate_run import run_simulate
+
+pytestmark = pytest.mark.long
+SMALL = ["lmax=4", "observation.runs.0.cycles=0.1"]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Data with gain drifts, mapped with the gain term and without; and those of another seed."""
+    folder = tmp_path_factory.mktemp("runs")
+    data = folder / "data.nc"
+    run_simulate(load_scenario("gain_1e-2", SMALL), data)
+    for name in ("gain_1e-2", "fiducial"):
+        run_map(load_scenario(name, SMALL), folder / name, data=data)
+    run_map(load_scenario("fiducial", [*SMALL, "seed=5"]), folder / "other")
+    return folder
+
+
+def test_the_right_model_wins(runs, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["compare", str(runs / "fiducial"), str(runs / "gain_1e-2"), "-o", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert "look at" in told and "cannot be compared" not in told
+    with (out / "comparison.csv").open(newline="") as file:
+        rows = {row["run"]: row for row in csv.DictReader(file)}
+    for name, row in rows.items():
+        summary = json.loads((runs / name / "summary.json").read_text())
+        assert float(row["log_evidence"]) == summary["log_evidence"]
+    assert float(rows["gain_1e-2"]["log_evidence_less_best"]) == 0.0
+    difference = float(rows["fiducial"]["log_evidence"]) - float(rows["gain_1e-2"]["log_evidence"])
+    assert float(rows["fiducial"]["log_evidence_less_best"]) == difference < -100.0
+    page = (out / "comparison.html").read_text()
+    assert "All runs map the same data" in page and "gain_1e-2" in page
+    assert page.count("data:image/png;base64,") == 2 and "://" not in page
+    for name in ("maps", "curves"):
+        assert matplotlib.image.imread(out / "figures" / f"{name}.png").std() > 0.01
+
+
+def test_different_data_are_told_apart(runs, tmp_path, capsys):
+    read = read_runs([runs / "fiducial", runs / "other"])
+    assert not same_data(read)
+    assert same_data(read_runs([runs / "fiducial", runs / "gain_1e-2"]))
+    np.testing.assert_array_equal(read[0].mean.shape, read[1].mean.shape)
+    out = str(tmp_path / "out")
+    assert main(["compare", str(runs / "fiducial"), str(runs / "other"), "-o", out]) == 0
+    assert "cannot be compared" in capsys.readouterr().out
+
+
+def test_what_cannot_be_compared(runs, tmp_path, capsys):
+    for folders, message in (
+        ([runs / "fiducial"], "give two folders or more to compare, got 1"),
+        ([runs / "fiducial", tmp_path], "has no summary.json"),
+        ([runs / "fiducial", runs / "fiducial"], "two of the folders are named 'fiducial'"),
+    ):
+        command = ["compare", *map(str, folders), "-o", str(tmp_path / "out")]
+        assert main(command) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

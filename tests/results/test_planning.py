@@ -1,0 +1,352 @@
+"""What an observation would tell: against dense textbook algebra and against simulated data."""
+
+import csv
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import matplotlib.image
+import numpy as np
+import pytest
+import scipy.linalg
+
+from lusee_bayes.cli.main import main
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.harmonics import sum_over_m
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.products import all_products
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.linear.metrics import ell_cross
+from lusee_bayes.linear.model import FORMS, LinearGaussian
+from lusee_bayes.noise.covariance import DiagonalCovariance
+from lusee_bayes.results import variations
+from lusee_bayes.results.forecast import (
+    Variation,
+    expected_snr_squared,
+    forecast,
+    forecast_rows,
+    forecasts_of,
+    informed_modes,
+    without_ports,
+)
+from lusee_bayes.results.variations import default_variations
+from lusee_bayes.sky.priors import HarmonicPrior
+
+# many shapes, each of which is compiled
+pytestmark = pytest.mark.long
+SMALL = ["lmax=6", "observation.runs.0.cycles=0.3", "noise.radiometer.factor=100"]
+N_SETS = 200
+
+
+def varied(*overrides, lost=()):
+    return Variation("small", "test", "test", load_scenario("fiducial", [*SMALL, *overrides]), lost)
+
+
+def turned(*angles, factor=100):
+    """The same time at each of these angles, 0.3 cycles in all; ``factor`` of the noise."""
+    runs = ", ".join(f"{{cycles: {0.3 / len(angles)}, turntable_deg: {a}}}" for a in angles)
+    return varied(f"observation.runs=[{runs}]", f"noise.radiometer.factor={factor}")
+
+
+def bits(*overrides, lost=()):
+    return forecast(varied(*overrides, lost=lost)).information_bits
+
+
+def simulated(variation):
+    """The model of a variation, a posterior, and 200 skies with the means of their maps."""
+    model = full_model(set_up(variation.scenario))
+    solver = model.factorise()
+    skies = model.prior.sample(jax.random.key(3), N_SETS)
+    signals = skies @ model.coupling.dense().T
+    keys = jax.random.split(jax.random.key(4), N_SETS)
+    posteriors = [
+        solver.condition(signal + model.noise.sample(key))
+        for signal, key in zip(signals, keys, strict=True)
+    ]
+    means = np.stack([np.asarray(p.mean) for p in posteriors])
+    return model, posteriors[0], np.asarray(skies), means
+
+
+@pytest.mark.parametrize("angles", [(0,), (0, 30), (0, 30, 60)], ids=str)
+def test_information_is_the_mean_log_ratio_of_posterior_to_prior_density(angles):
+    """ln p(m | d) - ln p(m) at the true sky, with NumPy alone, over 200 data sets."""
+    predicted = forecast(turned(*angles))
+    model, posterior, skies, means = simulated(turned(*angles))
+    prior = np.asarray(model.prior.variance())
+    root = np.sqrt(prior)
+    # in units of the prior; the 2 pi cancel
+    c = np.asarray(posterior.covariance()) / np.outer(root, root)
+    shift = (skies - means) / root
+    chi2 = np.einsum("si,ij,sj->s", shift, np.linalg.inv(c), shift)
+    log_ratio = 0.5 * ((skies**2 / prior).sum(1) - chi2 - np.linalg.slogdet(c)[1])
+    nats = predicted.information_bits * np.log(2.0)
+    # 4 standard errors, from the scatter of the 200
+    error = log_ratio.std(ddof=1) / np.sqrt(N_SETS)
+    assert abs(log_ratio.mean() - nats) < 4 * error
+    # which is a sharp test: the scatter is of order sqrt(modes), a per cent of the information
+    assert error < 0.01 * nats
+
+
+def test_expected_snr_is_that_of_simulated_maps():
+    """sum_m mean^2 and sum_m (mean - m)^2, averaged over the 200, and the ell where they cross."""
+    faint = turned(0, 30, factor=1e7)  # SNR^2 from 120 to 0.2
+    predicted = forecast(faint)
+    model, _, skies, means = simulated(faint)
+    power, error = sum_over_m(means**2), sum_over_m((means - skies) ** 2)
+    prior = sum_over_m(np.asarray(model.prior.variance()))
+    left = prior / (1.0 + predicted.snr_squared)
+    for values, expected in ((power, prior - left), (error, left)):
+        tolerance = 4.5 * values.std(axis=0, ddof=1) / np.sqrt(N_SETS)
+        assert (np.abs(values.mean(axis=0) - expected) < tolerance).all()
+    # SNR^2 is 2.0 before and 0.4 after it: 200 sets decide without doubt
+    assert predicted.ell_cross == 5
+    assert predicted.ell_cross == ell_cross(np.sqrt(power.mean(0) / error.mean(0)))
+
+
+def test_turning_in_the_same_time_tells_more():
+    """The three choices differ by far more than rounding, and in this order."""
+    still, once, twice = (forecast(turned(*a)) for a in [(0,), (0, 30), (0, 30, 60)])
+    assert still.information_bits + 1 < once.information_bits
+    assert still.information_bits + 1 < twice.information_bits
+    # nearly the same time: each run loses less than one sample of two hours
+    assert 0 <= still.days - twice.days < 3 * 2 / 24
+
+
+def textbook(variation, keep=None):
+    """(A, S, N) as matrices with the rows ``keep``."""
+    model = full_model(set_up(variation.scenario))
+    keep = slice(None) if keep is None else keep
+    a, s = np.asarray(model.coupling.dense())[keep], np.asarray(model.prior.covariance())
+    return a, s, np.asarray(model.noise.dense())[keep][:, keep]
+
+
+def assert_forecast_is(found, a, s, n):
+    """Against the data-space evidence ratio and the generalised eigenvalues of (S, C)."""
+    root = np.linalg.cholesky(n)
+    w = np.linalg.solve(root, a) * np.sqrt(np.diag(s))
+    nats = 0.5 * np.linalg.slogdet(np.eye(len(w)) + w @ w.T)[1]
+    # w w^T squares the signal-to-noise ratio, 1e5: eps x 1e10 x 100 directions
+    assert found.information_bits == pytest.approx(nats / np.log(2.0), abs=1e-3)
+    c = np.linalg.inv(w.T @ w + np.eye(w.shape[1])) * np.sqrt(np.outer(np.diag(s), np.diag(s)))
+    # (S - C) x = lambda C x
+    ratios = scipy.linalg.eigh(s - c, s, eigvals_only=True)
+    ratios = ratios / (1.0 - ratios)
+    assert found.modes == (ratios > 1.0).sum()
+    lmax = int(np.sqrt(len(s))) - 1
+    snr2 = [
+        (np.diag(s) - np.diag(c))[e**2 : (e + 1) ** 2].sum() / np.diag(c)[e**2 : (e + 1) ** 2].sum()
+        for e in range(lmax + 1)
+    ]
+    np.testing.assert_allclose(found.snr_squared, snr2, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("cycles", "systematic"),
+    [(0.01, "noise.beam={shift_mhz: 4.0}"), (0.3, "noise.gain={sigma: 0.01}")],
+    ids=["fewer data than modes", "more"],
+)
+def test_numbers_of_an_experiment_against_dense_algebra(cycles, systematic):
+    variation = varied(f"observation.runs.0.cycles={cycles}", systematic)
+    found = forecast(variation)
+    assert 0 < found.modes < 49  # neither none nor all
+    assert found.n_data == 16 * int(cycles * 27.321661 * 12)
+    assert_forecast_is(found, *textbook(variation))
+
+
+def test_a_lost_antenna_is_flags():
+    variation = varied()
+    dead = [p.i == 2 or p.j == 2 for p in all_products()]
+    experiment = build(variation.scenario)
+    setup = experiment.setup
+    flags = np.repeat(np.array(dead)[:, None], setup.observation.n_times, axis=1)
+    found = forecast(replace(variation, lost=(2,)))
+    assert found.n_data == 9 * setup.observation.n_times
+    assert_forecast_is(found, *textbook(variation, ~flags.ravel()))
+    # and the same model as that of data with these flags
+    layout = DataLayout.from_flags(flags)
+    whole = experiment.data
+    data = Visibilities(
+        layout.gather(whole.layout.scatter(whole.data)), layout, whole.observation, 25.0
+    )
+    expected = full_model(set_up(variation.scenario, data))
+    got = full_model(without_ports(setup, [2]))
+    np.testing.assert_array_equal(got.coupling.dense(), expected.coupling.dense())
+    np.testing.assert_array_equal(got.noise.diagonal(), expected.noise.diagonal())
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_modes_do_not_depend_on_the_basis(form):
+    """m' = R m, u' = R u for any rotation R: the directions are others, their number is not."""
+    rng = np.random.default_rng(1)
+    scale = np.array([30.0, 3.0, 1.5, 1.01, 0.99, 0.5, 0.1, 0.01, 0.0])  # SNR of nine directions
+    rotation = scipy.linalg.qr(rng.normal(size=(9, 9)))[0]
+    prior = HarmonicPrior(jnp.ones(3))
+    for basis in (np.eye(9), rotation):
+        a = jnp.asarray((np.diag(scale) @ basis)[:8])
+        model = LinearGaussian(a, prior, DiagonalCovariance(jnp.ones(8)))
+        posterior = model.factorise(form).condition(jnp.zeros(8))
+        assert informed_modes(posterior) == 4
+
+
+def test_an_ell_that_is_not_seen_and_one_without_power():
+    """Expected SNR^2 of 0 and NaN; neither is clipped."""
+    a = jnp.eye(9)[:4]
+    prior = HarmonicPrior(jnp.asarray([0.0, 3.0, 2.0]))
+    model = LinearGaussian(a, prior, DiagonalCovariance(jnp.ones(4)))
+    found = expected_snr_squared(model.factorise("map").condition(jnp.zeros(4)))
+    assert np.isnan(found[0])
+    np.testing.assert_allclose(found[1:], [3.0, 0.0], atol=1e-15)
+
+
+def test_more_data_never_tell_less():
+    assert bits("observation.runs.0.cycles=0.15") < bits()
+    # the Sun rises in the middle of it
+    sunrise = "observation.start=2027-01-25"
+    assert bits(sunrise, "observation.runs.0.night_only=true") < bits(sunrise)
+    assert bits(lost=(0, 1)) < bits(lost=(0,)) < bits()
+
+
+def test_a_duty_cycle_is_worth_the_noise_it_makes():
+    """Half the integration time is twice the variance, and never more than half a bit per mode."""
+    half, whole = bits("noise.radiometer.duty_cycle=0.5"), bits()
+    assert half == pytest.approx(bits("noise.radiometer.factor=200"), rel=1e-12)
+    assert 0 < whole - half < 0.5 * 49
+
+
+def test_default_variations_compare_like_with_like():
+    scenario = load_scenario("two_cycles")
+    found = default_variations("two_cycles", scenario)
+    assert found[0].scenario == scenario
+    families = {v.family: [w for w in found if w.family == v.family] for v in found}
+
+    def runs(variation):
+        return [(r.cycles, r.turntable_deg) for r in variation.scenario.observation.runs]
+
+    def time(variation):
+        return sum(cycles for cycles, _ in runs(variation))
+
+    assert [time(v) for v in families["turned, same time"]] == pytest.approx([2.0] * 3)
+    assert runs(families["turned, same time"][1]) == [(0.5, 0), (0.5, 30), (0.5, 30), (0.5, 60)]
+    assert [time(v) for v in families["turned, more time"]] == [4.0, 6.0]
+    assert runs(families["turned, more time"][0]) == [(1, 0), (1, 30), (1, 30), (1, 60)]
+    assert [time(v) for v in families["duration"]] == [0.25, 0.5, 1.0, 2.0, 3.0]
+    assert all(r.night_only for v in families["nights only"] for r in v.scenario.observation.runs)
+    duty = [v.scenario.noise.radiometer.duty_cycle for v in families["duty cycle"]]
+    assert duty == [0.25, 0.5, 1.0]
+    assert [v.lost for v in families["antenna lost"]] == [(0,), (1,), (2,), (3,)]
+
+
+def test_what_is_there_twice_is_computed_once(monkeypatch):
+    computed = []
+    whole = varied()
+    first = forecast(whole)
+    monkeypatch.setattr(
+        "lusee_bayes.results.forecast.forecast",
+        lambda variation: computed.append(variation) or replace(first, variation=variation),
+    )
+    again, broken = replace(whole, name="again"), replace(whole, lost=(1,))
+    rows = forecast_rows(forecasts_of([whole, again, broken]))
+    assert computed == [whole, broken]
+    assert [row["variation"] for row in rows] == ["test", "again", "test"]
+    assert rows[1]["difference_bits"] == "0.00"
+
+
+def test_ports_that_do_not_exist_and_none_left():
+    with pytest.raises(InputError, match="no port 4 to lose; ports are 0 to 3"):
+        forecast(varied(lost=(4,)))
+    with pytest.raises(InputError, match="small, test: all .* samples are flagged"):
+        forecast(varied(lost=(0, 1, 2, 3)))
+
+
+TINY = ["--set", "lmax=6", "--set", "observation.runs.0.cycles=0.05"]
+
+
+def run(*arguments) -> int:
+    return main([str(a) for a in arguments])
+
+
+def rows_of(folder):
+    with (folder / "plan.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_command_writes_table_and_figure(tmp_path, capsys, monkeypatch):
+    # a few variations are enough; the Sun is up all the time
+    monkeypatch.setattr(variations, "CYCLES", (0.05,))
+    monkeypatch.setattr(variations, "PARTS", (1,))
+    tiny = [*TINY, "--set", "observation.start=2027-02-03"]
+    assert run("plan", "fiducial", "noise_x100", *tiny, "-o", tmp_path) == 0
+    assert {p.name for p in tmp_path.iterdir()} == {"plan.csv", "figures", "manifest.json"}
+    assert matplotlib.image.imread(tmp_path / "figures" / "plan.png").std() > 0.01
+    rows = rows_of(tmp_path)
+    names = [row["variation"] for row in rows if row["scenario"] == "fiducial"]
+    assert names == [
+        "as given", "0°", "0.05 cycles", "0.25", "0.5", "1", "port 0", "port 1", "port 2", "port 3",
+    ]  # fmt: skip
+    assert [row["variation"] for row in rows if row["scenario"] == "noise_x100"] == names
+    expected = forecast(Variation("", "", "", load_scenario("fiducial", tiny[1::2])))
+    first = rows[0]
+    # two decimals
+    assert float(first["information_bits"]) == pytest.approx(expected.information_bits, abs=0.0051)
+    assert int(first["modes_snr_above_1"]) == expected.modes
+    more = float(rows[4]["information_bits"]) - expected.information_bits
+    assert float(rows[4]["difference_bits"]) == pytest.approx(more, abs=0.0101)
+    out = capsys.readouterr().out
+    assert "left out: fiducial, nights only, 0.05 cycles: run 0 holds no lunar night" in out
+    assert "noise_x100: " in out
+    assert out.strip().splitlines()[-1] == f"look at {tmp_path}/figures/plan.png"
+
+
+def test_values_of_ones_own(tmp_path, capsys):
+    arguments = ["plan", "fiducial", *TINY, "--vary", "noise.radiometer.duty_cycle=0.5,1", "-q"]
+    assert run(*arguments, "--vary", "observation.start=2027-01-15,2027-01-22", "-o", tmp_path) == 0
+    rows = rows_of(tmp_path)
+    assert [row["variation"] for row in rows] == [
+        "as given",
+        "0.5",
+        "1",
+        "2027-01-15",
+        "2027-01-22",
+    ]
+    found = [float(row["information_bits"]) for row in rows]
+    assert found[1] < found[0] == found[2] == found[3]
+    assert found[4] != found[0]
+    assert capsys.readouterr().out == ""
+
+
+def test_brackets_are_values_not_markup(tmp_path, capsys):
+    """A list of runs is a value as any other, and printed as it is."""
+    runs = "observation.runs=[{cycles: 0.03}, {cycles: 0.02, turntable_deg: 30}]"
+    vary = ["--vary", runs, "--vary", "noise.gain=null"]
+    assert run("plan", "fiducial", *TINY, *vary, "-o", tmp_path) == 0
+    name = "[{'cycles': 0.03}, {'cycles': 0.02, 'turntable_deg': 30}]"
+    assert [row["variation"] for row in rows_of(tmp_path)] == ["as given", name, "None"]
+    assert name in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nonsense"], "no scenario 'nonsense'"),
+        (["fiducial", "fiducial"], "the scenario 'fiducial' is given twice; give each once"),
+        (["fiducial", "--vary", "lmax"], "--vary takes key.path=value,value"),
+        (["fiducial", "--vary", "lmax=]"], "--vary takes key.path=value,value"),
+        (["fiducial", "--vary", "lmx=3,4"], "unknown key 'lmx'; did you mean 'lmax'?"),
+        (["fiducial", "--vary", "lmax=3,0"], "greater than or equal to 1"),
+        (["fiducial", "--set", "sky.file=a.fits"], "fiducial, as given: no sky map at 'a.fits'"),
+        (["fiducial", "--set", "observation.start=soon"], "fiducial, as given: start 'soon'"),
+        ([], "scenario"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_exit_code_2(tmp_path, capsys, arguments, message):
+    out = tmp_path / "out"
+    assert run("plan", *arguments, "-o", out, "-q") == 2
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert error.startswith("lusee-bayes: ")
+    assert "\n" not in error
+    assert not out.exists()

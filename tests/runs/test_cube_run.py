@@ -1,0 +1,327 @@
+"""Runs of several frequencies from the command line: independent, joint, resumed, shared out."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import healpy
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+
+from lusee_bayes.cli.main import main
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.harmonics import modes_to_map
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.experiment.terms import Around
+from lusee_bayes.linear.metrics import signal_to_noise
+from lusee_bayes.results import channel_threads, cube_channels
+from lusee_bayes.runs import folder as folder_module
+from lusee_bayes.runs import map_run
+from lusee_bayes.runs.map_run import run_map
+from lusee_bayes.sampling.datatree import read_datatree
+from lusee_bayes.sky import SkyCube
+
+SMALL = ["--set", "lmax=4", "--set", "observation.runs.0.cycles=0.1"]
+THREE = ["--frequencies", "20:30:5", *SMALL]
+# two components for three channels
+JOINT = [*THREE, "--joint", "--set", "spectral.components=[power_law, curvature]"]
+
+
+def run(*arguments) -> int:
+    return main([str(a) for a in arguments])
+
+
+def posterior_of(folder) -> xr.Dataset:
+    return xr.load_dataset(folder / "posterior.nc", engine="h5netcdf")
+
+
+def assert_equal(got, expected, sigma):
+    """Of two cubes: means within ``sigma`` standard deviations, these within that part."""
+    std = expected["std"].values
+    assert (np.abs(got["mean"].values - expected["mean"].values) / std).max() < sigma
+    np.testing.assert_allclose(got["std"].values, std, rtol=sigma)
+
+
+def three(*overrides, frequencies="[20, 25, 30]"):
+    """The scenario of the command line's THREE."""
+    return load_scenario("fiducial", [*SMALL[1::2], f"frequencies_mhz={frequencies}", *overrides])
+
+
+@pytest.fixture(scope="module")
+def independent(small_cube):
+    """Of a finished run, shared: to be read."""
+    return small_cube.folder
+
+
+@pytest.fixture(scope="module")
+def joint(tmp_path_factory):
+    """Made by the command line."""
+    out = tmp_path_factory.mktemp("joint")
+    assert run("map", "fiducial", *JOINT, "--draws", 3, "-o", out, "-q") == 0
+    return out
+
+
+@pytest.fixture
+def numbers_alone(monkeypatch):
+    """Runs of this process write no figures."""
+    monkeypatch.setattr(map_run, "CUBE", replace(map_run.CUBE, figures={}))
+    monkeypatch.setattr(folder_module, "PAGES", {})
+
+
+@pytest.mark.long
+def test_independent_channels_are_maps_of_each_frequency(independent):
+    cube = posterior_of(independent)
+    np.testing.assert_array_equal(cube["frequency"], [20.0, 25.0, 30.0])
+    assert cube["draws"].dims == ("frequency", "draw", "mode") and cube.sizes["draw"] == 3
+    for number, frequency in enumerate((20, 25, 30)):
+        settings = [*SMALL[1::2], f"frequency_mhz={frequency}", f"seed={1 + number}"]
+        experiment = build(load_scenario("fiducial", settings))
+        data = experiment.data
+        model = full_model(experiment.setup, Around(data))
+        expected = model.condition(data.data)
+        here, std = cube.isel(frequency=number), np.asarray(expected.std())
+        assert (np.abs(here["mean"] - np.asarray(expected.mean)) / std).max() < 1e-6
+        # standard deviations of the normal equations
+        np.testing.assert_allclose(here["std"], std, rtol=1e-4)
+        np.testing.assert_array_equal(here["truth"], np.asarray(data.truth))
+    summary = json.loads((independent / "summary.json").read_text())
+    assert summary["joint"] is None and len(summary["channels"]) == 3
+    assert not (independent / "channels").exists()
+
+
+@pytest.mark.long
+def test_files_of_a_cube_agree_with_each_other(joint, capsys):
+    cube = posterior_of(joint)
+    assert run("info", joint / "posterior.nc") == 0
+    said = capsys.readouterr().out
+    assert "25 modes (lmax 4) at 3 frequencies from 20 to 30 MHz, one posterior for all" in said
+    assert run("info", joint / "mean.fits") == 0
+    assert "20" in capsys.readouterr().out
+    nside = load_scenario("fiducial", SMALL[1::2]).map_nside
+    for name in ("mean", "truth"):
+        read = SkyCube.read(joint / f"{name}.fits")
+        np.testing.assert_allclose(read.frequencies_mhz, cube["frequency"])
+        for k in range(3):
+            expected = modes_to_map(cube[name].values[k], nside)
+            np.testing.assert_allclose(read.map_at(20.0 + 5 * k), expected, rtol=1e-12)
+    assert SkyCube.read(joint / "std.fits").pixels.shape == (3, healpy.nside2npix(nside))
+    with (joint / "spectra.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(r["frequency_mhz"]) for r in rows] == list(np.repeat([20.0, 25.0, 30.0], 5))
+    for name, column in (("mean", "snr"), ("independent_mean", "snr_independent")):
+        snr = signal_to_noise(cube[name].values[1], cube["truth"].values[1])
+        np.testing.assert_allclose([float(r[column]) for r in rows[5:10]], snr, rtol=1e-9)
+    assert "20 to 30 MHz" in (joint / "report.html").read_text()
+    maps = cube["mixing"].values @ cube["component_mean"].values
+    # the rest of each channel is a few percent of it
+    assert 0 < np.abs(maps - cube["mean"].values).max() < 0.2 * np.abs(maps).max()
+
+
+@pytest.mark.long
+def test_the_independent_means_of_a_joint_run_are_those_of_an_independent_run(joint, independent):
+    a, b = posterior_of(joint), posterior_of(independent)
+    far = np.abs(a["independent_mean"].values - b["mean"].values) / b["std"].values
+    assert far.max() < 1e-3  # it is where the first solution was
+    assert (np.abs(a["mean"].values - b["mean"].values) / b["std"].values).max() > 0.05
+
+
+@pytest.mark.long
+def test_conjugate_gradients_give_the_same_maps(joint, tmp_path, numbers_alone):
+    components = ["spectral.components=[power_law, curvature]", "joint=true"]
+    cg = [*components, "spectral.solver=conjugate_gradients"]
+    run_map(three(*cg), tmp_path / "cg")
+    got, expected = posterior_of(tmp_path / "cg"), posterior_of(joint)
+    far = np.abs(got["mean"].values - expected["mean"].values) / expected["std"].values
+    assert far.max() < 1e-6
+    # of 50 draws: a tenth each, and 75 of them
+    assert np.abs(got["std"].values / expected["std"].values - 1).max() < 0.45
+    summary = json.loads((tmp_path / "cg" / "summary.json").read_text())
+    assert summary["log_evidence"] is None and summary["joint"]["iterations"] >= 1
+    assert summary["joint"]["refinement_sigma"] <= 1e-7
+    slow = ["spectral.iterations=1", "spectral.tolerance=1e-300"]
+    with pytest.raises(InputError, match="conjugate gradients did not converge: after 1 iter"):
+        run_map(three(*cg, *slow), tmp_path / "slow")
+    assert not (tmp_path / "slow" / "posterior.nc").exists()
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Channels whose posterior was really computed, in order."""
+    done, inform = [], cube_channels.inform
+
+    def counting(experiment, *arguments):
+        done.append(experiment.scenario.frequency_mhz)
+        return inform(experiment, *arguments)
+
+    monkeypatch.setattr(channel_threads, "THREADS_PER_DEVICE", 1)
+    monkeypatch.setattr(cube_channels, "inform", counting)
+    return done
+
+
+@pytest.mark.long
+def test_an_interrupted_run_goes_on_where_it_was(
+    independent, tmp_path, made, monkeypatch, capsys, numbers_alone
+):
+    inform = cube_channels.inform
+
+    def some(*arguments):
+        if len(made) == 2:
+            raise KeyboardInterrupt
+        return inform(*arguments)
+
+    command = ["map", "fiducial", *THREE, "--draws", 3, "-o", tmp_path, "-q"]
+    with monkeypatch.context() as patch:
+        patch.setattr(cube_channels, "inform", some)
+        assert run(*command) == 130
+    assert capsys.readouterr().err.strip() == (
+        f"lusee-bayes: interrupted; nothing has been written in '{tmp_path}'; the same command "
+        "goes on from the channels that are done"
+    )
+    assert made == [20, 25] and not (tmp_path / "posterior.nc").exists()
+    made.clear()
+    assert run(*command) == 0
+    assert made == [30]
+    assert not (tmp_path / "channels").exists()
+    xr.testing.assert_identical(
+        posterior_of(tmp_path).drop_attrs(), posterior_of(independent).drop_attrs()
+    )
+
+
+@pytest.mark.long
+def test_files_of_another_run_are_not_taken_up(tmp_path, made, monkeypatch, numbers_alone):
+    # the channels' files stay
+    monkeypatch.setattr(map_run, "CUBE", replace(map_run.CUBE, unfinished=""))
+    two = "[20, 25]"
+    run_map(three(frequencies=two), tmp_path)
+    run_map(three(frequencies=two), tmp_path)
+    assert made == [20, 25]
+    run_map(three("noise.radiometer.factor=2", frequencies=two), tmp_path)
+    assert made == [20, 25] * 2
+
+
+@pytest.mark.long
+def test_measured_data_of_several_channels(tmp_path, capsys, numbers_alone):
+    data = tmp_path / "w.fits"
+    assert run("simulate", "fiducial", *THREE, "-o", data, "-q") == 0
+    read = ["--data", data]
+    assert run("map", "fiducial", *THREE, *read, "-q", "-o", tmp_path / "a", "--truth") == 0
+    assert "truth" in posterior_of(tmp_path / "a")
+    capsys.readouterr()
+    for given, message in (
+        (["--frequencies", "20,40", *SMALL, *read], "40"),
+        ([*THREE, "--data", tmp_path / "gone.fits"], "no data at"),
+    ):
+        assert run("map", "fiducial", *given, "-q", "-o", tmp_path / "b") == 2
+        assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--frequencies", "20,60"], "less than or equal to 50"),
+        (["--frequencies", "20,10"], "expected growing MHz"),
+        (["--joint"], "joint needs frequencies_mhz"),
+        (["--processes", "2"], "give --frequencies"),
+        (["--devices", "2"], "give --frequencies"),
+        (["--frequencies", "20,25", "--compact"], "--compact is for a single frequency"),
+        (["--frequencies", "20,25", "--onto", "x"], "--onto is for a single frequency"),
+        (["--frequencies", "20,25", "--joint"], "need at least as many channels, got 2"),
+        (["--set", "spectral.components=[hot]", "--frequencies", "20,25"], "spectral.components"),
+    ],
+    ids=str,
+)
+def test_bad_input_is_one_sentence(arguments, message, tmp_path, capsys):
+    assert run("map", "fiducial", *SMALL, *arguments, "-o", tmp_path / "x", "-q") == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_too_many_data_for_a_single_map(monkeypatch, tmp_path, capsys, numbers_alone):
+    monkeypatch.setattr("lusee_bayes.linear.model.DENSE_BYTES", 1e3)
+    assert run("map", "fiducial", *SMALL, "-o", tmp_path / "x", "-q") == 2
+    assert "use --frequencies 25 for a map without that" in capsys.readouterr().err
+    assert run("map", "fiducial", *SMALL, "--frequencies", "25", "-o", tmp_path / "y", "-q") == 0
+    assert SkyCube.read(tmp_path / "y" / "mean.fits").frequencies_mhz == jnp.array([25.0])
+
+
+@pytest.mark.long
+def test_sampling_several_channels(tmp_path, capsys):
+    few = ["--chains", 2, "--draws", 100, "--warmup", 100, "-q", "--set", "lmax=2"]
+    command = ["sample", "fiducial", "--frequencies", "20,30", *SMALL, *few, "-o", tmp_path]
+    assert run(*command) == 0
+    assert SkyCube.read(tmp_path / "mean.fits").pixels.shape[0] == 2
+    for name in ("20MHz", "30MHz"):
+        assert (tmp_path / name / "report.html").is_file()
+    before = read_datatree(tmp_path / "20MHz" / "samples.nc")["posterior"]["sky"].values
+    assert run(*command, "--resume") == 0
+    after = read_datatree(tmp_path / "20MHz" / "samples.nc")["posterior"]["sky"].values
+    np.testing.assert_array_equal(after, before)
+    assert run(*command, "--set", "joint=true") == 2
+    assert "channels are sampled one by one" in capsys.readouterr().err
+
+
+def started(folder, *arguments):
+    """The joint run in a process of its own, with more processes or devices."""
+    command = [
+        "-m",
+        "lusee_bayes.cli",
+        "map",
+        "fiducial",
+        *JOINT,
+        "-o",
+        str(folder),
+        "--draws=3",
+    ]
+    return subprocess.Popen(
+        [sys.executable, *command, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"MPLBACKEND": "agg"},
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("how", ["--processes=2", "--devices=3"])
+def test_processes_and_devices_give_the_same_numbers(how, joint, tmp_path):
+    with started(tmp_path, how) as process:
+        said, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert said.count("one posterior") == 1
+    assert_equal(posterior_of(tmp_path), posterior_of(joint), 1e-6)
+
+
+def children_of(pid: int) -> list[int]:
+    text = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True)
+    return [int(line) for line in text.stdout.split()]
+
+
+@pytest.mark.long
+def test_a_killed_process_ends_the_run_which_can_be_resumed(joint, tmp_path):
+    with started(tmp_path, "--processes=2", "-q") as process:
+        deadline = time.monotonic() + 120
+        while not list(tmp_path.glob("channels/*.information.nc")):
+            assert time.monotonic() < deadline and process.poll() is None
+            time.sleep(0.05)
+        victim = children_of(process.pid)[1]
+        os.kill(victim, signal.SIGKILL)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "process 1 of 0..1 was ended by SIGKILL" in errors
+    assert "goes on from what is finished" in errors
+    assert not (tmp_path / "posterior.nc").exists()
+    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("channels/*.nc")}
+    assert kept
+    with started(tmp_path, "--processes=2", "-q") as process:
+        _, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert_equal(posterior_of(tmp_path), posterior_of(joint), 1e-6)

@@ -1,0 +1,762 @@
+"""Sampling as a user meets it: killed, resumed, refused, its files, and its validation.
+
+One run is killed with SIGKILL and resumed here, another is left alone; most tests look at these.
+"""
+
+import csv
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import equinox as eqx
+import healpy
+import matplotlib.image
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from arviz_stats.base import array_stats
+from reference_linear import z_of
+
+import lusee_bayes
+from lusee_bayes.cli.main import main
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.experiment import Experiment, build
+from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.results import sample_result as results
+from lusee_bayes.results.channel import channel_of_posterior
+from lusee_bayes.results.sample_result import sample_result
+from lusee_bayes.runs import sample_run, validate_run
+from lusee_bayes.runs.folder import run_folder, write_run
+from lusee_bayes.runs.sample_run import SAMPLE
+from lusee_bayes.sampling import checkpoints
+from lusee_bayes.sampling.datatree import read_datatree
+from lusee_bayes.sampling.hmc import CHUNK, Sampler
+from lusee_bayes.sampling.programs import load_program
+
+ROOT = Path(lusee_bayes.__file__).resolve().parents[1]
+OVERRIDES = ["lmax=6", "observation.runs.0.cycles=0.1"]
+SMALL = ["fiducial", *(a for override in OVERRIDES for a in ("--set", override))]
+# what SETTINGS make of a scenario with seed 1
+# runs that are killed and resumed take a minute and more together
+pytestmark = pytest.mark.long
+SAMPLER = Sampler(chains=4, warmup=100, draws=1000, seed=1)
+SETTINGS = ["--chains", "4", "--warmup", "100", "--draws", "1000"]
+N_MODES, NSIDE = 49, 8
+GROUPS = {
+    "posterior", "sample_stats", "prior", "prior_predictive", "posterior_predictive",
+    "observed_data", "constant_data",
+}  # fmt: skip
+
+
+def run(*arguments) -> int:
+    return main([str(a) for a in arguments])
+
+
+def start(folder, *extra, settings=SETTINGS):
+    """lusee-bayes sample in a process of its own, as a user starts it."""
+    arguments = ["sample", *SMALL, *settings, "-q", "-o", str(folder), *extra]
+    return subprocess.Popen(
+        [sys.executable, "-m", "lusee_bayes.cli", *arguments],
+        env=os.environ | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"},
+        cwd=folder.parent,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def chunks(folder) -> dict[int, Path]:
+    """Files of draws by their iteration, warmup's included."""
+    found = (folder / "chains").glob(checkpoints.CHUNK_GLOB)
+    return {int(path.stem.removeprefix("chunk-")): path for path in sorted(found)}
+
+
+def executioner(process, chunk, delay_s=0.0):
+    """A shell that kills ``process`` once the file ``chunk`` is there, whatever goes on here."""
+    script = 'until [ -e "$0" ]; do sleep 0.01; done; sleep "$1"; kill -9 "$2"'
+    arguments = [str(chunk), str(delay_s), str(process.pid)]
+    return subprocess.Popen(["timeout", "300", "sh", "-c", script, *arguments])
+
+
+def chunk_path(folder, iteration):
+    return folder / "chains" / f"chunk-{iteration:08d}.npz"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """(whole, killed): folders of an undisturbed run and of one killed among its draws.
+
+    The first runs in this process, with types and shapes enforced, the other in its own.
+    """
+    base = tmp_path_factory.mktemp("runs")
+    whole, killed = base / "whole", base / "killed"
+    process = start(killed)
+    # three files of draws, out of forty
+    killer = executioner(process, chunk_path(killed, SAMPLER.warmup + 3 * CHUNK))
+    try:
+        assert run("sample", *SMALL, *SETTINGS, "-q", "-o", whole) == 0
+        assert killer.wait() == 0, process.communicate()[1]
+        assert process.wait() == -signal.SIGKILL, process.communicate()[1]
+    finally:
+        process.kill()
+        killer.kill()
+        process.communicate()
+    return whole, killed
+
+
+@pytest.fixture
+def whole(runs, tmp_path):
+    """A copy of the undisturbed run's folder."""
+    return Path(shutil.copytree(runs[0], tmp_path / "whole"))
+
+
+@pytest.fixture
+def killed(runs, tmp_path):
+    """A copy of the folder that the kill has left."""
+    return Path(shutil.copytree(runs[1], tmp_path / "killed"))
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    """That of the runs."""
+    return build(load_scenario("fiducial", OVERRIDES))
+
+
+@pytest.fixture(scope="module")
+def tree(runs):
+    return read_datatree(runs[0] / "samples.nc")
+
+
+@pytest.fixture
+def no_sampling(runs, monkeypatch):
+    """Any attempt to draw fails."""
+
+    def fail(*_, **__):
+        raise AssertionError("it began to sample")
+
+    monkeypatch.setattr(results, "sample", fail)
+
+
+def content(folder):
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def assert_one_sentence(capsys, *words):
+    error = capsys.readouterr().err.strip()
+    assert error.startswith("lusee-bayes: ")
+    assert "\n" not in error
+    for word in words:
+        assert word in error
+
+
+def assert_same_trees(found, expected):
+    """Every variable and coordinate of every group, bit by bit."""
+    assert set(found.children) == set(expected.children) == GROUPS
+    for name, group in expected.children.items():
+        assert set(found[name].variables) == set(group.variables), name
+        for variable, values in group.variables.items():
+            got = found[name].variables[variable]
+            assert got.dims == values.dims
+            assert got.dtype == values.dtype
+            np.testing.assert_array_equal(got.values, values.values, err_msg=f"{name}/{variable}")
+
+
+# ---- a run that is killed
+
+
+def test_a_killed_run_leaves_its_draws_and_nothing_half_made(runs):
+    whole, killed = runs
+    assert not (whole / "chains").exists()
+    assert {path.name for path in killed.iterdir()} == {"chains"}
+    done = chunks(killed)
+    assert list(done) == list(range(CHUNK, max(done) + 1, CHUNK))
+    assert SAMPLER.warmup + 3 * CHUNK <= max(done) < SAMPLER.warmup + SAMPLER.draws
+
+
+@pytest.mark.long
+def test_a_killed_run_resumes_to_the_draws_of_an_undisturbed_one(runs, killed, tree, monkeypatch):
+    """Bit by bit, in another process, with nothing done twice."""
+    before = {i: (p.stat().st_ino, p.stat().st_mtime_ns) for i, p in chunks(killed).items()}
+    written, untouched = [], []
+    write = checkpoints.Chunk.write
+
+    def spy(chunk, folder):
+        written.append(chunk.iteration)
+        write(chunk, folder)
+        now = {i: (p.stat().st_ino, p.stat().st_mtime_ns) for i, p in chunks(killed).items()}
+        untouched.append(before.items() <= now.items())
+
+    monkeypatch.setattr(checkpoints.Chunk, "write", spy)
+    assert run("sample", *SMALL, *SETTINGS, "-q", "-o", killed, "--resume") == 0
+    total = SAMPLER.warmup + SAMPLER.draws
+    assert written == list(range(max(before) + CHUNK, total + 1, CHUNK))
+    assert all(untouched)
+    assert_same_trees(read_datatree(killed / "samples.nc"), tree)
+    assert not (killed / "chains").exists()
+    assert not list(killed.glob(".partial*"))
+    # what is made of the draws is the same, too, but for times, memory and speed
+    whole = runs[0]
+    assert {p.name for p in killed.iterdir()} == {p.name for p in whole.iterdir()}
+    assert (killed / "summary.csv").read_bytes() == (whole / "summary.csv").read_bytes()
+    for name in ("mean", "std", "lower", "upper"):
+        np.testing.assert_array_equal(
+            *(healpy.read_map(f / f"{name}.fits", dtype=np.float64) for f in (killed, whole))
+        )
+
+
+def test_starting_again_without_resume_is_refused_and_touches_nothing(killed, no_sampling, capsys):
+    before = content(killed)
+    assert run("sample", *SMALL, *SETTINGS, "-q", "-o", killed) == 2
+    done = max(chunks(killed))
+    assert_one_sentence(capsys, f"unfinished run ({done} iterations done)", "--resume")
+    assert content(killed) == before
+
+
+def test_resuming_with_other_chains_is_refused(killed, no_sampling, capsys):
+    before = content(killed)
+    settings = ["--chains", "3", *SETTINGS[2:]]
+    assert run("sample", *SMALL, *settings, "-q", "-o", killed, "--resume") == 2
+    assert_one_sentence(capsys, "has another sampler's chains: 4, now 3", "delete the folder")
+    assert content(killed) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sampler": {"warmup": 150}}, "another sampler's warmup: 100, now 150"),
+        ({"sampler": {"seed": 7}}, "another sampler's seed: 1, now 7"),
+        ({"sampler": {"algorithm": "hmc"}}, "another sampler's algorithm: nuts, now hmc"),
+        ({"sampler": {"target_accept": 0.8}}, "another sampler's target_accept: 0.7, now 0.8"),
+        ({"program": "sky_marginal"}, "another program: sky, now sky_marginal"),
+        ({"digest": "0"}, "another program text: "),
+        ({"nside": 4}, "another scenario: "),
+        ({"data": 1e-9}, "another data: "),
+    ],
+    ids=str,
+)
+def test_resuming_another_run_is_refused_and_the_difference_named(
+    experiment, killed, no_sampling, change, message
+):
+    setup, data = experiment.setup, experiment.data
+    program = load_program(change.get("program", "sky"))
+    if "digest" in change:
+        program = replace(program, digest=change["digest"])
+    if "nside" in change:
+        scenario = load_scenario("fiducial", [*OVERRIDES, f"nside={change['nside']}"])
+        setup = replace(setup, scenario=scenario)
+    if "data" in change:
+        data = replace(data, data=data.data * (1.0 + change["data"]))
+    sampler = replace(SAMPLER, **change.get("sampler", {}))
+    before = content(killed)
+    with pytest.raises(InputError, match=message):
+        sample_result(Experiment(setup, data), program, sampler, killed, resume=True)
+    assert content(killed) == before
+
+
+@pytest.fixture(scope="module")
+def short(experiment, runs, tmp_path_factory):
+    """The killed run resumed for sixty draws, fewer than there are; not written yet."""
+    folder = shutil.copytree(runs[1], tmp_path_factory.mktemp("short") / "killed")
+    sampler = replace(SAMPLER, draws=60)
+    return sample_result(experiment, load_program("sky"), sampler, folder, resume=True)
+
+
+def test_resuming_with_fewer_draws_takes_the_first_of_those_there_are(short, tree):
+    """The number of draws is no part of a run's identity."""
+    for group in ("posterior", "sample_stats"):
+        for name, values in tree[group].data_vars.items():
+            np.testing.assert_array_equal(short.tree[group][name], values.values[:, :60])
+    assert short.gradients_per_second is None  # nothing was drawn in this session
+
+
+def test_draws_stay_where_they_are_until_the_results_are_written(short, killed, tree, monkeypatch):
+    before = content(killed)
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sample_run, "write_map", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            write_run(killed, short, SAMPLE, Stages())
+    assert content(killed) == before
+    write_run(killed, short, SAMPLE, Stages())
+    assert not (killed / "chains").exists()
+    written = read_datatree(killed / "samples.nc")["posterior"]["sky"]
+    np.testing.assert_array_equal(written, tree["posterior"]["sky"].values[:, :60])
+
+
+def test_results_can_be_written_twice(short, killed, tmp_path):
+    numbers = replace(SAMPLE, figures={}, name="without a page")
+    for folder in (killed, killed, tmp_path / "elsewhere"):
+        write_run(folder, short, numbers, Stages())
+    assert (tmp_path / "elsewhere" / "samples.nc").exists()
+
+
+@pytest.mark.parametrize("deleted", [0, 1, 3])
+def test_a_kill_while_the_draws_are_removed_is_no_harm(
+    experiment, short, killed, tree, no_sampling, deleted
+):
+    """The results are there, ``deleted`` of the files that they were made of are not."""
+    left = deleted
+
+    def unlink(*args, real=os.unlink, **options):
+        nonlocal left
+        if left == 0:
+            raise KeyboardInterrupt
+        left -= 1
+        real(*args, **options)
+
+    n_chunks = len(chunks(killed))
+    numbers = replace(SAMPLE, figures={}, name="without a page")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "unlink", unlink)
+        patch.setattr(os, "remove", unlink)
+        with pytest.raises(KeyboardInterrupt):
+            write_run(killed, short, numbers, Stages())
+    assert (killed / "samples.nc").exists()
+    # the marker of the run is a file, too
+    assert len(list((killed / "chains").iterdir())) == n_chunks + 1 - deleted
+    sampler = replace(SAMPLER, draws=60)
+    with run_folder(killed) as folder:
+        again = sample_result(experiment, load_program("sky"), sampler, folder, resume=True)
+    assert not (killed / "chains").exists()
+    np.testing.assert_array_equal(again.skies, tree["posterior"]["sky"].values[:, :60])
+
+
+@pytest.mark.long
+def test_resuming_a_finished_run_takes_it_over(whole, tree, no_sampling):
+    before = content(whole)
+    summary = pd.read_csv(whole / "summary.csv", index_col="quantity")
+    assert run("sample", *SMALL, *SETTINGS, "-q", "-o", whole, "--resume") == 0
+    assert_same_trees(read_datatree(whole / "samples.nc"), tree)
+    after = content(whole)
+    assert set(after) == set(before)
+    # draws that lie in memory in another order are summed in another order
+    again = pd.read_csv(whole / "summary.csv", index_col="quantity")
+    pd.testing.assert_frame_equal(again, summary, check_exact=False, rtol=1e-6)
+    assert not (whole / "chains").exists()
+
+
+@pytest.mark.parametrize("change", [{"draws": 500}, {"draws": 2000}, {"seed": 7}], ids=str)
+def test_a_finished_run_with_other_settings_is_not_taken_over(
+    experiment, whole, no_sampling, change
+):
+    before = content(whole)
+    with pytest.raises(InputError, match="finished run with other settings; leave out --resume"):
+        sample_result(
+            experiment, load_program("sky"), replace(SAMPLER, **change), whole, resume=True
+        )
+    assert content(whole) == before
+
+
+@pytest.mark.long
+def test_a_run_that_is_killed_again_and_again_ends_with_the_same_draws(runs, tree, tmp_path):
+    """Wherever it is hit: in warmup, among the draws, or while results are made and written."""
+    folder = tmp_path / "unlucky"
+    rng = random.Random(5)
+    total = SAMPLER.warmup + SAMPLER.draws
+    for iteration, at_most_s in [(50, 0.05), (125, 0.05), (600, 0.1), (total, 0.5), (total, 5.0)]:
+        process = start(folder, "--resume")
+        killer = executioner(process, chunk_path(folder, iteration), rng.uniform(0, at_most_s))
+        assert killer.wait() == 0
+        assert process.wait() == -signal.SIGKILL, process.communicate()[1]
+        process.communicate()
+    process = start(folder, "--resume")
+    errors = process.communicate(timeout=600)[1]
+    assert process.returncode == 0, errors
+    assert_same_trees(read_datatree(folder / "samples.nc"), tree)
+    assert not (folder / "chains").exists()
+
+
+# ---- the files
+
+
+def test_sample_writes_what_it_promises(runs):
+    whole = runs[0]
+    assert {p.name for p in whole.iterdir()} == {
+        "samples.nc", "summary.csv", "mean.fits", "std.fits", "lower.fits", "upper.fits",
+        "scenario.yaml", "sampling.json", "report.html", "figures", "manifest.json",
+    }  # fmt: skip
+    assert {p.stem for p in (whole / "figures").iterdir()} == {
+        "uncertainty", "traces", "ranks", "energy", "pairs", "against_analytic",
+    }  # fmt: skip
+    for figure in (whole / "figures").iterdir():
+        assert matplotlib.image.imread(figure).std() > 0.01  # not blank
+    expected = load_scenario("fiducial", OVERRIDES)
+    assert load_scenario(whole / "scenario.yaml") == expected
+
+
+def maps_of(folder, *names):
+    return [healpy.read_map(folder / f"{name}.fits", dtype=np.float64) for name in names]
+
+
+def test_the_maps_are_those_of_the_draws(runs, tree):
+    """Mean, standard deviation and central 90 % of every pixel, by healpy and numpy."""
+    skies = tree["posterior"]["sky"].values.reshape(-1, N_MODES)
+    assert len(skies) == SAMPLER.chains * SAMPLER.draws
+    mean, std, lower, upper = maps_of(runs[0], "mean", "std", "lower", "upper")
+    synthesis = np.stack([modes_to_map(mode, NSIDE) for mode in np.eye(N_MODES)])
+    values = skies @ synthesis
+    # rounding of sums of 49 terms that cancel in part
+    np.testing.assert_allclose(mean, values.mean(0), rtol=1e-9)
+    np.testing.assert_allclose(std, values.std(0, ddof=1), rtol=1e-8)
+    low, high = np.quantile(values, [0.05, 0.95], axis=0)
+    np.testing.assert_allclose(lower, low, rtol=1e-8)
+    np.testing.assert_allclose(upper, high, rtol=1e-8)
+    header = dict(healpy.read_map(runs[0] / "lower.fits", h=True)[1])
+    assert (header["COORDSYS"], header["ORDERING"], header["TUNIT1"]) == ("G", "RING", "K")
+
+
+def test_the_maps_agree_with_the_analytic_ones_to_monte_carlo_error(runs, tree, experiment):
+    """What lusee-bayes map writes beside what sample does, pixel by pixel; ESS by ArviZ."""
+    mean, std = maps_of(runs[0], "mean", "std")
+    analytic = channel_of_posterior(experiment, infer(experiment)).maps()
+    analytic_mean, analytic_std = analytic["mean"], analytic["std"]
+    values = tree["posterior"]["sky"].values @ pixel_matrix(NSIDE, 6).T
+    scaled = (values - analytic_mean) / analytic_std
+    # ESS itself scatters by a tenth at this length
+    limit = 1.1 * z_of(len(mean))
+    ess = array_stats.ess(scaled, chain_axis=0, draw_axis=1, method="mean")
+    assert np.abs((mean - analytic_mean) / analytic_std * np.sqrt(ess)).max() < limit
+    ess = array_stats.ess(scaled**2, chain_axis=0, draw_axis=1, method="mean")
+    assert ess.min() > 400
+    # a Gaussian's variance scatters by sqrt(2 / ess), its root by half of that
+    assert (np.abs(std / analytic_std - 1) * np.sqrt(2 * ess)).max() < limit
+    # a tenth too wide would not pass anywhere
+    assert (0.1 * np.sqrt(2 * ess)).min() > 0.5 * limit
+
+
+def test_the_analytic_posterior_is_in_the_samples(tree, experiment):
+    data, posterior = experiment.data, infer(experiment).posterior
+    constants = tree["constant_data"]
+    np.testing.assert_array_equal(constants["analytic_mean"], posterior.mean)
+    np.testing.assert_array_equal(constants["analytic_std"], posterior.std())
+    np.testing.assert_array_equal(constants["truth"], data.truth)
+    np.testing.assert_array_equal(tree["observed_data"]["data"], data.data)
+    assert tree.attrs["program"] == "sky"
+    assert tree.attrs["scenario"] == experiment.scenario.to_yaml()
+
+
+def test_the_summary_tells_of_landmarks_powers_and_lowest_modes(runs, tree):
+    table = pd.read_csv(runs[0] / "summary.csv", index_col="quantity")
+    skies = tree["posterior"]["sky"].values
+    expected = {
+        "T(Galactic centre) [K]": (0.0, 0.0),
+        "T(anticentre) [K]": (180.0, 0.0),
+        "T(north Galactic pole) [K]": (0.0, 90.0),
+        "T(south Galactic pole) [K]": (0.0, -90.0),
+    }
+    mean_alm = skies.mean((0, 1))
+    for name, (l_deg, b_deg) in expected.items():
+        # a map so fine that its own interpolation is good to 1e-4 of a smooth sky
+        fine = modes_to_map(mean_alm, 128)
+        there = healpy.get_interp_val(fine, l_deg, b_deg, lonlat=True)
+        assert table.loc[name, "mean"] == pytest.approx(there, rel=1e-3)
+    for ell in (0, 1, 2, 5, 6):
+        powers = (skies[..., ell**2 : (ell + 1) ** 2] ** 2).mean(-1)
+        row = table.loc[f"C_{ell} [K2]"]
+        assert row["mean"] == pytest.approx(powers.mean(), rel=1e-10)
+        assert row["sd"] == pytest.approx(powers.std(), rel=1e-3)
+    for number, name in enumerate(
+        f"sky({ell}, {m}) [K]" for ell in range(3) for m in range(-ell, ell + 1)
+    ):
+        assert table.loc[name, "mean"] == pytest.approx(skies[..., number].mean(), rel=1e-10)
+    assert len(table) == 4 + 5 + 9
+    assert (table["r_hat"] < 1.02).all()
+    assert table["ess_bulk"].min() > 100 * SAMPLER.chains
+
+
+def test_sampling_json_tells_of_the_very_run(runs, tree):
+    figures = json.loads((runs[0] / "sampling.json").read_text())
+    statistics = tree["sample_stats"]
+    assert (figures["program"], figures["chains"], figures["draws"]) == ("sky", 4, 1000)
+    assert figures["divergences"] == int(statistics["diverging"].sum()) == 0
+    assert figures["step_size"] == statistics["step_size"].values[:, -1].tolist()
+    assert figures["mean_steps"] == pytest.approx(statistics["n_steps"].values.mean())
+    assert figures["mean_acceptance"] == pytest.approx(statistics["acceptance_rate"].values.mean())
+    # speed times the sampling's time is no more than all gradients but the first file's
+    drawn = statistics["n_steps"].values[:, CHUNK:].sum()
+    assert 0 < drawn / figures["gradients_per_second"] < figures["seconds"]["sampling"]
+    assert set(figures["seconds"]) >= {"posterior", "sampling", "data tree", "figures"}
+    assert {"lusee_bayes", "jax", "numpyro", "arviz-stats"} <= set(figures["versions"])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("program", ["sky_marginal", "prior_amplitude"])
+def test_programs_without_the_sky_get_their_maps_too(program, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["--model", program, "--draws", "150", "--warmup", "100", "--chains", "2"]
+    assert run("sample", *SMALL, *arguments, "-q", "-o", out) == 0
+    tree = read_datatree(out / "samples.nc")
+    assert set(tree.children) == GROUPS
+    others = set(tree["posterior"].data_vars) - {"sky"}
+    expected = {"sky_marginal": {"noise_level"}, "prior_amplitude": {"amplitude", "tilt"}}
+    assert others == expected[program]
+    table = pd.read_csv(out / "summary.csv", index_col="quantity")
+    assert expected[program] <= set(table.index)
+    skies = tree["posterior"]["sky"].values.reshape(-1, N_MODES)
+    (mean,) = maps_of(out, "mean")
+    np.testing.assert_allclose(mean, modes_to_map(skies.mean(0), NSIDE), rtol=1e-9)
+    # the truth within six posterior deviations in every mode
+    off = (skies.mean(0) - tree["constant_data"]["truth"].values) / skies.std(0)
+    assert np.abs(off).max() < 6
+
+
+# ---- bad input
+
+GOOD = """
+import numpyro
+import lusee_bayes as lb
+
+def model(coupling, prior, fixed_noise, data=None):
+    sky = numpyro.sample("sky", lb.SkyPrior(prior))
+    numpyro.sample("data", lb.CorrelatedNormal(coupling @ sky, fixed_noise), obs=data)
+"""
+NO_LATENT = """
+import numpyro
+import lusee_bayes as lb
+
+def model(coupling, prior, noise, data=None):
+    gaussian = lb.LinearGaussian(coupling, prior, noise)
+    numpyro.sample("data", lb.Marginal(gaussian), obs=data)
+    return gaussian
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--model", "skies"], ["no program 'skies'", "prior_amplitude, sky, sky_marginal"]),
+        (["--model", "gone.py"], ["no program 'gone.py'"]),
+        (["--draws", "0"], ["draws must be at least 1, got 0"]),
+        (["--draws", "many"], ["many"]),
+        (["--chains", "0"], ["chains must be at least 1, got 0"]),
+        (["--warmup", "3"], ["warmup must be at least 20, got 3"]),
+        (["--algorithm", "hcm"], ["hcm", "nuts"]),
+        (["--set", "lmaxx=3"], ["unknown key 'lmaxx'"]),
+        (["--data", "gone.nc"], ["no data at 'gone.nc'"]),
+        (["--colour", "blue"], ["--colour"]),
+    ],
+    ids=lambda value: " ".join(value),
+)
+def test_bad_options_are_one_sentence_and_exit_code_2(tmp_path, capsys, arguments, words):
+    out = tmp_path / "out"
+    assert run("sample", *SMALL, "-q", "-o", out, *arguments) == 2
+    assert_one_sentence(capsys, *words)
+    assert not out.exists()
+
+
+def test_a_scenario_is_needed_and_has_to_exist(tmp_path, capsys):
+    assert run("sample") == 2
+    assert_one_sentence(capsys, "scenario")
+    assert run("sample", "fiducal", "-q", "-o", tmp_path / "out") == 2
+    assert_one_sentence(capsys, "no scenario 'fiducal'", "did you mean 'fiducial'?")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("def model(data=None:\n", ["does not run"]),
+        ("import nowhere_to_be_found\n", ["does not run", "nowhere_to_be_found"]),
+        ("1 / 0\n", ["does not run", "division by zero"]),
+        ("x = 1\n", ["has no function 'model'"]),
+        (GOOD.replace(", data=None", "").replace("obs=data", ""), ["no argument 'data'"]),
+        (GOOD.replace("fixed_noise", "noises"), ["asks for 'noises'", "did you mean 'noise'?"]),
+        # the following would else be found out after all draws are made, or never
+        (GOOD.replace("data=None", "data"), ["data"]),
+        (GOOD.replace(", obs=data", ""), ["data"]),
+        (GOOD.replace('"data"', '"visibilities"'), ["data"]),
+        (GOOD.replace('"sky"', '"m"'), ["sky"]),
+        (NO_LATENT, ["program"]),
+    ],
+    ids=[
+        "syntax", "import", "division", "no model", "no data", "unknown piece", "no default",
+        "not observed", "no site data", "no site sky", "nothing to sample",
+    ],
+)  # fmt: skip
+def test_programs_that_cannot_be_sampled_are_refused_before_it(
+    tmp_path, capsys, monkeypatch, text, words
+):
+    path = tmp_path / "mine.py"
+    path.write_text(text)
+    begun = []
+    monkeypatch.setattr(checkpoints.Chunk, "write", lambda *_: begun.append(1))
+    arguments = ["--model", path, "--draws", "10", "--warmup", "20", "--chains", "1"]
+    try:
+        code = run("sample", *SMALL, *arguments, "-q", "-o", tmp_path / "out")
+    except Exception as error:
+        raise AssertionError(f"a traceback, not a sentence: {error!r}") from error
+    assert code == 2
+    assert_one_sentence(capsys, str(path), *words)
+    assert not begun
+
+
+@pytest.mark.parametrize("below", [False, True], ids=["a file", "below a file"])
+def test_an_output_that_is_a_file_is_refused_before_sampling(tmp_path, capsys, no_sampling, below):
+    (tmp_path / "x").write_text("mine")
+    out = tmp_path / "x" / "y" if below else tmp_path / "x"
+    assert run("sample", *SMALL, *SETTINGS, "-q", "-o", out) == 2
+    assert_one_sentence(capsys, str(tmp_path / "x"), "is a file; give a folder")
+    assert (tmp_path / "x").read_text() == "mine"
+
+
+def test_data_of_another_frequency_or_kind_are_refused(experiment, runs, tmp_path, capsys):
+    replace(experiment.data, frequency_mhz=30.0).write(tmp_path / "data.nc")
+    out = tmp_path / "out"
+    assert run("sample", *SMALL, "-q", "-o", out, "--data", tmp_path / "data.nc") == 2
+    assert_one_sentence(capsys, "the data are at 30.0 MHz, the scenario at 25.0")
+    assert run("sample", *SMALL, "-q", "-o", out, "--data", runs[0] / "samples.nc") == 2
+    assert_one_sentence(capsys, "is not a file of visibilities", "lusee_bayes samples 1")
+    assert not out.exists()
+
+
+def test_an_interrupt_is_exit_code_130_and_a_sentence(killed, tmp_path, capsys, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sample_run, "sample_result", interrupt)
+    assert run("sample", *SMALL, "-q", "-o", tmp_path / "out") == 130
+    assert_one_sentence(capsys, f"interrupted; nothing has been written in '{tmp_path / 'out'}'")
+    assert run("sample", *SMALL, "-q", "-o", killed, "--resume") == 130
+    assert_one_sentence(capsys, f"nothing has been written in '{killed}'; go on with --resume")
+
+
+# ---- validation of the same draws
+
+
+@pytest.fixture(scope="module")
+def validated(runs, tmp_path_factory):
+    """(exit code, folder): the undisturbed run judged, with a hundred simulations."""
+    folder = Path(shutil.copytree(runs[0], tmp_path_factory.mktemp("validated") / "out"))
+    arguments = [*SMALL, *SETTINGS, "--simulations", "100", "-q", "-o", folder, "--resume"]
+    return run("validate", *arguments), folder
+
+
+def test_validation_of_the_true_posterior_passes(validated):
+    code, folder = validated
+    report = json.loads((folder / "validation.json").read_text())
+    assert report["passed"], [c for c in report["checks"] if not c["passed"]]
+    assert code == 0
+    for figure in ("comparison", "calibration"):
+        assert matplotlib.image.imread(folder / "figures" / f"{figure}.png").std() > 0.01
+
+
+def table_of(folder):
+    """Rows of validation.md's first table."""
+    lines = (folder / "validation.md").read_text().splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if "|" in line]
+    first = rows.index(next(row for row in rows if row[0] == "check"))
+    names = [row[0] for row in rows[first:]]
+    return rows[first + 2 : first + names.index("quantity")]
+
+
+def consistent(folder):
+    """validation.json, once it and validation.md are found to say the same."""
+    report = json.loads((folder / "validation.json").read_text())
+    rows = table_of(folder)
+    assert len(rows) == len(report["checks"]) >= 10
+    for row, check in zip(rows, report["checks"], strict=True):
+        lower = -np.inf if check["lower"] is None else check["lower"]
+        upper = np.inf if check["upper"] is None else check["upper"]
+        assert check["passed"] == (lower <= check["value"] <= upper)
+        assert row[0] == check["name"]
+        assert float(row[1]) == pytest.approx(check["value"], rel=1e-3)
+        assert row[3] == ("ok" if check["passed"] else "**failed**")
+        assert row[4] == check["meaning"]
+    assert report["passed"] == all(check["passed"] for check in report["checks"])
+    return report
+
+
+def test_validation_json_and_md_agree_with_each_other_and_the_draws(validated, tree):
+    _, folder = validated
+    report = consistent(folder)
+    skies, constants = tree["posterior"]["sky"].values, tree["constant_data"]
+    scaled = (skies - constants["analytic_mean"].values) / constants["analytic_std"].values
+    np.testing.assert_allclose(report["variance_ratio"], (scaled**2).mean((0, 1)), rtol=1e-9)
+    ess = array_stats.ess(scaled, chain_axis=0, draw_axis=1, method="mean")
+    expected = scaled.mean((0, 1)) * np.sqrt(ess)
+    # ESS by the same library: rounding, of numbers that may be near zero
+    np.testing.assert_allclose(report["mean_z"], expected, rtol=1e-6, atol=1e-6)
+    values = {check["name"]: check["value"] for check in report["checks"]}
+    assert abs(values["mean"]) == pytest.approx(np.abs(expected).max(), rel=1e-6)
+    assert values["divergences"] == tree["sample_stats"]["diverging"].values.sum()
+    assert values["calibration"] == pytest.approx(min(report["p_values"].values()))
+    assert len(report["eigenvalues"]) == N_MODES
+    for levels in report["coverage"].values():
+        for level, share in levels.items():
+            # binomial of 100 simulations; about a hundred shares
+            error = np.sqrt(float(level) * (1 - float(level)) / 100)
+            assert abs(share - float(level)) < 1.1 * z_of(100) * error
+
+
+def test_half_the_covariance_is_found_out_with_exit_code_1(validated, tmp_path, monkeypatch):
+    folder = Path(shutil.copytree(validated[1], tmp_path / "out"))
+
+    def with_half_the_covariance(*args, **options):
+        found = sample_result(*args, **options)
+        posterior = found.inference.posterior
+        half = eqx.tree_at(lambda p: p.lower, posterior, np.sqrt(2) * posterior.lower)
+        ratio = half.covariance() / posterior.covariance()
+        np.testing.assert_allclose(ratio, 0.5, rtol=1e-6)
+        return replace(found, inference=replace(found.inference, posterior=half))
+
+    monkeypatch.setattr(validate_run, "sample_result", with_half_the_covariance)
+    arguments = [*SMALL, *SETTINGS, "--simulations", "100", "-q", "-o", folder, "--resume"]
+    assert run("validate", *arguments) == 1
+    report = consistent(folder)
+    assert not report["passed"]
+    failed = {check["name"] for check in report["checks"] if not check["passed"]}
+    # every variance is off by a factor of two; deviations of the means grow by the root of that,
+    # which may or may not be seen; nothing else knows of the covariance
+    assert {"variance", "covariance, largest"} <= failed
+    assert all(name.startswith(("variance", "covariance", "mean")) for name in failed)
+    np.testing.assert_allclose(
+        np.array(report["variance_ratio"]),
+        2 * np.array(json.loads((validated[1] / "validation.json").read_text())["variance_ratio"]),
+        rtol=1e-6,
+    )
+
+
+def test_too_few_draws_or_simulations_are_refused_before_sampling(tmp_path, capsys, no_sampling):
+    out = tmp_path / "out"
+    assert run("validate", *SMALL, *SETTINGS, "--simulations", "99", "-q", "-o", out) == 2
+    assert_one_sentence(capsys, "at least 100 simulations, got 99")
+    assert run("validate", *SMALL, "--draws", "99", "-q", "-o", out) == 2
+    assert_one_sentence(capsys, "100 draws of each chain, got 99")
+    assert not out.exists()
+
+
+def test_summary_csv_is_plain_csv(runs):
+    """Names hold commas: they are quoted, so that each row has as many cells as the header."""
+    with (runs[0] / "summary.csv").open(newline="") as file:
+        rows = list(csv.reader(file))
+    assert {len(row) for row in rows} == {len(rows[0])}
+    assert rows[0][0] == "quantity"
+    assert all(np.isfinite([float(cell) for cell in row[1:]]).all() for row in rows[1:])
+
+
+def test_info_says_what_the_samples_are(runs, capsys):
+    assert run("info", runs[0] / "samples.nc") == 0
+    out = capsys.readouterr().out
+    assert "4 x 1000 draws of the program sky at 25 MHz" in out
+
+
+def test_samples_open_with_xarray_alone(runs):
+    with xr.open_dataset(runs[0] / "samples.nc", group="posterior", engine="h5netcdf") as group:
+        assert group["sky"].dims == ("chain", "draw", "mode")
+        assert group["sky"].sel(chain=0, draw=3).sizes == {"mode": N_MODES}
+        np.testing.assert_array_equal(group["ell"] ** 2 + group["ell"] + group["m"], np.arange(49))

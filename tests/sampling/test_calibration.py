@@ -1,0 +1,561 @@
+"""Simulation-based calibration: passes for right posteriors, and notices wrong ones.
+
+By the analytic posterior and by Hamiltonian Monte Carlo, with every kind of N. The data are so few
+(96 of 49 modes) that between 1 % and 80 % of the modes' variances is left from the prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+from scipy import stats
+
+import lusee_bayes as lb
+from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.experiment.experiment import Experiment, build
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.terms import Around
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.sampling.calibration import (
+    FALSE_ALARM,
+    LEVELS,
+    N_DRAWS,
+    Ranks,
+    SkyQuantities,
+    calibrate,
+    calibrate_sky,
+)
+from lusee_bayes.sampling.hmc import Sampler, draw_within
+from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.sampling.whitening import Whitening
+
+SMALL = ("lmax=6", "observation.runs.0.cycles=0.02")
+NOISES = {
+    "paper": ("fiducial",),
+    "exact": ("fiducial", "noise.radiometer.form=exact"),
+    "gain": ("gain_1e-2",),
+    "beam": ("beam_4MHz",),
+}
+# one of them every time, the others by make long
+EVERY_NOISE = pytest.mark.parametrize(
+    "noise", [n if n == "exact" else pytest.param(n, marks=pytest.mark.long) for n in NOISES]
+)
+
+
+@lru_cache
+def experiment(noise: str) -> Experiment:
+    scenario, *overrides = NOISES[noise]
+    return build(lb.load_scenario(scenario, [*SMALL, *overrides]))
+
+
+@lru_cache
+def model(noise: str) -> lb.LinearGaussian:
+    return full_model(experiment(noise).setup)
+
+
+@lru_cache
+def dense_model(noise: str) -> lb.LinearGaussian:
+    """With A as a matrix, whose products take a fifth of the structured one's time at this size."""
+    return lb.LinearGaussian(model(noise).coupling.dense(), model(noise).prior, model(noise).noise)
+
+
+class UnevenPrior(lb.HarmonicPrior):
+    """A prior that is not isotropic: C_ell times a weight of every mode."""
+
+    weights: Float[Array, " modes"]
+
+    def diagonal_root(self):
+        return super().diagonal_root() * jnp.sqrt(self.weights)
+
+    def variance(self):
+        return super().variance() * self.weights
+
+
+def halved_prior(prior: lb.HarmonicPrior) -> UnevenPrior:
+    """Half the variance for m > 0."""
+    _, m = mode_numbers(len(prior.spectrum) - 1)
+    halved = UnevenPrior(prior.spectrum, jnp.where(jnp.asarray(m > 0), 0.5, 1.0))
+    expected = np.asarray(prior.variance()) * np.where(m > 0, 0.5, 1.0)
+    np.testing.assert_allclose(halved.covariance(), np.diag(expected), rtol=1e-14)
+    return halved
+
+
+def p_values(ranks: Ranks) -> dict[str, float]:
+    return dict(zip(ranks.names, ranks.p_values().tolist(), strict=True))
+
+
+# --- ranks ------------------------------------------------------------------------------------
+
+
+def ranks_of(*columns, n_draws=99, regions=()) -> Ranks:
+    names = tuple("abcdefgh"[: len(columns)])
+    return Ranks(np.stack(columns, axis=1), n_draws, names, regions)
+
+
+def test_even_ranks_are_covered_exactly_as_often_as_the_levels_say():
+    """Every rank once: regions and central intervals hold 50, 68, 90 and 95 % of the ranks."""
+    every = np.arange(N_DRAWS + 1)
+    ranks = ranks_of(every, every, n_draws=N_DRAWS, regions=("b",))
+    assert (ranks.histogram() == (N_DRAWS + 1) // 20).all()
+    np.testing.assert_allclose(ranks.p_values(), 1.0)
+    assert ranks.passed
+    for name in "ab":
+        for level in LEVELS:
+            assert ranks.coverage()[name][level] == pytest.approx(level, abs=1e-12), (name, level)
+
+
+def test_the_histogram_has_twenty_bins_of_five_ranks():
+    column = np.repeat([0, 4, 5, 49, 50, 94, 95, 99], [1, 2, 4, 8, 16, 32, 64, 128])
+    expected = np.zeros(20, int)
+    expected[[0, 1, 9, 10, 18, 19]] = [3, 4, 8, 16, 32, 192]
+    ranks = ranks_of(column, column[::-1])
+    np.testing.assert_array_equal(ranks.histogram(), [expected, expected])
+    assert ranks.n_simulations == 255
+
+
+def test_coverage_counts_from_the_middle_or_from_the_inside():
+    """A truth below all draws of its distance is the likeliest, of a mode the least likely."""
+    for rank, interval, region in [
+        (0, [], LEVELS),
+        (49, LEVELS, LEVELS),
+        (50, LEVELS, (0.68, 0.90, 0.95)),
+        (76, (0.68, 0.90, 0.95), (0.90, 0.95)),
+        (16, (0.68, 0.90, 0.95), LEVELS),
+        (93, (0.90, 0.95), (0.95,)),
+        (5, (0.90, 0.95), LEVELS),
+        (99, [], []),
+    ]:
+        column = np.full(7, rank)
+        coverage = ranks_of(column, column, regions=("b",)).coverage()
+        assert coverage["a"] == {p: float(p in interval) for p in LEVELS}, rank
+        assert coverage["b"] == {p: float(p in region) for p in LEVELS}, rank
+
+
+@pytest.mark.parametrize(("n", "probability"), [(500, 0.99), (100, 0.99), (500, 0.5)])
+def test_the_band_holds_a_bin_with_its_probability(n, probability):
+    counts = np.arange(n + 1)
+    pmf = stats.binom.pmf(counts, n, 1 / 20)
+    low, high = ranks_of(np.zeros(n, int)).band(probability)
+    tail = (1 - probability) / 2
+    assert pmf[counts < low].sum() <= tail < pmf[counts <= low].sum()
+    assert pmf[counts > high].sum() <= tail < pmf[counts >= high].sum()
+
+
+def test_p_values_are_those_of_chi2_of_the_histogram():
+    rng = np.random.default_rng(1)
+    columns = [rng.integers(0, 100, 500), rng.binomial(99, 0.5, 500), np.arange(500) % 100]
+    ranks = ranks_of(*columns)
+    chi2 = ((ranks.histogram() - 25.0) ** 2 / 25.0).sum(1)
+    np.testing.assert_allclose(ranks.p_values(), stats.chi2.sf(chi2, 19), rtol=1e-10)
+    assert ranks.p_values()[1] < 1e-100 and ranks.p_values()[2] == 1.0
+
+
+def test_p_values_of_even_ranks_are_even():
+    """So that a false alarm is as rare as stated; 5 expected in a bin are as good as 25."""
+    rng = np.random.default_rng(2)
+    for n in (100, 500):
+        many = ranks_of(*rng.integers(0, 100, (8, n)))
+        p = [replace(many, ranks=rng.integers(0, 100, (n, 8))).p_values() for _ in range(500)]
+        p = np.concatenate(p)
+        # ranks and so p-values are discrete: a few percent of a step at 100
+        assert stats.kstest(p, "uniform").statistic < 0.03
+        # 4000 values: 4 expected below 1e-3, 16 once in 10^5
+        assert (p < 1e-3).sum() < 16
+
+
+def test_the_threshold_is_shared_by_all_quantities():
+    even = np.arange(500) % 100
+    uneven = even.copy()
+    # moved from other bins to the first: chi^2 = (24 (24/19) + 24^2) / 25 = 24.3
+    one, eight = ranks_of(even), ranks_of(*[even] * 8)
+    assert one.threshold == pytest.approx(FALSE_ALARM)
+    assert eight.threshold == pytest.approx(FALSE_ALARM / 8)
+    p = 1.0
+    moved = 0
+    while p > FALSE_ALARM:
+        where = 5 + 5 * (moved % 19) + 100 * (moved // 19)
+        uneven[where] = 0
+        moved += 1
+        p = ranks_of(uneven).p_values()[0]
+    assert FALSE_ALARM / 8 < p < FALSE_ALARM
+    assert not ranks_of(uneven).passed
+    # the same among eight quantities is not that rare
+    assert ranks_of(uneven, *[even] * 7).passed
+    assert one.passed and eight.passed
+    assert not ranks_of(np.full(500, 7), *[even] * 7).passed
+
+
+def test_the_standard_error_of_a_coverage():
+    """Of 500 data sets, 95 % are inside in 475 +- sqrt(500 x 0.95 x 0.05) = 4.9."""
+    ranks = ranks_of(np.zeros(500, int))
+    assert ranks.coverage_error(0.95) == pytest.approx(np.sqrt(500 * 0.95 * 0.05) / 500)
+
+
+# --- calibrate, where the answer is known in closed form --------------------------------------
+
+
+def test_ranks_count_the_draws_below_the_truth():
+    def simulate(key):
+        return {"x": jnp.asarray([37.5, 0.5, N_DRAWS + 0.5]), "y": jnp.asarray(98.0)}, jnp.zeros(1)
+
+    def draw(key, data):
+        grid = jnp.arange(1.0, N_DRAWS + 1.0)
+        shuffled = jax.random.permutation(key, grid)
+        return {"x": jnp.stack([shuffled, grid, grid], axis=1), "y": shuffled}
+
+    reports = []
+    ranks = calibrate(
+        simulate, draw, lambda sky, data: sky, n_simulations=130, batch=60, report=reports.append
+    )
+    assert ranks.names == ("x 0", "x 1", "x 2", "y")
+    assert ranks.n_draws == N_DRAWS
+    # 37 of 1, 2, ... lie below 37.5; 97 below 98
+    np.testing.assert_array_equal(ranks.ranks, np.tile([37, 0, N_DRAWS, 97], (130, 1)))
+    assert reports == [60, 120, 130]
+
+
+class Conjugate(eqx.Module):
+    """m ~ N(0, 1), d = m + S n: the posterior is N(d / (1 + s^2), s^2 / (1 + s^2)) with s = S.
+
+    Its mean is off by ``shift`` standard deviations and its random term by ``scale``.
+    """
+
+    shift: Float[Array, ""]
+    scale: Float[Array, ""]
+    s: Float[Array, ""]
+
+    def simulate(self, key):
+        truth, noise = jax.random.normal(key, (2,), dtype=jnp.float64)
+        return truth, (truth + S * noise)[None]
+
+    def draw(self, key, data):
+        z = jax.random.normal(key, (N_DRAWS,), dtype=jnp.float64)
+        std = self.s / jnp.sqrt(1 + self.s**2)
+        return data[0] / (1 + self.s**2) + std * (self.shift + self.scale * z)
+
+    def quantities(self, m, data):
+        distance = (m - data[0] / (1 + S**2)) ** 2
+        return {"m": m, "distance": distance, "log likelihood": -((data[0] - m) ** 2)}
+
+
+S = 0.7
+
+
+def conjugate(shift=0.0, scale=1.0, s=S, simulations=500, **options) -> Ranks:
+    model = Conjugate(*(jnp.asarray(float(x)) for x in (shift, scale, s)))
+    return calibrate(
+        model.simulate,
+        model.draw,
+        model.quantities,
+        n_simulations=simulations,
+        regions=("distance",),
+        **options,
+    )
+
+
+def test_the_conjugate_posterior_is_calibrated():
+    ranks = conjugate()
+    assert ranks.passed, p_values(ranks)
+    assert ranks.ranks.shape == (500, 3)
+    assert ranks.ranks.min() == 0 and ranks.ranks.max() == N_DRAWS
+    for name, coverage in ranks.coverage().items():
+        for level, share in coverage.items():
+            # 12 numbers: beyond 4 errors once in a thousand tests
+            assert abs(share - level) < 4 * ranks.coverage_error(level), (name, level)
+
+
+def test_every_data_set_is_another_and_batches_do_not_matter():
+    few, many = (conjugate(simulations=120, batch=b) for b in (25, 120))
+    np.testing.assert_array_equal(few.ranks, many.ranks)
+    assert (conjugate(simulations=120, seed=1).ranks != few.ranks).mean() > 0.9
+    # an empty bin or a bin of 20 of 120 ranks: once in a million
+    assert few.histogram()[0].max() < 20
+    # truths and their ranks are not drawn with the same numbers
+    neighbours = np.corrcoef(few.ranks[1:, 0], few.ranks[:-1, 0])[0, 1]
+    assert abs(neighbours) < 5 / np.sqrt(120)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "caught"),
+    [
+        # ranks of m pile up at one end, or at both, or in the middle
+        ({"shift": 0.5}, "m"),
+        ({"scale": np.sqrt(2)}, "distance"),
+        ({"scale": np.sqrt(0.5)}, "distance"),
+        # the noise taken for half of its variance: the data pull too much
+        ({"s": S / np.sqrt(2)}, "m"),
+    ],
+)
+def test_a_wrong_conjugate_posterior_is_noticed(wrong, caught):
+    ranks = conjugate(**wrong)
+    assert not ranks.passed
+    assert p_values(ranks)[caught] < 1e-6
+
+
+def test_a_random_term_that_is_too_wide_covers_too_often():
+    """Within q sqrt(2) sigma instead of q sigma, and the other way round."""
+    for scale in (np.sqrt(2), np.sqrt(0.5)):
+        ranks = conjugate(scale=scale)
+        for name in ("m", "distance"):
+            for level, share in ranks.coverage()[name].items():
+                expected = 1 - 2 * stats.norm.sf(stats.norm.isf((1 - level) / 2) * scale)
+                error = np.sqrt(expected * (1 - expected) / 500)
+                # one rank in 100 is the resolution
+                assert abs(share - expected) < 4 * error + 0.01, (name, scale, level)
+
+
+def test_a_posterior_that_ignores_the_data_is_noticed_only_by_what_depends_on_them():
+    """Modrak et al. (2023): the prior is calibrated for every function of m alone."""
+
+    # taken for infinitely noisy, data leave the posterior at the prior
+    p = p_values(conjugate(s=1e10))
+    assert p["m"] > FALSE_ALARM
+    assert p["log likelihood"] < 1e-20
+
+
+def test_too_few_data_sets_are_refused():
+    with pytest.raises(lb.InputError, match="at least 100 simulations, got 99"):
+        conjugate(simulations=99)
+    assert conjugate(simulations=100).n_simulations == 100
+    with pytest.raises(lb.InputError, match="at least 100 simulations, got 20"):
+        calibrate_sky(random_model(True), random_model(True), n_simulations=20)
+
+
+# --- calibrate_sky ----------------------------------------------------------------------------
+
+
+@lru_cache
+def right(noise: str) -> Ranks:
+    return calibrate_sky(model(noise), model(noise), seed=1)
+
+
+@pytest.mark.long
+@pytest.mark.essential
+@EVERY_NOISE
+def test_the_sky_is_calibrated(noise):
+    ranks = right(noise)
+    assert ranks.n_simulations == 500
+    assert ranks.passed, p_values(ranks)
+    assert len(ranks.names) == len(set(ranks.names)) == 22
+    assert {"mode 0", "mode 48", "projection 9", "distance", "log likelihood"} < set(ranks.names)
+    for name, coverage in ranks.coverage().items():
+        for level, share in coverage.items():
+            # 88 numbers, many of them tied to each other: beyond 4 errors once in 200 tests
+            assert abs(share - level) < 4 * ranks.coverage_error(level), (name, level)
+
+
+def random_model(offset: bool) -> lb.LinearGaussian:
+    rng = np.random.default_rng(1)
+    return lb.LinearGaussian(
+        jnp.asarray(rng.standard_normal((6, 9))),
+        lb.HarmonicPrior(jnp.asarray([4.0, 1.0, 0.5])),
+        lb.DiagonalCovariance(jnp.asarray(rng.uniform(0.2, 1.0, 6))),
+        jnp.asarray(5.0 * rng.standard_normal(6) * offset),
+    )
+
+
+def test_what_is_ranked_of_a_sky():
+    """Against the textbook's formulas with matrices, with fewer data than modes and an offset."""
+    gaussian = random_model(True)
+    quantities = SkyQuantities.spread(gaussian.factorise(), 4, 3, seed=0)
+    sky, data = (np.asarray(x) for x in gaussian.sample(jax.random.key(3)))
+    got = quantities(jnp.asarray(sky), jnp.asarray(data))
+    np.testing.assert_array_equal(got["mode"], sky[[0, 2, 5, 8]])
+    s, n = np.asarray(gaussian.prior.variance()), np.asarray(gaussian.noise.dense())
+    projections = np.random.default_rng(0).standard_normal((3, 9)) @ (sky / np.sqrt(s))
+    np.testing.assert_allclose(got["projection"], projections, rtol=1e-12)
+    a, offset = np.asarray(gaussian.coupling.dense()), np.asarray(gaussian.offset)
+    precision = a.T @ np.linalg.solve(n, a) + np.diag(1 / s)
+    off = sky - np.linalg.solve(precision, a.T @ np.linalg.solve(n, data - offset))
+    assert float(got["distance"]) == pytest.approx(off @ precision @ off, rel=1e-10)
+    residual = data - offset - a @ sky
+    expected = -residual @ np.linalg.solve(n, residual) / 2
+    assert float(got["log likelihood"]) == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.long
+def test_fewer_data_than_modes_with_an_offset():
+    ranks = calibrate_sky(random_model(True), random_model(True))
+    assert ranks.passed, p_values(ranks)
+    assert {f"mode {i}" for i in range(9)} < set(ranks.names)
+    assert not calibrate_sky(random_model(True), random_model(False)).passed
+
+
+def test_halved_prior_variance_of_some_modes_is_noticed():
+    truth = model("exact")
+    wrong = lb.LinearGaussian(truth.coupling, halved_prior(truth.prior), truth.noise)
+    ranks = calibrate_sky(truth, wrong, seed=1)
+    assert not ranks.passed
+    assert p_values(ranks)["distance"] < 1e-8
+
+
+@pytest.mark.parametrize("factor", [2.0, 0.5])
+@EVERY_NOISE
+def test_a_noise_off_by_sqrt_2_is_noticed(noise, factor):
+    truth = model(noise)
+    wrong = lb.LinearGaussian(truth.coupling, truth.prior, truth.noise.scaled(factor))
+    ranks = calibrate_sky(truth, wrong, seed=1)
+    assert not ranks.passed
+    p = p_values(ranks)
+    assert max(p["distance"], p["log likelihood"]) < 1e-8
+
+
+class Draws(eqx.Module):
+    """Draws of a model's posterior whose random term is off by ``scale``."""
+
+    solver: lb.solver.Solver
+    scale: Float[Array, ""]
+
+    def __call__(self, key, data):
+        posterior = self.solver.condition(data)
+        mean = posterior.mean[None]
+        return mean + self.scale * (posterior.sample(key, N_DRAWS) - mean)
+
+
+class Quantities(eqx.Module):
+    """Every fifth mode, distance from the mean, and the likelihood of all the data."""
+
+    solver: lb.solver.Solver
+    model: lb.LinearGaussian
+
+    def __call__(self, sky, data):
+        residual = data - self.model.coupling @ sky
+        posterior = self.solver.condition(data)
+        return {
+            "mode": sky[::5],
+            "distance": (posterior.whiten(sky[None]) ** 2).sum(),
+            "log likelihood": -(self.solver.factor.whiten(residual) ** 2).sum(),
+        }
+
+
+@pytest.mark.parametrize("scale", [np.sqrt(2), pytest.param(np.sqrt(0.5), marks=pytest.mark.long)])
+def test_a_random_term_off_by_sqrt_2_is_noticed(scale):
+    truth = dense_model("exact")
+    solver = truth.factorise()
+    ranks = calibrate(
+        truth.sample,
+        Draws(solver, jnp.asarray(scale)),
+        Quantities(solver, truth),
+        regions=("distance",),
+    )
+    p = p_values(ranks)
+    assert max(p["distance"], p["log likelihood"]) < 1e-20
+    # every single mode notices, too
+    assert max(v for name, v in p.items() if name.startswith("mode")) < 1e-3
+    # chi^2 of 49 degrees is 49 +- 10, seldom half or twice of that: no truth, or all, are inside
+    assert abs(ranks.coverage()["distance"][0.5] - float(scale > 1)) < 0.02
+
+
+# --- one time sample --------------------------------------------------------------------------
+
+
+def without_noise_of(model: lb.LinearGaussian, time: int) -> lb.LinearGaussian:
+    """N with a thousandth of the noise at one time, its correlations with other times in step."""
+    weight = np.where(model.coupling.layout.time == time, np.sqrt(1e-3), 1.0)
+    noise = np.asarray(model.noise.dense()) * np.outer(weight, weight)
+    return lb.LinearGaussian(model.coupling, model.prior, lb.DenseCovariance(jnp.asarray(noise)))
+
+
+@EVERY_NOISE
+def test_noise_left_out_at_one_time_is_noticed(noise):
+    truth = model(noise)
+    ranks = calibrate_sky(truth, without_noise_of(truth, 2), seed=1)
+    assert not ranks.passed
+    p = p_values(ranks)
+    assert max(p["distance"], p["log likelihood"]) < 1e-8
+
+
+class WithoutTime(eqx.Module):
+    """The experiment's posterior where one time is flagged: draws and quantities.
+
+    These rank modes, the likelihood of the data that were used, and that of all.
+    """
+
+    all: lb.LinearGaussian
+    rest: lb.LinearGaussian
+    solver: lb.solver.Solver
+    index: Array
+
+    @classmethod
+    def of(cls, noise: str, time: int):
+        e = experiment(noise)
+        data = e.data
+        flags = np.zeros(e.setup.signal.shape, bool)
+        flags[:, time] = True
+        layout = DataLayout.from_flags(flags)
+        flagged = replace(data, data=data.data[layout.index], layout=layout)
+        rest = full_model(build(e.scenario, flagged).setup, Around(flagged))
+        assert (e.setup.coupling.shape[0], rest.n_data) == (96, 80)
+        return cls(dense_model(noise), rest, rest.factorise(), layout.index)
+
+    def draw(self, key, data):
+        return self.solver.condition(data[self.index]).sample(key, N_DRAWS)
+
+    def quantities(self, sky, data):
+        whole = self.all.noise.factor().whiten(data - self.all.coupling @ sky)
+        used = self.solver.factor.whiten(data[self.index] - self.rest.coupling @ sky)
+        return {
+            "mode": sky[::5],
+            "log likelihood of the rest": -(used**2).sum(),
+            "log likelihood": -(whole**2).sum(),
+        }
+
+
+@pytest.mark.long
+@EVERY_NOISE
+def test_a_time_that_is_left_out_is_noticed_only_by_the_likelihood_of_all_data(noise):
+    """A posterior given 15 of 16 data is calibrated, too; but not the one that was asked for."""
+    short = WithoutTime.of(noise, 2)
+    p = p_values(calibrate(short.all.sample, short.draw, short.quantities, seed=1))
+    assert p.pop("log likelihood") < 1e-20
+    assert min(p.values()) > FALSE_ALARM / len(p), p
+
+
+# --- by Hamiltonian Monte Carlo ---------------------------------------------------------------
+
+
+class HMCDraws(eqx.Module):
+    """Every second of 198 draws of one chain, of the program of ``models/sky.py``.
+
+    Ranks are uneven where draws hang together, and those of NUTS do in their distance from the
+    mean. A trajectory of a quarter of a turn forgets where a round Gaussian was, at every draw that
+    is accepted; 0.3 of them are not, so every second draw hangs together by 0.3^2.
+    """
+
+    model: lb.LinearGaussian
+    solver: lb.solver.Solver
+
+    def __call__(self, key, data):
+        program = load_program("sky")
+        arguments = {**program.arguments(self.model), "data": data}
+        whitening = Whitening.of(self.solver.condition(data))
+        sampler = Sampler(warmup=100, draws=N_DRAWS, algorithm="hmc")
+        return draw_within(program.model, arguments, key, sampler, whitening, thin=2)["sky"]
+
+
+@pytest.mark.long
+@EVERY_NOISE
+def test_draws_by_hmc_are_calibrated(noise):
+    truth = dense_model(noise)
+    solver = truth.factorise()
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        ranks = calibrate(
+            truth.sample,
+            HMCDraws(truth, solver),
+            Quantities(solver, truth),
+            regions=("distance",),
+            seed=2,
+        )
+    assert ranks.passed, p_values(ranks)
+    for level in LEVELS:
+        chance = 1 - FALSE_ALARM / (len(LEVELS) * len(ranks.names))
+        least, most = stats.binom.interval(chance, ranks.n_simulations, level)
+        for name, coverage in ranks.coverage().items():
+            assert least <= coverage[level] * ranks.n_simulations <= most, (name, level)

@@ -1,0 +1,311 @@
+"""Draws on disk: what is written comes back, and what cannot be trusted is refused."""
+
+import json
+import os
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.sampling import checkpoints
+from lusee_bayes.sampling.checkpoints import Checkpoints, Chunk
+
+IDENTITY = {"program": "sky", "sampler's seed": 3, "versions": {"jax": "0.10"}}
+N_CHUNKS, N_DRAWS, N_CHAINS = 3, 4, 2
+
+
+def arrays_of(number):
+    """State and draws of one chunk; no two numbers of a run are the same."""
+    rng = np.random.default_rng(number)
+    state = [
+        rng.standard_normal((N_CHAINS, 5)),
+        rng.integers(0, 2**32, (N_CHAINS, 2), dtype=np.uint32),
+        np.asarray(float(number)),
+        *(np.full(1, i) for i in range(12)),  # more than ten: names have to sort as numbers
+    ]
+    draws = {
+        "sky": rng.standard_normal((N_DRAWS, N_CHAINS, 9)),
+        "diverging": rng.random((N_DRAWS, N_CHAINS)) > 0.5,
+        "with: colon": rng.integers(0, 100, (N_DRAWS, N_CHAINS)),
+    }
+    return state, draws
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """An unfinished run: a chunk of warmup without draws, then chunks with draws."""
+    run = Checkpoints(tmp_path / "deep" / "chains", IDENTITY, resume=False)
+    run.append(N_DRAWS, arrays_of(0)[0], {})
+    for number in range(1, N_CHUNKS + 1):
+        run.append(N_DRAWS * (number + 1), *arrays_of(number))
+    return run.folder
+
+
+def again(folder, **changes):
+    return Checkpoints(folder, IDENTITY | changes, resume=True)
+
+
+def chunks(folder):
+    return sorted(folder.glob(checkpoints.CHUNK_GLOB))
+
+
+def test_a_chunk_comes_back_bit_by_bit(tmp_path):
+    state, draws = arrays_of(7)
+    Chunk(1234, state, draws).write(tmp_path)
+    (path,) = tmp_path.iterdir()
+    found = Chunk.read(path)
+    assert found.iteration == 1234
+    for got, expected in [
+        *zip(found.state, state, strict=True),
+        *((found.draws[name], draws[name]) for name in {*draws, *found.draws}),
+    ]:
+        np.testing.assert_array_equal(got, expected)
+        assert got.dtype == expected.dtype
+        assert got.shape == expected.shape
+
+
+def test_a_run_found_again_goes_on_from_its_last_chunk_with_all_its_draws(folder):
+    found = again(folder)
+    last, expected = found.last(), arrays_of(N_CHUNKS)[0]
+    assert last.iteration == N_DRAWS * (N_CHUNKS + 1)
+    for got, leaf in zip(last.state, expected, strict=True):
+        np.testing.assert_array_equal(got, leaf)
+    draws = found.draws()
+    written = [arrays_of(number)[1] for number in range(1, N_CHUNKS + 1)]
+    assert set(draws) == set(written[0])
+    for name, values in draws.items():
+        for chain in range(N_CHAINS):
+            one_by_one = [draw[chain] for chunk in written for draw in chunk[name]]
+            np.testing.assert_array_equal(values[chain], one_by_one)
+
+
+def test_chunks_are_in_the_order_of_their_iterations(tmp_path):
+    """9 before 10 before 100000: names are not to be sorted as words."""
+    run = Checkpoints(tmp_path, IDENTITY, resume=False)
+    for first, last in [(0, 9), (9, 10), (10, 100_000)]:
+        run.append(last, [], {"x": np.arange(first, last)[:, None]})
+    np.testing.assert_array_equal(run.draws()["x"], [np.arange(100_000)])
+    assert run.last().iteration == 100_000
+
+
+def test_a_run_that_has_just_begun(tmp_path):
+    run = Checkpoints(tmp_path / "chains", IDENTITY, resume=True)
+    assert run.last() is None
+    assert run.draws() == {}
+    run.append(25, [np.zeros(2)], {})
+    assert run.draws() == {}
+    run.remove()
+    assert not run.folder.exists()
+
+
+def test_what_a_kill_left_half_written_is_ignored(folder):
+    """The scratch file of a later chunk, cut in the middle, beside the marker's scratch file."""
+    half = chunks(folder)[-1].read_bytes()[:500]
+    later = N_DRAWS * (N_CHUNKS + 2)
+    (folder / f".partial-chunk-{later:08d}.npz").write_bytes(half)
+    (folder / ".partial-run.json").write_text("{")
+    run = again(folder)
+    assert run.last().iteration == N_DRAWS * (N_CHUNKS + 1)
+    assert run.draws()["sky"].shape[1] == N_DRAWS * N_CHUNKS
+    # and it is in nobody's way when that chunk is written after all
+    run.append(later, *arrays_of(9))
+    assert run.last().iteration == later
+    assert not (folder / f".partial-chunk-{later:08d}.npz").exists()
+
+
+@pytest.mark.parametrize("moment", ["savez", "fsync", "replace"])
+def test_a_chunk_is_written_whole_or_not_at_all(folder, monkeypatch, moment):
+    """Whatever fails while the file is written, the run is as it was before."""
+
+    def fail(*_, **__):
+        raise OSError("disk full")
+
+    before = {path.name: path.read_bytes() for path in chunks(folder)}
+    run = again(folder)
+    owner = checkpoints.np if moment == "savez" else checkpoints.os
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, moment, fail)
+        with pytest.raises(OSError, match="disk full"):
+            run.append(99, *arrays_of(9))
+    assert {path.name: path.read_bytes() for path in chunks(folder)} == before
+    assert run.last().iteration == N_DRAWS * (N_CHUNKS + 1)
+
+
+def test_a_chunk_is_on_the_disk_before_it_has_its_name(folder, monkeypatch):
+    """Else a crash of the machine could leave the name with nothing behind it."""
+    events = []
+    for name in ("fsync", "replace"):
+        real = getattr(os, name)
+
+        def spy(*args, name=name, real=real):
+            events.append(name)
+            return real(*args)
+
+        monkeypatch.setattr(checkpoints.os, name, spy)
+    again(folder).append(99, *arrays_of(9))
+    assert events == ["fsync", "replace"]
+
+
+def test_an_unfinished_run_is_not_touched_without_resume(folder):
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(InputError, match=r"unfinished run \(16 iterations done\).*--resume"):
+        Checkpoints(folder, IDENTITY, resume=False)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_an_unfinished_run_without_a_chunk_says_so(tmp_path):
+    Checkpoints(tmp_path, IDENTITY, resume=False)
+    with pytest.raises(InputError, match=r"unfinished run \(no iterations done\)"):
+        Checkpoints(tmp_path, IDENTITY, resume=False)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sampler's seed": 4}, "has another sampler's seed: 3, now 4"),
+        ({"program": "sky_marginal"}, "has another program: sky, now sky_marginal"),
+        ({"versions": {"jax": "0.11"}}, r"another versions: \{'jax': '0.10'\}, now"),
+        ({"data": "abc"}, "has another data: None, now abc"),
+    ],
+)
+def test_another_run_is_refused_and_the_difference_named(folder, changes, message):
+    with pytest.raises(InputError, match=message) as caught:
+        again(folder, **changes)
+    assert str(folder) in str(caught.value)
+
+
+def test_an_identity_that_has_lost_an_entry_is_another(folder):
+    with pytest.raises(InputError, match="another program: sky, now None"):
+        Checkpoints(folder, {k: v for k, v in IDENTITY.items() if k != "program"}, resume=True)
+
+
+def test_long_differences_are_shortened_in_the_message(folder):
+    with pytest.raises(InputError) as caught:
+        again(folder, program="x" * 500)
+    assert len(str(caught.value)) < len(str(folder)) + 250
+
+
+def test_what_json_makes_of_an_identity_is_the_same_identity(tmp_path):
+    """Tuples come back as lists, numbers as keys come back as words."""
+    identity = {"turntable": (0.0, 90.0), "table": {1: 0.1}}
+    Checkpoints(tmp_path, identity, resume=False)
+    Checkpoints(tmp_path, identity, resume=True)
+
+
+def damage_cut(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def damage_empty(path):
+    path.write_bytes(b"")
+
+
+def damage_text(path):
+    path.write_text("not an archive")
+
+
+def damage_flipped(path):
+    content = bytearray(path.read_bytes())
+    content[220] ^= 0xFF  # inside the first array: 63 bytes of zip header, 128 of numpy's, 80
+    path.write_bytes(bytes(content))
+
+
+def damage_other(path):
+    np.savez(path, something=np.ones(3))
+
+
+def damage_one_array(path):
+    with path.open("wb") as file:
+        np.save(file, np.ones(3))
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [damage_cut, damage_empty, damage_text, damage_flipped, damage_other, damage_one_array],
+    ids=lambda damage: damage.__name__.removeprefix("damage_"),
+)
+def test_an_unreadable_chunk_is_named_and_deleting_it_helps(folder, damage):
+    path = chunks(folder)[-1]
+    damage(path)
+    run = again(folder)
+    for use in (run.last, run.draws):
+        with pytest.raises(InputError, match=f"'{path}' cannot be read.*delete it"):
+            use()
+    path.unlink()
+    assert run.last().iteration == N_DRAWS * N_CHUNKS
+    assert run.draws()["sky"].shape[1] == N_DRAWS * (N_CHUNKS - 1)
+
+
+def test_a_chunk_missing_in_the_middle_is_noticed(folder):
+    """Draws behind the gap would silently take the place of those in it."""
+    chunks(folder)[2].unlink()
+    with pytest.raises(InputError):
+        again(folder).draws()
+
+
+def test_chunks_without_a_marker_are_not_taken_for_ones_own(folder):
+    """What a kill during the folder's removal can leave: chunks of who knows which run."""
+    (folder / checkpoints.IDENTITY).unlink()
+    try:
+        run = Checkpoints(folder, IDENTITY | {"sampler's seed": 4}, resume=False)
+    except InputError:
+        return
+    assert run.last() is None
+
+
+@pytest.mark.parametrize("content", ["", "{", "[1]"])
+def test_an_unreadable_marker_is_bad_input(folder, content):
+    (folder / checkpoints.IDENTITY).write_text(content)
+    with pytest.raises(InputError, match=re.escape(str(folder))):
+        again(folder)
+
+
+def test_a_removal_that_is_killed_leaves_nothing_that_looks_complete(folder, monkeypatch):
+    """Killed after any number of deleted files, the folder resumes to the same draws or is new."""
+    whole = again(folder).draws()["sky"]
+    for survivors in range(1, N_CHUNKS + 3):
+        copy = folder.parent / f"copy-{survivors}"
+        shutil.copytree(folder, copy)
+        _kill_removal(copy, survivors, monkeypatch)
+        if not copy.exists():
+            continue
+        try:
+            run = again(copy)
+            kept = run.draws().get("sky", whole[:, :0])
+            last = run.last()
+        except InputError:
+            continue
+        # what is there is the beginning of the run, up to where it would go on
+        np.testing.assert_array_equal(kept, whole[:, : kept.shape[1]])
+        done = 0 if last is None else last.iteration
+        assert kept.shape[1] == max(0, done - N_DRAWS)
+
+
+class _KilledError(BaseException):
+    pass
+
+
+def _kill_removal(folder, survivors, monkeypatch):
+    """Remove the folder, but stop when only ``survivors`` of its files are left."""
+    left = len(list(folder.iterdir()))
+
+    def guarded(real):
+        def delete(*args, **kwargs):
+            nonlocal left
+            if left <= survivors:
+                raise _KilledError
+            left -= 1
+            return real(*args, **kwargs)
+
+        return delete
+
+    run = Checkpoints(folder, json.loads((folder / checkpoints.IDENTITY).read_text()), resume=True)
+    with monkeypatch.context() as patch:
+        for name in ("unlink", "remove"):
+            patch.setattr(os, name, guarded(getattr(os, name)))
+        try:
+            run.remove()
+        except _KilledError:
+            assert folder.exists() or list(folder.parent.glob(f"*{folder.name}*"))

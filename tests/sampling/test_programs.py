@@ -1,0 +1,343 @@
+"""Programs: found and refused in one sentence; skies and data drawn from collapsed ones."""
+
+import hashlib
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference_linear import assert_draws_follow, posterior, random_covariance
+
+import lusee_bayes as lb
+from lusee_bayes.sampling.programs import (
+    PIECES,
+    collapsed_skies,
+    is_collapsed,
+    load_program,
+    program_names,
+    replicated_data,
+)
+
+SPECTRUM = np.array([4.0, 1.0, 0.5])
+ELL_OF_MODE = np.repeat([0, 1, 2], [1, 3, 5])
+N_DATA = 12
+OFFSET = np.linspace(-3.0, 3.0, N_DATA)
+
+# the sky integrated out, with an offset, a deterministic site and a vector site
+OFFSET_PROGRAM = """
+import jax.numpy as jnp
+import numpyro
+from numpyro import distributions as dist
+
+import lusee_bayes as lb
+
+
+def model(coupling, prior, noise, data=None):
+    slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
+    gains = numpyro.sample("gains", dist.LogNormal(jnp.zeros(2), 1.0).to_event(1))
+    total = numpyro.deterministic("total", gains.sum())
+    offset = slope * jnp.linspace(-3.0, 3.0, coupling.shape[0])
+    gaussian = lb.LinearGaussian(coupling, prior, noise.scaled(total), offset)
+    numpyro.sample("data", lb.Marginal(gaussian), obs=data)
+    return gaussian
+"""
+
+
+@pytest.fixture(scope="module")
+def gaussian():
+    rng = np.random.default_rng(11)
+    return lb.LinearGaussian(
+        jnp.asarray(rng.standard_normal((N_DATA, 9))),
+        lb.HarmonicPrior(jnp.asarray(SPECTRUM)),
+        lb.DenseCovariance(jnp.asarray(3.0 * random_covariance(rng, N_DATA))),
+    )
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(text, name="mine.py"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+# --- finding them ---------------------------------------------------------------------------------
+
+
+def test_the_programs_of_the_package_have_names():
+    assert {"sky", "sky_marginal", "prior_amplitude"} <= set(program_names())
+    for name in program_names():
+        program = load_program(name)
+        assert program.name == name
+        assert callable(program.model)
+
+
+def test_a_program_by_its_path(write):
+    text = "def model(noise, coupling, data=None):\n    return 'mine'\n"
+    path = write(text)
+    for source in (path, str(path)):
+        program = load_program(source)
+        assert program.name == "mine"
+        assert program.model(None, None) == "mine"
+        assert program.digest == hashlib.sha256(text.encode()).hexdigest()
+
+
+def test_a_file_named_like_a_program_is_meant_only_by_its_path(write, monkeypatch, tmp_path):
+    path = write("def model(data=None):\n    return 'mine'\n", "sky.py")
+    monkeypatch.chdir(tmp_path)
+    assert load_program("sky").digest == load_program("sky").digest != load_program(path).digest
+    assert load_program("sky.py").model() == "mine"
+
+
+@pytest.mark.parametrize("bytecode", [True, False])
+def test_the_text_that_was_digested_is_the_one_that_runs(write, monkeypatch, bytecode):
+    """Edits within one second and of the same length: bytecode caches cannot tell them apart."""
+    monkeypatch.setattr(sys, "dont_write_bytecode", not bytecode)
+    for i in range(4):
+        program = load_program(write(f"def model(data=None):\n    return {i}\n"))
+        assert program.model() == i
+
+
+def test_a_program_may_hold_dataclasses_and_modules(write):
+    """Both look up the module that they are defined in."""
+    path = write(
+        "from __future__ import annotations\n"
+        "from dataclasses import dataclass\n"
+        "import equinox as eqx\n"
+        "@dataclass\n"
+        "class Settings:\n"
+        "    scale: float = 2.0\n"
+        "class Gains(eqx.Module):\n"
+        "    level: float = 3.0\n"
+        "def model(data=None):\n"
+        "    return Settings().scale * Gains().level\n"
+    )
+    assert load_program(path).model() == 6.0
+
+
+def test_a_program_has_its_own_future_imports_only(write):
+    """Annotations are strings in the package's modules, in a program only if it says so."""
+    path = write("def model(data: 1 + 1 = None):\n    pass\n")
+    assert load_program(path).model.__annotations__ == {"data": 2}
+
+
+# --- and refusing them ----------------------------------------------------------------------------
+
+
+def assert_one_sentence(error, *parts):
+    message = str(error.value)
+    assert "\n" not in message and len(message) < 300
+    for part in parts:
+        assert part in message
+
+
+def test_no_such_program(tmp_path):
+    missing = tmp_path / "missing.py"
+    for source in ("sky_margnal", missing, tmp_path):
+        with pytest.raises(lb.InputError, match="no program") as error:
+            load_program(source)
+        assert_one_sentence(error, str(source), "sky_marginal", "prior_amplitude")
+
+
+def test_only_python_files_are_programs(write):
+    path = write("def model(data=None):\n    pass\n", "mine.txt")
+    with pytest.raises(lb.InputError, match="give the path of a Python file"):
+        load_program(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("def model(:\n", "line 1"),
+        ("import nowhere_to_be_found\n", "nowhere_to_be_found"),
+        ("unknown_name + 1\n", "unknown_name"),
+        ("scale = 1 / 0\n", "division by zero"),
+        ("raise RuntimeError('no device')\n", "no device"),
+        ("open('/nonexistent/table.txt')\n", "/nonexistent/table.txt"),
+        ("{}['missing key']\n", "missing key"),
+        ("assert 1 > 2, 'not so'\n", "not so"),
+    ],
+)
+def test_a_file_that_does_not_run(write, text, reason):
+    path = write(text)
+    with pytest.raises(lb.InputError, match="does not run") as error:
+        load_program(path)
+    assert_one_sentence(error, str(path), reason)
+
+
+@pytest.mark.parametrize("text", ["x = 1\n", "model = 3\n", "def Model(data=None):\n    pass\n"])
+def test_a_file_without_model(write, text):
+    path = write(text)
+    with pytest.raises(lb.InputError, match="has no function 'model'") as error:
+        load_program(path)
+    assert_one_sentence(error, str(path), "def model(")
+
+
+def test_a_model_without_data(write):
+    path = write("def model(coupling, prior):\n    pass\n")
+    with pytest.raises(lb.InputError, match="has no argument 'data'") as error:
+        load_program(path)
+    assert_one_sentence(error, str(path))
+
+
+def test_a_model_that_cannot_be_called_without_data(write):
+    """The prior predictive draws need it; better refused now than after the sampling."""
+    path = write("def model(coupling, data):\n    pass\n")
+    with pytest.raises(lb.InputError, match="data=None") as error:
+        load_program(path)
+    assert_one_sentence(error, str(path))
+
+
+def test_an_unknown_argument_and_what_may_be_meant(write):
+    path = write("def model(coupling, nois, data=None):\n    pass\n")
+    with pytest.raises(lb.InputError, match="asks for 'nois'") as error:
+        load_program(path)
+    assert_one_sentence(error, str(path), "did you mean 'noise'?")
+    path = write("def model(xyz, data=None):\n    pass\n")
+    with pytest.raises(lb.InputError, match="asks for 'xyz'") as error:
+        load_program(path)
+    assert_one_sentence(error, *PIECES)
+
+
+# --- what they ask for ----------------------------------------------------------------------------
+
+
+def test_arguments_are_what_the_signature_names(write, gaussian):
+    program = load_program(write("def model(prior, data=None, *, noise, coupling):\n    pass\n"))
+    arguments = program.arguments(gaussian)
+    assert list(arguments) == ["prior", "noise", "coupling"]
+    for name in arguments:
+        assert arguments[name] is getattr(gaussian, name)
+    program = load_program(write("def model(fixed_noise, data=None):\n    pass\n"))
+    (factor,) = program.arguments(gaussian).values()
+    dense = np.asarray(gaussian.noise.dense())
+    identity = np.asarray(factor.solve(jnp.asarray(dense)))
+    np.testing.assert_allclose(identity, np.eye(N_DATA), atol=1e-12)
+    assert load_program(write("def model(data=None):\n    pass\n")).arguments(gaussian) == {}
+
+
+def test_which_programs_have_integrated_the_sky_out(write, gaussian):
+    data = np.asarray(gaussian.sample(jax.random.key(0))[1])
+    found = {}
+    for name in ("sky", "sky_marginal", "prior_amplitude"):
+        program = load_program(name)
+        found[name] = is_collapsed(program, program.arguments(gaussian), data)
+    assert found == {"sky": False, "sky_marginal": True, "prior_amplitude": True}
+    mine = load_program(write(OFFSET_PROGRAM))
+    assert is_collapsed(mine, mine.arguments(gaussian), data)
+    kept = load_program(write(OFFSET_PROGRAM.replace("return gaussian", "return None")))
+    assert not is_collapsed(kept, kept.arguments(gaussian), data)
+
+
+# --- draws from collapsed programs ----------------------------------------------------------------
+
+
+def repeated(values, shape=(2, 5000)):
+    """The same values of the sites at every draw."""
+    return {name: np.broadcast_to(v, (*shape, *np.shape(v))) for name, v in values.items()}
+
+
+@pytest.fixture(scope="module")
+def collapsed(gaussian, tmp_path_factory):
+    """By name: (program, fixed values of its sites, S, N and the offset at these values)."""
+    path = tmp_path_factory.mktemp("programs") / "offset.py"
+    path.write_text(OFFSET_PROGRAM)
+    s, n = np.diag(SPECTRUM[ELL_OF_MODE]), np.asarray(gaussian.noise.dense())
+    steeper = 2.5 * ((ELL_OF_MODE + 1.0) / 10.0) ** -0.6
+    return {
+        "prior_amplitude": (
+            load_program("prior_amplitude"),
+            {"amplitude": 2.5, "tilt": -0.6},
+            s * steeper,
+            n,
+            0.0,
+        ),
+        "sky_marginal": (load_program("sky_marginal"), {"noise_level": 0.4}, s, 0.4 * n, 0.0),
+        "offset": (
+            load_program(path),
+            {"slope": 1.5, "gains": np.array([0.5, 1.2]), "total": 1.7},
+            s,
+            1.7 * n,
+            1.5 * OFFSET,
+        ),
+    }
+
+
+each = pytest.mark.parametrize("name", ["prior_amplitude", "sky_marginal", "offset"])
+
+
+@each
+def test_skies_at_fixed_sites_follow_the_analytic_posterior(gaussian, collapsed, name):
+    program, values, s, n, offset = collapsed[name]
+    data = np.asarray(gaussian.sample(jax.random.key(1))[1])
+    arguments = program.arguments(gaussian)
+    skies = collapsed_skies(program, arguments, data, repeated(values), jax.random.key(2))
+    assert isinstance(skies, np.ndarray)
+    assert skies.shape == (2, 5000, 9)
+    expected = posterior(gaussian.coupling.dense(), s, n, data, offset)
+    assert_draws_follow(skies.reshape(-1, 9), expected.mean, expected.covariance)
+    # the same draws do not follow the posterior at the sites' usual values, 1 and 0
+    usual = posterior(
+        gaussian.coupling.dense(), np.diag(SPECTRUM[ELL_OF_MODE]), gaussian.noise.dense(), data
+    )
+    with pytest.raises(AssertionError, match="off by"):
+        assert_draws_follow(skies.reshape(-1, 9), usual.mean, usual.covariance)
+
+
+def test_every_draw_has_its_own_sites(gaussian, collapsed):
+    """The sites of draw (c, d) shape the sky of draw (c, d), and each has its own random numbers.
+
+    With levels 1e-12 the sky is the least squares solution, with 1e12 a draw of the prior.
+    """
+    program = collapsed["sky_marginal"][0]
+    data = np.asarray(gaussian.sample(jax.random.key(3))[1])
+    levels = np.full((3, 4), 1e12)
+    known = [(0, 1), (2, 0), (2, 3)]
+    for at in known:
+        levels[at] = 1e-12
+    arguments = program.arguments(gaussian)
+    skies = collapsed_skies(program, arguments, data, {"noise_level": levels}, jax.random.key(4))
+    white = np.linalg.inv(np.linalg.cholesky(np.asarray(gaussian.noise.dense())))
+    best = np.linalg.lstsq(white @ np.asarray(gaussian.coupling.dense()), white @ data)[0]
+    near = np.abs(skies - best).max(2)
+    # noise of 1e-6, against skies of order one
+    assert {(int(c), int(d)) for c, d in np.argwhere(near < 1e-3)} == set(known)
+    others = skies[levels > 1]
+    assert np.unique(others[:, 0]).size == len(others)
+    again = collapsed_skies(program, arguments, data, {"noise_level": levels}, jax.random.key(4))
+    np.testing.assert_array_equal(again, skies)
+    other = collapsed_skies(program, arguments, data, {"noise_level": levels}, jax.random.key(5))
+    assert (other[levels > 1] != others).all()
+
+
+@each
+def test_replicated_data_are_the_skies_seen_with_new_noise(gaussian, collapsed, name):
+    program, values, _, n, offset = collapsed[name]
+    sky, data = (np.asarray(x) for x in gaussian.sample(jax.random.key(6)))
+    skies = np.broadcast_to(sky, (2, 5000, 9))
+    arguments = program.arguments(gaussian)
+    seen = replicated_data(program, arguments, data, repeated(values), skies, jax.random.key(7))
+    assert seen.shape == (2, 5000, N_DATA)
+    mean = np.asarray(gaussian.coupling.dense()) @ sky + offset
+    assert_draws_follow(seen.reshape(-1, N_DATA), mean, n)
+    # noise sqrt(1.2) too strong, or a mean 0.1 standard deviations off, would be seen
+    with pytest.raises(AssertionError, match="sample covariance off"):
+        assert_draws_follow(seen.reshape(-1, N_DATA), mean, 1.2 * n)
+    with pytest.raises(AssertionError, match="sample mean off"):
+        assert_draws_follow(seen.reshape(-1, N_DATA), mean + 0.1 * np.sqrt(np.diag(n)), n)
+
+
+def test_each_sky_is_seen_in_its_own_place(gaussian, collapsed):
+    """Two skies far apart, in chain 0 and 1."""
+    program, values, *_ = collapsed["sky_marginal"]
+    data = np.asarray(gaussian.sample(jax.random.key(8))[1])
+    skies = np.stack([np.full((3, 9), 1e6), np.full((3, 9), -2e6)])
+    seen = replicated_data(
+        program, program.arguments(gaussian), data, repeated(values, (2, 3)), skies,
+        jax.random.key(9),
+    )  # fmt: skip
+    # noise of order one on data of order 1e6
+    np.testing.assert_allclose(seen, skies @ np.asarray(gaussian.coupling.dense()).T, atol=20.0)

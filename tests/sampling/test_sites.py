@@ -1,0 +1,357 @@
+"""Sample sites against scipy, and the programs of models/ against the analytic posterior.
+
+White coordinates are tested on the densities: whatever they are taken from, the density of z is
+the program's own at m = mean + R z, times |det R|.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import pytest
+from numpyro import distributions as dist
+from numpyro import handlers
+from numpyro.infer import MCMC, NUTS, Predictive
+from numpyro.infer.util import log_density
+from reference_linear import z_of
+from scipy.stats import multivariate_normal
+
+import lusee_bayes as lb
+from lusee_bayes.linear.model import FORMS
+from lusee_bayes.sampling.hmc import Sampler, sample
+from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.sampling.promotion import numpyro_promotion
+from lusee_bayes.sampling.whitening import Whitening, whitened
+
+LMAX = 2
+N_DATA = 30
+
+
+def program(name):
+    return load_program(name).model
+
+
+@pytest.fixture(scope="module")
+def gaussian():
+    rng = np.random.default_rng(1)
+    root = rng.standard_normal((N_DATA, N_DATA))
+    return lb.LinearGaussian(
+        jnp.asarray(rng.standard_normal((N_DATA, (LMAX + 1) ** 2))),
+        lb.HarmonicPrior(jnp.asarray([4.0, 1.0, 0.5])),
+        lb.DenseCovariance(jnp.asarray(root @ root.T / N_DATA + np.eye(N_DATA))),
+    )
+
+
+def test_densities_against_scipy(gaussian):
+    sky, data = gaussian.sample(jax.random.key(0))
+    s, n = np.asarray(gaussian.prior.covariance()), np.asarray(gaussian.noise.dense())
+    a = np.asarray(gaussian.coupling.dense())
+    prior = lb.SkyPrior(gaussian.prior).log_prob(sky)
+    assert float(prior) == pytest.approx(multivariate_normal(cov=s).logpdf(sky), rel=1e-12)
+    given = lb.CorrelatedNormal(gaussian.coupling @ sky, gaussian.noise).log_prob(data)
+    expected = multivariate_normal(a @ np.asarray(sky), n).logpdf(data)
+    assert float(given) == pytest.approx(expected, rel=1e-12)
+    alone = lb.Marginal(gaussian).log_prob(data)
+    expected = multivariate_normal(cov=a @ s @ a.T + n).logpdf(data)
+    assert float(alone) == pytest.approx(expected, rel=1e-11)
+
+
+def test_batches_and_draws(gaussian):
+    normal = lb.CorrelatedNormal(jnp.arange(float(N_DATA)), gaussian.noise.factor())
+    draws = normal.sample(jax.random.key(1), (4, 5000))
+    assert draws.shape == (4, 5000, N_DATA)
+    flat = np.asarray(draws).reshape(-1, N_DATA)
+    n = np.asarray(gaussian.noise.dense())
+    scale = np.sqrt(np.diag(n))
+    # 20000 draws: means to 5 sigma / sqrt(20000), correlations to 5 / sqrt(20000) times sqrt(2)
+    assert np.abs((flat.mean(0) - np.arange(N_DATA)) / scale).max() < 5 / np.sqrt(20000)
+    error = (np.cov(flat.T) - n) / np.outer(scale, scale)
+    assert np.abs(error).max() < 5 * np.sqrt(2 / 20000)
+    one_by_one = [[float(normal.log_prob(x)) for x in row[:2]] for row in draws]
+    np.testing.assert_allclose(normal.log_prob(draws)[:, :2], one_by_one, rtol=1e-12)
+    for site in (lb.SkyPrior(gaussian.prior), lb.Marginal(gaussian)):
+        drawn = site.sample(jax.random.key(2), (3,))
+        assert drawn.shape == (3, *site.event_shape)
+        assert site.log_prob(drawn).shape == (3,)
+
+
+def test_priors_without_density_are_refused():
+    spectrum = jnp.asarray([1.0, 0.0])
+    with pytest.raises(lb.InputError, match="zero at some ell"):
+        lb.SkyPrior(lb.HarmonicPrior(spectrum))
+    with pytest.raises(lb.InputError, match="over pixels has no density"):
+        lb.SkyPrior(lb.PixelPrior(spectrum, 1))
+
+
+def test_handlers_and_predictive(gaussian):
+    arguments = (gaussian.coupling, gaussian.prior, gaussian.noise.factor())
+    sky, data = gaussian.sample(jax.random.key(3))
+    trace = handlers.trace(handlers.substitute(program("sky"), {"sky": sky})).get_trace(
+        *arguments, data=data
+    )
+    assert trace["data"]["is_observed"]
+    total = sum(float(site["fn"].log_prob(site["value"])) for site in trace.values())
+    joint = lb.SkyPrior(gaussian.prior).log_prob(sky) + lb.CorrelatedNormal(
+        gaussian.coupling @ sky, gaussian.noise
+    ).log_prob(data)
+    assert total == pytest.approx(float(joint), rel=1e-12)
+    drawn = Predictive(program("sky"), num_samples=7)(jax.random.key(4), *arguments)
+    assert drawn["sky"].shape == (7, 9)
+    assert drawn["data"].shape == (7, N_DATA)
+
+
+@pytest.mark.long
+def test_nuts_finds_the_analytic_posterior(gaussian):
+    _, data = gaussian.sample(jax.random.key(5))
+    posterior = gaussian.condition(data)
+    mcmc = MCMC(
+        NUTS(program("sky")), num_warmup=500, num_samples=2000, num_chains=2,
+        chain_method="vectorized", progress_bar=False,
+    )  # fmt: skip
+    with numpyro_promotion():
+        mcmc.run(
+            jax.random.key(6), gaussian.coupling, gaussian.prior, gaussian.noise.factor(), data=data
+        )
+    draws = np.asarray(mcmc.get_samples()["sky"])
+    std = np.asarray(posterior.std())
+    # NUTS makes at least a tenth of its 4000 draws count: 400 independent ones, 5 sigma
+    assert np.abs((draws.mean(0) - np.asarray(posterior.mean)) / std).max() < 5 / np.sqrt(400)
+    assert np.abs(draws.std(0) / std - 1.0).max() < 5 / np.sqrt(2 * 400)
+    assert int(mcmc.get_extra_fields()["diverging"].sum()) == 0
+
+
+@pytest.mark.long
+def test_the_marginal_program_finds_the_noise_level(gaussian):
+    """Against the density of the noise level on a grid, normalised by the trapezoidal rule."""
+    _, data = gaussian.sample(jax.random.key(7))
+    mcmc = MCMC(NUTS(program("sky_marginal")), num_warmup=300, num_samples=2000, progress_bar=False)
+    with numpyro_promotion():
+        mcmc.run(jax.random.key(8), gaussian.coupling, gaussian.prior, gaussian.noise, data=data)
+    draws = np.asarray(mcmc.get_samples()["noise_level"])
+    logs = np.linspace(-3.0, 3.0, 121)
+
+    def log_density(x):
+        scaled = lb.LinearGaussian(
+            gaussian.coupling, gaussian.prior, gaussian.noise.scaled(jnp.exp(x))
+        )
+        return scaled.log_prob(data) - 0.5 * x**2
+
+    values = np.array([float(log_density(jnp.asarray(x))) for x in logs])
+    weights = np.exp(values - values.max())
+    weights /= weights.sum()
+    mean = weights @ logs
+    spread = np.sqrt(weights @ (logs - mean) ** 2)
+    # at least 400 of 2000 draws count; 5 sigma
+    assert abs(np.log(draws).mean() - mean) < 5 * spread / np.sqrt(400)
+    assert abs(np.log(draws).std() / spread - 1.0) < 5 / np.sqrt(2 * 400)
+
+
+# --- white coordinates ----------------------------------------------------------------------------
+
+
+def strong_sky(coupling, prior, fixed_noise, data=None):
+    """A program whose prior, noise and coupling are not those that the whitening was made with."""
+    amplitude = numpyro.sample("amplitude", dist.LogNormal(0.0, 0.5))
+    scaled = lb.HarmonicPrior(prior.spectrum * amplitude)
+    sky = numpyro.sample("sky", lb.SkyPrior(scaled))
+    seen = coupling @ sky
+    numpyro.sample("data", lb.CorrelatedNormal(seen + 0.1 * seen**2, fixed_noise), obs=data)
+
+
+def joint(model, arguments, values):
+    """ln p of all sites at these values, by NumPyro, whose own code mixes types."""
+    with numpyro_promotion():
+        return float(log_density(model, (), arguments, values)[0])
+
+
+@pytest.fixture(scope="module")
+def case(gaussian):
+    """(arguments of a program with data, whitening by the posterior given them)."""
+    _, data = gaussian.sample(jax.random.key(9))
+    arguments = {
+        "coupling": gaussian.coupling,
+        "prior": gaussian.prior,
+        "fixed_noise": gaussian.noise.factor(),
+        "data": data,
+    }
+    return arguments, Whitening.of(gaussian.condition(data))
+
+
+@pytest.fixture(scope="module")
+def z():
+    return jnp.asarray(np.random.default_rng(2).standard_normal((LMAX + 1) ** 2))
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("n_data", [N_DATA, 5])
+def test_the_log_determinant_is_that_of_the_root(gaussian, n_data, form):
+    """More and fewer data than the 9 modes, in both forms of the posterior."""
+    few = lb.LinearGaussian(
+        gaussian.coupling.dense()[:n_data],
+        gaussian.prior,
+        lb.DenseCovariance(gaussian.noise.matrix[:n_data, :n_data]),
+    )
+    posterior = few.condition(few.sample(jax.random.key(1))[1], form)
+    whitening = Whitening.of(posterior)
+    # a sum of 9 logarithms of order one, and of a root with condition below 100
+    log_det = np.linalg.slogdet(np.asarray(whitening.root))[1]
+    assert float(whitening.log_det) == pytest.approx(log_det, abs=1e-12)
+    halved = 0.5 * np.linalg.slogdet(np.asarray(posterior.covariance()))[1]
+    assert float(whitening.log_det) == pytest.approx(halved, abs=1e-11)
+    np.testing.assert_array_equal(whitening.mean, posterior.mean)
+
+
+def test_a_prior_without_density_has_no_white_coordinates():
+    spectrum = jnp.asarray([1.0, 0.0])
+    for prior in (lb.HarmonicPrior(spectrum), lb.PixelPrior(jnp.asarray([1.0, 0.5]), 1)):
+        a = jnp.asarray(np.random.default_rng(0).standard_normal((3, prior.size)))
+        model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(3)))
+        with pytest.raises(lb.InputError, match="has no density"):
+            Whitening.of(model.condition(jnp.ones(3)))
+
+
+def test_the_density_of_z_is_the_programs_own_times_the_determinant(gaussian, case, z):
+    """For any coordinates, and a program for which they are the wrong ones."""
+    arguments, right = case
+    wrong = Whitening.of(gaussian.condition(3.0 + 2.0 * arguments["data"], "data"))
+    wrong = eqx.tree_at(
+        lambda w: (w.root, w.log_det), wrong, (2.0 * wrong.root, wrong.log_det + 9 * np.log(2.0))
+    )
+    for model, others in [(program("sky"), {}), (strong_sky, {"amplitude": jnp.asarray(1.7)})]:
+        for whitening in (right, wrong):
+            sky = whitening.mean + whitening.root @ z
+            plain = joint(model, arguments, {"sky": sky, **others})
+            expected = plain + np.linalg.slogdet(np.asarray(whitening.root))[1]
+            model_of_z = whitened(model, whitening)
+            got = joint(model_of_z, arguments, {"sky_white": z, **others})
+            # terms up to 1e4, summed in another order: 1e4 x 10 x eps
+            assert got == pytest.approx(expected, abs=1e-11, rel=1e-13)
+            # and the determinant is not a detail
+            assert abs(got - plain) > 1.0
+
+
+def test_z_is_standard_normal_where_the_coordinates_are_the_posteriors(gaussian, case, z):
+    """p(d, m) |dm/dz| = p(d) N(z; 0, 1), with the evidence by scipy."""
+    arguments, whitening = case
+    a, s = np.asarray(gaussian.coupling.dense()), np.asarray(gaussian.prior.covariance())
+    covariance = a @ s @ a.T + np.asarray(gaussian.noise.dense())
+    evidence = multivariate_normal(cov=covariance).logpdf(arguments["data"])
+    for factor in (0.0, 1.0, -5.0):
+        at = factor * np.asarray(z)
+        expected = evidence + multivariate_normal(cov=np.eye(9)).logpdf(at)
+        got = joint(whitened(program("sky"), whitening), arguments, {"sky_white": jnp.asarray(at)})
+        assert got == pytest.approx(expected, rel=1e-11)
+
+
+def test_sites_of_a_whitened_program(case, z):
+    arguments, whitening = case
+    model = whitened(program("sky"), whitening)
+    trace = handlers.trace(handlers.substitute(model, {"sky_white": z})).get_trace(**arguments)
+    assert set(trace) == {"sky_white", "sky_density", "sky", "data"}
+    white, sky = trace["sky_white"], trace["sky"]
+    assert isinstance(white["fn"], dist.ImproperUniform)
+    assert white["type"] == "sample" and not white["is_observed"]
+    assert white["fn"].event_shape == (9,) and white["fn"].batch_shape == ()
+    assert float(white["fn"].log_prob(z)) == 0.0
+    assert sky["type"] == "deterministic"
+    expected = np.asarray(whitening.mean) + np.asarray(whitening.root) @ np.asarray(z)
+    np.testing.assert_allclose(sky["value"], expected, rtol=1e-14, atol=1e-14)
+    assert trace["data"]["is_observed"]
+    np.testing.assert_array_equal(trace["data"]["fn"].loc, arguments["coupling"] @ sky["value"])
+
+
+def test_other_sites_are_left_alone(case, z):
+    arguments, whitening = case
+    values = {"sky_white": z, "amplitude": jnp.asarray(0.7)}
+    model = whitened(strong_sky, whitening)
+    trace = handlers.trace(handlers.substitute(model, values)).get_trace(**arguments)
+    assert isinstance(trace["amplitude"]["fn"], dist.LogNormal)
+    assert float(trace["amplitude"]["value"]) == 0.7
+    # the prior is that of the sampled amplitude, not the one the coordinates come from
+    scaled = np.asarray(arguments["prior"].variance()) * 0.7
+    prior = multivariate_normal(cov=np.diag(scaled)).logpdf(trace["sky"]["value"])
+    factor = float(trace["sky_density"]["fn"].log_prob(trace["sky_density"]["value"]))
+    assert factor - float(whitening.log_det) == pytest.approx(prior, rel=1e-12)
+
+
+def test_conditioning_on_z_fixes_the_sky(case, z):
+    arguments, whitening = case
+    model = whitened(program("sky"), whitening)
+    free = {**arguments, "data": None}
+    conditioned = handlers.condition(model, {"sky_white": z})
+    trace = handlers.trace(handlers.seed(conditioned, 0)).get_trace(**free)
+    assert trace["sky_white"]["is_observed"]
+    np.testing.assert_allclose(
+        trace["sky"]["value"], whitening.mean + whitening.root @ z, rtol=1e-14, atol=1e-14
+    )
+    # the data are drawn by the seed: the same again, and others with another seed
+    again = handlers.trace(handlers.seed(conditioned, 0)).get_trace(**free)
+    other = handlers.trace(handlers.seed(conditioned, 1)).get_trace(**free)
+    np.testing.assert_array_equal(trace["data"]["value"], again["data"]["value"])
+    assert (trace["data"]["value"] != other["data"]["value"]).all()
+
+
+@pytest.mark.parametrize("how", ["obs", "condition"])
+def test_an_observed_sky_is_not_whitened(case, z, how):
+    arguments, whitening = case
+
+    def observed(coupling, prior, fixed_noise, data=None):
+        numpyro.sample("sky", lb.SkyPrior(prior), obs=z)
+
+    model = observed if how == "obs" else handlers.condition(program("sky"), {"sky": z})
+    with pytest.raises(lb.InputError, match="the site 'sky' is observed; only latent sites"):
+        handlers.substitute(whitened(model, whitening), {"sky_white": z})(**arguments)
+
+
+def test_an_improper_site_is_never_drawn_from(case):
+    """Prior draws of z do not exist; NumPyro says so, and makes nothing up."""
+    arguments, whitening = case
+    model = whitened(program("sky"), whitening)
+    free = {**arguments, "data": None}
+    with numpyro_promotion():
+        with pytest.raises(NotImplementedError):
+            handlers.seed(model, 0)(**free)
+        with pytest.raises(NotImplementedError):
+            Predictive(model, num_samples=3)(jax.random.key(0), **free)
+
+
+def test_predictions_from_draws_of_z(gaussian, case):
+    """Data seen again have mean A E[m | d] and covariance A C A^T + N."""
+    arguments, whitening = case
+    posterior = gaussian.condition(arguments["data"])
+    n = 4000
+    z = jax.random.normal(jax.random.key(3), (n, 9), dtype=jnp.float64)
+    free = {**arguments, "data": None}
+    with numpyro_promotion():
+        drawn = Predictive(whitened(program("sky"), whitening), {"sky_white": z})(
+            jax.random.key(4), **free
+        )
+    expected = np.asarray(whitening.mean) + np.asarray(z) @ np.asarray(whitening.root).T
+    np.testing.assert_allclose(drawn["sky"], expected, rtol=1e-13, atol=1e-13)
+    a = np.asarray(gaussian.coupling.dense())
+    variance = np.diag(a @ np.asarray(posterior.covariance()) @ a.T + gaussian.noise.dense())
+    delta = np.asarray(drawn["data"]) - a @ np.asarray(posterior.mean)
+    limit = z_of(2 * N_DATA)
+    assert np.abs(delta.mean(0) / np.sqrt(variance / n)).max() < limit
+    assert np.abs((delta**2).mean(0) / variance - 1.0).max() < limit * np.sqrt(2 / n)
+
+
+@pytest.mark.long
+def test_wrong_coordinates_slow_the_chains_down_and_leave_the_posterior_right(gaussian, case):
+    """z from other data and three times the noise: still the analytic posterior, by NUTS."""
+    arguments, _ = case
+    posterior = gaussian.condition(arguments["data"])
+    other = lb.LinearGaussian(gaussian.coupling, gaussian.prior, gaussian.noise.scaled(3.0))
+    wrong = Whitening.of(other.condition(1.0 + arguments["data"]))
+    # coordinates that differ by standard deviations, or the test would say nothing
+    assert np.abs((wrong.mean - posterior.mean) / posterior.std()).max() > 1.0
+    chains = sample(program("sky"), arguments, Sampler(chains=2, draws=1000), wrong)
+    draws = chains.sites["sky"].reshape(-1, 9)
+    white = np.asarray(posterior.whiten(draws))
+    # at least a fifth of the 2000 draws count
+    limit = z_of(2 * 9)
+    assert np.abs(white.mean(0)).max() < limit / np.sqrt(400)
+    assert np.abs((white**2).mean(0) - 1.0).max() < limit * np.sqrt(2 / 400)
+    # what those coordinates would give if their density were left out is seen by the same measure
+    assert np.abs(np.asarray(posterior.whiten(wrong.mean[None]))).max() > limit / np.sqrt(400)

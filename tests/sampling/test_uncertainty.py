@@ -1,0 +1,267 @@
+"""Statements about maps, from exact draws, against the Gaussian posterior's closed forms."""
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from arviz_stats.base import array_stats
+from reference_linear import posterior as naive_posterior
+from reference_linear import random_covariance, z_of
+from scipy.stats import norm
+
+import lusee_bayes as lb
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
+from lusee_bayes.sampling import uncertainty
+from lusee_bayes.sampling.uncertainty import (
+    disc,
+    pixel_interval_of_draws,
+    pixel_mean_of_draws,
+    pixel_std_of_draws,
+    probability_brighter,
+    region_brightness,
+    sky_quantities,
+    summary,
+)
+
+LMAX, NSIDE, N_MODES = 3, 4, 16
+N_CHAINS, N_DRAWS = 4, 5000
+N = N_CHAINS * N_DRAWS
+
+
+@pytest.fixture(scope="module")
+def gaussian():
+    """(posterior of the package, textbook answer): sixteen modes, ten data."""
+    rng = np.random.default_rng(3)
+    model = lb.LinearGaussian(
+        jnp.asarray(rng.normal(size=(10, N_MODES))),
+        lb.HarmonicPrior(jnp.asarray([4.0, 2.0, 1.0, 0.5])),
+        lb.DenseCovariance(jnp.asarray(random_covariance(rng, 10))),
+    )
+    _, data = model.sample(jax.random.key(0))
+    s, n = model.prior.covariance(), model.noise.dense()
+    return model.condition(data), naive_posterior(model.coupling.dense(), s, n, data)
+
+
+@pytest.fixture(scope="module")
+def skies(gaussian):
+    """Independent draws, as if of four chains."""
+    draws = gaussian[0].sample(jax.random.key(1), N)
+    return np.asarray(draws).reshape(N_CHAINS, N_DRAWS, N_MODES)
+
+
+def pixel_posterior(answer):
+    """Mean, std and covariance of every pixel; healpy makes the maps of single modes."""
+    y = np.stack([modes_to_map(mode, NSIDE) for mode in np.eye(N_MODES)], axis=1)
+    covariance = y @ answer.covariance @ y.T
+    return y @ answer.mean, np.sqrt(np.diag(covariance)), covariance
+
+
+def test_mean_and_standard_deviation_of_pixels(gaussian, skies):
+    posterior, answer = gaussian
+    mean, std, _ = pixel_posterior(answer)
+    n_pixels = healpy.nside2npix(NSIDE)
+    # the mean of N draws scatters by std / sqrt(N), their standard deviation by std / sqrt(2 N)
+    z = (pixel_mean_of_draws(skies, NSIDE) - mean) / (std / np.sqrt(N))
+    assert np.abs(z).max() < z_of(n_pixels)
+    ratio = pixel_std_of_draws(skies, NSIDE) / std - 1
+    assert np.abs(ratio).max() < z_of(n_pixels) / np.sqrt(2 * N)
+    of_the_package = np.asarray(posterior.std_of(pixel_matrix(NSIDE, LMAX)))
+    ratio = pixel_std_of_draws(skies, NSIDE) / of_the_package - 1
+    assert np.abs(ratio).max() < z_of(n_pixels) / np.sqrt(2 * N)
+
+
+@pytest.mark.parametrize("probability", [0.5, 0.9, 0.99])
+def test_intervals_of_pixels_are_the_central_gaussian_ones(gaussian, skies, probability):
+    mean, std, _ = pixel_posterior(gaussian[1])
+    tail = (1 - probability) / 2
+    lower, upper = pixel_interval_of_draws(skies, NSIDE, probability)
+    # a quantile scatters by sqrt(p (1 - p) / N) / density; 1.1: tails are binomial, not normal
+    error = std * np.sqrt(tail * (1 - tail) / N) / norm.pdf(norm.ppf(tail))
+    limit = 1.1 * z_of(2 * len(mean))
+    assert (np.abs(lower - (mean + std * norm.ppf(tail))) / error).max() < limit
+    assert (np.abs(upper - (mean - std * norm.ppf(tail))) / error).max() < limit
+
+
+def test_intervals_are_of_90_percent_unless_asked(skies):
+    values = modes_to_map(skies[0, 0], NSIDE)  # any draw: the share of pixels is not asked for
+    lower, upper = pixel_interval_of_draws(skies, NSIDE)
+    maps = skies.reshape(-1, N_MODES) @ pixel_matrix(NSIDE, LMAX).T
+    inside = ((maps > lower) & (maps < upper)).mean(0)
+    # quantiles of the very draws: the share is 0.9 to one draw
+    np.testing.assert_allclose(inside, 0.9, atol=2 / N)
+    assert lower.shape == upper.shape == values.shape
+
+
+@pytest.mark.parametrize(
+    "statistic", [pixel_mean_of_draws, pixel_std_of_draws, pixel_interval_of_draws]
+)
+def test_pixels_do_not_depend_on_how_many_are_held_at_once(skies, monkeypatch, statistic):
+    whole = statistic(skies[:, :50], NSIDE)
+    monkeypatch.setattr(uncertainty, "CHUNK", 100)  # 192 pixels: 100 and 92
+    # sums of sixteen terms, perhaps in another order
+    np.testing.assert_allclose(statistic(skies[:, :50], NSIDE), whole, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0, -0.1, 90.0, float("nan")])
+def test_an_interval_of_an_impossible_probability(skies, probability):
+    with pytest.raises(InputError, match="probability of an interval must lie in 0..1"):
+        pixel_interval_of_draws(skies, NSIDE, probability)
+
+
+@pytest.mark.parametrize(
+    ("l_deg", "b_deg", "radius_deg"), [(0.0, 0.0, 20.0), (250.0, -70.0, 35.0), (10.0, 90.0, 12.0)]
+)
+def test_a_disc_holds_the_pixels_within_its_radius(l_deg, b_deg, radius_deg):
+    """By the spherical law of cosines at pixel centres."""
+    longitude, latitude = (np.radians(x) for x in healpy.pix2ang(8, np.arange(768), lonlat=True))
+    l_rad, b_rad = np.radians([l_deg, b_deg])
+    cosine = np.sin(latitude) * np.sin(b_rad) + np.cos(latitude) * np.cos(b_rad) * np.cos(
+        longitude - l_rad
+    )
+    expected = cosine >= np.cos(np.radians(radius_deg))
+    assert 0 < expected.sum() < 768
+    np.testing.assert_array_equal(disc(8, l_deg, b_deg, radius_deg), expected)
+
+
+def test_a_disc_smaller_than_a_pixel_is_refused():
+    with pytest.raises(InputError, match="no pixel of NSIDE 2 lies within 1 degrees of l = 3, b"):
+        disc(2, 3.0, 4.0, 1.0)
+
+
+def test_the_brightness_of_a_region_is_the_mean_of_its_pixels(skies):
+    region = disc(NSIDE, 40.0, 20.0, 30.0)
+    got = region_brightness(skies[:, :3], region)
+    for index in np.ndindex(4, 3):
+        expected = modes_to_map(skies[index], NSIDE)[region].mean()
+        # healpy's own rounding
+        assert got[index] == pytest.approx(expected, rel=1e-10, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "centres", [((0.0, 0.0), (180.0, 0.0)), ((90.0, 30.0), (270.0, -30.0)), ((0, 60), (0, 20))]
+)
+def test_the_probability_of_being_brighter_is_the_gaussian_one(gaussian, skies, centres):
+    """Phi of the difference of the means over the difference's standard deviation."""
+    mean, _, covariance = pixel_posterior(gaussian[1])
+    first, second = (disc(NSIDE, float(l_), float(b), 25.0) for l_, b in centres)
+    weights = first / first.sum() - second / second.sum()
+    expected = norm.cdf(weights @ mean / np.sqrt(weights @ covariance @ weights))
+    assert 0.01 < expected < 0.99
+    share, error = probability_brighter(skies, first, second)
+    # a share of N independent draws, binomial
+    assert error == pytest.approx(np.sqrt(expected * (1 - expected) / N), rel=0.15)
+    assert abs(share - expected) < z_of(1) * np.sqrt(expected * (1 - expected) / N)
+    assert probability_brighter(skies, second, first)[0] == pytest.approx(1 - share, abs=1e-12)
+
+
+def test_the_error_of_a_probability_knows_that_draws_hang_together(gaussian):
+    """Every draw ten times over: the error is that of a tenth of the draws."""
+    draws = np.asarray(gaussian[0].sample(jax.random.key(2), 2000)).reshape(4, 500, N_MODES)
+    regions = disc(NSIDE, 0.0, 60.0, 25.0), disc(NSIDE, 0.0, 20.0, 25.0)
+    share, error = probability_brighter(draws, *regions)
+    repeated_share, repeated_error = probability_brighter(np.repeat(draws, 10, axis=1), *regions)
+    assert repeated_share == pytest.approx(share, abs=1e-12)
+    # ArviZ's estimate of ESS is good to a few per cent here; without it the ratio would be 0.32
+    assert repeated_error == pytest.approx(error, rel=0.15)
+
+
+def test_a_difference_that_no_draw_doubts_keeps_an_error(skies):
+    """The rule of three: with N draws of one kind the rest is below 3 / N at 95 %."""
+    bright = skies.copy()
+    bright[..., 2] = 1e6  # ell = 1, m = 0: brighter towards the north pole
+    north, south = disc(NSIDE, 0.0, 90.0, 20.0), disc(NSIDE, 0.0, -90.0, 20.0)
+    assert probability_brighter(bright, north, south) == (1.0, 3 / N)
+    assert probability_brighter(bright, south, north) == (0.0, 3 / N)
+
+
+def test_regions_of_another_resolution_are_refused(skies):
+    with pytest.raises(InputError, match=r"second region has shape \(768,\), expected \(192,\)"):
+        probability_brighter(skies, disc(4, 0.0, 0.0, 30.0), disc(8, 0.0, 0.0, 30.0))
+
+
+def test_quantities_against_direct_computation(skies):
+    few = skies[:, :5]
+    places = {"somewhere": (33.0, -21.0), "pole": (0.0, 90.0)}
+    found = sky_quantities(few, modes=[(0, 0), (2, -1), (3, 3)], ells=[0, 2, 3], pixels=places)
+    assert list(found) == [
+        "T(somewhere) [K]", "T(pole) [K]", "C_0 [K2]", "C_2 [K2]", "C_3 [K2]",
+        "sky(0, 0) [K]", "sky(2, -1) [K]", "sky(3, 3) [K]",
+    ]  # fmt: skip
+    np.testing.assert_array_equal(found["sky(0, 0) [K]"], few[..., 0])
+    np.testing.assert_array_equal(found["sky(2, -1) [K]"], few[..., 5])
+    np.testing.assert_array_equal(found["sky(3, 3) [K]"], few[..., 15])
+    for ell in (0, 2, 3):
+        modes = few[..., ell**2 : (ell + 1) ** 2]
+        expected = (modes**2).sum(-1) / (2 * ell + 1)
+        np.testing.assert_allclose(found[f"C_{ell} [K2]"], expected, rtol=1e-14)
+    # NSIDE 64 puts a pixel's centre within half a degree of any place: the place that is asked for
+    # is then the pixel's own
+    pixel = healpy.ang2pix(64, 33.0, -21.0, lonlat=True)
+    l_deg, b_deg = (float(x) for x in healpy.pix2ang(64, pixel, lonlat=True))
+    there = sky_quantities(few, pixels={"there": (l_deg, b_deg)})["T(there) [K]"]
+    for index in np.ndindex(4, 5):
+        expected = modes_to_map(few[index], 64)[pixel]
+        assert there[index] == pytest.approx(expected, rel=1e-9, abs=1e-11)
+    # at the pole only m = 0 is left: sum of sqrt((2 l + 1) / 4 pi) a_l0
+    ell = np.arange(LMAX + 1)
+    expected = few[..., ell**2 + ell] @ np.sqrt((2 * ell + 1) / (4 * np.pi))
+    np.testing.assert_allclose(found["T(pole) [K]"], expected, rtol=1e-12, atol=1e-13)
+
+
+def test_nothing_asked_for_is_nothing_given(skies):
+    assert sky_quantities(skies) == {}
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"ells": [4]}, "no ell = 4 up to lmax = 3"),
+        ({"ells": [1, -1]}, "no ell = -1 up to lmax = 3"),
+        ({"modes": [(4, 0)]}, r"no mode \(ell, m\) = \(4, 0\) up to lmax = 3"),
+        ({"modes": [(1, 2)]}, r"no mode \(ell, m\) = \(1, 2\)"),
+        ({"modes": [(1, -2)]}, r"no mode \(ell, m\) = \(1, -2\)"),
+        ({"modes": [(-1, 0)]}, r"no mode \(ell, m\) = \(-1, 0\)"),
+    ],
+)
+def test_modes_that_the_sky_does_not_have(skies, asked, message):
+    with pytest.raises(InputError, match=message):
+        sky_quantities(skies, **asked)
+
+
+def test_skies_that_fill_no_lmax_are_refused():
+    with pytest.raises(InputError, match="15 coefficients do not fill any lmax"):
+        pixel_std_of_draws(np.zeros((1, 2, 15)), NSIDE)
+
+
+def test_the_summary_has_a_row_for_each_quantity_with_its_own_numbers(gaussian, skies):
+    """Against numpy, the Gaussian, and ArviZ's own array functions."""
+    answer = gaussian[1]
+    quantities = sky_quantities(skies, modes=[(0, 0), (3, -2)], pixels={"centre": (0.0, 0.0)})
+    table = summary(quantities)
+    assert list(table.index) == list(quantities)
+    for name, draws in quantities.items():
+        row = table.loc[name]
+        assert row["mean"] == pytest.approx(draws.mean(), rel=1e-10)
+        assert row["sd"] == pytest.approx(draws.std(ddof=1), rel=1e-3)
+        # 5 % in each tail: the columns' own interpolation of quantiles is of order 1 / N
+        low, high = np.quantile(draws, [0.05, 0.95])
+        found = row.filter(regex="90").sort_values()
+        np.testing.assert_allclose(found, [low, high], atol=2e-3 * draws.std())
+        for column, method in [("ess_bulk", "bulk"), ("ess_tail", "tail")]:
+            tails = (0.05, 0.95) if method == "tail" else None
+            ess = array_stats.ess(draws, chain_axis=0, draw_axis=1, method=method, prob=tails)
+            # the tail's definition has moved between versions of ArviZ
+            assert row[column] == pytest.approx(float(ess), rel=1e-6 if method == "bulk" else 0.3)
+            assert row[column] == pytest.approx(N, rel=0.15)  # independent draws
+        assert abs(row["r_hat"] - 1) < 0.002
+        assert row["mcse_mean"] == pytest.approx(draws.std() / np.sqrt(N), rel=0.1)
+    mode = table.loc["sky(3, -2) [K]"]
+    assert mode["sd"] == pytest.approx(answer.std[10], rel=5 / np.sqrt(2 * N))
+
+
+def test_the_summary_of_many_short_chains_warns_of_nothing():
+    """More chains than draws is unusual, not wrong."""
+    draws = np.random.default_rng(0).normal(size=(8, 6))
+    assert list(summary({"x": draws}).index) == ["x"]

@@ -1,0 +1,273 @@
+"""The embedded diffuse sky: against ULSA itself, against naive integration, against physics."""
+
+from __future__ import annotations
+
+import itertools
+
+import h5py
+import healpy as hp
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.sky import free_free, galaxy
+from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES
+
+NSIDE = 64
+
+# (l, b) in degrees: plane, inner Galaxy, anticentre, Vela shell, local bubbles, poles.
+DIRECTIONS = [(0.5, 0.3), (0, 2), (30, 5), (45, 0), (80, -3), (180, 0), (60, -25), (200, 80)]
+
+
+@pytest.fixture
+def ulsa_map(test_data):
+    """ULSA's own map in K at 1, 3 or 10 MHz."""
+    folder = test_data / "ulsa"
+    if not folder.is_dir():
+        pytest.skip(f"no ULSA maps in {folder}")
+
+    def read(frequency_mhz):
+        name = f"exp{frequency_mhz:.1f}MHz_sky_map_with_absorption.hdf5"
+        with h5py.File(folder / name) as file:
+            return file["smooth_absorb"][:].astype(np.float64)
+
+    return read
+
+
+def embedded_sky(frequency_mhz: float) -> np.ndarray:
+    """Diffuse sky with every source spread over the pixel that it falls in."""
+    sky = galaxy.galaxy_map(frequency_mhz, NSIDE)
+    for source in BRIGHT_SOURCES:
+        pixel = hp.ang2pix(NSIDE, *source.galactic(), lonlat=True)
+        sky[pixel] += source.kelvin_steradian(frequency_mhz) / hp.nside2pixarea(NSIDE)
+    return sky
+
+
+def emissivity(s, lon_deg, lat_deg, frequency_mhz):
+    """Cong et al.'s formula, K/kpc, written out once more."""
+    lon, lat = np.radians(lon_deg), np.radians(lat_deg)
+    radius = np.hypot(s * np.cos(lat) * np.sin(lon), 8.5 - s * np.cos(lat) * np.cos(lon))
+    plane = 43.10 * ((radius + 0.1) / 3.41) ** 0.46 * np.exp(-radius / 3.41)
+    height = np.exp(-((s * np.abs(np.sin(lat)) / 1.12) ** 1.23))
+    return plane * height * (frequency_mhz / 408.0) ** -2.51
+
+
+def n_squared(s, lon_deg, lat_deg):
+    """<n_e^2> by asking of every point which region it lies in; cm^-6."""
+    lon, lat = np.radians(lon_deg), np.radians(lat_deg)
+    x, y = s * np.cos(lat) * np.sin(lon), 8.5 - s * np.cos(lat) * np.cos(lon)
+    z, radius = s * np.sin(lat), np.hypot(x, y)
+    total = free_free.thick_disc(radius) / np.cosh(np.minimum(np.abs(z) / 0.97, 90.0)) ** 4
+    total += free_free.thin_disc(radius) / np.cosh(np.minimum(np.abs(z) / 0.15, 90.0)) ** 4
+    for region in reversed(free_free.REGIONS):
+        turn = np.radians(region.angle_deg)
+        dx, dy, dz = (q - c for q, c in zip((x, y, z), region.centre_kpc, strict=True))
+        a, b, c = region.semi_axes_kpc
+        along, across = dx * np.cos(turn) + dy * np.sin(turn), dy * np.cos(turn) - dx * np.sin(turn)
+        inside = (along / a) ** 2 + (across / b) ** 2 + (dz / c) ** 2 <= 1.0
+        total = np.where(inside, region.n_squared_cm6, total)
+    return total
+
+
+def one_line(lon_deg, lat_deg, frequency_mhz, electrons=1.0):
+    lon, lat = np.array([float(lon_deg)]), np.array([float(lat_deg)])
+    temperature, depth = galaxy.line_of_sight(lon, lat, frequency_mhz, electrons)
+    row = 0 if lat_deg >= 0 else 1
+    return temperature[row, 0], depth[row, 0]
+
+
+# --- against ULSA -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("frequency_mhz", [1.0, 3.0, 10.0])
+def test_mean_temperature_is_ulsas(ulsa_map, frequency_mhz):
+    # Asked for: 25 %. The electron column, all that differs, is tuned at 1 MHz only: 5 % is had.
+    ratio = embedded_sky(frequency_mhz).mean() / ulsa_map(frequency_mhz).mean()
+    assert 0.95 < ratio < 1.05
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_spectrum_at_10_mhz_is_ulsas(ulsa_map, seed):
+    # Asked for: a factor of two. The random part adds up to 30 % to the weakest odd multipoles.
+    diffuse = hp.anafast(galaxy.galaxy_map(10.0, NSIDE, seed), lmax=47)
+    ratio = (diffuse / hp.anafast(ulsa_map(10.0), lmax=47))[1:31]
+    assert ratio.min() > 0.7 and ratio.max() < 1.5, np.round(ratio, 2)
+
+
+def test_spectrum_with_the_sources_is_ulsas_within_a_factor_of_two(ulsa_map):
+    # ULSA's smooth map has none: their white C_ell, up to 60 % of it at ell = 30, comes on top.
+    ratio = (hp.anafast(embedded_sky(10.0), lmax=47) / hp.anafast(ulsa_map(10.0), lmax=47))[1:31]
+    assert ratio.min() > 0.5 and ratio.max() < 2.0, np.round(ratio, 2)
+
+
+@pytest.mark.parametrize("frequency_mhz, floor", [(1.0, 0.85), (3.0, 0.85), (10.0, 0.98)])
+def test_pattern_is_ulsas(ulsa_map, frequency_mhz, floor):
+    # Spectra forget phases. What we leave out shows below 10 MHz: Loop I's cap in the north at
+    # 1 MHz, the arms at 3 MHz; each is about 15 % of the variance.
+    ours, theirs = galaxy.galaxy_map(frequency_mhz, NSIDE), ulsa_map(frequency_mhz)
+    assert np.corrcoef(ours, theirs)[0, 1] > floor
+
+
+def test_free_free_shadow_of_the_plane():
+    # Opaque plane at 1 MHz, transparent at 30 MHz: the contrast changes sides.
+    lon, lat = hp.pix2ang(NSIDE, np.arange(12 * NSIDE**2), lonlat=True)
+    inner = (np.abs(lat) < 5.0) & (np.abs((lon + 180.0) % 360.0 - 180.0) < 40.0)
+    low, high = galaxy.galaxy_map(1.0, NSIDE), galaxy.galaxy_map(30.0, NSIDE)
+    assert low[inner].mean() < 0.7 * low[np.abs(lat) > 40.0].mean()
+    assert high[inner].mean() > 3.0 * high[np.abs(lat) > 40.0].mean()
+
+
+# --- the line-of-sight integral ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lon_deg, lat_deg", [*DIRECTIONS, (10, 90), (263.25, -9)])
+def test_without_electrons_the_integral_is_quads(lon_deg, lat_deg):
+    # Three Gauss points per panel leave 1e-6; 1e-4 within 0.3 kpc of the cusp at the centre.
+    got, depth = one_line(lon_deg, lat_deg, 25.0, electrons=0.0)
+    edges = [0.0, 0.5, 2.0, 8.0, 8.5, 9.0, 17.0, 50.0]
+    want = sum(
+        quad(emissivity, a, b, args=(lon_deg, lat_deg, 25.0), epsabs=0.0, epsrel=1e-10)[0]
+        for a, b in itertools.pairwise(edges)
+    )
+    tolerance = 1e-4 if lon_deg < 1.0 else 1e-6
+    assert got == pytest.approx(want, rel=tolerance)
+    assert depth == 0.0
+
+
+@pytest.mark.parametrize("lon_deg, lat_deg", DIRECTIONS)
+@pytest.mark.parametrize("frequency_mhz, tolerance", [(1.0, 1e-2), (10.0, 1e-3)])
+def test_with_electrons_the_integral_is_that_of_tiny_steps(
+    lon_deg, lat_deg, frequency_mhz, tolerance
+):
+    # Slabs of constant j and kappa: second order in the depth of one, which is 100 times less
+    # at 10 MHz than at 1 MHz. Tolerances: see the measured errors in line_of_sight.
+    steps = 100_000
+    s, ds = (np.arange(steps) + 0.5) * 50.0 / steps, 50.0 / steps
+    kappa = 1e3 * free_free.absorption_per_emission_measure(frequency_mhz)
+    slab = kappa * n_squared(s, lon_deg, lat_deg) * ds
+    source = emissivity(s, lon_deg, lat_deg, frequency_mhz) * ds
+    got, depth = one_line(lon_deg, lat_deg, frequency_mhz)
+    assert got == pytest.approx(np.sum(source * np.exp(slab / 2 - np.cumsum(slab))), rel=tolerance)
+    # A step misses the edge of a region by half its length, of a path of about 1 kpc.
+    assert depth == pytest.approx(slab.sum(), rel=1e-3)
+
+
+@pytest.mark.parametrize("lon_deg, lat_deg", DIRECTIONS)
+def test_optically_thick_limit_is_the_local_source_function(lon_deg, lat_deg):
+    # All that is seen lies within the first node, 2 pc, where j changes by less than 1e-3.
+    electrons, frequency_mhz = 1e12, 5.0
+    got, _ = one_line(lon_deg, lat_deg, frequency_mhz, electrons)
+    kappa = 1e3 * electrons * free_free.absorption_per_emission_measure(frequency_mhz)
+    local = n_squared(np.zeros(1), 0.0, 0.0)[0]
+    want = emissivity(0.0, lon_deg, lat_deg, frequency_mhz) / (kappa * local)
+    assert got == pytest.approx(want, rel=2e-3)
+
+
+def test_absorption_coefficient_against_the_altenhoff_law():
+    # tau = 8.235e-2 T^-1.35 nu^-2.1 EM (Altenhoff et al. 1960) is a fit of the same Gaunt factor
+    # around 1 GHz, good to 5 % there (Mezger & Henderson 1967, ApJ 147, 471).
+    for nu_ghz in (0.3, 1.0, 3.0):
+        altenhoff = 8.235e-2 * free_free.ELECTRON_TEMPERATURE_K**-1.35 * nu_ghz**-2.1
+        ours = free_free.absorption_per_emission_measure(1e3 * nu_ghz)
+        assert ours == pytest.approx(altenhoff, rel=0.05)
+    # Below, nu^-2 and the logarithm alone: ln(49.55) + 1.5 ln 8000 = 17.383 at 1 MHz, ln 10 less
+    # at 10 MHz.
+    ratio = free_free.absorption_per_emission_measure(1.0)
+    ratio /= free_free.absorption_per_emission_measure(10.0)
+    assert ratio == pytest.approx(100.0 * 17.383 / 15.081, rel=1e-3)
+
+
+def test_chord_through_a_sphere():
+    # Centre 2 kpc away, radius 1: straight on [1, 3]; at 20 degrees the cosine rule; behind, none.
+    sphere = free_free.Region("test", (0.0, 6.5, 0.0), (1.0, 1.0, 1.0), 30.0, 1.0)
+    angle = np.radians([0.0, 20.0, 180.0])
+    direction = np.stack([np.sin(angle), -np.cos(angle), np.zeros(3)], axis=-1)
+    enter, leave = sphere.chord(direction)
+    half = np.sqrt(1.0 - 4.0 * np.sin(angle[1]) ** 2)
+    np.testing.assert_allclose(enter, [1.0, 2.0 * np.cos(angle[1]) - half, 0.0], atol=1e-12)
+    np.testing.assert_allclose(leave, [3.0, 2.0 * np.cos(angle[1]) + half, 0.0], atol=1e-12)
+
+
+# --- the map ----------------------------------------------------------------------------------
+
+
+def test_transparent_sky_scales_as_its_two_power_laws(monkeypatch):
+    # Without electrons T = G (nu/408)^-2.51 + 1.2 (nu/1000)^-2.58 exactly: rounding only.
+    per_measure = "absorption_per_emission_measure"
+    monkeypatch.setattr(free_free, per_measure, lambda frequency_mhz: 0.0)
+    low, high = (galaxy.galaxy_map(f, 16) - 1.2 * (f / 1e3) ** -2.58 for f in (2.0, 40.0))
+    np.testing.assert_allclose(low / high, (2.0 / 40.0) ** -2.51, rtol=1e-9)
+
+
+def test_background_is_absorbed_by_the_whole_column():
+    # Where tau > 100 nothing of the background is left; near the pole at 50 MHz all but 1e-3 is.
+    pixel = hp.ang2pix(NSIDE, [10.0, 200.0], [0.0, 85.0], lonlat=True)
+    with_background = galaxy.galaxy_map(1.0, NSIDE)[pixel[0]]
+    assert with_background < galaxy.background(1.0)
+    galactic, depth = one_line(200.0, 85.0, 50.0)
+    assert depth < 1e-3
+    sky = galaxy.galaxy_map(50.0, NSIDE)[pixel[1]]
+    # The random component moves the Galactic part by 5 sigma = 25 % at most.
+    assert sky == pytest.approx(galactic + galaxy.background(50.0), abs=0.25 * galactic)
+
+
+def test_pixel_order_is_galactic_ring():
+    # The Vela shell and the superbubble tell l from -l and b from -b.
+    frequency_mhz = 5.0
+    sky = galaxy.galaxy_map(frequency_mhz, NSIDE)
+    for direction in [(263.25, -9.0), (96.75, -9.0), (263.25, 9.0), (60.0, 30.0), (20.0, -70.0)]:
+        pixel = hp.ang2pix(NSIDE, *direction, lonlat=True)
+        lon, lat = hp.pix2ang(NSIDE, pixel, lonlat=True)
+        galactic, depth = one_line(lon, lat, frequency_mhz)
+        want = galactic + galaxy.background(frequency_mhz) * np.exp(-depth)
+        assert sky[pixel] == pytest.approx(want, abs=0.25 * galactic)  # 5 sigma of the texture
+    vela = hp.ang2pix(NSIDE, 263.25, -9.0, lonlat=True)
+    assert sky[vela] < 0.1 * np.median(sky)
+
+
+def test_map_is_positive_finite_float64():
+    for frequency_mhz in (1.0, 7.3, 50.0):
+        sky = galaxy.galaxy_map(frequency_mhz, 32, seed=5)
+        assert sky.dtype == np.float64 and sky.shape == (12 * 32**2,)
+        assert np.all(np.isfinite(sky)) and sky.min() > 0.0
+
+
+def test_seed_fixes_the_random_component_at_all_frequencies():
+    first = galaxy.galaxy_map(25.0, 32, seed=7)
+    np.testing.assert_array_equal(first, galaxy.galaxy_map(25.0, 32, seed=7))
+    assert np.abs(first / galaxy.galaxy_map(25.0, 32, seed=8) - 1.0).max() > 0.01
+
+    def texture(frequency_mhz, seed):
+        a, b = (galaxy.galaxy_map(frequency_mhz, 32, s) for s in (seed, seed + 1))
+        return np.log(a / b)
+
+    # The same pattern, diluted by the background: 25 and 45 MHz differ by its 7 % share of T.
+    assert np.corrcoef(texture(25.0, 1), texture(45.0, 1))[0, 1] > 0.99
+
+
+def test_random_component_has_the_stated_rms_and_large_scales_at_every_nside():
+    # One map's rms scatters by 0.12 of itself (few modes rule a spectrum ell^-2.7): 4 sigma.
+    rms = [np.std(galaxy._fluctuations(64, seed)) for seed in range(20)]
+    assert np.mean(rms) == pytest.approx(galaxy.FLUCTUATION_RMS, rel=4.0 * 0.12 / np.sqrt(20.0))
+    coarse, fine = (
+        hp.map2alm(galaxy._fluctuations(nside, 3), lmax=8, iter=10) for nside in (16, 64)
+    )
+    # Pixel quadrature at the band limit of nside 16 costs 1e-4, against 2e-2 of another draw.
+    np.testing.assert_allclose(coarse, fine, atol=2e-4)
+    assert np.std(fine) > 5e-3
+
+
+@pytest.mark.parametrize(
+    "arguments, word",
+    [
+        ((0.5,), "0.5"),
+        ((51.0,), "51.0"),
+        ((float("nan"),), "nan"),
+        ((10.0, 48), "48"),
+        ((10.0, 64, -1), "-1"),
+    ],
+)
+def test_bad_input_is_named(arguments, word):
+    with pytest.raises(InputError, match=f"is {word}, expected .*; (use|give) "):
+        galaxy.galaxy_map(*arguments)

@@ -1,0 +1,306 @@
+"""What cannot be, said of sources, antennas, priors and treatments: one clear sentence each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from experiments import program_arguments, small_experiment
+from numpyro import handlers
+
+from lusee_bayes.cli.main import main
+from lusee_bayes.core.checks import InputError
+from lusee_bayes.experiment.experiment import Experiment, build
+from lusee_bayes.experiment.model import base_model, model_with_fluxes, systematics
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.experiment.schema import SourceSection
+from lusee_bayes.experiment.setup import Setup, mean_flux, source_responses
+from lusee_bayes.experiment.simulate import simulate, true_values
+from lusee_bayes.experiment.terms import point_sources
+from lusee_bayes.sampling.program_sites import latent_sites
+from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.sky.priors import HarmonicPrior
+from lusee_bayes.systematics import Source, SpectrumBands, normal_within
+from lusee_bayes.testing import small_scenario
+
+CAS_A = "sources.list=[{name: Cas A}]"
+
+
+def built() -> Setup:
+    return small_experiment(CAS_A).setup
+
+
+def setup_of(*overrides: str) -> Setup:
+    """With a scenario of which A and the beams are the same (priors and treatments are not in)."""
+    return replace(built(), scenario=small_scenario(CAS_A, *overrides))
+
+
+def experiment(*overrides: str) -> Experiment:
+    setup = setup_of(*overrides)
+    return Experiment(setup, simulate(setup))
+
+
+def assert_one_sentence(caught):
+    text = str(caught.value)
+    assert "\n" not in text and len(text) < 300
+    assert "Traceback" not in text and "pydantic" not in text
+
+
+# --- in the scenario ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["sources.list=[{name: Cas A}, {name: Vir A}, {name: Cas A}]"],
+            "fiducial: sources: the source 'Cas A' is there twice",
+        ),
+        pytest.param(
+            ["sky.sources=true", CAS_A],
+            "the embedded sky holds the catalogue's sources already; .* set sky.sources=false",
+        ),
+        (["sources.list=[{name: X, ra_deg: 10}]"], "give both ra_deg and dec_deg, or none"),
+        (["sources.list=[{name: X, dec_deg: 10}]"], "give both ra_deg and dec_deg, or none"),
+        (
+            ["sources.list=[{name: X, ra_deg: 10, dec_deg: 91}]"],
+            "sources.list.0.dec_deg is 91, but .*less than or equal to 90",
+        ),
+        (
+            ["sources.list=[{name: Cas A, stokes_v: 1.5}]"],
+            "sources.list.0.stokes_v is 1.5, but .*less than or equal to 1",
+        ),
+        (
+            ["sources.list=[{name: Cas A, stokes_v: -1.01}]"],
+            "stokes_v is -1.01, but .*greater than or equal to -1",
+        ),
+        (["sources.list=[{name: Cas A, flux_jy: 0}]"], "flux_jy is 0, but .*greater than 0"),
+        (
+            ["sources.list=[{name: Cas A, relative_std: -1}]"],
+            "relative_std is -1, but .*greater than 0",
+        ),
+        (["sources.list=[{name: Cas A, block_h: 0}]"], "block_h is 0, but .*greater than 0"),
+        (
+            ["sources.list=[{name: Cas A, flux: 3}]"],
+            "unknown key 'sources.list.0.flux'; did you mean 'flux_jy'?",
+        ),
+        (["sources.list=[{flux_jy: 3}]"], "sources.list.0.name is missing"),
+        (
+            ["sources.treatment=[marginalised, sampled]"],
+            r"sources.treatment is \['marginalised', 'sampled'\], but .*'sampled' or 'ignored'",
+        ),
+        (
+            ["noise.gain.treatment=[marginalised, sampled]"],
+            r"noise.gain.treatment is \['marginalised', 'sampled'\], but .*'sampled' or 'ignored'",
+        ),
+        (
+            ["noise.beam={shift_mhz: 4, treatment: [marginalised, sampled]}"],
+            r"noise.beam.treatment is \['marginalised', 'sampled'\], but .*'sampled' or 'ignored'",
+        ),
+        (["noise.gain.log_sigma_std=0.5"], "log_sigma_std .* need treatment 'sampled'"),
+        (
+            ["noise.gain={log_correlation_std: 0.5, treatment: marginalised}"],
+            "log_correlation_std need treatment 'sampled'",
+        ),
+        (
+            ["noise.gain={log_correlation_std: 1.5, treatment: sampled}"],
+            "log_correlation_std is 1.5, but .*less than or equal to 1",
+        ),
+        (["prior.band_edges=[3, 3]"], "band_edges must grow from one to the next"),
+        (["prior.band_edges=[4, 2]"], "band_edges must grow from one to the next"),
+        (["prior.band_edges=[0, 2]"], "band_edges.0 is 0, but .*greater than or equal to 1"),
+        (
+            ["prior.band_edges=[2, 4]", "prior.tilt_std=0.5"],
+            "give either band_edges or log_amplitude_std and tilt_std",
+        ),
+        (
+            ["prior={band_edges: [2, 4], log_amplitude_std: 0.5}"],
+            "give either band_edges or log_amplitude_std and tilt_std",
+        ),
+        (["prior.tilt_std=0"], "prior.tilt_std is 0, but .*greater than 0"),
+        (["noise.radiometer.log_factor_std=-1"], "log_factor_std is -1, but .*greater than 0"),
+        (["noise.beam.parameters={length_m: 0}"], "length_m is 0, but .*greater than 0"),
+    ],
+)
+def test_scenarios_that_contradict_themselves(overrides, message):
+    with pytest.raises(InputError, match=message) as caught:
+        load_scenario("fiducial", ["sky.sources=false", *overrides])
+    assert_one_sentence(caught)
+
+
+# --- sources --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("{name: Cas B}", "unknown source 'Cas B'; did you mean 'Cas A'?"),
+        ("{name: Jupyter}", "unknown source 'Jupyter'; did you mean 'Jupiter'?"),
+        ("{name: Q}", "unknown source 'Q'; known: Cas A, Cen A, .*Venus.*ra_deg and dec_deg"),
+    ],
+)
+def test_unknown_sources_name_the_nearest(source, message):
+    scenario, setup = small_scenario(f"sources.list=[{source}]"), built()
+    with pytest.raises(InputError, match=message) as caught:
+        source_responses(scenario, setup.observation, setup.instrument.monopoles, 25.0)
+    assert_one_sentence(caught)
+
+
+def test_a_source_of_which_nothing_is_known_needs_a_flux():
+    """Bodies have no flux in the catalogue; the whole experiment says so."""
+    scenario = small_scenario("sources.list=[{name: Jupiter}]")
+    with pytest.raises(InputError, match="'Jupiter' is not in the catalogue.* give flux_jy") as c:
+        build(scenario)
+    assert_one_sentence(c)
+    own = SourceSection(name="mine", ra_deg=1.0, dec_deg=2.0)
+    with pytest.raises(InputError, match="'mine' is not in the catalogue"):
+        mean_flux(own, 25.0)
+
+
+@pytest.mark.parametrize(
+    ("columns", "std", "message"),
+    [
+        (jnp.full((4, 1), np.nan), 1.0, "the response to X holds NaN"),
+        (jnp.ones((4, 1)), 0.0, "standard deviation of X's flux must be positive"),
+        (jnp.ones((4, 1)), float("nan"), "standard deviation of X's flux must be positive"),
+    ],
+)
+def test_sources_that_cannot_be(columns, std, message):
+    with pytest.raises(InputError, match=message) as caught:
+        Source(columns, 1.0, std, "X")
+    assert_one_sentence(caught)
+
+
+def test_without_sources_there_are_no_fluxes():
+    for ask in (point_sources, model_with_fluxes):
+        with pytest.raises(InputError, match="the scenario has no sources.list") as caught:
+            ask(small_experiment().setup)
+        assert_one_sentence(caught)
+
+
+# --- antennas -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ("{lenght_m: 0.1}", "unknown beam parameter 'lenght_m'; did you mean 'length_m'?"),
+        ("{surface_permitivity: 0.1}", "did you mean 'surface_permittivity'?"),
+        ("{x: 1}", "unknown beam parameter 'x'; known: deep_permittivity, .*zenith_angle_deg"),
+        # 1 lies 2.7 / 5 standard deviations below: Phi(-0.54) = 29.5 %
+        (
+            "{surface_permittivity: 5}",
+            r"prior of surface_permittivity, 3.7 \+- 5, has 29.5% .*at least 1",
+        ),
+        # Phi(-0.1) = 46 %
+        ("{loss_tangent: 0.1}", r"prior of loss_tangent, 0.01 \+- 0.1, has 46.0% .*at least 0"),
+        # 105 / 60 standard deviations to 180 degrees, 75 / 60 to 0: 10.6 % and 4.0 %
+        (
+            "{zenith_angle_deg: 60}",
+            r"prior of zenith_angle_deg, 75 \+- 60, has 14.6% .*at least 0",
+        ),
+    ],
+)
+def test_antennas_that_cannot_be_sampled(parameters, message):
+    setup = setup_of(f"noise.beam.parameters={parameters}", "noise.beam.treatment=sampled")
+    for ask in (true_values, systematics):
+        with pytest.raises(InputError, match=message) as caught:
+            ask(setup)
+        assert_one_sentence(caught)
+
+
+def test_the_nearer_end_is_named():
+    with pytest.raises(InputError, match="at most 180"):
+        normal_within("angle", 170.0, 20.0, 0.0, 180.0)
+    # a quarter of a percent is allowed: 2.81 standard deviations
+    normal_within("angle", 180.0 - 2.82, 1.0, 0.0, 180.0)
+    with pytest.raises(InputError, match="0.3% of its weight"):
+        normal_within("angle", 180.0 - 2.80, 1.0, 0.0, 180.0)
+    with pytest.raises(InputError, match="standard deviation of angle must be positive"):
+        normal_within("angle", 1.0, 0.0)
+
+
+def test_bands_beyond_the_highest_ell():
+    e = experiment("prior.band_edges=[3, 7]")
+    program = load_program("systematics")
+    arguments = {n: v for n, v in program_arguments(program, e).items() if n != "data"}
+    with pytest.raises(InputError, match="a band begins at ell = 7, above lmax = 6") as caught:
+        latent_sites(program.model, arguments)
+    assert_one_sentence(caught)
+    # 6 is the highest ell itself
+    base = replace(base_model(e.setup), prior=HarmonicPrior(jnp.ones(7)))
+    with handlers.seed(rng_seed=0):
+        SpectrumBands((3, 6)).sampled(base)
+
+
+# --- programs that do not fit the scenario --------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("program", "overrides", "section"),
+    [
+        ("sources", [], "sources"),
+        ("gains", ["noise.gain.sigma=0.01"], "noise.gain"),
+        ("gain_scales", ["noise.gain.sigma=0.01"], "noise.gain"),
+        ("instrument", ["noise.beam.shift_mhz=4"], "noise.beam"),
+        ("instrument", ["noise.beam.parameters={length_m: 0.1}"], "noise.beam"),
+    ],
+)
+def test_nothing_is_counted_twice(program, overrides, section):
+    """What a program samples must not be in N as well."""
+    asked = load_program(program)
+    e = experiment(*overrides)
+    wanted = f"would count twice; set {section}.treatment=sampled"
+    with pytest.raises(InputError, match=wanted) as caught:
+        program_arguments(asked, e)
+    assert_one_sentence(caught)
+    # either of the other treatments will do
+    for treatment in ("sampled", "ignored"):
+        free = experiment(*overrides, f"{section}.treatment={treatment}")
+        assert program_arguments(asked, free)
+
+
+@pytest.mark.parametrize(
+    ("program", "message"),
+    [
+        ("gains", "the scenario has no noise.gain that could be sampled"),
+        ("sources", "the scenario has no sources.list"),
+    ],
+)
+def test_programs_about_what_the_scenario_does_not_have(program, message):
+    with pytest.raises(InputError, match=message) as caught:
+        program_arguments(load_program(program), small_experiment())
+    assert_one_sentence(caught)
+
+
+def test_pieces_of_an_experiment_need_one():
+    with pytest.raises(InputError, match="asks for 'gaussian', a piece of an experiment") as caught:
+        load_program("systematics").arguments(base_model(built()))
+    assert_one_sentence(caught)
+
+
+# --- commands -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "sources={list: [{name: Cas A}], treatment: sampled}",
+        "noise.gain={treatment: sampled}",
+        "noise.beam={shift_mhz: 4, treatment: sampled}",
+        "noise.radiometer.log_factor_std=0.5",
+        "prior.tilt_std=0.5",
+        "prior.log_amplitude_std=0.5",
+        "prior.band_edges=[2, 4]",
+    ],
+)
+def test_a_map_cannot_sample(override, tmp_path, capsys):
+    arguments = ["map", "fiducial", "-o", str(tmp_path / "out")]
+    for setting in ("lmax=6", "observation.runs.0.cycles=0.02", "sky.sources=false", override):
+        arguments += ["--set", setting]
+    assert main(arguments) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert said.endswith("a map can only marginalise; use: lusee-bayes sample")
+    assert not (tmp_path / "out").exists()

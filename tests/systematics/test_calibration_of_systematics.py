@@ -1,0 +1,226 @@
+"""Sampled systematics know how well they know: ranks of known truths over many data sets.
+
+Truths are drawn from a program's own priors, data from the truths (by the program without data),
+draws from the posterior by Hamiltonian Monte Carlo about the mode found for each data set.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import pytest
+from numpyro import handlers
+from scipy import stats
+
+import lusee_bayes as lb
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.pieces import program_pieces
+from lusee_bayes.sampling.calibration import FALSE_ALARM, LEVELS, N_DRAWS, Ranks, calibrate
+from lusee_bayes.sampling.hmc import Sampler, draw_within
+from lusee_bayes.sampling.mode import laplace_approximation
+from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.sampling.promotion import numpyro_promotion
+from lusee_bayes.systematics import SCALES
+from lusee_bayes.systematics.chart import Chart
+
+TINY = ("lmax=6", "observation.runs.0.cycles=0.02")  # 96 data, 49 modes
+MONTH = ("lmax=6", "observation.step_s=172800")  # a sample every other day: all sources rise
+LEVELS_UNKNOWN = (
+    "noise.radiometer.log_factor_std=0.5",
+    "prior.log_amplitude_std=0.5",
+    "prior.tilt_std=0.5",
+)
+SOURCES = (
+    "sources.treatment=sampled",
+    "sources.list=[{name: Cas A}, {name: Cyg A}, {name: For A}, "
+    "{name: Jupiter, flux_jy: 100000, stokes_v: 0.3}]",
+)
+
+
+def pieces(name: str, *overrides: str):
+    """(program, its arguments without the data) of a scenario."""
+    e, program = build(lb.load_scenario("fiducial", overrides)), load_program(name)
+    return program, program.arguments(full_model(e.setup), program_pieces(e))
+
+
+class Truth(eqx.Module):
+    """Values of all sites, and data, drawn by the program itself."""
+
+    program: object = eqx.field(static=True)
+    arguments: dict
+
+    def __call__(self, key):
+        trace = handlers.trace(handlers.seed(self.program.model, key)).get_trace(**self.arguments)
+        data = trace.pop("data")["value"]
+        return {name: site["value"] for name, site in trace.items()}, data
+
+
+class Draws(eqx.Module):
+    """Draws of one chain in the coordinates about the mode of each data set."""
+
+    program: object = eqx.field(static=True)
+    arguments: dict
+    sampler: Sampler = eqx.field(static=True)
+    starts: int = eqx.field(static=True, default=1)
+
+    def __call__(self, key, data):
+        arguments = {**self.arguments, "data": data}
+        approximation = laplace_approximation(self.program.model, arguments, starts=self.starts)
+        whitening = approximation.whitening
+        return draw_within(self.program.model, arguments, key, self.sampler, whitening)
+
+
+class Sites(eqx.Module):
+    """What is ranked: the sites of these names."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def __call__(self, unknowns, data):
+        return {name: unknowns[name] for name in self.names}
+
+
+def ranks_of(program, arguments, quantities, *, draws=None, n=100, seed=1, regions=()) -> Ranks:
+    """One data set after the other: in a batch, each would wait for the slowest."""
+    sampler = Sampler(warmup=60, draws=N_DRAWS, algorithm="hmc")
+    with numpyro_promotion():
+        return calibrate(
+            Truth(program, arguments),
+            draws or Draws(program, arguments, sampler),
+            quantities,
+            n_simulations=n,
+            seed=seed,
+            one_by_one=True,
+            regions=regions,
+        )
+
+
+def limits(ranks: Ranks, level: float) -> tuple[float, float]:
+    """Between which a coverage lies that is right, given how many are looked at."""
+    chance = 1 - FALSE_ALARM / (len(LEVELS) * len(ranks.names))
+    low, high = stats.binom.interval(chance, ranks.n_simulations, level)
+    return low / ranks.n_simulations, high / ranks.n_simulations
+
+
+def assert_calibrated(ranks: Ranks):
+    """Even ranks, and intervals that hold the truth as often as they say, binomially."""
+    assert ranks.passed, dict(zip(ranks.names, ranks.p_values(), strict=True))
+    for level in LEVELS:
+        least, most = limits(ranks, level)
+        for name, coverage in ranks.coverage().items():
+            assert least <= coverage[level] <= most, (name, level, coverage[level])
+
+
+@pytest.mark.long
+def test_noise_level_amplitude_and_tilt():
+    program, arguments = pieces("systematics", *TINY, *LEVELS_UNKNOWN)
+    found = ranks_of(program, arguments, Sites(("noise_level", "amplitude", "tilt")))
+    assert_calibrated(found)
+
+
+@pytest.mark.long
+def test_fluxes_of_sources_at_rest_and_of_jupiter():
+    program, arguments = pieces("systematics", *MONTH, *SOURCES)
+    names = tuple(f"flux_{name}" for name in ("Cas_A", "Cyg_A", "For_A", "Jupiter"))
+    assert_calibrated(ranks_of(program, arguments, Sites(names)))
+
+
+@pytest.mark.long
+def test_permittivity_loss_tangent_and_tilt():
+    """On a coarse grid (4e-4 of the beams), of truth and posterior alike: a gradient in 2 ms."""
+    parameters = "surface_permittivity: 0.1, loss_tangent: 0.002, zenith_angle_deg: 1.0"
+    treatment = f"noise.beam={{treatment: sampled, parameters: {{{parameters}}}}}"
+    program, arguments = pieces("systematics", *TINY, treatment)
+    (antennas,) = arguments["systematics"]
+    coarse = replace(antennas, instrument=replace(antennas.instrument, nodes=(12, 16)))
+    arguments = {**arguments, "systematics": (coarse,)}
+    sampler = Sampler(warmup=40, draws=N_DRAWS, algorithm="hmc")
+    draws = Draws(program, arguments, sampler, starts=3)
+    found = ranks_of(program, arguments, Sites(tuple(antennas.stds)), draws=draws)
+    assert_calibrated(found)
+
+
+# --- gain drifts ------------------------------------------------------------------------------
+
+
+def marginalised(arguments, data):
+    """The sky's posterior with the drifts in N, built around its own prediction."""
+    gaussian, drifts = arguments["gaussian"], arguments["gain_drifts"]
+    around = data
+    for _ in range(4):
+        seen = drifts.layout.scatter(around)
+        posterior = replace(drifts, visibilities=seen).marginalised(gaussian).condition(data)
+        around = gaussian.predict(posterior.mean)
+    return posterior
+
+
+class SampledDrifts(eqx.Module):
+    """Draws of sky and drifts together, as ``lusee-bayes sample`` makes them."""
+
+    program: object = eqx.field(static=True)
+    arguments: dict
+    chart: Chart
+    thin: int = eqx.field(static=True)
+
+    def __call__(self, key, data):
+        arguments = {**self.arguments, "data": data}
+        start = {"sky": marginalised(arguments, data).mean}
+        approximation = laplace_approximation(
+            self.program.model, arguments, start, SCALES, chart=self.chart
+        )
+        sampler = Sampler(warmup=100, draws=N_DRAWS, algorithm="hmc")
+        whitening = approximation.whitening
+        return draw_within(self.program.model, arguments, key, sampler, whitening, self.thin)
+
+
+class MarginalisedDrifts(eqx.Module):
+    """Draws of the sky with the drifts integrated out, to second order."""
+
+    arguments: dict
+
+    def __call__(self, key, data):
+        return {"sky": marginalised(self.arguments, data).sample(key, N_DRAWS)}
+
+
+class SkyAsAWhole(eqx.Module):
+    """Some modes, and the distance from the marginalised posterior's mean in its own metric."""
+
+    arguments: dict
+
+    def __call__(self, unknowns, data):
+        sky = unknowns["sky"]
+        white = marginalised(self.arguments, data).whiten(sky[None])[0]
+        return {"mode": sky[::6], "distance": (white**2).sum()}
+
+
+def drifting(drift: str):
+    program, arguments = pieces("gains", *TINY, f"noise.gain={{{drift}, treatment: sampled}}")
+    chart = arguments["gain_drifts"].chart(arguments["gaussian"])
+    return program, arguments, chart
+
+
+@pytest.mark.long
+def test_strong_drifts_are_calibrated_where_they_are_sampled_and_not_where_marginalised():
+    """sigma_g = 0.05 against noise of 1e-5: second order is not enough for the sky as a whole."""
+    program, arguments, chart = drifting("sigma: 0.05, correlation_h: 10")
+    quantities, regions = SkyAsAWhole(arguments), ("distance",)
+    draws = SampledDrifts(program, arguments, chart, 3)
+    exact = ranks_of(program, arguments, quantities, draws=draws, n=200, regions=regions)
+    assert_calibrated(exact)
+    draws = MarginalisedDrifts(arguments)
+    approximate = ranks_of(program, arguments, quantities, draws=draws, n=1000, regions=regions)
+    for level in (0.90, 0.95):
+        assert approximate.coverage()["distance"][level] < limits(approximate, level)[0], level
+        off = [abs(r.coverage()["distance"][level] - level) for r in (exact, approximate)]
+        assert off[0] < off[1], (level, off)
+
+
+@pytest.mark.long
+def test_strength_and_correlation_time_of_drifts():
+    """Sampled with the drifts themselves and the sky."""
+    scales = "sigma: 0.02, correlation_h: 10, log_sigma_std: 0.5, log_correlation_std: 0.2"
+    program, arguments, chart = drifting(scales)
+    quantities = Sites(("gain_sigma", "gain_correlation_h"))
+    draws = SampledDrifts(program, arguments, chart, 8)
+    assert_calibrated(ranks_of(program, arguments, quantities, draws=draws))

@@ -1,0 +1,311 @@
+"""Levels and spectra that are not known, and the general program, against hand-made densities.
+
+Small dense models against scipy; a scenario's own, of condition 1e12, against decimal arithmetic.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from experiments import program_arguments, small_experiment
+from numpyro import handlers
+from numpyro.infer import init_to_median
+from numpyro.infer.util import log_density
+from reference_linear import exact_posterior, random_covariance
+from scipy.stats import lognorm, multivariate_normal, norm
+
+import lusee_bayes as lb
+from lusee_bayes.experiment.model import full_model, model_to_sample, radiometer
+from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.experiment.simulate import true_values
+from lusee_bayes.experiment.terms import point_sources
+from lusee_bayes.instrument.beams import monopole_beams
+from lusee_bayes.instrument.coupling import CouplingMatrix
+from lusee_bayes.noise import difference
+from lusee_bayes.noise.covariance import LowRankCovariance
+from lusee_bayes.sampling.program_sites import site_names
+from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.sampling.promotion import numpyro_promotion
+from lusee_bayes.systematics import (
+    Marginalised,
+    NoiseLevel,
+    PointSources,
+    PowerSpectrum,
+    Source,
+    SpectrumBands,
+    uncertain_scale,
+)
+
+LMAX, N_DATA = 4, 40
+ELLS = np.arange(LMAX + 1)
+PER_ELL = 2 * ELLS + 1
+
+
+class Case:
+    """Data of 25 modes as dense matrices."""
+
+    def __init__(self):
+        rng = np.random.default_rng(4)
+        self.a, self.spectrum = rng.normal(size=(N_DATA, 25)), 4.0 / (1.0 + ELLS)
+        self.n = 3.0 * random_covariance(rng, N_DATA)
+        self.data = 3.0 * rng.normal(size=N_DATA)
+        self.model = lb.LinearGaussian(
+            jnp.asarray(self.a),
+            lb.HarmonicPrior(jnp.asarray(self.spectrum)),
+            lb.DenseCovariance(jnp.asarray(self.n)),
+        )
+
+    def evidence(self, factors=1.0, level=1.0, more=0.0, mean=0.0) -> float:
+        """ln N(d; mean, A S A^T + level N + more) with C_ell times ``factors``."""
+        variance = np.repeat(self.spectrum * factors, PER_ELL)
+        covariance = (self.a * variance) @ self.a.T + level * self.n + more
+        return float(multivariate_normal.logpdf(self.data, np.zeros(N_DATA) + mean, covariance))
+
+
+@pytest.fixture(scope="module")
+def case():
+    return Case()
+
+
+def density(program, arguments, values) -> tuple[float, dict]:
+    """ln p of everything at these values, and the trace."""
+    values = {name: jnp.asarray(value) for name, value in values.items()}
+    with numpyro_promotion():
+        got, trace = log_density(program.model, (), arguments, values)
+    return float(got), trace
+
+
+def general(case, systematics, values) -> float:
+    """By models/systematics.py; no site may be left to chance."""
+    arguments = {"gaussian": case.model, "systematics": tuple(systematics)}
+    got, trace = density(
+        load_program("systematics"), arguments | {"data": jnp.asarray(case.data)}, values
+    )
+    assert set(trace) == {*values, "data"}
+    return got
+
+
+# densities of order 100 of matrices with condition below 1e4: 1e-11 of them, as the others here
+CLOSE = 1e-11
+
+
+# --- one by one -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", [0.2, 1.0, 7.0])
+def test_the_noise_level_is_a_ratio_of_variances(case, level):
+    expected = case.evidence(level=level) + lognorm.logpdf(level, 0.7)
+    got = general(case, [NoiseLevel(0.7)], {"noise_level": level})
+    assert got == pytest.approx(expected, rel=CLOSE)
+
+
+@pytest.mark.parametrize(("amplitude", "tilt"), [(1.0, 0.0), (0.3, -1.0), (5.0, 1.4)])
+def test_amplitude_and_tilt_of_the_spectrum(case, amplitude, tilt):
+    """C_ell A ((ell + 1) / 10)^tilt; either may be known."""
+    steep = ((ELLS + 1) / 10) ** tilt
+    of_amplitude, of_tilt = lognorm.logpdf(amplitude, 0.4), norm.logpdf(tilt, 0.0, 0.6)
+    got = general(case, [PowerSpectrum(0.4, 0.6)], {"amplitude": amplitude, "tilt": tilt})
+    expected = case.evidence(amplitude * steep) + of_amplitude + of_tilt
+    assert got == pytest.approx(expected, rel=CLOSE)
+    got = general(case, [PowerSpectrum(0.4)], {"amplitude": amplitude})
+    assert got == pytest.approx(case.evidence(amplitude) + of_amplitude, rel=CLOSE)
+    got = general(case, [PowerSpectrum(tilt_std=0.6)], {"tilt": tilt})
+    assert got == pytest.approx(case.evidence(steep) + of_tilt, rel=CLOSE)
+
+
+@pytest.mark.parametrize(
+    ("edges", "power", "factors"),
+    [
+        ((2,), [0.5, 3.0], [0.5, 0.5, 3.0, 3.0, 3.0]),
+        ((1, 2, 4), [4.0, 0.3, 1.5, 0.7], [4.0, 0.3, 1.5, 1.5, 0.7]),
+    ],
+)
+def test_bands_of_the_spectrum(case, edges, power, factors):
+    """An edge is the first ell of its band; the lowest band begins at 0, the highest ends it."""
+    expected = case.evidence(np.array(factors)) + lognorm.logpdf(power, 0.8).sum()
+    got = general(case, [SpectrumBands(edges, 0.8)], {"band_power": np.array(power)})
+    assert got == pytest.approx(expected, rel=CLOSE)
+
+
+def test_the_program_with_bands(case):
+    """Its edges are 1, 3, 6, 12, 24, of which lmax = 4 leaves two."""
+    power = np.array([2.0, 0.4, 1.7])
+    expected = case.evidence(np.array([2.0, 0.4, 0.4, 1.7, 1.7]))
+    expected += lognorm.logpdf(power, 1.0).sum()
+    program = load_program("spectrum_bands")
+    arguments = program.arguments(case.model) | {"data": jnp.asarray(case.data)}
+    got, trace = density(program, arguments, {"band_power": power})
+    assert set(trace) == {"band_power", "data"}
+    assert got == pytest.approx(expected, rel=CLOSE)
+
+
+# --- priors ---------------------------------------------------------------------------------------
+
+
+def test_the_medians_change_nothing(case):
+    """All are ratios to what is known, of median one (the tilt: zero).
+
+    NumPyro's median is that of 15 draws: of ln to 1.25 / sqrt(15) of the standard deviation.
+    """
+    systematics = (NoiseLevel(0.5), PowerSpectrum(0.5, 0.5))
+    program, data = load_program("systematics"), jnp.asarray(case.data)
+    at_medians = {"noise_level": 1.0, "amplitude": 1.0, "tilt": 0.0}
+    priors = 2 * lognorm.logpdf(1.0, 0.5) + norm.logpdf(0.0, 0.0, 0.5)
+    assert general(case, systematics, at_medians) - priors == pytest.approx(
+        case.evidence(), rel=CLOSE
+    )
+    with numpyro_promotion():
+        model = handlers.substitute(handlers.seed(program.model, 0), substitute_fn=init_to_median)
+        trace = handlers.trace(model).get_trace(case.model, systematics, data)
+    for name, median in at_medians.items():
+        site = trace[name]
+        assert float(site["fn"].cdf(jnp.asarray(median))) == pytest.approx(0.5, abs=1e-15)
+        assert site["value"].dtype == np.float64
+        off = site["value"] if name == "tilt" else jnp.log(site["value"])
+        assert abs(float(off)) < 5 * 0.5 * 1.25 / np.sqrt(15)
+
+
+def test_an_uncertain_scale():
+    prior = uncertain_scale(0.01, 0.5)
+    for z in (-2.0, 0.0, 1.0):
+        value = 0.01 * np.exp(0.5 * z)
+        assert float(prior.cdf(jnp.asarray(value))) == pytest.approx(norm.cdf(z), abs=1e-14)
+        expected = lognorm.logpdf(value, 0.5, scale=0.01)
+        assert float(prior.log_prob(jnp.asarray(value))) == pytest.approx(expected, rel=1e-13)
+
+
+def test_marginalised_they_stay_as_they_are(case):
+    """There is no Gaussian for them."""
+    for systematic in (NoiseLevel(0.5), PowerSpectrum(0.5, 0.5), SpectrumBands((2,))):
+        assert systematic.marginalised(case.model) is case.model
+        assert not systematic.needs_sky
+
+
+# --- several at once ------------------------------------------------------------------------------
+
+
+def test_several_at_once(case):
+    """Noise level, bands and a source with two amplitudes; what is marginalised keeps its place."""
+    rng = np.random.default_rng(8)
+    columns, other = rng.normal(size=(N_DATA, 2)), rng.normal(size=(N_DATA, 1))
+    source = PointSources((Source(jnp.asarray(columns), 2.0, 0.5, "Cas A"),))
+    hidden = PointSources((Source(jnp.asarray(other), 3.0, 4.0, "Vir A"),))
+    level, power, flux = 2.5, np.array([0.6, 1.9]), np.array([1.2, 2.9])
+    values = {"noise_level": level, "band_power": power, "flux_Cas_A": flux}
+    priors = lognorm.logpdf(level, 0.7) + lognorm.logpdf(power, 0.8).sum()
+    priors += norm.logpdf(flux, 2.0, 0.5).sum()
+    factors = np.array([0.6, 0.6, 0.6, 1.9, 1.9])
+    mean, term = columns @ flux + 3.0 * other[:, 0], 16.0 * other @ other.T
+    levels, bands = NoiseLevel(0.7), SpectrumBands((3,), 0.8)
+    # the order of those that do not touch the noise is all the same
+    for order in (
+        [levels, bands, source, Marginalised(hidden)],
+        [source, levels, Marginalised(hidden), bands],
+    ):
+        expected = case.evidence(factors, level, term, mean) + priors
+        assert general(case, order, values) == pytest.approx(expected, rel=CLOSE)
+    # a level behind the marginalised source scales that, too
+    expected = case.evidence(factors, level, level * term, mean) + priors
+    got = general(case, [bands, Marginalised(hidden), levels, source], values)
+    assert got == pytest.approx(expected, rel=CLOSE)
+
+
+# --- in a scenario --------------------------------------------------------------------------------
+
+ALL = (
+    "noise.radiometer.log_factor_std=0.5",
+    "prior.band_edges=[2, 5]",
+    "prior.log_band_std=0.8",
+    "noise.beam={shift_mhz: 2, treatment: sampled}",
+    "sources={list: [{name: Cas A}, {name: For A, relative_std: 0.2}], treatment: sampled}",
+)
+
+
+def matrices(setup: Setup):
+    """A, the difference to the beams of 27 MHz, diagonals of S and of the radiometer's N."""
+    shift = CouplingMatrix.build(difference(monopole_beams(27.0, 6), setup.beams), setup.pointing)
+    return (
+        np.asarray(setup.coupling.dense()),
+        np.asarray(shift.dense()),
+        np.asarray(setup.prior.variance()),
+        np.asarray(radiometer(setup).diagonal()),
+    )
+
+
+@pytest.mark.long
+def test_all_that_a_scenario_samples():
+    """d ~ N(T f, (A + b dA) S (A + b dA)^T + level N_0), for values far from the medians."""
+    e = small_experiment(*ALL)
+    setup, data, program = e.setup, e.data, load_program("systematics")
+    arguments = program_arguments(program, e)
+    latent, observed = site_names(program.model, arguments)
+    sites = ["noise_level", "band_power", "beam_amplitude", "flux_Cas_A", "flux_For_A"]
+    assert latent == sites and observed == ["data"]
+    a, da, s, n = matrices(setup)
+    sources = point_sources(setup).sources
+    t = np.stack([np.asarray(r).reshape(-1) for r in setup.responses], axis=1)
+    level, power, amplitude = 1.8, np.array([0.7, 2.2, 0.9]), -0.6
+    flux = np.array([source.mean + 0.7 * source.std for source in sources])
+    s = s * np.repeat(power, [4, 21, 24])
+    d = np.asarray(data.data) - t @ flux
+    expected = exact_posterior(a + amplitude * da, s, np.diag(level * n), d).log_prob
+    expected += lognorm.logpdf(level, 0.5) + lognorm.logpdf(power, 0.8).sum()
+    expected += norm.logpdf(amplitude) + norm.logpdf(0.7) * 2
+    expected -= sum(np.log(source.std) for source in sources)
+    values = {
+        "noise_level": level,
+        "band_power": power,
+        "beam_amplitude": amplitude,
+        "flux_Cas_A": flux[0],
+        "flux_For_A": flux[1],
+    }
+    got, _ = density(program, arguments, values)
+    # 49 logarithms of squeezed modes with 1e-6 each, and chi^2 of which A, by two compilations,
+    # has its share of rounding: 1e-13 of 2e4 K against 0.2 K
+    assert got == pytest.approx(expected, rel=1e-8, abs=1e-4)
+
+
+def test_the_level_is_that_of_the_radiometer_only():
+    """A sampled noise level leaves a marginalised beam error as it is, and marginalised sources."""
+    sources = ALL[4].replace("sampled", "marginalised")
+    e = small_experiment(ALL[0], "noise.beam.shift_mhz=2", sources)
+    setup, data, program = e.setup, e.data, load_program("systematics")
+    base, rest = model_to_sample(setup, data)
+    assert isinstance(rest[0], NoiseLevel)
+    assert all(isinstance(systematic, Marginalised) for systematic in rest[1:]) and len(rest) == 3
+    np.testing.assert_array_equal(base.noise.diagonal(), radiometer(setup).diagonal())
+    _, da, s, n = matrices(setup)
+    t = np.stack([np.asarray(r).reshape(-1) for r in setup.responses], axis=1)
+    std = np.array([source.std for source in point_sources(setup).sources])
+    arguments = program_arguments(program, e)
+    with numpyro_promotion():
+        model = handlers.substitute(program.model, {"noise_level": jnp.asarray(9.0)})
+        given = model(**arguments)
+    term = (da * s) @ da.T + (t * std**2) @ t.T
+    expected = np.diag(9.0 * n) + term
+    got = np.asarray(given.noise.dense())
+    # the two terms hold up to 1e6 K^2 of which rounding leaves 1e-10 K^2, the radiometer 0.05
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13 * term.max())
+    assert np.abs(got - (np.diag(n) + term)).max() > 0.1
+    # in the first-order model the level is one
+    plain = np.diag(n) + term
+    np.testing.assert_allclose(
+        full_model(setup).noise.dense(), plain, rtol=0, atol=1e-13 * term.max()
+    )
+    # and in simulated data it is the drawn one
+    assert set(true_values(setup)) == {"noise_level", "beam_amplitude", "flux_Cas_A", "flux_For_A"}
+
+
+def test_a_term_that_is_already_there_is_scaled(case):
+    """By the definition of the level: of all noise that the model holds so far."""
+    root = np.random.default_rng(1).normal(size=(N_DATA, 2))
+    base = lb.LinearGaussian(
+        case.model.coupling,
+        case.model.prior,
+        case.model.noise + LowRankCovariance(jnp.asarray(root)),
+    )
+    with handlers.substitute(data={"noise_level": jnp.asarray(4.0)}):
+        got = NoiseLevel(1.0).sampled(base).noise.dense()
+    expected = 4.0 * (case.n + root @ root.T)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-14 * expected.max())

@@ -1,0 +1,348 @@
+"""Point sources beside the map: in N, among the unknowns, sampled, and in simulated data.
+
+The oracle takes A, N_0 and the responses as matrices and works in decimal arithmetic of 60 digits
+(``exact_posterior``): K = A S A^T + N has condition 1e12 here.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from functools import lru_cache
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from experiments import program_arguments, small_experiment
+from numpyro.infer.util import log_density
+from reference_linear import exact_posterior
+from scipy.constants import Boltzmann, speed_of_light
+from scipy.stats import chi2, norm
+
+from lusee_bayes.cli.main import main
+from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.model import (
+    base_model,
+    full_model,
+    model_to_sample,
+    model_with_fluxes,
+    radiometer,
+)
+from lusee_bayes.experiment.setup import Setup, source_responses
+from lusee_bayes.experiment.simulate import simulate, true_values
+from lusee_bayes.experiment.terms import point_sources
+from lusee_bayes.instrument.source_response import altitude_deg
+from lusee_bayes.results.fluxes import flux_lines, flux_table
+from lusee_bayes.results.map_result import map_result
+from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.sampling.promotion import numpyro_promotion
+from lusee_bayes.sky import BRIGHT_SOURCES, galactic_unit_vector
+from lusee_bayes.testing import small_scenario
+
+# Cas A is up, For A has an amplitude for every two of the six samples, and the last lies near the
+# north pole of the Moon, 24 degrees below the horizon for ever
+LIST = (
+    "sources.list=[{name: Cas A}, {name: For A, block_h: 4, relative_std: 0.2},"
+    " {name: Polaris, ra_deg: 270, dec_deg: 66.5, flux_jy: 20000}]"
+)
+SITES = ["flux_Cas_A", "flux_For_A", "flux_Polaris"]
+
+
+def built() -> Setup:
+    return small_experiment(LIST).setup
+
+
+def setup_of(treatment: str = "marginalised", seed: int = 1) -> Setup:
+    """Neither the treatment nor the seed enters what was built (A, the beams, the responses)."""
+    scenario = small_scenario(LIST, f"sources.treatment={treatment}", f"seed={seed}")
+    return replace(built(), scenario=scenario)
+
+
+@lru_cache
+def experiment(treatment: str = "marginalised", seed: int = 1) -> Setup:
+    setup = setup_of(treatment, seed)
+    return Experiment(setup, simulate(setup))
+
+
+def data(treatment: str = "marginalised", seed: int = 1):
+    return experiment(treatment, seed).data
+
+
+def columns() -> np.ndarray:
+    """T (data, 5): the responses of every source and block, from those of all products and times.
+
+    The data are all products of all times, products outside.
+    """
+    cas, fornax, polaris = (np.asarray(r) for r in built().responses)
+    rows = [cas]
+    for block in range(3):
+        row = np.zeros_like(fornax)
+        row[:, 2 * block : 2 * block + 2] = fornax[:, 2 * block : 2 * block + 2]
+        rows.append(row)
+    return np.stack([r.reshape(-1) for r in [*rows, polaris]], axis=1)
+
+
+def kelvin_steradian(flux_jy: float, frequency_mhz: float = 25.0) -> float:
+    """Rayleigh and Jeans: I = 2 k T nu^2 / c^2."""
+    return flux_jy * 1e-26 / (2 * Boltzmann * (frequency_mhz * 1e6 / speed_of_light) ** 2)
+
+
+def priors() -> tuple[np.ndarray, np.ndarray]:
+    """Means and standard deviations of the five fluxes, in K sr."""
+    known = {s.name: kelvin_steradian(float(s.flux_jy(25.0))) for s in BRIGHT_SOURCES}
+    mean = np.array([known["Cas A"], *[known["For A"]] * 3, kelvin_steradian(20000.0)])
+    return mean, mean * np.array([0.5, 0.2, 0.2, 0.2, 0.5])
+
+
+@lru_cache
+def answer():
+    """Posterior of sky and fluxes (minus their means) as one Gaussian, in closed form."""
+    e, (mean, std), t = built(), priors(), columns()
+    both = np.concatenate([np.asarray(e.coupling.dense()), t], axis=1)
+    variance = np.concatenate([np.asarray(e.prior.variance()), std**2])
+    noise = np.diag(np.asarray(radiometer(e).diagonal()))
+    return exact_posterior(both, variance, noise, np.asarray(data().data) - t @ mean)
+
+
+# --- responses ------------------------------------------------------------------------------------
+
+
+def test_the_columns_and_the_priors():
+    sources = point_sources(built())
+    t, (mean, std) = columns(), priors()
+    np.testing.assert_array_equal(sources.columns(), t)
+    # constants of nature of CODATA 2018 on both sides
+    np.testing.assert_allclose(sources.mean(), mean, rtol=1e-12)
+    np.testing.assert_allclose(sources.std(), std, rtol=1e-12)
+    assert [s.n_blocks for s in sources.sources] == [1, 3, 1]
+    assert [s.site for s in sources.sources] == SITES
+
+
+def test_the_columns_of_the_blocks_sum_to_that_of_one_amplitude():
+    whole = built().responses[1].reshape(-1)
+    blocks = point_sources(built()).sources[1].columns
+    np.testing.assert_array_equal(blocks.sum(1), whole)
+    # each datum belongs to one block
+    assert ((np.asarray(blocks) != 0).sum(1) == 1).all()
+
+
+def test_the_circularly_polarised_part_enters_linearly():
+    """An auto sees the power in one polarisation, so it never is negative, whatever V is."""
+    e = built()
+    fornax = "ra_deg: 50.67, dec_deg: -37.21, flux_jy: 1"
+    circular = [f"{{name: V {v}, stokes_v: {v}, {fornax}}}" for v in (0.0, 1.0, -1.0, 0.3)]
+    scenario = small_scenario(f"sources.list=[{', '.join(circular)}]")
+    found = source_responses(scenario, e.observation, scenario.beam.source().monopoles, 25.0)
+    none, right, left, some = (np.asarray(r) for r in found)
+    largest = np.abs(none).max()
+    slope = 0.5 * (right - left)
+    assert np.abs(slope).max() > 0.1 * largest
+    # rounding of sums of three numbers
+    np.testing.assert_allclose(0.5 * (right + left), none, rtol=0, atol=1e-14 * largest)
+    np.testing.assert_allclose(some, none + 0.3 * slope, rtol=0, atol=1e-14 * largest)
+    for auto in (0, 7, 12, 15):
+        assert (right[auto] >= -1e-14 * largest).all()
+        assert (left[auto] >= -1e-14 * largest).all()
+
+
+# --- marginalised ---------------------------------------------------------------------------------
+
+
+def test_marginalised_they_are_in_the_noise_and_the_offset():
+    setup = setup_of()
+    base, sources = base_model(setup), point_sources(setup)
+    model = sources.marginalised(base)
+    t, (mean, std) = columns(), priors()
+    expected = np.diag(np.asarray(base.noise.diagonal())) + (t * std**2) @ t.T
+    np.testing.assert_allclose(
+        model.noise.dense(), expected, rtol=0, atol=1e-14 * np.abs(expected).max()
+    )
+    np.testing.assert_allclose(model.offset, t @ mean, rtol=0, atol=1e-13 * np.abs(t @ mean).max())
+    # an offset that is there already stays
+    twice = sources.marginalised(replace(base, offset=jnp.ones(96)))
+    np.testing.assert_allclose(twice.offset, 1.0 + model.offset, rtol=1e-14)
+    # it is what the experiment itself makes
+    whole = full_model(setup)
+    np.testing.assert_array_equal(whole.noise.dense(), model.noise.dense())
+    np.testing.assert_array_equal(whole.offset, model.offset)
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_the_sky_is_the_same_with_fluxes_in_the_noise_or_beside_it():
+    """Both against the closed form: Lambda's condition of 1e10 costs 1e-6 of a variance; means are
+    refined, to better than 1e-6 standard deviations."""
+    setup, expected = setup_of(), answer()
+    marginal = full_model(setup).condition(data().data)
+    joint = model_with_fluxes(setup).condition(data().data)
+    sky = expected.std[:49]
+    for posterior in (marginal, joint):
+        off = (np.asarray(posterior.mean)[:49] - expected.mean[:49]) / sky
+        assert np.abs(off).max() < 1e-5
+        np.testing.assert_allclose(np.asarray(posterior.std())[:49], sky, rtol=1e-5)
+        assert float(posterior.log_evidence) == pytest.approx(expected.log_prob, abs=1e-4)
+    assert marginal.mean.shape == (49,) and joint.mean.shape == (54,)
+    # the sources matter: with them in the data only, the sky is off by what can be seen
+    wrong = full_model(setup_of("ignored")).condition(data().data)
+    assert np.abs((np.asarray(wrong.mean) - expected.mean[:49]) / sky).max() > 1.0
+
+
+# --- fluxes ---------------------------------------------------------------------------------------
+
+
+def test_fluxes_with_the_sky_integrated_out():
+    """d - T mean ~ N(T x, A S A^T + N_0): generalised least squares with a prior."""
+    posterior = model_with_fluxes(setup_of()).condition(data().data)
+    mean, std = priors()
+    expected = answer()
+    flux = mean + np.asarray(posterior.mean)[49:]
+    np.testing.assert_allclose(np.asarray(posterior.std())[49:], expected.std[49:], rtol=1e-5)
+    off = (flux - mean - expected.mean[49:]) / expected.std[49:]
+    assert np.abs(off).max() < 1e-5
+    # the data do tell something
+    assert expected.std[49] < 0.9 * std[0]
+
+
+def test_the_table_is_in_jansky():
+    table = flux_table(experiment(), infer(experiment()))
+    expected, (mean, std), truth = answer(), priors(), true_values(setup_of())
+    jansky = 1.0 / kelvin_steradian(1.0)
+    assert list(table["source"]) == ["Cas A", "For A", "For A", "For A", "Polaris"]
+    assert list(table["block"]) == [0, 0, 1, 2, 0]
+    assert list(table["above_horizon"]) == [True, True, True, True, False]
+    fluxes = mean + expected.mean[49:]
+    np.testing.assert_allclose(table["flux_k_sr"], fluxes, rtol=1e-5)
+    np.testing.assert_allclose(table["flux_jy"], fluxes * jansky, rtol=1e-5)
+    np.testing.assert_allclose(table["std_k_sr"], expected.std[49:], rtol=1e-5)
+    np.testing.assert_allclose(table["std_jy"], expected.std[49:] * jansky, rtol=1e-5)
+    np.testing.assert_allclose(table["prior_jy"], mean * jansky, rtol=1e-12)
+    np.testing.assert_allclose(table["prior_std_jy"], std * jansky, rtol=1e-12)
+    true = np.concatenate([np.atleast_1d(truth[site]) for site in SITES])
+    np.testing.assert_allclose(table["true_jy"], true * jansky, rtol=1e-12)
+    # and the truth is where the posterior says, five of them to 5 sigma
+    off = (table["flux_jy"] - table["true_jy"]) / table["std_jy"]
+    assert np.abs(off).max() < 5.0
+    # data without a truth have no such column
+    real = replace(experiment(), data=replace(data(), truth=None))
+    assert "true_jy" not in flux_table(real, infer(real))
+
+
+@pytest.mark.long
+def test_a_source_below_the_horizon_is_known_from_its_prior_only():
+    e = experiment()
+    polaris = galactic_unit_vector(270.0, 66.5)
+    assert altitude_deg(e.setup.observation, polaris).max() < -20.0
+    result = map_result(e)
+    row = result.fluxes.iloc[4]
+    assert not row["above_horizon"]
+    assert row["flux_jy"] == row["prior_jy"]
+    # its column of Lambda is that of the unit matrix, exactly
+    assert row["std_jy"] == pytest.approx(row["prior_std_jy"], rel=1e-15)
+    lines = flux_lines(result.fluxes)
+    assert len(lines) == 5
+    said = ["never above the horizon" in line for line in lines]
+    assert said == [False, False, False, False, True]
+    assert lines[4].startswith("Polaris: 2e+04 +- 1e+04 Jy")
+    assert [line.split(":")[0] for line in lines[1:4]] == ["For A", "For A (1)", "For A (2)"]
+    assert result.lines()[1:-1] == lines
+
+
+def test_ignored_sources_have_no_fluxes():
+    result = map_result(experiment("ignored"))
+    assert result.fluxes is None and result.lines() == [result.headline(), result.verdict()]
+
+
+# --- sampled --------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_the_program_given_its_fluxes():
+    """d ~ N(T f, A S A^T + N_0). ln det K of 49 squeezed modes: 1e-6 each."""
+    e, program = experiment("sampled"), load_program("sources")
+    setup = e.setup
+    setup = e.setup
+    t, (mean, std) = columns(), priors()
+    arguments = program_arguments(program, e)
+    a, s = np.asarray(setup.coupling.dense()), np.asarray(setup.prior.variance())
+    noise = np.diag(np.asarray(radiometer(setup).diagonal()))
+    for z in (np.zeros(5), np.array([0.3, -1.0, 0.5, 2.0, -0.7])):
+        flux = mean + std * z
+        expected = exact_posterior(a, s, noise, np.asarray(data().data) - t @ flux).log_prob
+        expected += norm.logpdf(flux, mean, std).sum()
+        values = {"flux_Cas_A": flux[0], "flux_For_A": flux[1:4], "flux_Polaris": flux[4]}
+        values = {name: jnp.asarray(value) for name, value in values.items()}
+        with numpyro_promotion():
+            got, trace = log_density(program.model, (), arguments, values)
+        assert set(trace) == {*SITES, "data"}
+        assert float(got) == pytest.approx(expected, rel=1e-9, abs=1e-4)
+
+
+# --- simulated data -------------------------------------------------------------------------------
+
+
+def test_simulated_data_hold_the_drawn_fluxes():
+    setup = setup_of()
+    truth = true_values(setup)
+    flux = np.concatenate([np.atleast_1d(truth[site]) for site in SITES])
+    d = data()
+    t, a = columns(), np.asarray(setup.coupling.dense())
+    sigma = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+
+    def misfit(flux):
+        off = np.asarray(d.data) - a @ np.asarray(d.truth) - t @ flux
+        return float(((off / sigma) ** 2).sum())
+
+    # chi^2 of 96 data, beyond which it is once in a million
+    low, high = chi2.ppf(5e-7, 96), chi2.isf(5e-7, 96)
+    assert low < misfit(flux) < high
+    # each of the four amplitudes of sources that are up is seen in it
+    for k in range(4):
+        other = flux.copy()
+        other[k] = priors()[0][k]
+        assert misfit(other) > high
+    z = (flux - priors()[0]) / priors()[1]
+    assert np.abs(z).max() < 5.0 and len(set(z)) == 5
+
+
+def test_the_seed_decides_the_fluxes():
+    first, again, other = (true_values(setup_of(seed=s)) for s in (1, 1, 2))
+    assert set(first) == set(SITES)
+    for site in SITES:
+        np.testing.assert_array_equal(first[site], again[site])
+        assert (np.asarray(first[site]) != np.asarray(other[site])).all()
+
+
+def test_the_treatment_changes_the_model_only():
+    for treatment in ("ignored", "sampled"):
+        np.testing.assert_array_equal(data(treatment).data, data().data)
+    ignoring = full_model(setup_of("ignored"))
+    assert ignoring.offset is None
+    np.testing.assert_array_equal(ignoring.noise.dense(), radiometer(built()).dense())
+    # sampled ones are in N of the first-order model, and not in that of the program
+    sampled = setup_of("sampled")
+    marginalised = full_model(setup_of()).noise.dense()
+    np.testing.assert_array_equal(full_model(sampled).noise.dense(), marginalised)
+    base, rest = model_to_sample(sampled, data())
+    assert base.offset is None and len(rest) == 1
+
+
+# --- command --------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_the_map_command_writes_the_fluxes(tmp_path, capsys):
+    arguments = ["map", "fiducial", "-o", str(tmp_path)]
+    for override in ("lmax=6", "observation.runs.0.cycles=0.02", "sky.sources=false", LIST):
+        arguments += ["--set", override]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "Polaris: 2e+04 +- 1e+04 Jy, the prior's: it is never above the horizon" in printed
+    with (tmp_path / "sources.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    table = flux_table(experiment(), infer(experiment()))
+    assert list(rows[0]) == list(table.columns)
+    assert [row["source"] for row in rows] == list(table["source"])
+    # written in full
+    for name in ("flux_jy", "std_jy", "true_jy"):
+        np.testing.assert_allclose([float(r[name]) for r in rows], table[name], rtol=1e-9)
