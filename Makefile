@@ -3,6 +3,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # numbers that must not depend on the machine's locale or on a display
 export MPLBACKEND := agg
+# modules are compiled once, not by every process
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: map test essential long lint docs bench clean
 

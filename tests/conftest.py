@@ -39,7 +39,7 @@ DATA = Path(
 
 # Linux lets a process have 65530 memory maps; every compiled program takes some, and XLA crashes
 # where there are no more
-MANY_MAPS = 25_000
+MANY_MAPS = 45_000
 
 
 @pytest.fixture(autouse=True, scope="module")

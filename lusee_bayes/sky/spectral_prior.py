@@ -39,6 +39,36 @@ SPECTRA = {
 KERNEL_TOLERANCE = 1e-10
 
 
+def check_components(names: tuple[str, ...], n_channels: int, residual: float | None) -> None:
+    """Refuse spectral components that so many channels cannot tell apart.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Keys of ``SPECTRA``.
+    n_channels : int
+    residual : float, optional
+        None if it is what a fit of the components leaves, for which it must leave something.
+
+    Raises
+    ------
+    InputError
+        For unknown names, and for fewer channels than the components need.
+    """
+    for name in names:
+        if name not in SPECTRA:
+            raise InputError(f"unknown component '{name}'; {nearest(name, SPECTRA)}")
+    if not names or n_channels < len(names):
+        raise InputError(
+            f"{len(names)} spectral components need at least as many channels, got {n_channels}"
+        )
+    if residual is None and n_channels == len(names):
+        raise InputError(
+            f"{len(names)} spectral components fit the skies of {n_channels} channels "
+            "exactly, whatever these are; give a residual, or fewer components"
+        )
+
+
 class SpectralPrior(eqx.Module):
     """N(0, S) over the skies of all channels; see the module's equations.
 
@@ -122,20 +152,8 @@ class SpectralPrior(eqx.Module):
         InputError
             For unknown names, and for fewer channels than the components need.
         """
-        for name in names:
-            if name not in SPECTRA:
-                raise InputError(f"unknown component '{name}'; {nearest(name, SPECTRA)}")
         frequencies, skies = np.asarray(frequencies_mhz), np.asarray(skies)
-        if not names or len(frequencies) < len(names):
-            raise InputError(
-                f"{len(names)} spectral components need at least as many channels, got "
-                f"{len(frequencies)}"
-            )
-        if residual is None and len(frequencies) == len(names):
-            raise InputError(
-                f"{len(names)} spectral components fit the skies of {len(frequencies)} channels "
-                "exactly, whatever these are; give a residual, or fewer components"
-            )
+        check_components(names, len(frequencies), residual)
         x, y = frequencies / reference_mhz, frequencies / turnover_mhz
         power_law = x**index
         shapes = np.stack([SPECTRA[name](x, y) for name in names], axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,26 @@ from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
 from lusee_bayes.linear.normal_matrix import normal_matrix
 from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.testing.refusals import ROUNDING, assert_refused
+
+
+@eqx.filter_jit
+def _numbers(coupling: Coupling, matrix: DenseCoupling, m, d, skies, responses, half):
+    """What the contract compares inside transformations, in one program."""
+    first, second = responses
+    changed = coupling.with_response(first).with_response(second)
+    return {
+        "jitted": coupling @ m,
+        "mapped": jax.vmap(lambda x: coupling @ x)(skies),
+        "slope": jax.grad(lambda x: d @ (coupling @ x))(m),
+        "changed": changed.dense(),
+        "changed_mv": changed @ m,
+        "changed_transpose_mv": changed.transpose_mv(d),
+        "slope_of_response": jax.grad(lambda r: d @ (coupling.with_response(r) @ m))(first),
+        "plus": coupling.plus(half, coupling).dense(),
+        "changed_plus": changed.plus(half, coupling).dense(),
+        "plus_dense": changed.plus(half, matrix) @ m,
+        "slope_of_plus": jax.grad(lambda x: d @ (coupling.plus(x, coupling) @ m))(half),
+    }
 
 
 def check_coupling(coupling: Coupling, dense: Float[np.ndarray, "data unknowns"]) -> None:
@@ -43,32 +64,31 @@ def check_coupling(coupling: Coupling, dense: Float[np.ndarray, "data unknowns"]
     same(coupling.dense(), dense)
     same(coupling @ m, dense @ sky)
     same(coupling.transpose_mv(d), dense.T @ data)
-    same(jax.jit(lambda a, x: a @ x)(coupling, m), dense @ sky)
-    skies = rng.standard_normal((3, n_unknowns))
-    same(jax.vmap(lambda x: coupling @ x)(jnp.asarray(skies)), skies @ dense.T)
-    slope = jax.grad(lambda x: d @ (coupling @ x))(m)
-    same(slope, dense.T @ data)
     assert np.isnan(coupling @ m.at[0].set(jnp.nan)).any()
+    skies, responses = rng.standard_normal((3, n_unknowns)), rng.uniform(0.5, 2.0, (2, n_data))
+    half, matrix = jnp.asarray(0.5), DenseCoupling(jnp.asarray(dense))
+    arguments = (m, d, jnp.asarray(skies), jnp.asarray(responses), half)
+    got = _numbers(coupling, matrix, *arguments)
+    same(got["jitted"], dense @ sky)
+    same(got["mapped"], skies @ dense.T)
+    same(got["slope"], dense.T @ data)
 
     # responses multiply the rows, one on top of the other, and sampling goes through them
-    first, second = rng.uniform(0.5, 2.0, (2, n_data))
-    changed = coupling.with_response(jnp.asarray(first)).with_response(jnp.asarray(second))
-    rows = (first * second)[:, None] * dense
+    changed = coupling.with_response(arguments[3][0]).with_response(arguments[3][1])
+    factors = responses.prod(0)
+    rows = factors[:, None] * dense
     assert changed.shape == dense.shape
-    same(changed.response, first * second)
-    same(changed.dense(), rows)
-    same(changed @ m, rows @ sky)
-    same(changed.transpose_mv(d), rows.T @ data)
-    slope = jax.grad(lambda r: d @ (coupling.with_response(r) @ m))(jnp.asarray(first))
-    same(slope, data * (dense @ sky))
+    same(changed.response, factors)
+    same(got["changed"], rows)
+    same(got["changed_mv"], rows @ sky)
+    same(got["changed_transpose_mv"], rows.T @ data)
+    same(got["slope_of_response"], data * (dense @ sky))
 
     # a multiple of another matrix is added to A itself, the response stays
-    half = jnp.asarray(0.5)
-    same(coupling.plus(half, coupling).dense(), 1.5 * dense)
-    same(changed.plus(half, coupling).dense(), 1.5 * rows)
-    same(changed.plus(half, DenseCoupling(jnp.asarray(dense))) @ m, 1.5 * rows @ sky)
-    slope = jax.grad(lambda x: d @ (coupling.plus(x, coupling) @ m))(half)
-    same(slope, data @ (dense @ sky))
+    same(got["plus"], 1.5 * dense)
+    same(got["changed_plus"], 1.5 * rows)
+    same(got["plus_dense"], 1.5 * rows @ sky)
+    same(got["slope_of_plus"], data @ (dense @ sky))
     assert_refused(lambda: coupling.plus(half, changed))
 
     # what claims structure in time can be summed without A

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -82,3 +85,19 @@ def test_checked_cholesky_names_what_has_no_factor():
         checked_cholesky("the noise", stack)
     # values are not known there
     assert np.isnan(jax.jit(lambda m: checked_cholesky("the noise", m))(stack)[1]).any()
+
+
+def test_batched_solves_side_by_side_end():
+    """In some versions of jaxlib such calls wait for each other for ever; none of them fits."""
+    program = (
+        "import sys; import jax, jax.numpy as jnp; import lusee_bayes\n"
+        "a = jnp.eye(60) + jnp.tril(jnp.full((64, 60, 60), 0.01))\n"
+        "f = jax.vmap(lambda a: [jax.scipy.linalg.solve_triangular(a * k, a, lower=True)\n"
+        "                        for k in range(1, 9)])\n"
+        "print([float(jnp.abs(x - jnp.eye(60) / k).max()) < 1e-14\n"
+        "       for _ in range(10) for k, x in enumerate(jax.jit(f)(a), 1)].count(True))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
+    )
+    assert done.stdout == "80\n", done.stderr

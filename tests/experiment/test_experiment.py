@@ -132,7 +132,9 @@ def test_data_of_another_frequency_are_refused(small_experiment):
         build(other, small_experiment.data)
 
 
-@pytest.mark.parametrize("form", ["paper", "exact"])
+@pytest.mark.parametrize(
+    "form", ["paper", pytest.param("exact", marks=[pytest.mark.long, pytest.mark.essential])]
+)
 def test_the_map_recovers_the_sky(form):
     experiment = make_small_experiment(f"noise.radiometer.form={form}", cycles=0.2)
     result = map_result(experiment)

@@ -70,7 +70,7 @@ def chi2_per_mode(posterior, truth) -> float:
     "term",
     [
         pytest.param(GAIN, marks=pytest.mark.long),
-        SHIFT,
+        pytest.param(SHIFT, marks=[pytest.mark.long, pytest.mark.essential]),
         pytest.param(PARAMETERS, marks=pytest.mark.long),
     ],
 )
@@ -96,6 +96,8 @@ def test_marginalising_saves_the_map(term):
     assert float(posterior.log_evidence) > float(wrong.log_evidence) + 1000.0
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_the_gain_terms_model_is_the_papers():
     setup, data, model = experiment(GAIN).setup, experiment(GAIN).data, inferred(GAIN).model
     plain_setup = experiment().setup
@@ -153,6 +155,8 @@ def test_the_evidence_finds_the_size_of_the_drifts():
     assert evidence_without(clean, quiet) > with_drift + 100.0
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_the_evidence_finds_the_size_of_the_beam_error():
     setup, data = experiment(SHIFT).setup, experiment(SHIFT).data
     level, coupling = radiometer(setup), full_model(setup).coupling
@@ -172,6 +176,8 @@ def test_the_evidence_finds_the_size_of_the_beam_error():
 # --- what the gain term is built around -------------------------------------------------------
 
 
+@pytest.mark.long
+@pytest.mark.essential
 @pytest.mark.parametrize("source", ["measured", "posterior"])
 def test_what_the_gain_term_is_built_around_matters_to_second_order(source):
     """Around d' instead of d, the drift X d is X d' with X (d' - d) left over.
@@ -220,6 +226,8 @@ def test_the_posteriors_own_prediction_has_settled():
 # --- beams ------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_beam_parameters_are_directions_of_one_sigma():
     setup, model = experiment(PARAMETERS).setup, inferred(PARAMETERS).model
     assert isinstance(model.noise, LowRankUpdate)
@@ -444,6 +452,8 @@ def test_notices_a_term_that_is_missing(setup, missing):
     assert p_value(*simulate_and_condition(model, assumed, keys)) < 1e-10
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_calibrated_with_gains_that_really_drift(setup):
     """(1 + g_i)(1 + g_j) V_ij on skies of the prior, N around each true signal; sigma_g = 1e-3."""
     sigma, hours, rng = 1e-3, setup.observation.hours, np.random.default_rng(SEED)

@@ -111,6 +111,7 @@ def test_azimuth_the_other_way_conjugated_crosses_and_permuted_ports_are_noticed
         assert off(case, expected) > 1e-4
 
 
+@pytest.mark.long
 def test_what_the_rectangle_rule_costs(luseepy):
     """h^2 / 12 times the slopes of the beam at zenith and horizon (Euler and Maclaurin): 1.6e-4 of
     the peak for steps of 1 degree, a quarter of it for half a degree.

@@ -172,6 +172,7 @@ def test_gradients_agree_with_finite_differences():
         assert abs(slopes[k] * x[k]) > 1e-4, name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("frequency", "lmax"), [(50.0, 16), (25.0, 47)])
 def test_coefficients_do_not_change_when_the_nodes_double(frequency, lmax):
     grid = HemisphereGrid.for_lmax(lmax)

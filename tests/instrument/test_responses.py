@@ -79,6 +79,8 @@ def off(got, expected) -> float:
     return np.abs(got - expected).max() / np.abs(expected).max()
 
 
+@pytest.mark.long
+@pytest.mark.essential
 @pytest.mark.parametrize(
     "channel", [0, 3, *(pytest.param(k, marks=pytest.mark.long) for k in (1, 2))]
 )

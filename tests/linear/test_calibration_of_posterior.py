@@ -111,6 +111,8 @@ def test_more_data_than_modes(long_run, noise, form):
     assert_calibrated(long_run.standardised(n, n, form))
 
 
+@pytest.mark.long
+@pytest.mark.essential
 @pytest.mark.parametrize(
     ("form", "noise"), [("map", "exact"), ("data", "exact"), ("data", "diagonal+dense")]
 )

@@ -138,6 +138,8 @@ def test_the_direct_solution_is_the_textbooks(case):
         assert np.abs(z @ z.T / 4000 - np.eye(N_MODES)).max() < z_of(81) * np.sqrt(2 / 4000)
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_conjugate_gradients_agree_with_the_direct_solution(case):
     prior, _, channels, reference, *_ = case
     direct = solve_directly(prior, channels, reference)

@@ -61,7 +61,11 @@ FLAGS[3, 5], FLAGS[:, 11] = True, True
     "case",
     [
         pytest.param({"overrides": ()}, id="diagonal"),
-        pytest.param({"overrides": ("noise.radiometer.form=exact",)}, id="blocks"),
+        pytest.param(
+            {"overrides": ("noise.radiometer.form=exact",)},
+            id="blocks",
+            marks=[pytest.mark.long, pytest.mark.essential],
+        ),
         pytest.param(
             {"overrides": ("noise.gain={sigma: 0.01}", "noise.beam={shift_mhz: 4}")},
             id="banded and low rank",

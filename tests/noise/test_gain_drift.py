@@ -198,6 +198,7 @@ def test_runs_with_gaps_between_them():
     close(got.dense(), expected, 4e-15)
 
 
+@pytest.mark.long
 def test_what_the_band_leaves_out_changes_nothing():
     """50 samples over 16 h with a correlation of half an hour, against the kernel in full."""
     hours = np.cumsum(np.random.default_rng(2).uniform(0.05, 0.6, 50))

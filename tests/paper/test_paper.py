@@ -81,6 +81,8 @@ def test_everything_is_written(folder):
     assert (rows[0]["rho_10"], rows[0]["ell_cross"]) == ("0.95", "33")
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_claims_have_every_column_filled(folder):
     with (folder / "claims.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))

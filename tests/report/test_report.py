@@ -81,10 +81,13 @@ class Outline(HTMLParser):
         assert self.open.pop() == tag
 
 
+# a map run with all its figures takes half a minute
+
+FOLDER = pytest.param("folder", marks=[pytest.mark.long, pytest.mark.essential])
 SAMPLED = pytest.param("sampled", marks=pytest.mark.long)
 
 
-@pytest.mark.parametrize("which", ["folder", pytest.param("cube", marks=pytest.mark.long), SAMPLED])
+@pytest.mark.parametrize("which", [FOLDER, pytest.param("cube", marks=pytest.mark.long), SAMPLED])
 def test_pages_are_whole_and_need_nothing_else(which, request):
     page = (request.getfixturevalue(which) / "report.html").read_text()
     outline = Outline()
@@ -99,6 +102,8 @@ def test_pages_are_whole_and_need_nothing_else(which, request):
     assert len(page) < 8e6
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_a_pixels_posterior_is_that_of_the_file(folder):
     data = explorer_data((folder / "report.html").read_text())
     with xr.open_dataset(folder / "posterior.nc", engine="h5netcdf") as file:
@@ -126,6 +131,8 @@ def test_a_pixels_posterior_is_that_of_the_file(folder):
     np.testing.assert_allclose(layer(data, "prior_fraction"), share, rtol=1e-5)
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_the_point_spread_function_is_what_injected_sources_give(small_map, folder):
     """Noiseless data of one source after the other, mapped; the page keeps bytes of the peak."""
     data = explorer_data((folder / "report.html").read_text())
@@ -145,6 +152,8 @@ def test_the_point_spread_function_is_what_injected_sources_give(small_map, fold
         )
 
 
+@pytest.mark.long
+@pytest.mark.essential
 @pytest.mark.parametrize("manifest", [True, False], ids=["manifest", "an older folder without"])
 def test_report_makes_it_anew(folder, manifest, tmp_path, capsys):
     # the title is the folder's name
@@ -253,7 +262,7 @@ def in_browser(page: str, tmp_path, width: int, points) -> dict:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize("width", [1280, 390])
-@pytest.mark.parametrize("which", ["folder", SAMPLED])
+@pytest.mark.parametrize("which", [FOLDER, SAMPLED])
 def test_in_a_browser(which, width, request, tmp_path):
     folder = request.getfixturevalue(which)
     rng = np.random.default_rng(3)

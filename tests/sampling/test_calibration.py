@@ -388,6 +388,8 @@ def test_fewer_data_than_modes_with_an_offset():
     assert not calibrate_sky(random_model(True), random_model(False)).passed
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_halved_prior_variance_of_some_modes_is_noticed():
     truth = model("exact")
     wrong = lb.LinearGaussian(truth.coupling, halved_prior(truth.prior), truth.noise)

@@ -164,6 +164,7 @@ def test_how_many_draws_count(name, least):
     assert got.error**2 == pytest.approx((400 / got.effective - 1) / 399, rel=1e-6)
 
 
+@pytest.mark.long
 def test_more_draws_are_better():
     few = evidence("sky_marginal")
     many = comparison.estimate_evidence(
@@ -194,6 +195,7 @@ def test_the_mode_and_the_curvature_in_one_dimension():
     assert abs(root) == pytest.approx(std, rel=0.02)
 
 
+@pytest.mark.long
 def test_the_mode_and_the_curvature_in_two_dimensions():
     it = evidence("prior_amplitude").laplace
     names = [name for name, _ in it.whitening.sites]

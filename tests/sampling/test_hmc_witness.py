@@ -182,6 +182,8 @@ def test_what_the_wrong_posteriors_are_made_with_is_right(noise):
     assert not w.failed_of(w.condition())
 
 
+@pytest.mark.long
+@pytest.mark.essential
 @EVERY_NOISE
 def test_a_prior_variance_halved_for_some_modes_fails(noise):
     w = witness(noise)
@@ -190,6 +192,8 @@ def test_a_prior_variance_halved_for_some_modes_fails(noise):
     assert TOO_NARROW in w.failed_of(w.condition(prior=halved))
 
 
+@pytest.mark.long
+@pytest.mark.essential
 @EVERY_NOISE
 @pytest.mark.parametrize(("factor", "end"), [(2.0, TOO_WIDE), (0.5, TOO_NARROW)])
 def test_a_random_term_off_by_sqrt_2_fails(noise, factor, end):
@@ -199,6 +203,8 @@ def test_a_random_term_off_by_sqrt_2_fails(noise, factor, end):
     assert {"variance", end, "covariance, mean"} <= w.failed_of(wrong)
 
 
+@pytest.mark.long
+@pytest.mark.essential
 @EVERY_NOISE
 @pytest.mark.parametrize(("factor", "end"), [(2.0, TOO_WIDE), (0.5, TOO_NARROW)])
 def test_a_noise_off_by_sqrt_2_fails(noise, factor, end):
@@ -221,6 +227,8 @@ def test_a_posterior_without_one_time_sample_fails(noise):
     assert {"mean", TOO_WIDE} <= failed(w.judge(wrong))
 
 
+@pytest.mark.long
+@pytest.mark.essential
 @EVERY_NOISE
 def test_noise_left_out_at_one_time_fails(noise):
     """A thousandth of the noise at one time, its correlations in step: too sure of that time."""

@@ -109,6 +109,8 @@ def test_nuts_follows_the_analytic_posterior(nuts, exact):
     assert_follows(chains.sites["sky"], exact)
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_the_comparison_notices_a_posterior_that_is_ten_percent_too_wide(nuts, exact):
     wide = exact.mean + 1.1 * (nuts[0].sites["sky"] - exact.mean)
     with pytest.raises(AssertionError, match="covariance off"):
@@ -193,6 +195,8 @@ def by_quadrature(gaussian, data, noise, logs):
     return np.array([answer.log_prob for answer in given]), given
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_a_sky_in_white_coordinates_beside_a_site_in_none(gaussian, data, level_grid):
     """Against quadrature over the level: p(level | d), and the sky's mean and second moments."""
     whitening = Whitening.of(gaussian.condition(data))

@@ -176,10 +176,13 @@ def test_the_density_is_the_priors_times_the_evidence(case):
 
 
 @pytest.mark.long
+@pytest.mark.essential
 def test_nuts_follows_the_grid(grid, sites):
     assert_follow(grid, np.log(sites["amplitude"]), sites["tilt"])
 
 
+@pytest.mark.long
+@pytest.mark.essential
 @pytest.mark.parametrize("wrong", [{"base": 2.0}, {"base": 0.5}, {"n": 2.0}])
 def test_nuts_does_not_follow_the_grid_of_another_program(case, sites, wrong):
     """A prior of twice or half the power, and noise sqrt(2) too strong."""
@@ -222,6 +225,8 @@ def assert_variances(skies, mean, variance):
             assert abs(values[..., i].mean() - expected[i]) < limit * error, f"{what} of {i} off"
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_skies_obey_the_law_of_total_variance(case, grid, sites):
     """Mean of the conditional variances plus variance of the conditional means, mode by mode."""
     total = grid.mean_variance + grid.variance_of_means

@@ -83,6 +83,8 @@ def test_there_and_back_with_the_determinant_of_the_derivative(scales):
     assert abs(expected) > 1e-2
 
 
+@pytest.mark.long
+@pytest.mark.essential
 @pytest.mark.parametrize("scales", CASES)
 def test_the_data_do_not_change_along_the_shared_scale(scales):
     """Nor with strength and correlation time, by more than the noise."""

@@ -29,6 +29,8 @@ def density(name: str, e: Experiment, values: dict) -> tuple[float, dict]:
     return float(got), trace
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_the_instruments_program():
     """Beams of antennas built so, the evidence in decimal arithmetic, and the priors by scipy."""
     e = small_experiment(lmax=4)
@@ -55,6 +57,8 @@ def test_the_instruments_program():
     assert got == pytest.approx(expected, rel=1e-7)
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_the_program_of_gain_scales():
     """N with the drifts' covariance entry by entry, the mean of the autos, and the priors."""
     gain = "noise.gain={sigma: 0.01, correlation_h: 8, treatment: sampled}"
