@@ -144,6 +144,8 @@ def test_the_frequency_may_be_traced():
 # --- polarisation
 
 
+@pytest.mark.long
+@pytest.mark.essential
 @pytest.mark.parametrize("stokes_v", [1.0, pytest.param(-1.0, marks=pytest.mark.long)])
 def test_a_circular_wave_is_the_square_of_its_voltages(stokes_v):
     theta, phi = np.array([0.2, 0.9, 1.4]), np.array([0.3, 2.0, -1.0])

@@ -144,6 +144,8 @@ def test_what_is_wrong_is_pointed_at(kind, name):
     assert len(found.suspects()) == len({k for k, _ in found.suspects()})
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_what_no_group_explains():
     model, data = simulated()
     rng = np.random.default_rng(1)

@@ -178,6 +178,8 @@ def test_more_draws_are_better():
 # --- the mode -------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_the_mode_and_the_curvature_in_one_dimension():
     """x = ln level is what is unconstrained, so the density is the one of x.
 
