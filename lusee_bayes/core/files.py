@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
@@ -19,8 +20,9 @@ from pathlib import Path
 
 from lusee_bayes.core.checks import InputError
 
-# names inside a folder of results: scratch folders (with the process's number), the new results
-# that are still to be moved into place, and the list of what the last run has written
+# names inside a folder of results: scratch folders (with the process's number and its host, since
+# several may share a disk), the new results that are still to be moved into place, and the list of
+# what the last run has written
 SCRATCH, COMMITTED, MANIFEST = ".partial-", ".committed", "manifest.json"
 
 
@@ -64,7 +66,8 @@ def transaction(folder: str | Path, kind: str, discard: Sequence[str] = ()) -> I
     require_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     recover(folder)
-    stage = Path(tempfile.mkdtemp(prefix=f"{SCRATCH}{os.getpid()}-", dir=folder))
+    prefix = f"{SCRATCH}{os.getpid()}-{socket.gethostname()}-"
+    stage = Path(tempfile.mkdtemp(prefix=prefix, dir=folder))
     try:
         yield stage
         files = sorted(str(p.relative_to(stage)) for p in stage.rglob("*") if p.is_file())
@@ -108,7 +111,9 @@ def recover(folder: str | Path) -> None:
         _move(committed / MANIFEST, folder / MANIFEST)
     shutil.rmtree(committed, ignore_errors=True)
     for scratch in folder.glob(f"{SCRATCH}*"):
-        if not _alive(scratch.name.removeprefix(SCRATCH).split("-")[0]):
+        process, _, rest = scratch.name.removeprefix(SCRATCH).partition("-")
+        # a process of another host is not to be seen from here
+        if rest.rpartition("-")[0] == socket.gethostname() and not _alive(process):
             shutil.rmtree(scratch, ignore_errors=True)
 
 

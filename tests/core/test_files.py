@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -211,16 +212,21 @@ def test_scratch_folders_of_the_dead_go_and_of_the_living_stay(folder):
     ended.wait()
     living = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     try:
-        names = {pid: f"{SCRATCH}{pid}-abc" for pid in (ended.pid, living.pid, os.getpid(), "x")}
-        for name in names.values():
+        host = socket.gethostname()
+        pids = (ended.pid, living.pid, os.getpid(), "x")
+        names = {pid: f"{SCRATCH}{pid}-{host}-abc" for pid in pids}
+        # on a disk that several hosts share: whether that process is alive is not to be seen here
+        elsewhere = f"{SCRATCH}{ended.pid}-not-{host}-abc"
+        for name in (*names.values(), elsewhere):
             write(folder, {f"{name}/figures/maps.png": "half"})
         recover(folder)
         left = {path.name for path in folder.glob(f"{SCRATCH}*")}
-        assert left == {names[living.pid], names[os.getpid()]}
+        assert left == {names[living.pid], names[os.getpid()], elsewhere}
     finally:
         living.communicate()
     recover(folder)
-    assert {path.name for path in folder.glob(f"{SCRATCH}*")} == {names[os.getpid()]}
+    left = {path.name for path in folder.glob(f"{SCRATCH}*")}
+    assert left == {names[os.getpid()], elsewhere}
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
