@@ -35,6 +35,15 @@ def require_folder(folder: Path) -> None:
             return
 
 
+def require_files(folder: Path, names: Sequence[str], command: str) -> None:
+    """InputError if ``folder`` lacks one of the files that ``lusee-bayes command`` writes."""
+    for name in names:
+        if not (folder / name).is_file():
+            raise InputError(
+                f"'{folder}' has no {name}; make the results anew with lusee-bayes {command}"
+            )
+
+
 @contextmanager
 def transaction(folder: str | Path, kind: str, discard: Sequence[str] = ()) -> Iterator[Path]:
     """Write a run's results into a folder: all of them take effect at once, or none does.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.files import require_files
 from lusee_bayes.report import html
 from lusee_bayes.report.run_details import details
 
@@ -54,11 +54,7 @@ def cube_page(folder: Path, name: str) -> str:
     InputError
         If something is missing in the folder.
     """
-    for needed in (*NEEDED, *(f"figures/{figure}.png" for figure in FIGURES)):
-        if not (folder / needed).is_file():
-            raise InputError(
-                f"'{folder}' has no {needed}; make the results anew with lusee-bayes map"
-            )
+    require_files(folder, (*NEEDED, *(f"figures/{figure}.png" for figure in FIGURES)), "map")
     summary = json.loads((folder / "summary.json").read_text())
     frequencies = summary["frequencies_mhz"]
     title = (

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.files import require_files
 from lusee_bayes.linear.residuals import SIGNIFICANCE, probability
 from lusee_bayes.report import html
 from lusee_bayes.report.explorer import explorer
@@ -44,11 +44,7 @@ def map_page(folder: Path, name: str) -> str:
     InputError
         If something is missing in the folder.
     """
-    for needed in (*NEEDED, *(f"figures/{figure}.png" for figure in FIGURES)):
-        if not (folder / needed).is_file():
-            raise InputError(
-                f"'{folder}' has no {needed}; make the results anew with lusee-bayes map"
-            )
+    require_files(folder, (*NEEDED, *(f"figures/{figure}.png" for figure in FIGURES)), "map")
     summary = json.loads((folder / "summary.json").read_text())
     found = read_diagnostics(folder / "diagnostics.nc")
     title = f"{name}: the sky at {summary['frequency_mhz']:g} MHz"

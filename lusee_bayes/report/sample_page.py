@@ -6,7 +6,7 @@ import csv
 import json
 from pathlib import Path
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.files import require_files
 from lusee_bayes.report import html
 from lusee_bayes.report.run_details import details
 
@@ -65,11 +65,7 @@ def sample_page(folder: Path, name: str) -> str:
     InputError
         If something is missing in the folder.
     """
-    for needed in ("summary.csv", "sampling.json", "scenario.yaml"):
-        if not (folder / needed).is_file():
-            raise InputError(
-                f"'{folder}' has no {needed}; make the results anew with lusee-bayes sample"
-            )
+    require_files(folder, ("summary.csv", "sampling.json", "scenario.yaml"), "sample")
     sampling = json.loads((folder / "sampling.json").read_text())
     with (folder / "summary.csv").open(newline="") as file:
         header, *rows = list(csv.reader(file))
