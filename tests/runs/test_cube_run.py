@@ -265,7 +265,8 @@ def test_sampling_several_channels(tmp_path, capsys):
     assert run(*command, "--resume") == 0
     after = read_datatree(tmp_path / "20MHz" / "samples.nc")["posterior"]["sky"].values
     np.testing.assert_array_equal(after, before)
-    assert run(*command, "--set", "joint=true") == 2
+    joint = ("--set", "joint=true", "--set", "spectral.components=[power_law]")
+    assert run(*command, *joint) == 2
     assert "channels are sampled one by one" in capsys.readouterr().err
 
 
