@@ -21,6 +21,8 @@ test: $(VENV)/installed-dev
 essential: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m "long and essential" -n 2 --dist loadfile
 
+# these compute for longer than they compile
+long: export LUSEE_BAYES_TEST_XLA_LEVEL := 3
 long: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m long -n 2 --dist loadfile
 
