@@ -21,10 +21,14 @@ test: $(VENV)/installed-dev
 essential: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m "long and essential" -n 2 --dist loadfile
 
-# these compute for longer than they compile
-long: export LUSEE_BAYES_TEST_XLA_LEVEL := 3
+# the rest of the longer checks. Those that compute for longer than they compile come first, with
+# LLVM's optimisations, and each by itself
+LONG := $(BIN)/python -m pytest -m "long and not essential" -n 2
+COMPUTING := $(addprefix tests/, sampling/test_hmc_full_size.py sampling/test_prior_amplitude.py \
+	sampling/test_calibration.py systematics/test_calibration_of_systematics.py)
 long: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -m long -n 2 --dist loadfile
+	LUSEE_BAYES_TEST_XLA_LEVEL=3 $(LONG) --dist load $(COMPUTING)
+	$(LONG) --dist loadfile $(addprefix --ignore=,$(COMPUTING))
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .

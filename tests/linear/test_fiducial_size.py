@@ -13,7 +13,7 @@ from lusee_bayes.results.map_result import map_result
 pytestmark = pytest.mark.long
 
 
-@pytest.mark.parametrize("frequency", [5, 15, 25, 35, 45])
+@pytest.mark.parametrize("frequency", [5, 25, 45])
 def test_one_word_changes_the_frequency(frequency):
     scenario = load_scenario("fiducial", [f"frequency_mhz={frequency}"])
     result = map_result(build(scenario))

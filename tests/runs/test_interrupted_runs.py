@@ -43,7 +43,7 @@ sys.exit(main(arguments))
 """
 # of each command, with an earlier run in its folder and without: half a minute each. Ten before a
 # release
-MOMENTS = int(os.environ.get("LUSEE_BAYES_TEST_KILLS", "3"))
+MOMENTS = int(os.environ.get("LUSEE_BAYES_TEST_KILLS", "1"))
 TINY = ["lmax=3", "observation.step_s=43200"]
 ROOT = Path(__file__).resolve().parents[2]
 CACHE = ROOT / ".pytest_cache" / "xla" / "interrupted"

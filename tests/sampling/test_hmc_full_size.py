@@ -13,26 +13,25 @@ from lusee_bayes.sampling.whitening import Whitening
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["fiducial", "gain_1e-2"])
-def test_nuts_agrees_with_every_mean_every_variance_and_the_covariance(name):
-    experiment = build(lb.load_scenario(name))
+def test_nuts_agrees_with_every_mean_every_variance_and_the_covariance():
+    experiment = build(lb.load_scenario("gain_1e-2"))
     inference, data = infer(experiment), experiment.data
     model, posterior = inference.model, inference.posterior
     program = load_program("sky")
     chains = sample(
         program.model,
         {**program.arguments(model), "data": data.data},
-        Sampler(chains=4, draws=1000, seed=2),
+        Sampler(chains=4, draws=250, seed=2),
         Whitening.of(posterior),
     )
     draws = chains.sites["sky"]
-    assert draws.shape == (4, 1000, 2304)
+    assert draws.shape == (4, 250, 2304)
     found = validate_draws(
         draws, posterior, chains.statistics["diverging"], chains.statistics["energy"]
     )
     assert found.passed, [check for check in found.checks if not check.passed]
-    assert found.ess_bulk.min() > 2000
-    # standard deviations 2 % off do not pass: total variance: 4 % off, 0.7 % allowed
+    assert found.ess_bulk.min() > 500
+    # standard deviations 2 % off do not pass: total variance: 4 % off, 1.4 % allowed
     wrong = eqx.tree_at(lambda p: p.lower, posterior, 1.02 * posterior.lower)
     again = validate_draws(
         draws, wrong, chains.statistics["diverging"], chains.statistics["energy"]

@@ -509,7 +509,7 @@ def test_chains_are_shared_out_among_devices_and_draw_the_same(gaussian, data, t
     env = os.environ | {
         "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
         "JAX_PLATFORMS": "cpu",
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": os.pathsep.join((str(ROOT), str(TESTS.parent))),
     }
     code = textwrap.dedent(DEVICES_SCRIPT.format(tests=str(TESTS)))
     done = subprocess.run(

@@ -371,9 +371,9 @@ def test_calibration_notices_what_is_wrong(wrong, witness):
 
 
 @pytest.mark.long
-def test_calibrated_over_500_data_sets_of_16_modes():
+def test_calibrated_over_200_data_sets_of_16_modes():
     """By NUTS, the package's own choice; every third draw is kept."""
-    settings = (of_no_data(3, 20, 15.0), Sampler(warmup=150, draws=N_DRAWS), 3, 500, 100)
+    settings = (of_no_data(3, 20, 15.0), Sampler(warmup=150, draws=N_DRAWS), 3, 200, 100)
     found = ranks(*settings)
     assert found.passed, p_values(found)
     assert_covers(found)
