@@ -115,7 +115,7 @@ def assert_calibrated(ranks: Ranks):
 @pytest.mark.long
 def test_noise_level_amplitude_and_tilt():
     program, arguments = pieces("systematics", *TINY, *LEVELS_UNKNOWN)
-    found = ranks_of(program, arguments, Sites(("noise_level", "amplitude", "tilt")), n=50)
+    found = ranks_of(program, arguments, Sites(("noise_level", "amplitude", "tilt")))
     assert_calibrated(found)
 
 
@@ -137,7 +137,7 @@ def test_permittivity_loss_tangent_and_tilt():
     arguments = {**arguments, "systematics": (coarse,)}
     sampler = Sampler(warmup=40, draws=N_DRAWS, algorithm="hmc")
     draws = Draws(program, arguments, sampler, starts=3)
-    found = ranks_of(program, arguments, Sites(tuple(antennas.stds)), draws=draws, n=50)
+    found = ranks_of(program, arguments, Sites(tuple(antennas.stds)), draws=draws)
     assert_calibrated(found)
 
 
@@ -223,4 +223,4 @@ def test_strength_and_correlation_time_of_drifts():
     program, arguments, chart = drifting(scales)
     quantities = Sites(("gain_sigma", "gain_correlation_h"))
     draws = SampledDrifts(program, arguments, chart, 8)
-    assert_calibrated(ranks_of(program, arguments, quantities, draws=draws, n=50))
+    assert_calibrated(ranks_of(program, arguments, quantities, draws=draws))
