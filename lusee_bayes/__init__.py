@@ -24,11 +24,16 @@ The folders are the symbols, then what is done with them; each imports only from
 Importing the package switches JAX to 64 bit: Lambda's condition number is about 1e10.
 """
 
-import jax
+import os
+import sys
+
 import lazy_loader
 
-jax.config.update("jax_enable_x64", True)
+# JAX is not imported for that: --help and completion answer without it
+os.environ["JAX_ENABLE_X64"] = "1"
+if "jax" in sys.modules:
+    sys.modules["jax"].config.update("jax_enable_x64", True)
 
-# every public name stands in __init__.pyi; each is imported when it is first used, since healpy,
-# lunarsky and xarray take seconds together
+# every public name stands in __init__.pyi; each is imported when it is first used, since JAX,
+# healpy, lunarsky and xarray take seconds together
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-from .core.checks import InputError as InputError
+from .core.errors import InputError as InputError
 from .core.version import __version__ as __version__
 from .experiment.experiment import Experiment as Experiment
 from .experiment.experiment import build as build

@@ -7,12 +7,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 from rich.console import Console
-from rich.table import Table
 
 from lusee_bayes.cli.options import Quiet, Verbose, say
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.results.finished_runs import comparison_rows, same_data
-from lusee_bayes.runs.compare_run import run_compare
 
 
 def compare_command(
@@ -36,20 +33,14 @@ def compare_command(
     verbose
         Tell the memory in use after every stage.
     """
+    from lusee_bayes.cli.tables import comparison_table
+    from lusee_bayes.results.finished_runs import same_data
+    from lusee_bayes.runs.compare_run import run_compare
+
     console = Console(quiet=quiet, soft_wrap=True)
     run = run_compare(folders, output, stages=Stages(console, verbose=verbose))
     say(console, *(f"  {path}" for path in run.files))
-    shown = Table("run", "SNR < 1 from ell", "bits", "ln evidence", "less the best", "p")
-    for row in comparison_rows(run.runs):
-        shown.add_row(
-            str(row["run"]),
-            str(row["ell_cross"]),
-            f"{row['information_bits']:.0f}",
-            f"{row['log_evidence']:.1f}",
-            f"{row['log_evidence_less_best']:.1f}",
-            f"{row['p']:.2g}",
-        )
-    console.print(shown)
+    console.print(comparison_table(run.runs))
     if not same_data(run.runs):
         console.print("different data: the evidences cannot be compared with each other")
     console.print(f"look at {output / 'comparison.html'}", highlight=False)

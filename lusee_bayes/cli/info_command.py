@@ -6,12 +6,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from lusee_bayes.report.describe import describe
-
 
 def info_command(file: Path) -> None:
     """Say what is in a file: visibilities, a posterior, samples, or a sky map.
 
     Example: lusee-bayes info output/fiducial/posterior.nc
     """
+    from lusee_bayes.report.describe import describe
+
     Console(soft_wrap=True).print(describe(file), highlight=False, markup=False)

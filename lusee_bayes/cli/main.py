@@ -9,7 +9,7 @@ from __future__ import annotations
 from cyclopts import App, CycloptsError
 from rich.console import Console
 
-from lusee_bayes.core.checks import InputError, ProcessLost
+from lusee_bayes.core.errors import InputError, ProcessLost
 from lusee_bayes.core.version import __version__
 
 app = App(

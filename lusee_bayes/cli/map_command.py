@@ -18,13 +18,8 @@ from lusee_bayes.cli.options import (
     load,
     say,
 )
-from lusee_bayes.core.checks import InputError
-from lusee_bayes.core.launcher import run_processes
-from lusee_bayes.core.process_group import use_cpu_devices
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.rendezvous import is_launched, join
-from lusee_bayes.report.pages import REPORT
-from lusee_bayes.runs.map_run import run_map
 
 
 def map_command(
@@ -93,6 +88,12 @@ def map_command(
     verbose
         Tell the memory in use after every stage.
     """
+    from lusee_bayes.core.launcher import run_processes
+    from lusee_bayes.core.process_group import use_cpu_devices
+    from lusee_bayes.core.rendezvous import is_launched, join
+    from lusee_bayes.report.pages import REPORT
+    from lusee_bayes.runs.map_run import run_map
+
     console = Console(quiet=quiet, soft_wrap=True)
     resolved = load(
         scenario,

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from math import isclose
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes.core.checks import InputError
-from lusee_bayes.experiment.scenario import Scenario, load_scenario
+from lusee_bayes.core.errors import InputError
+
+if TYPE_CHECKING:
+    from lusee_bayes.experiment.scenario import Scenario
 
 Overrides = Annotated[list[str], Parameter(name="--set", negative="")]
 Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")]
@@ -46,6 +48,8 @@ def load(
     InputError
         As :func:`.load_scenario`.
     """
+    from lusee_bayes.experiment.scenario import load_scenario
+
     overrides = list(set_ or [])
     if frequencies is not None:
         overrides.append(f"frequencies_mhz={parse_frequencies(frequencies)}")
@@ -78,7 +82,7 @@ def parse_frequencies(text: str) -> list[float]:
             first, last, step = (float(part) for part in text.split(":"))
             count = round((last - first) / step)
             found = [first + k * step for k in range(count + 1)]
-            if not step > 0 or not np.isclose(found[-1] if found else np.nan, last):
+            if not step > 0 or not (found and isclose(found[-1], last, rel_tol=1e-5, abs_tol=1e-8)):
                 raise ValueError
     except (ValueError, ZeroDivisionError, OverflowError):
         found = []

@@ -10,7 +10,6 @@ from rich.console import Console
 
 from lusee_bayes.cli.options import Quiet, say
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.runs.paper_run import run_paper
 
 
 def paper_command(
@@ -37,6 +36,8 @@ def paper_command(
     quiet
         Print nothing but errors.
     """
+    from lusee_bayes.runs.paper_run import run_paper
+
     console = Console(quiet=quiet, soft_wrap=True)
     run = run_paper(output, skies=sky or [], stages=Stages(console))
     say(console, *(f"  {path}" for path in run.files if path.suffix != ".nc"))

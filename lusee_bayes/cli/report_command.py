@@ -7,7 +7,6 @@ from pathlib import Path
 from rich.console import Console
 
 from lusee_bayes.cli.options import Quiet
-from lusee_bayes.report.pages import write_report
 
 
 def report_command(folder: Path, *, quiet: Quiet = False) -> None:
@@ -22,5 +21,7 @@ def report_command(folder: Path, *, quiet: Quiet = False) -> None:
     quiet
         Print nothing but errors.
     """
+    from lusee_bayes.report.pages import write_report
+
     path = write_report(folder)
     Console(quiet=quiet, soft_wrap=True).print(f"look at {path}", highlight=False, markup=False)

@@ -19,10 +19,6 @@ from lusee_bayes.cli.options import (
     say,
 )
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.report.pages import REPORT
-from lusee_bayes.runs.sample_run import default_program, run_sample
-from lusee_bayes.sampling.hmc import Sampler
-from lusee_bayes.sampling.programs import load_program
 
 
 def sample_command(
@@ -81,6 +77,11 @@ def sample_command(
     verbose
         Tell the memory in use after every stage.
     """
+    from lusee_bayes.report.pages import REPORT
+    from lusee_bayes.runs.sample_run import default_program, run_sample
+    from lusee_bayes.sampling.hmc import Sampler
+    from lusee_bayes.sampling.programs import load_program
+
     console = Console(quiet=quiet, soft_wrap=True)
     resolved = load(scenario, set_, frequencies)
     program = default_program(resolved) if model is None else load_program(model)

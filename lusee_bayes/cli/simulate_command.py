@@ -18,7 +18,6 @@ from lusee_bayes.cli.options import (
     say,
 )
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.runs.simulate_run import run_simulate
 
 
 def simulate_command(
@@ -52,6 +51,8 @@ def simulate_command(
     verbose
         Tell the memory in use after every stage.
     """
+    from lusee_bayes.runs.simulate_run import run_simulate
+
     console = Console(quiet=quiet, soft_wrap=True)
     data = run_simulate(
         load(scenario, set_),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from lusee_bayes.cli.options import (
     Flag,
@@ -18,11 +17,6 @@ from lusee_bayes.cli.options import (
     say,
 )
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.report.pages import REPORT
-from lusee_bayes.results.validation_result import allowed
-from lusee_bayes.runs.validate_run import run_validate
-from lusee_bayes.sampling.hmc import Sampler
-from lusee_bayes.sampling.validation import Check
 
 
 def validate_command(
@@ -70,6 +64,11 @@ def validate_command(
     verbose
         Tell the memory in use after every stage.
     """
+    from lusee_bayes.cli.tables import checks_table
+    from lusee_bayes.report.pages import REPORT
+    from lusee_bayes.runs.validate_run import run_validate
+    from lusee_bayes.sampling.hmc import Sampler
+
     console = Console(quiet=quiet, soft_wrap=True)
     resolved = load(scenario, set_)
     run = run_validate(
@@ -83,15 +82,6 @@ def validate_command(
         stages=Stages(console, verbose=verbose),
     )
     say(console, *(f"  {path}" for path in run.files))
-    console.print(as_table(run.result.checks))
+    console.print(checks_table(run.result.checks))
     say(console, f"{run.result.headline()}; look at {run.folder / REPORT}")
     return 0 if run.result.passed else 1
-
-
-def as_table(checks: list[Check]) -> Table:
-    """The checks for the terminal."""
-    table = Table("check", "value", "allowed", "", "what it is")
-    for check in checks:
-        verdict = "ok" if check.passed else "FAILED"
-        table.add_row(check.name, f"{check.value:.4g}", allowed(check), verdict, check.meaning)
-    return table

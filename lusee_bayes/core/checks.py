@@ -13,15 +13,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from lusee_bayes.core.errors import InputError
+
 AnyArray = jax.Array | np.ndarray
-
-
-class InputError(ValueError):
-    """Input that cannot be used. The message says what is wrong, where, and what to do."""
-
-
-class ProcessLost(RuntimeError):
-    """Raised when another process of the run has ended, so that this one cannot go on."""
 
 
 def is_traced(*arrays: Any) -> bool:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 
 Operator = Callable[[Array], Array]
 

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 
 # names inside a folder of results: scratch folders (with the process's number and its host, since
 # several may share a disk), the new results that are still to be moved into place, and the list of

@@ -11,7 +11,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyWarning
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 
 
 def is_fits(path: str | Path) -> bool:

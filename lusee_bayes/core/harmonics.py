@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 from scipy.special import sph_legendre_p_all
 
-from lusee_bayes.core.checks import AnyArray, InputError, require_finite
+from lusee_bayes.core.checks import AnyArray, require_finite
+from lusee_bayes.core.errors import InputError
 
 SQRT2 = np.sqrt(2.0)
 

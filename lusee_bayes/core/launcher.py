@@ -17,7 +17,7 @@ from typing import IO
 
 from rich.console import Console
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.rendezvous import COORDINATOR, LEASH, PROCESS, PROCESSES
 
 # seconds that processes have to end by themselves, when another has failed or a signal asks them to

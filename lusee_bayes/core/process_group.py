@@ -13,7 +13,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from lusee_bayes.core.checks import InputError, ProcessLost, require_float64
+from lusee_bayes.core.checks import require_float64
+from lusee_bayes.core.errors import InputError, ProcessLost
 
 T = TypeVar("T")
 

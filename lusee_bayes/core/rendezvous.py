@@ -25,7 +25,7 @@ from typing import Any
 
 import jax
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.process_group import ProcessGroup
 
 # the launcher sets these for each process: host:port of the first one, how many there are, which

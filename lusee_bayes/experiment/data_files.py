@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import is_fits
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities

@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 
 
 def apply_override(tree: dict[str, Any], override: str) -> None:

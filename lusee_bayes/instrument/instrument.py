@@ -8,7 +8,7 @@ from dataclasses import replace
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beam_operator import BeamOperator
 from lusee_bayes.instrument.beams import Monopoles, ProductBeams, monopole_beams, parameter, placed
 from lusee_bayes.instrument.coupling import CouplingMatrix

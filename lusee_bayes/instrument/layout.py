@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lusee_bayes.core.checks import InputError, is_traced
+from lusee_bayes.core.checks import is_traced
+from lusee_bayes.core.errors import InputError
 
 
 class DataLayout(eqx.Module):

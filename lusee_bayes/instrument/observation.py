@@ -21,7 +21,8 @@ from jaxtyping import Bool, Float, Int
 from lunarsky import MCMF
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from lusee_bayes.core.checks import InputError, require_finite, require_positive
+from lusee_bayes.core.checks import require_finite, require_positive
+from lusee_bayes.core.errors import InputError
 
 CYCLE_DAYS = 27.321661
 # period after which the sky repeats itself in luseepy's default engines

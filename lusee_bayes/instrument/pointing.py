@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.rotations import Rotation, tilt_powers
 from lusee_bayes.instrument.observation import Observation
 

@@ -10,13 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lusee_bayes.core.checks import (
-    InputError,
-    is_traced,
-    require_finite,
-    require_float64,
-    require_shape,
-)
+from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams import Monopoles, beams_towards
 from lusee_bayes.instrument.observation import Observation
 

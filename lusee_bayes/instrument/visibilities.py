@@ -12,14 +12,14 @@ import xarray as xr
 from astropy.time import Time
 from jaxtyping import Array, Float
 
-from lusee_bayes.core.checks import InputError, require_finite, require_float64, require_shape
+from lusee_bayes.core import formats
+from lusee_bayes.core.checks import require_finite, require_float64, require_shape
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation, unannounced_leap_seconds
 from lusee_bayes.instrument.products import labels
-
-FORMAT = "lusee_bayes visibilities 1"
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Visibilities:
                 "time": observation.times.isot.astype("datetime64[ms]"),
             },
             attrs={
-                "format": FORMAT,
+                "format": formats.VISIBILITIES,
                 "frequency_mhz": self.frequency_mhz,
                 "lon_deg": observation.lon_deg,
                 "lat_deg": observation.lat_deg,
@@ -154,10 +154,10 @@ def read_visibilities(path: str | Path) -> Visibilities:
             dataset = file.load()
     except OSError as error:
         raise InputError(f"{path} is not a netCDF file of visibilities ({error})") from error
-    if dataset.attrs.get("format") != FORMAT:
+    if dataset.attrs.get("format") != formats.VISIBILITIES:
         raise InputError(
             f"{path} is not a file of visibilities: its format is "
-            f"'{dataset.attrs.get('format', 'absent')}', expected '{FORMAT}'"
+            f"'{dataset.attrs.get('format', 'absent')}', expected '{formats.VISIBILITIES}'"
         )
     n = round(np.sqrt(dataset.sizes["product"]))
     found = tuple(str(p) for p in dataset["product"].values)

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core import formats
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers
 from lusee_bayes.linear.posterior import Posterior
 
-FORMAT = "lusee_bayes compact posterior 1"
 # directions whose variance the data reduce by less than this share are left at the prior's
 TOLERANCE = 1e-2
 
@@ -144,7 +144,7 @@ class CompactPosterior:
                 variances=self.variances,
                 ell=ell,
                 m=m,
-                about=json.dumps({"format": FORMAT, **metadata}),
+                about=json.dumps({"format": formats.COMPACT_POSTERIOR, **metadata}),
             )
 
 
@@ -176,20 +176,3 @@ def read_compact(path: str | Path) -> tuple[CompactPosterior, dict[str, object]]
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"'{path}' cannot be read as a compact posterior: {error}") from error
     return posterior, metadata
-
-
-def is_compact(path: Path) -> bool:
-    """Tell whether a .npz file holds a compact posterior.
-
-    Parameters
-    ----------
-    path : Path
-        Of a .npz file.
-
-    Returns
-    -------
-    bool
-        True if it does.
-    """
-    with np.load(path, allow_pickle=False) as file:
-        return "directions" in file

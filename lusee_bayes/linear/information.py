@@ -22,12 +22,12 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lusee_bayes.core.checks import (
     AnyArray,
-    InputError,
     is_traced,
     require_finite,
     require_float64,
     require_shape,
 )
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import gram_matrix, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
 from lusee_bayes.linear.normal_matrix import has_structure, normal_matrix

@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lusee_bayes.core.checks import AnyArray, InputError
+from lusee_bayes.core.checks import AnyArray
 from lusee_bayes.core.conjugate_gradients import conjugate_gradients
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.joint import common_part, reference_maps

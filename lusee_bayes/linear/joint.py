@@ -22,7 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lusee_bayes.core.checks import AnyArray, InputError
+from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import inverse_from_cholesky
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior

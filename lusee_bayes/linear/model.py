@@ -16,12 +16,12 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lusee_bayes.core.checks import (
     AnyArray,
-    InputError,
     nearest,
     require_finite,
     require_float64,
     require_shape,
 )
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.coupling import Coupling, as_coupling
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.normal_matrix import has_structure

@@ -21,7 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from lusee_bayes.core.checks import InputError, require_shape
+from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import N_BLOCKS, gram_matrix
 from lusee_bayes.core.rotations import Rotation
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_about_pole

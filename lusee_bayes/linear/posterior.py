@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lusee_bayes.core.checks import AnyArray, InputError, is_traced
+from lusee_bayes.core.checks import AnyArray, is_traced
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower
 from lusee_bayes.sky.priors import Prior
 

@@ -10,7 +10,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lusee_bayes.core.checks import AnyArray, InputError
+from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.linear.posterior import Posterior
 

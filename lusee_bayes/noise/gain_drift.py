@@ -24,13 +24,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lusee_bayes.core.checks import (
     AnyArray,
-    InputError,
     is_traced,
     require_finite,
     require_float64,
     require_positive,
     require_shape,
 )
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.products import Product, all_products
 from lusee_bayes.noise.covariance import TimeBandedCovariance

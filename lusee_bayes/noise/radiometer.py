@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lusee_bayes.core.checks import (
-    InputError,
     is_traced,
     nearest,
     require_finite,
@@ -26,6 +25,7 @@ from lusee_bayes.core.checks import (
     require_positive,
     require_shape,
 )
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.products import all_products, auto_indices, to_matrix
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, TimeBlockCovariance

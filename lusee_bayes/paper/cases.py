@@ -11,7 +11,8 @@ import h5py
 import numpy as np
 import xarray as xr
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core import formats
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.version import __version__, versions
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.inference import infer
@@ -22,8 +23,6 @@ from lusee_bayes.experiment.terms import beam_rms_difference
 from lusee_bayes.instrument.beams import HemisphereGrid, stokes_beam
 from lusee_bayes.paper.claims import FREQUENCIES, Cases, cross, frequency_case
 from lusee_bayes.results.channel import channel_of_posterior
-
-FORMAT = "lusee_bayes paper case 1"
 
 # by name: a scenario of the package and what differs from it; those after the frequencies are not
 # among the paper's figures, but its text speaks of them or they tell why a claim does not hold
@@ -102,7 +101,7 @@ def read_case(path: Path, scenario: Scenario) -> xr.Dataset | None:
     if not h5py.is_hdf5(path):
         return None
     case = xr.load_dataset(path, engine="h5netcdf")
-    wanted = {"format": FORMAT, "scenario": scenario.to_yaml(), "version": __version__}
+    wanted = {"format": formats.PAPER_CASE, "scenario": scenario.to_yaml(), "version": __version__}
     return case if all(case.attrs.get(key) == value for key, value in wanted.items()) else None
 
 
@@ -149,7 +148,7 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
             "phi": grid.phi,
         },
         attrs={
-            "format": FORMAT,
+            "format": formats.PAPER_CASE,
             "scenario": scenario.to_yaml(),
             "version": __version__,
             "versions": json.dumps(versions()),

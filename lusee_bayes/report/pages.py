@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import read_manifest, recover, replacing
 from lusee_bayes.report.cube_page import cube_page
 from lusee_bayes.report.map_page import map_page

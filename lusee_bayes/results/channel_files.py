@@ -13,7 +13,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.scenario import Scenario

@@ -24,7 +24,6 @@ from lusee_bayes.results.joint_components import (
 )
 from lusee_bayes.sampling.uncertainty import LANDMARKS
 
-FORMAT = "lusee_bayes posterior cube 1"
 # chi^2 of a channel that is further from its mean, in standard deviations of the widest
 # distribution it can have, is called bad
 SIGNIFICANT = 6.0
@@ -233,7 +232,7 @@ class CubeResult:
                 "m": ("mode", m),
             },
             attrs={
-                "format": FORMAT,
+                "format": formats.POSTERIOR_CUBE,
                 "lmax": scenario.lmax,
                 "frame": "galactic",
                 "basis": "real orthonormal spherical harmonics, index ell^2 + ell + m",

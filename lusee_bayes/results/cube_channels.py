@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.process_group import ProcessGroup
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import read_data

@@ -14,7 +14,8 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core import formats
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference
@@ -23,7 +24,6 @@ from lusee_bayes.linear.residuals import Group, residuals
 from lusee_bayes.linear.resolution import resolution_rows
 from lusee_bayes.results.channel import ChannelResult, draw_key
 
-FORMAT = "lusee_bayes diagnostics 1"
 # regions and the directions of point-spread functions, and the maps these are drawn on
 REGION_NSIDE, KERNEL_NSIDE = 8, 16
 N_DRAWS = 4
@@ -96,7 +96,7 @@ def diagnostics(
         variables,
         coords={"product": list(data.labels), "hours": ("time", data.observation.hours)},
         attrs={
-            "format": FORMAT,
+            "format": formats.DIAGNOSTICS,
             "verdict": found.verdict(),
             "chi2": found.chi2,
             "p": found.p,
@@ -120,10 +120,11 @@ def read_diagnostics(path: str | Path) -> xr.Dataset:
             dataset = file.load()
     except (OSError, ValueError) as error:
         raise InputError(f"'{path}' cannot be read as diagnostics: {error}") from error
-    if dataset.attrs.get("format") != FORMAT:
+    if dataset.attrs.get("format") != formats.DIAGNOSTICS:
         raise InputError(
             f"'{path}' is not a file of diagnostics: its format is "
-            f"'{dataset.attrs.get('format')}', expected '{FORMAT}' (lusee-bayes map writes one)"
+            f"'{dataset.attrs.get('format')}', expected '{formats.DIAGNOSTICS}' (lusee-bayes map "
+            "writes one)"
         )
     return dataset
 

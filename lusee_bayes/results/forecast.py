@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import sum_over_m
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.core.progress import Stages

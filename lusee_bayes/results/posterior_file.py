@@ -13,8 +13,6 @@ from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.results.map_result import MapResult
 
-FORMAT = "lusee_bayes posterior 1"
-
 
 def write_posterior(result: MapResult, path: Path) -> None:
     """Write posterior.nc."""
@@ -32,7 +30,7 @@ def posterior_dataset(result: MapResult) -> xr.Dataset:
     variables = {
         name: (*value, {"units": "K"}) for name, value in result.channel.variables().items()
     }
-    attrs = {"format": FORMAT, **about(scenario)}
+    attrs = {"format": formats.POSTERIOR, **about(scenario)}
     if scenario.output.covariance:
         matrix = np.asarray(posterior.covariance())
         variables["covariance"] = (("mode", "mode_2"), matrix, {"units": "K2"})

@@ -14,7 +14,7 @@ import pandas as pd
 import xarray as xr
 from numpyro.infer.hmc import HMCState
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages, peak_memory_gb
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.experiment import Experiment

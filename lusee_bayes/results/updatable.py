@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover
 from lusee_bayes.core.harmonics import power_spectrum
 from lusee_bayes.experiment.scenario import Scenario

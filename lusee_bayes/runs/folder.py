@@ -10,7 +10,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import MANIFEST, recover, require_folder, transaction
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.report.pages import PAGES, REPORT

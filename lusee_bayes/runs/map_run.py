@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.process_group import ProcessGroup
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.tables import rows_of, write_csv

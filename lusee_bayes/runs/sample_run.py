@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import transaction
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import read_data

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import Scenario

@@ -15,7 +15,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from lusee_bayes.core.checks import AnyArray, InputError
+from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.errors import InputError
 
 IDENTITY = "run.json"
 CHUNK_GLOB = "chunk-*.npz"

@@ -11,7 +11,8 @@ import numpy as np
 import xarray as xr
 from numpyro.infer import Predictive
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core import formats
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
@@ -21,7 +22,6 @@ from lusee_bayes.sampling.programs import Program, collapsed_skies, is_collapsed
 from lusee_bayes.sampling.promotion import numpyro_promotion
 from lusee_bayes.systematics.base import SKY
 
-FORMAT = "lusee_bayes samples 1"
 DATA = "data"
 
 
@@ -110,7 +110,7 @@ def to_datatree(
         groups,
         dims=dims,
         check_conventions=False,  # more chains than draws is unusual, not wrong
-        attrs={"/": {"format": FORMAT, "program": program.name, **(attributes or {})}},
+        attrs={"/": {"format": formats.SAMPLES, "program": program.name, **(attributes or {})}},
     )
     tree["posterior_predictive"] = tree["posterior_predictive"].dataset.assign_coords(
         draw=np.arange(n_draws)[::step]
@@ -158,9 +158,9 @@ def read_datatree(path: str | Path) -> xr.DataTree:
         tree = xr.load_datatree(path, engine="h5netcdf")
     except (OSError, ValueError) as error:
         raise InputError(f"'{path}' cannot be read as samples: {error}") from error
-    if tree.attrs.get("format") != FORMAT:
+    if tree.attrs.get("format") != formats.SAMPLES:
         raise InputError(
             f"'{path}' is not a file of samples: its format is '{tree.attrs.get('format')}', "
-            f"expected '{FORMAT}' (lusee-bayes sample writes one)"
+            f"expected '{formats.SAMPLES}' (lusee-bayes sample writes one)"
         )
     return tree

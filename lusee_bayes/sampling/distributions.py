@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from numpyro import distributions as dist
 
-from lusee_bayes.core.checks import InputError, is_traced
+from lusee_bayes.core.checks import is_traced
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, Factor
 from lusee_bayes.sky.priors import Prior

@@ -25,7 +25,8 @@ from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.util import potential_energy
 
-from lusee_bayes.core.checks import AnyArray, InputError
+from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling.mode import LaplaceApproximation, laplace_approximation
 from lusee_bayes.sampling.programs import Program
 from lusee_bayes.sampling.promotion import numpyro_promotion

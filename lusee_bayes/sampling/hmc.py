@@ -20,7 +20,8 @@ from jaxtyping import Array, PRNGKeyArray
 from numpyro.infer import HMC, NUTS
 from numpyro.infer.hmc import HMCState
 
-from lusee_bayes.core.checks import AnyArray, InputError, nearest
+from lusee_bayes.core.checks import AnyArray, nearest
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling.chains import STATISTICS, Chains
 from lusee_bayes.sampling.checkpoints import Checkpoints
 from lusee_bayes.sampling.program_sites import latent_sites, predicts

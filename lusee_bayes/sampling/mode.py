@@ -20,7 +20,8 @@ from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer import init_to_median
 
-from lusee_bayes.core.checks import InputError, is_traced
+from lusee_bayes.core.checks import is_traced
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling.curvature import Potential, root_of_inverse, without_held
 from lusee_bayes.sampling.distributions import HALF_LOG_2PI, CorrelatedNormal
 from lusee_bayes.sampling.promotion import numpyro_promotion

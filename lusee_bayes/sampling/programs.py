@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 from numpyro import handlers
 
-from lusee_bayes.core.checks import AnyArray, InputError, nearest
+from lusee_bayes.core.checks import AnyArray, nearest
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.sampling.promotion import numpyro_promotion
 

@@ -16,7 +16,8 @@ import pandas as pd
 from arviz_stats.base import array_stats
 from jaxtyping import Bool, Float
 
-from lusee_bayes.core.checks import InputError, require_shape
+from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, pixel_matrix, power_spectrum, synthesis_matrix
 
 # pixels of which all draws are held at once

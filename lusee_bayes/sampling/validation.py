@@ -23,7 +23,8 @@ from arviz_stats.base import array_stats
 from jaxtyping import Bool, Float
 from scipy import stats
 
-from lusee_bayes.core.checks import InputError, require_shape
+from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.posterior import Posterior
 
 # chance that a true posterior fails one of the three comparisons

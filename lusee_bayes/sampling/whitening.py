@@ -17,7 +17,8 @@ from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.reparam import Reparam
 
-from lusee_bayes.core.checks import InputError, is_traced
+from lusee_bayes.core.checks import is_traced
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling.distributions import SkyPrior
 from lusee_bayes.systematics.chart import Chart

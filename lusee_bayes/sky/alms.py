@@ -14,7 +14,8 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import AnyArray, InputError, require_finite
+from lusee_bayes.core.checks import AnyArray, require_finite
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.fits_files import is_fits, opened
 from lusee_bayes.core.harmonics import from_healpy, lmax_of, n_modes, to_healpy

@@ -18,7 +18,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import synthesis_matrix
 
 BOLTZMANN = 1.380649e-23  # J/K

@@ -13,7 +13,8 @@ import healpy
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import InputError, require_finite
+from lusee_bayes.core.checks import require_finite
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import is_fits, opened
 from lusee_bayes.sky.files import SkyFile, modes_of_map
 

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lusee_bayes.core.checks import InputError, is_traced, require_finite, require_float64
+from lusee_bayes.core.checks import is_traced, require_finite, require_float64
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, per_mode, pixel_matrix
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import map_to_modes
 from lusee_bayes.sky.alms import SkyAlms
 from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES, PointSource

@@ -18,13 +18,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lusee_bayes.core.checks import (
     AnyArray,
-    InputError,
     nearest,
     require_finite,
     require_float64,
     require_positive,
     require_shape,
 )
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import per_mode, power_spectrum
 from lusee_bayes.sky.priors import HarmonicPrior
 

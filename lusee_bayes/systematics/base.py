@@ -13,7 +13,8 @@ import numpyro
 from jaxtyping import Array, Float, PRNGKeyArray
 from numpyro import distributions as dist
 
-from lusee_bayes.core.checks import InputError, require_positive
+from lusee_bayes.core.checks import require_positive
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance

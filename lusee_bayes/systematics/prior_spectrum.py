@@ -11,7 +11,7 @@ import numpyro
 from jaxtyping import Array, Float
 from numpyro import distributions as dist
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.sky.priors import HarmonicPrior
 from lusee_bayes.systematics.base import Scale, scalar, scalar_or_none, uncertain_scale

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 
 # relative error that sums of a few thousand terms may make
 ROUNDING = 1e-12

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from lusee_bayes.core.checks import (
-    InputError,
     is_traced,
     nearest,
     require_finite,
@@ -16,6 +15,7 @@ from lusee_bayes.core.checks import (
     require_positive,
     require_shape,
 )
+from lusee_bayes.core.errors import InputError
 
 
 def test_input_error_is_a_value_error():

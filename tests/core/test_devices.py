@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.launcher import run_processes
 from lusee_bayes.core.process_group import ProcessGroup, use_cpu_devices
 from lusee_bayes.core.rendezvous import COORDINATOR, HEARTBEAT, PROCESS, PROCESSES, join
@@ -21,7 +21,7 @@ CREW = """
 import os, sys, time
 import jax, numpy as np
 import lusee_bayes
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.rendezvous import join
 
 def numbers(k):
@@ -361,7 +361,7 @@ def test_results_do_not_depend_on_the_device(tmp_path):
     code = """
 import sys
 import lusee_bayes
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.process_group import ProcessGroup, use_cpu_devices
 n = int(sys.argv[1])
 use_cpu_devices(n)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import lusee_bayes
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import (
     COMMITTED,
     MANIFEST,

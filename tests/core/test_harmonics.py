@@ -5,7 +5,7 @@ import pytest
 from reference import real_harmonics
 
 from lusee_bayes.core import harmonics as h
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 
 LMAX = 9
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from experiments import small_experiment as make_small_experiment
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model, radiometer
 from lusee_bayes.experiment.scenario import load_scenario

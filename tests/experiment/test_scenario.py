@@ -3,7 +3,7 @@
 import pytest
 import yaml
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.scenario import Scenario, load_scenario, scenario_names
 
 

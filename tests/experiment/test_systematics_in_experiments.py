@@ -13,7 +13,7 @@ import pytest
 from experiments import small_experiment
 from scipy.stats import chi2, kstest
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.experiment.inference import SETTLED, Inference, infer, prediction
 from lusee_bayes.experiment.model import full_model, radiometer

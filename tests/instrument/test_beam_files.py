@@ -15,7 +15,7 @@ from fits_files import write_images
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.pieces import program_pieces

@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams import (
     BeamSource,
     EmbeddedBeams,

@@ -8,7 +8,7 @@ from numpy.polynomial.legendre import Legendre
 from reference import SPEED_OF_LIGHT, hemisphere, real_harmonics
 from scipy.special import eval_legendre, factorial
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
 from lusee_bayes.instrument.beams import (
     AntennaFields,

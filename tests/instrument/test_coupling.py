@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from reference import arm_response, hemisphere, visibilities
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mode_numbers, n_modes
 from lusee_bayes.core.rotations import Rotation, turn_about_z
 from lusee_bayes.instrument.beams import Monopoles, ProductBeams, monopole_beams

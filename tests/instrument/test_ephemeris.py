@@ -6,7 +6,7 @@ from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, SkyCoor
 from astropy.time import Time
 from lunarsky import MCMF, LunarTopo, MoonLocation
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.ephemeris import (
     BODIES,
     MOON_RADIUS_KM,

@@ -12,7 +12,7 @@ from numpyro import handlers
 from scipy.stats import norm, truncnorm
 
 import lusee_bayes as lb
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beam_operator import BeamOperator
 from lusee_bayes.instrument.beams import Monopoles, ProductBeams, Regolith, monopole_beams
 from lusee_bayes.instrument.coupling import CouplingMatrix

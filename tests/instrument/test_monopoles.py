@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from reference import SPEED_OF_LIGHT, arm_response
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.rotations import turn_about_z
 from lusee_bayes.instrument.beams import (
     HemisphereGrid,

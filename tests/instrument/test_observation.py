@@ -13,7 +13,7 @@ from astropy.time import Time
 from lunarsky import MCMF, LunarTopo, MoonLocation
 from reference import galactic_directions
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.observation import CYCLE_DAYS, Observation, Run
 
 # the leap seconds of years far ahead are unknown; astropy says so whenever it converts them

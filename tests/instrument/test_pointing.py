@@ -6,7 +6,7 @@ import pytest
 from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.rotations import generators, tilt_powers
 from lusee_bayes.instrument.observation import Observation, Run
 from lusee_bayes.instrument.pointing import (

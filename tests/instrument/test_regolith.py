@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from reference import layered_reflection
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams import Regolith
 
 COSINES = np.cos(np.radians([0.0, 20.0, 45.0, 70.0, 85.0, 89.9]))

@@ -15,7 +15,7 @@ from scipy.constants import Boltzmann, c, physical_constants
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build

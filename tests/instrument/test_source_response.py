@@ -8,7 +8,7 @@ from astropy.time import Time
 from reference import galactic_directions, hemisphere, real_harmonics
 from scipy.special import eval_legendre
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams import (
     HemisphereGrid,
     Monopoles,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation, Run
 from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities

@@ -13,7 +13,7 @@ from scipy import stats
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.linear.compact import CompactPosterior, read_compact
 from lusee_bayes.noise.covariance import DiagonalCovariance

@@ -7,8 +7,8 @@ import pytest
 from reference_linear import z_of
 from scipy import stats
 
-from lusee_bayes.core.checks import InputError
 from lusee_bayes.core.conjugate_gradients import conjugate_gradients
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.iterative_joint import solve_iteratively
 from lusee_bayes.linear.joint import solve_directly
 from lusee_bayes.linear.joint_skies import channel_sky, paired

@@ -18,7 +18,7 @@ from reference_linear import (
 )
 from scipy.stats import multivariate_normal
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams import monopole_beams
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.layout import DataLayout

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import pixel_matrix
 from lusee_bayes.instrument.beams import ProductBeams
 from lusee_bayes.instrument.coupling import CouplingMatrix

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from reference_linear import assert_draws_follow, posterior, random_covariance
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear import posterior as posterior_module
 from lusee_bayes.linear.model import FORMS, LinearGaussian
 from lusee_bayes.noise.covariance import DenseCovariance

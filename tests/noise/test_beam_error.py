@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from reference import real_harmonics
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams import Monopoles, ProductBeams, Regolith, monopole_beams, placed
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.layout import DataLayout

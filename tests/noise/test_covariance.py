@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from reference_linear import random_covariance
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.noise.covariance import (
     Covariance,

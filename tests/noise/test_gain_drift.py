@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from reference_linear import assert_draws_follow, z_of
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation, Run
 from lusee_bayes.noise import GainDrift, with_gains

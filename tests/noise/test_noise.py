@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from reference_linear import z_of
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.noise import exact_blocks, paper_variance, radiometer_noise
 from lusee_bayes.noise.covariance import DiagonalCovariance, TimeBlockCovariance

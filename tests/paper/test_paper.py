@@ -11,7 +11,7 @@ import xarray as xr
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams import HemisphereGrid
 from lusee_bayes.instrument.products import labels
 from lusee_bayes.paper import cases as paper
@@ -30,7 +30,7 @@ def folder(tmp_path_factory):
     def made_up(scenario):
         case = synthetic(next(names), agrees=True)
         return case.assign_attrs(
-            format=paper.FORMAT, version=paper.__version__, scenario=scenario.to_yaml(),
+            format=formats.PAPER_CASE, version=paper.__version__, scenario=scenario.to_yaml(),
             frequency_mhz=scenario.frequency_mhz, log_evidence=1.0, chi2=2.0, chi2_expected=3.0,
         )  # fmt: skip
 

@@ -11,7 +11,7 @@ import pytest
 import scipy.linalg
 
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import sum_over_m
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model

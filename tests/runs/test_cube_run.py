@@ -16,7 +16,7 @@ import pytest
 import xarray as xr
 
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model

@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling import checkpoints
 from lusee_bayes.sampling.checkpoints import Checkpoints, Chunk
 

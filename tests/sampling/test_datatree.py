@@ -14,9 +14,8 @@ from reference_linear import assert_draws_follow, random_covariance, z_of
 from reference_linear import posterior as naive_posterior
 
 import lusee_bayes as lb
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.sampling import datatree
 from lusee_bayes.sampling.chains import STATISTICS, Chains
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree, write_datatree
 from lusee_bayes.sampling.programs import load_program
@@ -303,7 +302,7 @@ def test_a_written_tree_comes_back(which, request, tmp_path):
         for name, values in group.data_vars.items():
             assert again[name].dtype == values.dtype, f"{path[0]}/{name}"
             np.testing.assert_array_equal(again[name].values, values.values)
-    assert found.attrs["format"] == datatree.FORMAT
+    assert found.attrs["format"] == formats.SAMPLES
     assert found.attrs["program"] == {"drawn": "sky", "collapsed": "sky_marginal"}[which]
     if which == "drawn":
         assert (found.attrs["frequency_mhz"], found.attrs["note"]) == (25.0, "µ = 1")

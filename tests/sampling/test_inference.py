@@ -21,7 +21,7 @@ from reference_linear import random_covariance, z_of
 from scipy.stats import lognorm, multivariate_normal
 
 import lusee_bayes as lb
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling import hmc as inference
 from lusee_bayes.sampling.chains import STATISTICS
 from lusee_bayes.sampling.checkpoints import Checkpoints

@@ -11,7 +11,7 @@ from reference_linear import random_covariance, z_of
 from scipy.stats import norm
 
 import lusee_bayes as lb
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.sampling import uncertainty
 from lusee_bayes.sampling.uncertainty import (

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.sky import free_free, galaxy
 from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES
 

@@ -10,7 +10,7 @@ import pytest
 from reference_linear import assert_draws_follow, posterior
 from scipy.special import eval_legendre
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.sky.priors import HarmonicPrior, PixelPrior

@@ -8,7 +8,7 @@ import pytest
 from astropy.io import fits
 
 import lusee_bayes as lb
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map
 from lusee_bayes.report.describe import describe
 from lusee_bayes.sky import SkyAlms, SkyCube, sky_from_file, write_alms

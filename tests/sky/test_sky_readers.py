@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map, synthesis_matrix
 from lusee_bayes.sky import BRIGHT_SOURCES, Sky, galaxy_sky, read_sky_file, sky_from_file
 

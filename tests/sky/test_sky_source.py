@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map, to_healpy
 from lusee_bayes.sky import (
     SKY_READERS,

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.sky import galaxy
 from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES
 

@@ -11,7 +11,7 @@ from experiments import program_arguments, small_experiment
 from numpyro import handlers
 
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.experiment.model import base_model, model_with_fluxes, systematics
 from lusee_bayes.experiment.scenario import load_scenario

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 from numpyro import handlers
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms.term import Around, Term, Truth
 from lusee_bayes.instrument.visibilities import Visibilities

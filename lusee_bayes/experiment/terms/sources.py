@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.setup import Setup, block_of_times, mean_flux, source_responses
 from lusee_bayes.experiment.terms.beam_error import true_instrument
 from lusee_bayes.experiment.terms.term import Around, Term, Truth

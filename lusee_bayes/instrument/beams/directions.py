@@ -12,13 +12,13 @@ from jaxtyping import Array, Float
 
 from lusee_bayes.core.checks import (
     AnyArray,
-    InputError,
     is_traced,
     require_finite,
     require_float64,
     require_positive,
     require_shape,
 )
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
 from lusee_bayes.instrument.beams.monopoles import Monopoles

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from lusee_bayes.core.checks import InputError, require_shape
+from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
 
 SPEED_OF_LIGHT = 299792458.0  # m/s

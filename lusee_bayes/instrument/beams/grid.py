@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import roots_legendre
 
-from lusee_bayes.core.checks import InputError, require_shape
+from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import SQRT2, mode_numbers, polar_functions
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.interpolate import CubicSpline, make_interp_spline
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
 
 

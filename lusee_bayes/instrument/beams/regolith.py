@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from lusee_bayes.core.checks import AnyArray, InputError, is_traced, require_positive
+from lusee_bayes.core.checks import AnyArray, is_traced, require_positive
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import wavenumber
 
 N_LAYERS = 8

@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 from scipy.constants import Boltzmann, physical_constants
 
-from lusee_bayes.core.checks import InputError, nearest, require_finite
+from lusee_bayes.core.checks import nearest, require_finite
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import read_images
 from lusee_bayes.instrument.beams.fields import SPEED_OF_LIGHT, AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid

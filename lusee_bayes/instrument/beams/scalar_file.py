@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from lusee_bayes.core.checks import InputError, require_finite
+from lusee_bayes.core.checks import require_finite
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import image_names, read_images
 from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid

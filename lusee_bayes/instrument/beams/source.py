@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
 from lusee_bayes.instrument.beams.gridded import at_frequency

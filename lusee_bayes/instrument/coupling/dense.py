@@ -5,13 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lusee_bayes.core.checks import (
-    AnyArray,
-    InputError,
-    require_finite,
-    require_float64,
-    require_shape,
-)
+from lusee_bayes.core.checks import AnyArray, require_finite, require_float64, require_shape
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.coupling.base import Coupling
 
 

@@ -21,7 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from lusee_bayes.core.checks import InputError, require_shape
+from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers
 from lusee_bayes.core.rotations import tilts, turn_about_z
 from lusee_bayes.instrument.beams import ProductBeams

@@ -15,7 +15,7 @@ from astropy.io import fits
 from astropy.time import STANDARD_TIME_SCALES, Time
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import read_images
 from lusee_bayes.instrument.observation import Observation, unannounced_leap_seconds
 from lusee_bayes.instrument.products import N_ANTENNAS, all_products, labels

@@ -17,7 +17,7 @@ from astropy.io import fits
 from astropy.time import Time
 from jaxtyping import Complex
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.fits_files import read_images
 from lusee_bayes.core.version import __version__

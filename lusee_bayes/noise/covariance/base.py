@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lusee_bayes.core.checks import InputError
+from lusee_bayes.core.errors import InputError
 
 
 class Factor(eqx.Module):

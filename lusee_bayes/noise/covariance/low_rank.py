@@ -15,13 +15,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lusee_bayes.core.checks import (
-    InputError,
-    require_finite,
-    require_float64,
-    require_positive,
-    require_shape,
-)
+from lusee_bayes.core.checks import require_finite, require_float64, require_positive, require_shape
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.noise.covariance.base import Covariance, Factor
 from lusee_bayes.noise.covariance.dense import DenseCovariance

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from lusee_bayes.core.checks import (
-    InputError,
     is_traced,
     require_finite,
     require_float64,
     require_shape,
     require_symmetric,
 )
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.noise.covariance.base import Covariance, Factor

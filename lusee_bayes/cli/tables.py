@@ -1,0 +1,64 @@
+"""The tables that commands print."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.markup import escape
+from rich.table import Table
+
+from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows
+from lusee_bayes.results.forecast import AS_GIVEN, Forecast, forecast_rows
+from lusee_bayes.results.validation_result import allowed
+from lusee_bayes.sampling.validation import Check
+
+
+def forecast_table(forecasts: list[Forecast]) -> Table:
+    """The forecasts of one scenario as a table for the terminal."""
+    source = forecasts[0].variation.source
+    text = Table(title=escape(source), title_justify="left", title_style="bold")
+    text.add_column("variation", no_wrap=True)
+    for name in ("days", "data", "bits", "more", "SNR > 1", "ell_cross", "deg"):
+        text.add_column(name, justify="right")
+    family = ""
+    for row, forecast in zip(forecast_rows(forecasts), forecasts, strict=True):
+        if row["family"] != family:
+            family = str(row["family"])
+            text.add_section()
+            if family != AS_GIVEN:
+                text.add_row(f"[italic]{escape(family)}")
+        text.add_row(
+            escape(str(row["variation"])),
+            f"{forecast.days:.1f}",
+            str(row["n_data"]),
+            f"{forecast.information_bits:.0f}",
+            f"{float(str(row['difference_bits'])):+.0f}",
+            str(row["modes_snr_above_1"]),
+            str(row["ell_cross"]),
+            str(row["resolution_deg"]),
+        )
+    return text
+
+
+def checks_table(checks: list[Check]) -> Table:
+    """The checks of a validation."""
+    table = Table("check", "value", "allowed", "", "what it is")
+    for check in checks:
+        verdict = "ok" if check.passed else "FAILED"
+        table.add_row(check.name, f"{check.value:.4g}", allowed(check), verdict, check.meaning)
+    return table
+
+
+def comparison_table(runs: Sequence[FinishedRun]) -> Table:
+    """Finished runs side by side."""
+    shown = Table("run", "SNR < 1 from ell", "bits", "ln evidence", "less the best", "p")
+    for row in comparison_rows(runs):
+        shown.add_row(
+            str(row["run"]),
+            str(row["ell_cross"]),
+            f"{row['information_bits']:.0f}",
+            f"{row['log_evidence']:.1f}",
+            f"{row['log_evidence_less_best']:.1f}",
+            f"{row['p']:.2g}",
+        )
+    return shown

@@ -1,0 +1,71 @@
+"""Recognising files and saying what is in them."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from pkgutil import resolve_name
+
+import h5py
+
+from lusee_bayes.core import formats
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.fits_files import image_names, is_fits
+
+# the package's own netCDF files, by their attribute ``format``. What describes a kind is named by
+# path and imported when there is such a file: each needs libraries that others do not
+OWN_FORMATS = {
+    formats.VISIBILITIES: "data_files:describe_visibilities",
+    formats.POSTERIOR: "posteriors:describe_posterior",
+    formats.POSTERIOR_CUBE: "posteriors:describe_posterior_cube",
+    formats.DIAGNOSTICS: "diagnostics:describe_diagnostics",
+    formats.SAMPLES: "samples:describe_samples",
+}
+
+
+def _has_image(*names: str) -> Callable[[Path], bool]:
+    """Whether a FITS file has one of these images."""
+    return lambda path: is_fits(path) and bool(set(names) & set(image_names(path)))
+
+
+def _is_compact(path: Path) -> bool:
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as file:
+        return "directions.npy" in file.namelist()
+
+
+# other files: how each kind is recognised; what is none of them is a sky
+KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
+    (_has_image("h_theta_real"), "beam_files:describe_response"),
+    (_has_image("etheta_real"), "beam_files:describe_scalar_beam"),
+    (_has_image("combinations", "products"), "data_files:describe_waterfall"),
+    (_is_compact, "compact:describe_compact"),
+    (lambda path: True, "skies:describe_sky"),
+)
+
+
+def describe(path: str | Path) -> str:
+    """A few lines on a file: visibilities, a posterior, samples, beams, or a sky.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, or of none of these kinds.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"no file at '{path}'")
+    kind = OWN_FORMATS.get(_netcdf_format(path) or "")
+    if kind is None:
+        kind = next(kind for recognises, kind in KINDS if recognises(path))
+    return str(resolve_name(f"{__name__}.{kind}")(path))
+
+
+def _netcdf_format(path: Path) -> str | None:
+    if not h5py.is_hdf5(path):
+        return None
+    with h5py.File(path) as file:
+        kind = file.attrs.get("format")
+    return kind.decode() if isinstance(kind, bytes) else kind

@@ -1,0 +1,60 @@
+"""What is in visibilities and waterfalls."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from lusee_bayes.instrument.products import labels
+from lusee_bayes.instrument.visibilities import read_visibilities
+from lusee_bayes.instrument.waterfalls import read_waterfall
+
+
+def describe_visibilities(path: Path) -> str:
+    """Visibilities at one frequency."""
+    data = read_visibilities(path)
+    observation = data.observation
+    grid = data.grid()
+    autos = grid[[k for k, label in enumerate(data.labels) if label[0] == label[1]]]
+    return "\n".join(
+        [
+            f"{path}: visibilities at {data.frequency_mhz:g} MHz",
+            f"  {data.layout.n_products} products ({data.labels[0]} ... {data.labels[-1]}), "
+            f"{data.layout.n_times} times of {observation.step_s:g} s, {data.n_missing} samples "
+            "missing",
+            f"  {observation.times[0].isot} to {observation.times[-1].isot} UTC, "
+            f"{observation.n_runs} run(s) at turntable {observation.turntable_deg} degrees",
+            f"  site: longitude {observation.lon_deg}, latitude {observation.lat_deg} degrees",
+            f"  autos {np.nanmin(autos):.4g} to {np.nanmax(autos):.4g} K",
+            f"  true sky {'included' if data.truth is not None else 'not known'}",
+        ]
+    )
+
+
+def describe_waterfall(path: Path) -> str:
+    """A waterfall of luseepy."""
+    waterfall = read_waterfall(path)
+    grid, observation = waterfall.grid, waterfall.observation
+    four_port = waterfall.per_kelvin is not None
+    here = ~np.isnan(grid).all((1, 2))
+    names = [name for name, there in zip(labels(), here, strict=True) if there]
+    gaps = int(np.isnan(grid[here]).sum())
+    four_port_lines = []
+    if four_port:
+        kelvin = waterfall.per_kelvin
+        four_port_lines = [
+            f"  in V^2/Hz: 1 K is {kelvin.min():.4g} to {kelvin.max():.4g} of them",
+            f"  with the emission of the Moon at {waterfall.moon_k:g} K",
+        ]
+    return "\n".join(
+        [
+            f"{path}: a waterfall of luseepy" + (", four ports" if four_port else ""),
+            f"  channels at {', '.join(f'{f:g}' for f in waterfall.frequencies_mhz)} MHz",
+            f"  {len(names)} products ({' '.join(names)}), {observation.n_times} times of "
+            f"{observation.step_s:g} s, {gaps} samples missing",
+            f"  {observation.times[0].isot} to {observation.times[-1].isot} UTC",
+            f"  site: longitude {observation.lon_deg}, latitude {observation.lat_deg} degrees",
+            *four_port_lines,
+        ]
+    )

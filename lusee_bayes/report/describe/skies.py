@@ -1,0 +1,28 @@
+"""What is in maps and cubes of the sky."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lusee_bayes.core.fits_files import is_fits, opened
+from lusee_bayes.sky import read_sky_file
+
+
+def describe_sky(path: Path) -> str:
+    """A sky map, cube or coefficients."""
+    first, *further = read_sky_file(path).summary()
+    cards = _describe_cards(path) if is_fits(path) else []
+    return "\n".join([f"{path}: {first}", *(f"  {line}" for line in further), *cards])
+
+
+def _describe_cards(path: Path) -> list[str]:
+    """What a FITS file of the package says of itself."""
+    with opened(path) as hdus:
+        header = hdus[1].header if len(hdus) > 1 else {}
+        if "SCENHASH" not in header:
+            return []
+        return [
+            f"  {header['CONTENT']} at {header['FREQ']:g} MHz up to ell = {header['LMAX']}, beam "
+            f"{header['BEAM']}, site {header['SITELON']:g}, {header['SITELAT']:g} degrees",
+            f"  {header['CREATOR']}, scenario {header['SCENHASH'][:12]}",
+        ]
