@@ -15,8 +15,6 @@ import numpy as np
 
 from lusee_bayes.core.errors import InputError
 
-AnyArray = jax.Array | np.ndarray
-
 
 def is_traced(*arrays: Any) -> bool:
     """Return whether any of ``arrays`` is a tracer, whose values are not known yet."""

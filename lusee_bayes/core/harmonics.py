@@ -15,10 +15,11 @@ from functools import lru_cache
 
 import healpy
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 from scipy.special import sph_legendre_p_all
 
-from lusee_bayes.core.checks import AnyArray, require_finite
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import require_finite
 from lusee_bayes.core.errors import InputError
 
 SQRT2 = np.sqrt(2.0)
@@ -61,7 +62,7 @@ def from_healpy(
     return np.where(m == 0, picked.real, SQRT2 * np.where(m > 0, picked.real, picked.imag))
 
 
-def to_healpy(modes: Float[AnyArray, " modes"]) -> Complex[np.ndarray, " alms"]:
+def to_healpy(modes: Float[Array, " modes"]) -> Complex[np.ndarray, " alms"]:
     """Convert real packed coefficients to healpy's; inverse of :func:`from_healpy`."""
     modes = np.asarray(modes)
     lmax = lmax_of(modes.shape[-1])
@@ -103,7 +104,7 @@ def map_to_modes(pixels: Float[np.ndarray, " pixels"], lmax: int) -> Float[np.nd
     return from_healpy(healpy.map2alm(pixels, lmax=lmax, iter=10))
 
 
-def modes_to_map(modes: Float[AnyArray, " modes"], nside: int) -> Float[np.ndarray, " pixels"]:
+def modes_to_map(modes: Float[Array, " modes"], nside: int) -> Float[np.ndarray, " pixels"]:
     """Synthesise the HEALPix RING map of packed coefficients."""
     alm = to_healpy(modes)
     return healpy.alm2map(alm, nside, lmax=lmax_of(np.shape(modes)[-1]))
@@ -163,13 +164,13 @@ def pixel_matrix(nside: int, lmax: int) -> Float[np.ndarray, "pixels modes"]:
     return synthesis_matrix(theta, phi, lmax)
 
 
-def sum_over_m(values: Float[AnyArray, "*batch modes"]) -> Float[np.ndarray, "*batch ells"]:
+def sum_over_m(values: Float[Array, "*batch modes"]) -> Float[np.ndarray, "*batch ells"]:
     """Sum a quantity that is given per mode over the modes of each ell = 0..lmax."""
     lmax = lmax_of(values.shape[-1])
     return np.add.reduceat(np.asarray(values), np.arange(lmax + 1) ** 2, axis=-1)
 
 
-def power_spectrum(modes: Float[AnyArray, "*batch modes"]) -> Float[np.ndarray, "*batch ells"]:
+def power_spectrum(modes: Float[Array, "*batch modes"]) -> Float[np.ndarray, "*batch ells"]:
     """Return C_ell = sum_m a_lm^2 / (2 ell + 1) for ell = 0..lmax; the mean is not subtracted."""
     return sum_over_m(np.asarray(modes) ** 2) / (2.0 * np.arange(lmax_of(modes.shape[-1]) + 1) + 1)
 

@@ -14,8 +14,9 @@ from itertools import pairwise
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
 

@@ -11,10 +11,10 @@ from __future__ import annotations
 from functools import lru_cache
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.harmonics import mode_numbers, n_modes
 
 
@@ -77,7 +77,7 @@ class Rotation(eqx.Module):
             _block_z(ell, first) @ _block_y(ell, tilt) @ _block_z(ell, last)
             for ell in range(lmax + 1)
         ]
-        return cls(tuple(jnp.asarray(block) for block in blocks))
+        return cls(tuple(blocks))
 
     @property
     def T(self) -> Rotation:
@@ -89,7 +89,7 @@ class Rotation(eqx.Module):
         turned = []
         for ell, block in enumerate(self.blocks):
             turned.append(modes[..., ell**2 : (ell + 1) ** 2] @ block.T)
-        return jnp.concatenate(turned, axis=-1)
+        return namespace(*turned).concatenate(turned, axis=-1)
 
 
 def euler_zyz(matrix: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
@@ -127,8 +127,9 @@ def turn_about_z(
     lmax = round(np.sqrt(modes.shape[-1])) - 1
     ell, m = mode_numbers(lmax)
     mirrored = modes[..., ell * (ell + 1) - m]
-    angles = jnp.asarray(m, dtype=jnp.float64) * angle
-    cosine, sine = jnp.cos(angles), jnp.sin(angles)
+    xp = namespace(modes, angle)
+    angles = m.astype(np.float64) * angle
+    cosine, sine = xp.cos(angles), xp.sin(angles)
     shape = (1,) * (modes.ndim - 1) + (-1,)
     return modes * cosine.reshape(shape) + mirrored * sine.reshape(shape)
 
@@ -155,7 +156,7 @@ def apply_generator(modes: Float[Array, "*batch modes"], axis: int) -> Float[Arr
     """Return K_x (axis 0) or K_y (axis 1) times packed modes, in time linear in their number."""
     columns, weights = _horizontal_generators(round(np.sqrt(modes.shape[-1])) - 1)
     shape = (1,) * (modes.ndim - 1) + (-1,)
-    first, second = (jnp.asarray(weights[axis, :, i]).reshape(shape) for i in (0, 1))
+    first, second = (weights[axis, :, i].reshape(shape) for i in (0, 1))
     return first * modes[..., columns[axis, :, 0]] + second * modes[..., columns[axis, :, 1]]
 
 

@@ -56,7 +56,6 @@ def build(
     if data is None:
         with stages("noise"):
             data = simulate(setup)
-            data.data.block_until_ready()
     return Experiment(setup, data)
 
 

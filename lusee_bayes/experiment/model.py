@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from lusee_bayes.core.arrays import on_device
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import TERMS, Around, measured_visibilities, point_sources
 from lusee_bayes.instrument.coupling import DenseCoupling
@@ -39,7 +40,8 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, S
 
 def base_model(setup: Setup, data: Visibilities | None = None) -> LinearGaussian:
     """d = A m + background + n with radiometer noise only."""
-    return LinearGaussian(setup.coupling, setup.prior, radiometer(setup, data), setup.offset)
+    noise = radiometer(setup, data)
+    return on_device(LinearGaussian(setup.coupling, setup.prior, noise, setup.offset))
 
 
 def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:

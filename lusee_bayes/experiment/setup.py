@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import nearest
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
@@ -85,7 +84,7 @@ class Setup:
         if not self.beam_source.emits:
             return None
         grid = (self.layout.n_products, self.layout.n_times)
-        return self.layout.gather(jnp.broadcast_to(self.background[:, None], grid))
+        return self.layout.gather(np.broadcast_to(self.background[:, None], grid))
 
     @cached_property
     def prepared(self) -> Instrument:
@@ -126,7 +125,7 @@ def set_up(
         pointing = Pointing.of(observation, scenario.lmax)
     with stages("beams"):
         source = scenario.beam.source()
-        beams = jax.block_until_ready(source.beams(scenario.frequency_mhz, scenario.lmax))
+        beams = source.beams(scenario.frequency_mhz, scenario.lmax)
         background = source.background(scenario.frequency_mhz)
         # sources need the exact pattern, which only the embedded antennas have
         responses: tuple[Float[Array, "products times"], ...] = ()
@@ -148,7 +147,7 @@ def set_up(
         instrument = Instrument(
             _antennas(scenario, source), pointing, layout, scenario.frequency_mhz, scenario.lmax
         )
-        coupling = instrument.coupling_of(beams)
+        coupling = replace(complete, layout=layout)
     return Setup(
         scenario,
         observation,

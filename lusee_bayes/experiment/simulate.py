@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import TERMS, Truth, true_beams, true_instrument

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.instrument.beams import ProductBeams

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beam_operator import BeamOperator
 from lusee_bayes.instrument.beams import Monopoles, ProductBeams, monopole_beams, parameter, placed

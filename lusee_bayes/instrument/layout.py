@@ -7,10 +7,10 @@ never taken are not in d at all, so the positions are explicit.
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
 
@@ -45,7 +45,7 @@ class DataLayout(eqx.Module):
             raise InputError(
                 f"all {flags.size} samples are flagged or missing; there is nothing to map"
             )
-        index = None if not flags.any() else jnp.asarray(np.flatnonzero(~flags.ravel()))
+        index = None if not flags.any() else np.flatnonzero(~flags.ravel())
         return cls(*flags.shape, index)
 
     @property
@@ -66,9 +66,9 @@ class DataLayout(eqx.Module):
     @property
     def present(self) -> Bool[Array, "products times"]:
         """Whether each sample of the grid is in d."""
-        grid = jnp.zeros(self.n_products * self.n_times, dtype=bool)
-        grid = ~grid if self.index is None else grid.at[self.index].set(True)
-        return grid.reshape(self.n_products, self.n_times)
+        if self.index is None:
+            return np.ones((self.n_products, self.n_times), dtype=bool)
+        return self.scatter(namespace(self.index).ones(self.size, dtype=bool))
 
     def _positions(self) -> np.ndarray:
         if self.index is None:
@@ -106,18 +106,23 @@ class DataLayout(eqx.Module):
         rest = data.shape[1:]
         if self.index is None:
             return data.reshape(self.n_products, self.n_times, *rest)
-        flat = jnp.zeros((self.n_products * self.n_times, *rest), dtype=data.dtype)
-        return flat.at[self.index].set(data).reshape(self.n_products, self.n_times, *rest)
+        xp = namespace(data, self.index)
+        flat = xp.zeros((self.n_products * self.n_times, *rest), dtype=data.dtype)
+        if xp is np:
+            flat[self.index] = data
+        else:
+            flat = flat.at[self.index].set(data)
+        return flat.reshape(self.n_products, self.n_times, *rest)
 
     def by_time(
         self, data: Float[Array, "data *columns"]
     ) -> Float[Array, "times products all_columns"]:
         """Return d with the products of one time together; missing samples are zero."""
         grid = self.scatter(data)
-        return jnp.swapaxes(grid.reshape(*grid.shape[:2], -1), 0, 1)
+        return grid.reshape(*grid.shape[:2], -1).swapaxes(0, 1)
 
     def from_times(
         self, grid: Float[Array, "times products all_columns"], shape: tuple[int, ...]
     ) -> Float[Array, "data *columns"]:
         """Return the array of this shape that :meth:`by_time` has made ``grid`` of."""
-        return self.gather(jnp.swapaxes(grid, 0, 1)).reshape(shape)
+        return self.gather(grid.swapaxes(0, 1)).reshape(shape)

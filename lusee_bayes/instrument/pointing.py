@@ -14,11 +14,11 @@ from __future__ import annotations
 from math import factorial
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation as SpatialRotation
 
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.rotations import Rotation, tilt_powers
 from lusee_bayes.instrument.observation import Observation
@@ -86,11 +86,11 @@ class Pointing(eqx.Module):
         azimuth, tilt = split(mcmf @ pole_frame.T)
         starts = np.searchsorted(observation.run, np.arange(observation.n_runs + 1))
         return cls(
-            azimuth=jnp.asarray(azimuth),
-            tilt=jnp.asarray(tilt),
+            azimuth=azimuth,
+            tilt=tilt,
             pole_from_galactic=Rotation.from_matrix(pole_frame, lmax),
             mcmf_from_topocentric=Rotation.from_matrix(observation.topocentric_from_mcmf().T, lmax),
-            turntable=jnp.radians(jnp.asarray(observation.turntable_deg, dtype=jnp.float64)),
+            turntable=np.radians(np.array(observation.turntable_deg, dtype=np.float64)),
             run_starts=tuple(int(s) for s in starts),
             order=sufficient_order(tilt, lmax) if order is None else order,
         )
@@ -113,7 +113,7 @@ class Pointing(eqx.Module):
         """
         ex, ey = -self.tilt[:, 0], -self.tilt[:, 1]
         terms = [ex**a * ey**b / factorial(a + b) for a, b in tilt_powers(self.order)]
-        return jnp.stack(terms, axis=1)
+        return namespace(self.tilt).stack(terms, axis=1)
 
 
 def mean_pole_frame(mcmf: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "3 3"]:

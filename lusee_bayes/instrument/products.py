@@ -10,10 +10,10 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
+
+from lusee_bayes.core.arrays import Array, namespace
 
 N_ANTENNAS = 4
 
@@ -58,22 +58,22 @@ def to_real(matrix: Complex[Array, "antennas antennas *rest"]) -> Float[Array, "
     picked = matrix[np.array([p.i for p in products]), np.array([p.j for p in products])]
     imaginary = np.array([p.part == "I" for p in products])
     imaginary = imaginary.reshape(-1, *(1,) * (picked.ndim - 1))
-    return jnp.where(jnp.asarray(imaginary), picked.imag, picked.real)
+    return namespace(matrix).where(imaginary, picked.imag, picked.real)
 
 
 def to_matrix(
     products: Float[Array, "products *rest"],
 ) -> Complex[Array, "antennas antennas *rest"]:
     """Return the Hermitian matrix V_ij of real products; inverse of :func:`to_real`."""
-    n = round(np.sqrt(products.shape[0]))
+    xp, n = namespace(products), round(np.sqrt(products.shape[0]))
     position = {p: k for k, p in enumerate(all_products(n))}
     rows = []
     for i in range(n):
         for j in range(n):
             real = products[position[Product(min(i, j), max(i, j), "R")]]
             if i == j:
-                imag = jnp.zeros_like(real)
+                imag = xp.zeros_like(real)
             else:
                 imag = products[position[Product(min(i, j), max(i, j), "I")]]
-            rows.append(jax.lax.complex(real, imag if i < j else -imag))
-    return jnp.stack(rows).reshape(n, n, *products.shape[1:])
+            rows.append(real + 1j * (imag if i < j else -imag))
+    return xp.stack(rows).reshape(n, n, *products.shape[1:])

@@ -6,10 +6,10 @@ No harmonic expansion comes in, so that the source rises and sets sharply, and i
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams import Monopoles, beams_towards
@@ -104,7 +104,7 @@ def source_response(
     if not is_traced(stokes_v) and stokes_v == 0.0:
         return response
     circular = beams_towards(frequency_mhz, directions, monopoles, stokes="V")
-    return response + jnp.asarray(stokes_v, dtype=jnp.float64) * circular
+    return response + stokes_v * circular
 
 
 def _topocentric(

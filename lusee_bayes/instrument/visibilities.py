@@ -6,13 +6,13 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from astropy.time import Time
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
@@ -180,9 +180,9 @@ def read_visibilities(path: str | Path) -> Visibilities:
         tuple(float(t) for t in dataset["turntable_deg"].values),
         float(dataset.attrs["step_s"]),
     )
-    truth = jnp.asarray(dataset["truth"].values) if "truth" in dataset else None
+    truth = dataset["truth"].values if "truth" in dataset else None
     return Visibilities(
-        layout.gather(jnp.asarray(np.where(flags, 0.0, values))),
+        layout.gather(np.where(flags, 0.0, values)),
         layout,
         observation,
         float(dataset.attrs["frequency_mhz"]),

@@ -18,15 +18,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.checks import (
-    AnyArray,
-    is_traced,
-    require_finite,
-    require_float64,
-    require_shape,
-)
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import gram_matrix, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
@@ -76,7 +71,7 @@ class Information(eqx.Module):
         prior: Prior,
         noise: Covariance,
         offset: Float[Array, " data"] | None,
-        data: Float[AnyArray, " data"],
+        data: Float[Array, " data"],
         key: PRNGKeyArray | None = None,
         n_perturbations: int = 0,
     ) -> tuple[Information, Posterior]:

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.conjugate_gradients import conjugate_gradients
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import solve_lower
@@ -148,7 +148,7 @@ def _times(matrix: Array, columns: Array, u: Array) -> Array:
 def solve_iteratively(
     prior: SpectralPrior,
     channels: Iterable[Information],
-    reference: Float[AnyArray, "channels modes"],
+    reference: Float[Array, "channels modes"],
     key: PRNGKeyArray,
     *,
     tolerance: float = 1e-7,

@@ -20,9 +20,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import inverse_from_cholesky
 from lusee_bayes.linear.information import Information
@@ -114,7 +114,7 @@ class ComponentSums(eqx.Module):
 
     @classmethod
     def empty(
-        cls, prior: SpectralPrior, reference: Float[AnyArray, "channels modes"]
+        cls, prior: SpectralPrior, reference: Float[Array, "channels modes"]
     ) -> ComponentSums:
         """Start the sums, with no channel in them.
 
@@ -143,7 +143,7 @@ class ComponentSums(eqx.Module):
 
 
 def reference_maps(
-    prior: SpectralPrior, reference: Float[AnyArray, "channels modes"]
+    prior: SpectralPrior, reference: Float[Array, "channels modes"]
 ) -> Float[Array, "components modes"]:
     """Fit component maps to a sky of every channel, by least squares.
 
@@ -201,7 +201,7 @@ def _assembled(sums: ComponentSums) -> Information:
 def solve_directly(
     prior: SpectralPrior,
     channels: Iterable[Information],
-    reference: Float[AnyArray, "channels modes"],
+    reference: Float[Array, "channels modes"],
 ) -> Posterior:
     """Compute the posterior of all component maps by factorising its matrix.
 

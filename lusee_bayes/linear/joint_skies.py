@@ -12,8 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower, symmetric_product
 from lusee_bayes.linear.information import Information

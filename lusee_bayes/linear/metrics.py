@@ -6,9 +6,9 @@ import equinox as eqx
 import healpy
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.harmonics import lmax_of, sum_over_m
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.instrument.observation import Observation
@@ -17,7 +17,7 @@ from lusee_bayes.linear.posterior import Posterior
 
 
 def correlation(
-    mean: Float[AnyArray, " modes"], truth: Float[AnyArray, " modes"]
+    mean: Float[Array, " modes"], truth: Float[Array, " modes"]
 ) -> Float[np.ndarray, " ells"]:
     """Compute rho_ell = sum_m a a_true / sqrt(sum_m a^2 sum_m a_true^2), as the paper does.
 
@@ -37,7 +37,7 @@ def correlation(
 
 
 def signal_to_noise(
-    mean: Float[AnyArray, " modes"], truth: Float[AnyArray, " modes"]
+    mean: Float[Array, " modes"], truth: Float[Array, " modes"]
 ) -> Float[np.ndarray, " ells"]:
     """Compute SNR_ell = sqrt( sum_m a^2 / sum_m (a - a_true)^2 ), as the paper does.
 

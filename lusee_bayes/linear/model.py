@@ -12,15 +12,10 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.checks import (
-    AnyArray,
-    nearest,
-    require_finite,
-    require_float64,
-    require_shape,
-)
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import nearest, require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.coupling import Coupling, as_coupling
 from lusee_bayes.linear.information import Information
@@ -150,7 +145,7 @@ class LinearGaussian(eqx.Module):
             raise InputError(f"unknown form '{form}'; {nearest(form, FORMS)}")
         return factorise(self.coupling, self.prior, self.noise, self.offset, form)
 
-    def condition(self, data: Float[AnyArray, " data"], form: str | None = None) -> Posterior:
+    def condition(self, data: Float[Array, " data"], form: str | None = None) -> Posterior:
         """Compute the posterior over the sky given data.
 
         Parameters
@@ -184,7 +179,7 @@ class LinearGaussian(eqx.Module):
 
     def inform(
         self,
-        data: Float[AnyArray, " data"],
+        data: Float[Array, " data"],
         key: PRNGKeyArray | None = None,
         n_perturbations: int = 0,
     ) -> tuple[Information, Posterior]:
@@ -215,7 +210,7 @@ class LinearGaussian(eqx.Module):
             self.coupling, self.prior, self.noise, self.offset, data, key, n_perturbations
         )
 
-    def log_prob(self, data: Float[AnyArray, " data"]) -> Float[Array, ""]:
+    def log_prob(self, data: Float[Array, " data"]) -> Float[Array, ""]:
         """Compute the evidence ln p(d), with the sky integrated out. Differentiable.
 
         Parameters

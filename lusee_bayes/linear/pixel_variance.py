@@ -13,8 +13,9 @@ import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.harmonics import azimuth_functions, lmax_of, mode_numbers, polar_functions
 
 

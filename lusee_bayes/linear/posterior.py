@@ -6,9 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.checks import AnyArray, is_traced
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower
 from lusee_bayes.sky.priors import Prior
@@ -74,7 +75,7 @@ class Posterior(eqx.Module):
         scale = self.prior.diagonal_root()
         return self.std_of(jnp.eye(self.prior.size)) if scale is None else scale * white
 
-    def std_of(self, directions: Float[AnyArray, "n unknowns"]) -> Float[Array, " n"]:
+    def std_of(self, directions: Float[Array, "n unknowns"]) -> Float[Array, " n"]:
         """Compute the standard deviation of linear combinations of the unknowns.
 
         Parameters
@@ -113,7 +114,7 @@ class Posterior(eqx.Module):
         """
         return _times_root(self, jnp.eye(self.prior.rank)).T
 
-    def whiten(self, skies: Float[AnyArray, "n unknowns"]) -> Float[Array, "n white"]:
+    def whiten(self, skies: Float[Array, "n unknowns"]) -> Float[Array, "n white"]:
         """Compute z = R^-1 (m - mean): standard normals, if the skies are draws of this posterior.
 
         Parameters

@@ -16,10 +16,11 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import Factor

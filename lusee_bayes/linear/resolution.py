@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.linear.posterior import Posterior
 
 
 def resolution_rows(
-    posterior: Posterior, directions: Float[AnyArray, "n modes"]
+    posterior: Posterior, directions: Float[Array, "n modes"]
 ) -> Float[Array, "n modes"]:
     """Compute y^T R for linear combinations y of the modes.
 

@@ -22,15 +22,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from lusee_bayes.core.checks import (
-    AnyArray,
-    is_traced,
-    require_finite,
-    require_float64,
-    require_shape,
-)
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import gram_matrix, solve_lower
 from lusee_bayes.instrument.coupling import Coupling
@@ -72,7 +67,7 @@ class Solver(eqx.Module):
     basis: Float[Array, "white rank"] | None
     offset: Float[Array, " data"] | None
 
-    def condition(self, data: Float[AnyArray, " data"]) -> Posterior:
+    def condition(self, data: Float[Array, " data"]) -> Posterior:
         """Compute the posterior over the sky given data.
 
         Parameters
@@ -101,7 +96,7 @@ class Solver(eqx.Module):
             refinement=moved,
         )
 
-    def log_prob(self, data: Float[AnyArray, " data"]) -> Float[Array, ""]:
+    def log_prob(self, data: Float[Array, " data"]) -> Float[Array, ""]:
         """Compute the evidence ln p(d).
 
         Parameters
@@ -132,7 +127,7 @@ class Solver(eqx.Module):
         inside = self.whitened if self.basis is None else self.whitened @ self.basis
         return solve_lower(self.lower, inside.T, transpose=False)
 
-    def _solve(self, data: Float[AnyArray, " data"]) -> tuple[Array, Array, Array]:
+    def _solve(self, data: Float[Array, " data"]) -> tuple[Array, Array, Array]:
         require_float64("the data", data)
         require_shape("the data", data, (self.whitened.shape[0],))
         require_finite("the data", data)

@@ -15,8 +15,9 @@ from math import factorial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.rotations import tilt_powers
 
 # times that are summed at once: it bounds the memory

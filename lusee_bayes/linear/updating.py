@@ -16,9 +16,9 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.linear.model import LinearGaussian
@@ -63,9 +63,7 @@ def deviation_model(posterior: Posterior, model: LinearGaussian) -> LinearGaussi
     )
 
 
-def updated(
-    posterior: Posterior, model: LinearGaussian, data: Float[AnyArray, " data"]
-) -> Posterior:
+def updated(posterior: Posterior, model: LinearGaussian, data: Float[Array, " data"]) -> Posterior:
     """Compute the posterior given earlier data and new ones with independent noise.
 
     Gain drifts that go on from the earlier data into the new ones are not independent: they couple

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.instrument.beams import Monopoles, ProductBeams, monopole_beams, parameter, placed
 from lusee_bayes.instrument.coupling import Coupling

@@ -20,10 +20,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import (
-    AnyArray,
     is_traced,
     require_finite,
     require_float64,
@@ -81,7 +81,7 @@ class GainDrift(eqx.Module):
     def covariance(
         self,
         visibilities: Float[Array, "products times"],
-        hours: Float[AnyArray, " times"],
+        hours: Float[Array, " times"],
         layout: DataLayout,
         width: int | None = None,
     ) -> TimeBandedCovariance:
@@ -142,8 +142,8 @@ class GainDrift(eqx.Module):
     def history(
         self,
         white: Float[Array, "antennas grid"],
-        hours: Float[AnyArray, " times"],
-        grid: Float[AnyArray, " grid"],
+        hours: Float[Array, " times"],
+        grid: Float[Array, " grid"],
     ) -> Float[Array, "antennas times"]:
         """Return the gains that white noise on an even grid of times makes.
 

@@ -12,11 +12,10 @@ duty cycle)::
 
 from __future__ import annotations
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import (
     is_traced,
     nearest,
@@ -105,7 +104,7 @@ def paper_variance(
     return (t_ii * t_jj + visibilities**2) / 2.0
 
 
-@eqx.filter_jit
+@compiled
 def exact_blocks(
     visibilities: Float[Array, "products times"],
 ) -> Float[Array, "times products products"]:
@@ -119,8 +118,8 @@ def exact_blocks(
     products = all_products(n)
     i = np.array([p.i for p in products])
     j = np.array([p.j for p in products])
-    part = jnp.asarray([1.0 + 0j if p.part == "R" else -1j for p in products])
-    t = jnp.moveaxis(to_matrix(visibilities), 2, 0)
+    part = np.array([1.0 + 0j if p.part == "R" else -1j for p in products])
+    t = namespace(visibilities).moveaxis(to_matrix(visibilities), 2, 0)
     hermitian = t[:, i[:, None], i[None]] * t[:, j[:, None], j[None]].conj()
     pseudo = t[:, i[:, None], j[None]] * t[:, j[:, None], i[None]].conj()
     weights = (part[:, None] * part[None].conj())[None], (part[:, None] * part[None])[None]

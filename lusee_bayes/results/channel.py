@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array, Float, PRNGKeyArray, Shaped
+from jaxtyping import Float, PRNGKeyArray, Shaped
 
-from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.harmonics import modes_to_map, power_spectrum, sum_over_m
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference
@@ -328,5 +328,5 @@ def channel_of_information(
     )
 
 
-def _array(values: Float[AnyArray, " modes"] | None) -> Float[np.ndarray, " modes"] | None:
+def _array(values: Float[Array, " modes"] | None) -> Float[np.ndarray, " modes"] | None:
     return None if values is None else np.asarray(values)

@@ -11,6 +11,7 @@ import xarray as xr
 from jaxtyping import Float
 from scipy import stats as distributions
 
+from lusee_bayes.core import formats
 from lusee_bayes.core.harmonics import mode_numbers, synthesis_matrix
 from lusee_bayes.core.progress import peak_memory_gb
 from lusee_bayes.core.version import versions

@@ -9,8 +9,8 @@ from threading import get_ident
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.process_group import ProcessGroup
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from lusee_bayes.core import formats
 from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario

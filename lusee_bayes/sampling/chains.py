@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpyro.infer.hmc import HMCState
 
-from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.arrays import Array
 
 # statistics of every draw, by their ArviZ names
-STATISTICS: dict[str, Callable[[HMCState], AnyArray]] = {
+STATISTICS: dict[str, Callable[[HMCState], Array]] = {
     "lp": lambda s: -s.potential_energy,
     "energy": lambda s: s.energy,
     "diverging": lambda s: s.diverging,

@@ -15,7 +15,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 
 IDENTITY = "run.json"
@@ -135,7 +135,7 @@ class Checkpoints:
         paths = self._paths()
         return Chunk.read(paths[-1]) if paths else None
 
-    def append(self, iteration: int, state: list[AnyArray], draws: dict[str, AnyArray]) -> None:
+    def append(self, iteration: int, state: list[Array], draws: dict[str, Array]) -> None:
         """Keep what was sampled since the last call.
 
         Parameters

@@ -9,11 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.util import potential_energy
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.sampling.distributions import CorrelatedNormal
 from lusee_bayes.sampling.whitening import Whitening
 

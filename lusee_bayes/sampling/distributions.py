@@ -9,9 +9,10 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 from numpyro import distributions as dist
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.model import LinearGaussian

@@ -20,12 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import xarray as xr
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.util import potential_energy
 
-from lusee_bayes.core.checks import AnyArray
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling.mode import LaplaceApproximation, laplace_approximation
 from lusee_bayes.sampling.programs import Program
@@ -61,7 +61,7 @@ class Evidence:
 def estimate_evidence(
     program: Program,
     arguments: Mapping[str, Any],
-    data: Float[AnyArray, " data"],
+    data: Float[Array, " data"],
     *,
     n: int = 400,
     seed: int = 0,
@@ -120,7 +120,7 @@ def _log_weights(
 def pointwise(
     program: Program,
     arguments: Mapping[str, Any],
-    data: Float[AnyArray, " data"],
+    data: Float[Array, " data"],
     sites: Mapping[str, np.ndarray],
 ) -> Float[np.ndarray, "chains draws data"]:
     """Compute ln p(d_i | all other data, sites) of every datum and draw.

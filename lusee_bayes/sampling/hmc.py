@@ -16,11 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 from numpyro.infer import HMC, NUTS
 from numpyro.infer.hmc import HMCState
 
-from lusee_bayes.core.checks import AnyArray, nearest
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import nearest
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling.chains import STATISTICS, Chains
 from lusee_bayes.sampling.checkpoints import Checkpoints
@@ -293,7 +294,7 @@ class _Run:
         ]
         return self._shared_out(jax.tree.unflatten(jax.tree.structure(like), arrays))
 
-    def advance(self, state: HMCState, n: int) -> tuple[HMCState, dict[str, AnyArray]]:
+    def advance(self, state: HMCState, n: int) -> tuple[HMCState, dict[str, Array]]:
         """``n`` iterations: the state behind them, and the draws (n, chains, ...)."""
         state, rows = self._advance(state, n, self.dynamic)
         return state, {name: values[:n] for name, values in rows.items()}

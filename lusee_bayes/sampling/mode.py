@@ -15,11 +15,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer import init_to_median
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling.curvature import Potential, root_of_inverse, without_held

@@ -15,10 +15,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key, PRNGKeyArray
+from jaxtyping import Float, Key, PRNGKeyArray
 from numpyro import handlers
 
-from lusee_bayes.core.checks import AnyArray, nearest
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import nearest
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.sampling.promotion import numpyro_promotion
@@ -161,7 +162,7 @@ def _find(source: str | Path) -> Path:
 
 
 @numpyro_promotion()
-def is_collapsed(program: Program, arguments: dict[str, Any], data: AnyArray) -> bool:
+def is_collapsed(program: Program, arguments: dict[str, Any], data: Array) -> bool:
     """Tell whether the program integrates the sky out: its model returns a LinearGaussian."""
     found = []
 
@@ -177,7 +178,7 @@ def is_collapsed(program: Program, arguments: dict[str, Any], data: AnyArray) ->
 def collapsed_skies(
     program: Program,
     arguments: dict[str, Any],
-    data: Float[AnyArray, " data"],
+    data: Float[Array, " data"],
     sites: dict[str, np.ndarray],
     key: PRNGKeyArray,
 ) -> Float[np.ndarray, "chains draws modes"]:
@@ -207,7 +208,7 @@ def collapsed_skies(
 def replicated_data(
     program: Program,
     arguments: dict[str, Any],
-    data: Float[AnyArray, " data"],
+    data: Float[Array, " data"],
     sites: dict[str, np.ndarray],
     skies: Float[np.ndarray, "chains draws modes"],
     key: PRNGKeyArray,

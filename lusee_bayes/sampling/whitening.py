@@ -12,11 +12,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import numpyro
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer.reparam import Reparam
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.posterior import Posterior

@@ -14,7 +14,8 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import AnyArray, require_finite
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import require_finite
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.fits_files import is_fits, opened
@@ -101,9 +102,7 @@ class SkyAlms(SkyFile):
         )
 
 
-def write_alms(
-    path: str | Path, modes: Float[AnyArray, " modes"], header: dict[str, object]
-) -> Path:
+def write_alms(path: str | Path, modes: Float[Array, " modes"], header: dict[str, object]) -> Path:
     """Write coefficients as healpy.write_alm does, in float64.
 
     Parameters

@@ -12,8 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import is_traced, require_finite, require_float64
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, per_mode, pixel_matrix
@@ -115,9 +116,9 @@ class HarmonicPrior(Prior):
 
     def diagonal_root(self):
         # the derivative of sqrt at an ell without power is zero here, not infinite
-        power = self.spectrum > 0
-        root = jnp.sqrt(jnp.where(power, self.spectrum, 1.0))
-        return per_mode(jnp.where(power, root, 0.0))
+        xp, power = namespace(self.spectrum), self.spectrum > 0
+        root = xp.sqrt(xp.where(power, self.spectrum, 1.0))
+        return per_mode(xp.where(power, root, 0.0))
 
     def colour(self, u):
         return u * self.diagonal_root().reshape(*(1,) * (u.ndim - 1), -1)

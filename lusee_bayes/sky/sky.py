@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_finite, require_float64
 from lusee_bayes.core.harmonics import lmax_of, power_spectrum
 
@@ -50,4 +50,4 @@ class Sky(eqx.Module):
 
     def spectrum(self) -> Float[Array, " ells"]:
         """C_ell in K^2, mean not subtracted."""
-        return jnp.asarray(power_spectrum(self.modes))
+        return power_spectrum(self.modes)

@@ -6,8 +6,6 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax.numpy as jnp
-
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import map_to_modes
 from lusee_bayes.sky.alms import SkyAlms
@@ -63,7 +61,7 @@ class GalaxySource(SkySource):
         modes = map_to_modes(galaxy_map(frequency_mhz, nside=nside, seed=self.seed), lmax)
         for source in self.sources:
             modes = modes + source.modes(frequency_mhz, lmax)
-        return Sky(jnp.asarray(modes), float(frequency_mhz), "embedded Galaxy")
+        return Sky(modes, float(frequency_mhz), "embedded Galaxy")
 
 
 @dataclass(frozen=True)
@@ -104,7 +102,7 @@ class FileSource(SkySource):
             read_at = float(self.file_frequency_mhz)
             scale = (frequency_mhz / read_at) ** self.spectral_index
         modes = read_sky_file(self.path, self.dataset).modes_at(read_at, lmax)
-        return Sky(jnp.asarray(scale * modes), float(frequency_mhz), Path(self.path).name)
+        return Sky(scale * modes, float(frequency_mhz), Path(self.path).name)
 
 
 def read_sky_file(path: str | Path, dataset: str | None = None) -> SkyFile:

@@ -14,10 +14,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import (
-    AnyArray,
     nearest,
     require_finite,
     require_float64,
@@ -118,8 +118,8 @@ class SpectralPrior(eqx.Module):
     @classmethod
     def components(
         cls,
-        frequencies_mhz: Float[AnyArray, " channels"],
-        skies: Float[AnyArray, "channels modes"],
+        frequencies_mhz: Float[Array, " channels"],
+        skies: Float[Array, "channels modes"],
         names: tuple[str, ...] = tuple(SPECTRA),
         *,
         index: float = -2.5,
@@ -174,8 +174,8 @@ class SpectralPrior(eqx.Module):
     @classmethod
     def kernel(
         cls,
-        frequencies_mhz: Float[AnyArray, " channels"],
-        skies: Float[AnyArray, "channels modes"],
+        frequencies_mhz: Float[Array, " channels"],
+        skies: Float[Array, "channels modes"],
         *,
         length: float = 1.0,
         index: float = -2.5,

@@ -6,7 +6,9 @@ from abc import abstractmethod
 from collections.abc import Mapping
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from lusee_bayes.core.arrays import Array
 
 
 class Chart(eqx.Module):

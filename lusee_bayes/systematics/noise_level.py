@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import equinox as eqx
 import numpyro
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.systematics.base import Scale, scalar, uncertain_scale
 

@@ -11,6 +11,7 @@ import xarray as xr
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 
+from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams import HemisphereGrid
 from lusee_bayes.instrument.products import labels

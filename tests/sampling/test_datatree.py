@@ -14,6 +14,7 @@ from reference_linear import assert_draws_follow, random_covariance, z_of
 from reference_linear import posterior as naive_posterior
 
 import lusee_bayes as lb
+from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.sampling.chains import STATISTICS, Chains

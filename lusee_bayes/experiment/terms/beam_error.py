@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import jax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.experiment.schema import section_of_file
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms.term import Around, Term, Truth

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 from numpyro import handlers
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms.term import Around, Term, Truth
@@ -93,4 +93,4 @@ def measured_visibilities(
             "was measured there; use noise.radiometer.temperature=model and "
             "noise.gain.visibilities=model"
         )
-    return jnp.where(complete[None], data.layout.scatter(data.data), model)
+    return np.where(complete[None], data.layout.scatter(data.data), model)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.setup import Setup, block_of_times, mean_flux, source_responses
 from lusee_bayes.experiment.terms.beam_error import true_instrument
@@ -57,7 +57,7 @@ class SourcesTerm(Term):
         for section, response in zip(sections, responses, strict=True):
             flux = np.atleast_1d(truth[f"flux_{section.name.replace(' ', '_')}"])
             block = block_of_times(section, setup.observation)
-            visibilities = visibilities + jnp.asarray(flux)[block][None] * response
+            visibilities = visibilities + np.asarray(flux)[block][None] * response
         return visibilities
 
 
@@ -70,10 +70,10 @@ def point_sources(setup: Setup) -> PointSources:
         flux = mean_flux(section, setup.scenario.frequency_mhz)
         block = block_of_times(section, setup.observation)
         columns = [
-            setup.layout.gather(jnp.where(jnp.asarray(block == b)[None], response, 0.0))
+            setup.layout.gather(np.where((block == b)[None], response, 0.0))
             for b in range(block.max() + 1)
         ]
         sources.append(
-            Source(jnp.stack(columns, axis=1), flux, section.relative_std * flux, section.name)
+            Source(np.stack(columns, axis=1), flux, section.relative_std * flux, section.name)
         )
     return PointSources(tuple(sources))

@@ -11,8 +11,9 @@ from typing import Any, ClassVar
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.systematics import AdditiveNoise, Systematic

@@ -5,13 +5,11 @@ Harmonic coefficients up to lmax blur a point source; the field pattern itself d
 
 from __future__ import annotations
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import (
-    AnyArray,
     is_traced,
     require_finite,
     require_float64,
@@ -34,7 +32,7 @@ NORMALISATION_LMAX = 63
 
 def beams_towards(
     frequency_mhz: float | Float[Array, ""],
-    directions: Float[AnyArray, "directions 3"],
+    directions: Float[Array, "directions 3"],
     monopoles: Monopoles | None = None,
     *,
     stokes: str = "I",
@@ -73,12 +71,13 @@ def beams_towards(
     require_finite("directions", directions)
     _require_unit(directions)
     monopoles = Monopoles() if monopoles is None else monopoles
-    frequency = jnp.asarray(frequency_mhz, dtype=jnp.float64)  # one compilation for all of them
-    patterns = _patterns(frequency, jnp.asarray(directions), monopoles, stokes)
+    # an array: one compilation for all frequencies
+    frequency = namespace(frequency_mhz).asarray(frequency_mhz, dtype=np.float64)
+    patterns = _patterns(frequency, directions, monopoles, stokes)
     return patterns / _normalisation(frequency, monopoles)
 
 
-@eqx.filter_jit
+@compiled
 def _patterns(
     frequency_mhz: Float[Array, ""],
     directions: Float[Array, "directions 3"],
@@ -87,21 +86,22 @@ def _patterns(
 ) -> Float[Array, "products directions"]:
     visible = directions[:, 2] > 0.0
     # a visible direction replaces the hidden ones: its field and its slopes are finite
-    stand_in = jnp.asarray([0.6, 0.0, 0.8])[None]
-    east, north, up = jnp.where(visible[:, None], directions, stand_in).T
-    theta, phi = jnp.arctan2(jnp.hypot(east, north), up), jnp.arctan2(north, east)
+    xp = namespace(frequency_mhz, directions, monopoles)
+    stand_in = np.array([0.6, 0.0, 0.8])[None]
+    east, north, up = xp.where(visible[:, None], directions, stand_in).T
+    theta, phi = xp.arctan2(xp.hypot(east, north), up), xp.arctan2(north, east)
     patterns = to_real(stokes_pairs(*monopoles.towards(frequency_mhz, theta, phi), stokes))
-    return jnp.where(visible[None], patterns, 0.0)
+    return xp.where(visible[None], patterns, 0.0)
 
 
-@eqx.filter_jit
+@compiled
 def _normalisation(frequency_mhz: Float[Array, ""], monopoles: Monopoles) -> Float[Array, ""]:
     grid = HemisphereGrid.for_lmax(NORMALISATION_LMAX)
     e_theta, e_phi = monopoles.towards(frequency_mhz, grid.theta[:, None], grid.phi[None])
     return mean_auto_integral(AntennaFields(e_theta, e_phi, grid))
 
 
-def _require_unit(directions: Float[AnyArray, "directions 3"]) -> None:
+def _require_unit(directions: Float[Array, "directions 3"]) -> None:
     if is_traced(directions):
         return
     length = np.linalg.norm(np.asarray(directions), axis=1)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
@@ -22,7 +21,8 @@ def wavenumber(frequency_mhz: float | Float[Array, ""]) -> float | Float[Array, 
 
 def phasor(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
     """Return exp(i angle)."""
-    return jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
+    xp = namespace(angle)
+    return xp.cos(angle) + 1j * xp.sin(angle)
 
 
 class AntennaFields(eqx.Module):
@@ -96,5 +96,5 @@ def displaced(
         raise InputError(f"give the pattern of one antenna, got {one.n_antennas}")
     require_shape("positions_m", positions_m, (None, 3))
     path = np.einsum("ac,ctp->atp", positions_m, unit_vectors(one.grid))
-    phase = phasor(wavenumber(frequency_mhz) * jnp.asarray(path))
+    phase = phasor(wavenumber(frequency_mhz) * path)
     return AntennaFields(one.e_theta * phase, one.e_phi * phase, one.grid)

@@ -8,11 +8,11 @@ sum there is exact up to aliasing.
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.special import roots_legendre
 
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import SQRT2, mode_numbers, polar_functions
@@ -65,7 +65,7 @@ class HemisphereGrid(eqx.Module):
 
     def integrate(self, f: Float[Array, "*batch theta phi"]) -> Float[Array, "*batch"]:
         """Integrate over the hemisphere; the result is in units of f times steradian."""
-        return (f.sum(-1) @ jnp.asarray(self.weights)) * (2.0 * np.pi / self.n_phi)
+        return (f.sum(-1) @ self.weights) * (2.0 * np.pi / self.n_phi)
 
     def modes(self, f: Float[Array, "*batch theta phi"], lmax: int) -> Float[Array, "*batch modes"]:
         """Return the harmonic coefficients of a function that is zero below the horizon.
@@ -94,8 +94,9 @@ class HemisphereGrid(eqx.Module):
                 f"{self.n_phi} azimuths cannot resolve lmax = {lmax}; give more than {2 * lmax}"
             )
         _, m = mode_numbers(lmax)
-        fourier = jnp.fft.rfft(f, axis=-1)[..., : lmax + 1] * (2.0 * np.pi / self.n_phi)
-        parts = jnp.concatenate(
+        xp = namespace(f)
+        fourier = xp.fft.rfft(f, axis=-1)[..., : lmax + 1] * (2.0 * np.pi / self.n_phi)
+        parts = xp.concatenate(
             [
                 SQRT2 * fourier.imag[..., :0:-1],
                 fourier.real[..., :1],
@@ -103,6 +104,6 @@ class HemisphereGrid(eqx.Module):
             ],
             axis=-1,
         )
-        polar = jnp.asarray(self.polar_weights(lmax))
+        polar = self.polar_weights(lmax)
         polar = polar.reshape(*(1,) * (f.ndim - 2), *polar.shape)
         return (parts[..., m + lmax] * polar).sum(-2)

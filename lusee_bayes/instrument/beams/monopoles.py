@@ -14,12 +14,11 @@ parameters.
 from __future__ import annotations
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
-from lusee_bayes.core.checks import AnyArray, require_finite, require_positive
+from lusee_bayes.core.arrays import Array, compiled, namespace
+from lusee_bayes.core.checks import require_finite, require_positive
 from lusee_bayes.instrument.beams.fields import AntennaFields, phasor, wavenumber
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
 from lusee_bayes.instrument.beams.product_beams import ProductBeams, product_modes
@@ -30,7 +29,7 @@ PORT_AZIMUTHS_DEG = (90.0, 0.0, -90.0, 180.0)
 
 
 def _array(x) -> Float[Array, "..."]:
-    return jnp.asarray(x, dtype=jnp.float64)
+    return namespace(x).asarray(x, dtype=np.float64)
 
 
 class Monopoles(eqx.Module):
@@ -82,8 +81,8 @@ class Monopoles(eqx.Module):
     def towards(
         self,
         frequency_mhz: float | Float[Array, ""],
-        theta: Float[AnyArray, "*#directions"],
-        phi: Float[AnyArray, "*#directions"],
+        theta: Float[Array, "*#directions"],
+        phi: Float[Array, "*#directions"],
     ) -> tuple[Complex[Array, "antennas *directions"], Complex[Array, "antennas *directions"]]:
         """Return the fields of every arm in directions above the horizon; phase centre: the feed.
 
@@ -101,25 +100,26 @@ class Monopoles(eqx.Module):
         # an array, so that all frequencies share one program
         return self._towards(_array(frequency_mhz), theta, phi)
 
-    @eqx.filter_jit
+    @compiled
     def _towards(
         self,
         frequency_mhz: Float[Array, ""],
-        theta: Float[AnyArray, "*#directions"],
-        phi: Float[AnyArray, "*#directions"],
+        theta: Float[Array, "*#directions"],
+        phi: Float[Array, "*#directions"],
     ) -> tuple[Complex[Array, "antennas *directions"], Complex[Array, "antennas *directions"]]:
         k = wavenumber(frequency_mhz)
-        cos, sin = jnp.cos(theta)[None], jnp.sin(theta)[None]
-        tilt = jnp.radians(self.zenith_angle_deg)
-        azimuth = jnp.radians(self.azimuths_deg + self.turntable_offset_deg).reshape(
+        xp = namespace(self, frequency_mhz, theta, phi)
+        cos, sin = xp.cos(theta)[None], xp.sin(theta)[None]
+        tilt = xp.radians(self.zenith_angle_deg)
+        azimuth = xp.radians(self.azimuths_deg + self.turntable_offset_deg).reshape(
             -1, *(1,) * phi.ndim
         )
-        relative = jnp.asarray(phi)[None] - azimuth
+        relative = phi[None] - azimuth
         # the arm along the horizontal direction of the wave, across it, and up
         along, across, up = (
-            jnp.sin(tilt) * jnp.cos(relative),
-            -jnp.sin(tilt) * jnp.sin(relative),
-            jnp.cos(tilt),
+            xp.sin(tilt) * xp.cos(relative),
+            -xp.sin(tilt) * xp.sin(relative),
+            xp.cos(tilt),
         )
         s, p = (
             r.reshape(cos.shape) for r in self.regolith.reflection(cos.reshape(-1), frequency_mhz)
@@ -127,10 +127,8 @@ class Monopoles(eqx.Module):
         ground = phasor(-2.0 * k * self.height_m * cos)
         direct = self._current_integral(k, along * sin + up * cos)
         bounced = self._current_integral(k, along * sin - up * cos) * ground
-        to_theta = (along * cos - up * sin).astype(jnp.complex128)
-        to_reflected = (along * cos + up * sin).astype(jnp.complex128)
-        e_theta = to_theta * direct - p * to_reflected * bounced
-        e_phi = across.astype(jnp.complex128) * (direct + s * bounced)
+        e_theta = (along * cos - up * sin) * direct - p * (along * cos + up * sin) * bounced
+        e_phi = across * (direct + s * bounced)
         return e_theta, e_phi
 
     def _current_integral(
@@ -143,10 +141,11 @@ class Monopoles(eqx.Module):
         """
         kl = k * self.length_m
         a, b = kl * (1.0 - projection) / 2.0, kl * (1.0 + projection) / 2.0
-        sinc_a, sinc_b = jnp.sinc(a / np.pi), jnp.sinc(b / np.pi)
-        real = jnp.sin(b) * sinc_a + jnp.sin(a) * sinc_b
-        imaginary = jnp.cos(a) * sinc_b - jnp.cos(b) * sinc_a
-        return jax.lax.complex(real, imaginary) * (self.length_m / 2.0).astype(jnp.complex128)
+        xp = namespace(a)
+        sinc_a, sinc_b = xp.sinc(a / np.pi), xp.sinc(b / np.pi)
+        real = xp.sin(b) * sinc_a + xp.sin(a) * sinc_b
+        imaginary = xp.cos(a) * sinc_b - xp.cos(b) * sinc_a
+        return (real + 1j * imaginary) * (self.length_m / 2.0)
 
 
 def monopole_beams(
@@ -187,7 +186,7 @@ def monopole_beams(
     return ProductBeams(modes, float(frequency_mhz))
 
 
-@eqx.filter_jit
+@compiled
 def _modes(
     frequency_mhz: Float[Array, ""],
     lmax: int,

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import nearest
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.monopoles import Monopoles
@@ -65,6 +65,6 @@ def placed(monopoles: Monopoles, values: Mapping[str, float | Float[Array, ""]])
         If a name is unknown.
     """
     for name, value in values.items():
-        value = jnp.asarray(value, dtype=jnp.float64)
+        value = namespace(value).asarray(value, dtype=np.float64)
         monopoles = eqx.tree_at(parameter(name).where, monopoles, value)
     return monopoles

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import nearest, require_float64
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of
@@ -158,4 +158,4 @@ def product_modes(
 def mean_auto_integral(fields: AntennaFields) -> Float[Array, ""]:
     """Return the integral of the Stokes I auto beam in steradian, averaged over antennas."""
     autos = to_real(stokes_beam(fields))[auto_indices(fields.n_antennas)]
-    return jnp.mean(fields.grid.integrate(autos))
+    return fields.grid.integrate(autos).mean()

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+import numpy as np
+from jaxtyping import Complex, Float
 
-from lusee_bayes.core.checks import AnyArray, is_traced, require_positive
+from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.checks import is_traced, require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import wavenumber
 
@@ -16,7 +16,7 @@ DEPTH_M = 100.0
 
 
 def _scalar(x) -> Float[Array, ""]:
-    return jnp.asarray(x, dtype=jnp.float64)
+    return namespace(x).asarray(x, dtype=np.float64)
 
 
 class Regolith(eqx.Module):
@@ -54,15 +54,15 @@ class Regolith(eqx.Module):
 
     def permittivities(self) -> Complex[Array, " layers"]:
         """Return the complex relative permittivity of each layer from the top down."""
-        rise = jnp.linspace(0.0, 1.0, N_LAYERS)
+        rise = np.linspace(0.0, 1.0, N_LAYERS)
         real = self.surface_permittivity + rise * (
             self.deep_permittivity - self.surface_permittivity
         )
-        return jax.lax.complex(real, -real * self.loss_tangent)
+        return real - 1j * (real * self.loss_tangent)
 
     def reflection(
         self,
-        cos_theta: Float[AnyArray, " theta"],
+        cos_theta: Float[Array, " theta"],
         frequency_mhz: float | Float[Array, ""],
     ) -> tuple[Complex[Array, " theta"], Complex[Array, " theta"]]:
         """Return the reflection coefficients for waves that arrive at zenith angle theta.
@@ -87,13 +87,13 @@ class Regolith(eqx.Module):
         Born & Wolf, Principles of Optics, section 1.6.4.
         """
         thickness = wavenumber(frequency_mhz) * DEPTH_M / (N_LAYERS - 1)  # in radians of vacuum
-        thickness = jnp.asarray(thickness, dtype=jnp.complex128)
-        cosine = jnp.asarray(cos_theta, dtype=jnp.complex128)
+        xp = namespace(self, cos_theta, frequency_mhz)
+        cosine = xp.asarray(cos_theta, dtype=np.complex128)
         sin2 = 1.0 - cosine**2
-        eps = [jnp.ones((), dtype=jnp.complex128), *self.permittivities()]
+        eps = [xp.ones((), dtype=np.complex128), *self.permittivities()]
         # vertical wave numbers over k; the root with Im <= 0 decays downwards under exp(+i w t)
         vertical = [cosine] + [_decaying_root(e - sin2) for e in eps[1:]]
-        s, p = jnp.zeros_like(vertical[0]), jnp.zeros_like(vertical[0])
+        s, p = xp.zeros_like(vertical[0]), xp.zeros_like(vertical[0])
         for upper in range(N_LAYERS - 1, -1, -1):
             q0, q1 = vertical[upper], vertical[upper + 1]
             y0, y1 = q0 * eps[upper + 1], q1 * eps[upper]
@@ -101,7 +101,7 @@ class Regolith(eqx.Module):
             if upper == N_LAYERS - 1:  # nothing comes back from below the last interface
                 s, p = fresnel_s, fresnel_p
                 continue
-            delay = jnp.exp(-2j * thickness * q1)
+            delay = xp.exp(-2j * thickness * q1)
             s = (fresnel_s + s * delay) / (1.0 + fresnel_s * s * delay)
             p = (fresnel_p + p * delay) / (1.0 + fresnel_p * p * delay)
         return s, p
@@ -109,5 +109,6 @@ class Regolith(eqx.Module):
 
 def _decaying_root(z: Complex[Array, " theta"]) -> Complex[Array, " theta"]:
     """The root with Im <= 0, which decays downwards under exp(+i w t)."""
-    root = jnp.sqrt(z)
-    return jnp.where(root.imag > 0, -root, root)
+    xp = namespace(z)
+    root = xp.sqrt(z)
+    return xp.where(root.imag > 0, -root, root)

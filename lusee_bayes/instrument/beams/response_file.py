@@ -17,11 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 from scipy.constants import Boltzmann, physical_constants
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import nearest, require_finite
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import read_images
@@ -145,8 +145,7 @@ class PortResponse:
             np.tensordot(mixing, [on_grid(h, self.theta, grid, turn_deg) for h in part], axes=1)
             for part in parts
         )
-        loaded = (jnp.asarray(part) for part in turned)
-        return AntennaFields(*loaded, grid)
+        return AntennaFields(*turned, grid)
 
     def beams(
         self,
@@ -200,7 +199,7 @@ class PortResponse:
         if unit == "K":
             root = np.sqrt(self.per_kelvin(frequency_mhz))
             seen = seen / (root[:, None] * root[None])
-        return to_real(jnp.asarray(seen))
+        return to_real(seen)
 
     def _impedance(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
         (impedance,) = at_frequency(self.path, self.frequencies_mhz, frequency_mhz, self.impedance)

@@ -14,10 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_finite
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import image_names, read_images
@@ -119,7 +119,7 @@ class ScalarBeam:
             np.stack([on_grid(part, self.theta, grid, a) for a in rotations_deg]) * scale[:, None]
             for part in parts
         )
-        return AntennaFields(*(jnp.asarray(x, dtype=jnp.complex128) for x in turned), grid)
+        return AntennaFields(*(x.astype(np.complex128) for x in turned), grid)
 
     def beams(
         self,
@@ -169,7 +169,7 @@ class ScalarBeam:
         """
         fields = self.fields(frequency_mhz, grid=grid, taper=taper, rotations_deg=rotations_deg)
         sky = fields.grid.integrate(to_real(stokes_beam(fields)))
-        return moon_k * (to_real(jnp.eye(len(rotations_deg), dtype=jnp.complex128)) - sky)
+        return moon_k * (to_real(np.eye(len(rotations_deg), dtype=np.complex128)) - sky)
 
 
 def read_scalar_beam(path: str | Path) -> ScalarBeam:

@@ -11,10 +11,10 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
@@ -156,7 +156,7 @@ class EmbeddedBeams(BeamSource):
         return monopole_beams(frequency_mhz, lmax, self.antennas)
 
     def background(self, frequency_mhz: float) -> Float[Array, " products"]:
-        return jnp.zeros(self.n_ports**2)
+        return np.zeros(self.n_ports**2)
 
     @property
     def monopoles(self) -> Monopoles:
@@ -205,7 +205,7 @@ class ScalarFileBeams(BeamSource):
 
     def background(self, frequency_mhz: float) -> Float[Array, " products"]:
         if not self.emits:
-            return jnp.zeros(self.n_ports**2)
+            return np.zeros(self.n_ports**2)
         return self.beam.background(frequency_mhz, self.moon_k, grid=self._grid, **self._placement)
 
     def impedance(self, frequency_mhz: float) -> complex | None:
@@ -265,7 +265,7 @@ class ResponseBeams(BeamSource):
 
     def background(self, frequency_mhz: float) -> Float[Array, " products"]:
         if not self.emits:
-            return jnp.zeros(self.n_ports**2)
+            return np.zeros(self.n_ports**2)
         return self.response.background(frequency_mhz, self.moon_k, self.antenna_k)
 
     def per_kelvin(self, frequency_mhz: float) -> Float[np.ndarray, " ports"]:

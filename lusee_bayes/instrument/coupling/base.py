@@ -10,8 +10,9 @@ from abc import abstractmethod
 from dataclasses import replace
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_finite, require_float64, require_shape
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from lusee_bayes.core.checks import AnyArray, require_finite, require_float64, require_shape
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.coupling.base import Coupling
 
@@ -31,7 +32,7 @@ class DenseCoupling(Coupling):
 
     def __init__(
         self,
-        matrix: Float[AnyArray, "data unknowns"],
+        matrix: Float[Array, "data unknowns"],
         *,
         response: Float[Array, " data"] | None = None,
     ):
@@ -62,6 +63,6 @@ class DenseCoupling(Coupling):
         return self.matrix.T @ (data if self.response is None else data * self.response)
 
 
-def as_coupling(coupling: Coupling | AnyArray) -> Coupling:
+def as_coupling(coupling: Coupling | Array) -> Coupling:
     """Wrap an array in a :class:`DenseCoupling`; a coupling is returned as it is."""
     return coupling if isinstance(coupling, Coupling) else DenseCoupling(coupling)

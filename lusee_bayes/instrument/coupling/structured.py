@@ -19,8 +19,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers
@@ -195,13 +196,13 @@ class CouplingMatrix(Coupling):
         ]:
             if ((numbers < 0) | (numbers >= limit)).any():
                 raise InputError(f"{name} numbers must lie in 0..{limit - 1}, got {numbers}")
-        rows = jnp.zeros((len(product), self.shape[1]))
+        places, blocks = [], []
         for run, span in self.pointing.runs():
             here = np.flatnonzero((time >= span.start) & (time < span.stop))
             times, position = np.unique(time[here], return_inverse=True)
-            block = self._block(run, times)[product[here], position]
-            rows = rows.at[here].set(block)
-        return rows
+            places.append(here)
+            blocks.append(self._block(run, times)[product[here], position])
+        return namespace(*blocks).concatenate(blocks)[np.argsort(np.concatenate(places))]
 
     def dense(self) -> Float[Array, "data modes"]:
         """A as a matrix (96 MB for 5232 x 2304)."""
@@ -216,7 +217,7 @@ class CouplingMatrix(Coupling):
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:
         """Rows of all products for some samples of one run; times: a slice or numbers."""
         factors = self.pointing.tilt_factors()[times]
-        tilted = jnp.einsum("tp,kpc->ktc", factors, self.body_beams[run])
+        tilted = factors @ self.body_beams[run]
         return self.pointing.pole_from_galactic.T(
             turned_about_pole(tilted, self.pointing.azimuth[times])
         )
@@ -241,39 +242,40 @@ def turned_about_pole(
     """
     _, m = mode_numbers(lmax_of(beams.shape[-1]))
     mirrored = beams[..., np.arange(len(m)) - 2 * m]
-    angle = azimuth[:, None] * jnp.arange(0.0, m.max() + 1.0)[None]
-    cosine, sine = jnp.cos(angle), jnp.sin(angle)
-    signed = sine[:, np.abs(m)] * _signs(m)[None]
+    xp = namespace(beams, azimuth)
+    angle = azimuth[:, None] * np.arange(0.0, m.max() + 1.0)[None]
+    cosine, sine = xp.cos(angle), xp.sin(angle)
+    signed = sine[:, np.abs(m)] * np.sign(m)[None]
     return beams * cosine[None, :, np.abs(m)] - mirrored * signed[None]
 
 
-@eqx.filter_jit
+@compiled
 def _body_beams(
     modes: Float[Array, "products modes"], pointing: Pointing
 ) -> Float[Array, "runs products powers modes"]:
     """Tilted copies of the beams in the Moon-fixed frame, for every run's turntable angle."""
-    runs = []
+    xp, runs = namespace(modes, pointing), []
     for run in range(len(pointing.run_starts) - 1):
         body = pointing.mcmf_from_topocentric(turn_about_z(modes, pointing.turntable[run]))
-        runs.append(jnp.stack(tilts(body, pointing.order), axis=1))
-    return jnp.stack(runs)
+        runs.append(xp.stack(tilts(body, pointing.order), axis=1))
+    return xp.stack(runs)
 
 
-@eqx.filter_jit
+@compiled
 def _dense(coupling: CouplingMatrix) -> Float[Array, "data modes"]:
     blocks = [coupling._block(run, span) for run, span in coupling.pointing.runs()]
-    grid = blocks[0] if len(blocks) == 1 else jnp.concatenate(blocks, axis=1)
-    rows = coupling.layout.gather(grid)
+    rows = coupling.layout.gather(namespace(*blocks).concatenate(blocks, axis=1))
     return rows if coupling.response is None else rows * coupling.response[:, None]
 
 
 def _phases(pointing: Pointing, lmax: int) -> tuple[Array, Array]:
     """cos m phi(t) and sin m phi(t), each (times, orders)."""
-    angle = pointing.azimuth[:, None] * jnp.arange(lmax + 1.0)[None]
-    return jnp.cos(angle), jnp.sin(angle)
+    xp = namespace(pointing.azimuth)
+    angle = pointing.azimuth[:, None] * np.arange(lmax + 1.0)[None]
+    return xp.cos(angle), xp.sin(angle)
 
 
-@eqx.filter_jit
+@compiled
 def _by_order(
     body_beams: Float[Array, "runs products powers modes"], lmax: int
 ) -> Float[Array, "runs orders beams degrees"]:
@@ -290,30 +292,31 @@ def _pairs(modes: Float[Array, "*batch modes"], lmax: int) -> Float[Array, "*bat
     """c_lm for l = 0..lmax, then c_l,-m, of m = 0..lmax; zero for l < m, and for c_l,-0."""
     ell, m = np.arange(lmax + 1)[:, None], np.arange(lmax + 1)[None]
     centre = ell**2 + ell
-    plus = jnp.where(ell >= m, modes[..., np.where(ell >= m, centre + m, 0)], 0.0)
+    xp = namespace(modes)
+    plus = xp.where(ell >= m, modes[..., np.where(ell >= m, centre + m, 0)], 0.0)
     inside = (ell >= m) & (m > 0)
-    minus = jnp.where(inside, modes[..., np.where(inside, centre - m, 0)], 0.0)
-    return jnp.concatenate([plus, minus], axis=-2)
+    minus = xp.where(inside, modes[..., np.where(inside, centre - m, 0)], 0.0)
+    return xp.concatenate([plus, minus], axis=-2)
 
 
-@eqx.filter_jit
+@compiled
 def _forward(coupling: CouplingMatrix, sky: Float[Array, " modes"]) -> Float[Array, " data"]:
     n_products, n_powers = coupling.body_beams.shape[1:3]
     pairs = _pairs(coupling.pointing.pole_from_galactic(sky), coupling.lmax)
     plus, minus = pairs[: coupling.lmax + 1], pairs[coupling.lmax + 1 :]
-    zero_order = jnp.arange(coupling.lmax + 1)[None] == 0
-    crossed = jnp.concatenate([minus, -jnp.where(zero_order, 0.0, plus)])
-    both = jnp.stack([pairs.T, crossed.T], axis=-1)
+    xp = namespace(coupling, sky)
+    zero_order = np.arange(coupling.lmax + 1)[None] == 0
+    crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
+    both = xp.stack([pairs.T, crossed.T], axis=-1)
     cosine, sine = _phases(coupling.pointing, coupling.lmax)
     factors = coupling.pointing.tilt_factors()
     grids = []
     for run, span in coupling.pointing.runs():
-        x_and_y = jnp.einsum("mbl,mlc->mbc", coupling.by_order[run], both)
-        x_and_y = x_and_y.reshape(-1, n_products, n_powers, 2)
-        c = jnp.einsum("tm,mkp->ktp", cosine[span], x_and_y[..., 0])
-        s = jnp.einsum("tm,mkp->ktp", sine[span], x_and_y[..., 1])
-        grids.append(jnp.einsum("tp,ktp->kt", factors[span], c + s))
-    data = coupling.layout.gather(jnp.concatenate(grids, axis=1))
+        x_and_y = coupling.by_order[run] @ both
+        over_time = cosine[span] @ x_and_y[..., 0] + sine[span] @ x_and_y[..., 1]
+        over_time = over_time.reshape(-1, n_products, n_powers)
+        grids.append((over_time * factors[span][:, None]).sum(-1).T)
+    data = coupling.layout.gather(xp.concatenate(grids, axis=1))
     return data if coupling.response is None else data * coupling.response
 
 
@@ -323,7 +326,3 @@ def _backward(coupling: CouplingMatrix, data: Float[Array, " data"]) -> Float[Ar
     sky = jax.ShapeDtypeStruct((coupling.shape[1],), jnp.float64)
     (transposed,) = jax.linear_transpose(lambda a: _forward(coupling, a), sky)(data)
     return transposed
-
-
-def _signs(m: np.ndarray) -> Float[Array, " modes"]:
-    return jnp.sign(jnp.asarray(m, dtype=jnp.float64))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -94,5 +93,5 @@ class Waterfall:
             layout = DataLayout.from_flags(~present[within])
         except InputError as error:
             raise InputError(f"{self.path} at {frequency_mhz:g} MHz: {error}") from error
-        data = layout.gather(jnp.asarray(np.where(present, values, 0.0)[within]))
+        data = layout.gather(np.where(present, values, 0.0)[within])
         return Visibilities(data, layout, self.observation, float(self.frequencies_mhz[channel]))

@@ -15,8 +15,11 @@ from abc import abstractmethod
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
 
 
@@ -106,6 +109,8 @@ class Covariance(eqx.Module):
     def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
         """Draw from N(0, N): a (data,) array, or an (n, data) one with ``n``."""
         z = jax.random.normal(key, (self.rank, 1 if n is None else n), dtype=jnp.float64)
+        if namespace(self) is np and not is_traced(z):
+            z = np.asarray(z)
         draws = self.colour(z).T
         return draws[0] if n is None else draws
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import require_float64, require_positive, require_shape
 from lusee_bayes.noise.covariance.base import Covariance, Factor
 
@@ -35,7 +35,7 @@ class DiagonalFactor(Factor):
         return z * _down(self.sigma, z)
 
     def log_det(self):
-        return 2.0 * jnp.log(self.sigma).sum()
+        return 2.0 * namespace(self.sigma).log(self.sigma).sum()
 
 
 class DiagonalCovariance(Covariance):
@@ -70,10 +70,10 @@ class DiagonalCovariance(Covariance):
         return self.variance
 
     def dense(self):
-        return jnp.diag(self.variance)
+        return namespace(self.variance).diag(self.variance)
 
     def factor(self):
-        return DiagonalFactor(jnp.sqrt(self.variance))
+        return DiagonalFactor(namespace(self.variance).sqrt(self.variance))
 
     def absorb(self, other):
         if isinstance(other, DiagonalCovariance):

@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_finite, require_float64, require_positive, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower

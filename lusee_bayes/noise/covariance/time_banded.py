@@ -12,8 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import (
     is_traced,
     require_finite,
