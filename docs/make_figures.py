@@ -19,7 +19,8 @@ from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.simulate import true_values
 from lusee_bayes.linear.metrics import ell_cross, signal_to_noise
-from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar, mollweide
+from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar
+from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.map_result import map_result
 from lusee_bayes.sampling.datatree import read_datatree
 from lusee_bayes.sampling.uncertainty import summary
@@ -77,7 +78,7 @@ def embedded_sky(ulsa: Path | None) -> None:
             pairs.append(("ULSA (Cong et al. 2021)", modes_to_map(sky.modes, 64)))
         norm = LogNorm(*np.percentile(ours, [1, 99.5]))
         for column, (name, pixels) in enumerate(pairs):
-            axes = figure.add_subplot(3, 2, 2 * row + column + 1, projection="mollweide")
+            axes = figure.add_subplot(3, 2, 2 * row + column + 1)
             image = mollweide(axes, pixels, norm=norm)
             axes.set_title(f"{name}, {frequency:g} MHz")
             colour_bar(figure, image, axes, label="K", shrink=0.8)
@@ -121,7 +122,7 @@ def point_sources() -> None:
     for column, (treatment, title) in enumerate(
         [("marginalised", "fitted separately"), ("ignored", "left to the map")]
     ):
-        axes = top.add_subplot(1, 2, column + 1, projection="mollweide")
+        axes = top.add_subplot(1, 2, column + 1)
         image = mollweide(
             axes, residuals[treatment], norm=Normalize(-largest, largest), cmap="RdBu_r"
         )

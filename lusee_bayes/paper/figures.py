@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from lusee_bayes.instrument.beams import HemisphereGrid
 from lusee_bayes.paper.claims import FREQUENCIES, SHOWN_FREQUENCIES, Cases, frequency_case
-from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, mollweide, orthographic
+from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, orthographic
+from lusee_bayes.report.figures.mollweide import mollweide
 
 # the paper's colours by group, of lightness different enough for colour-blind readers; the lines
 # within a group differ in style
@@ -112,9 +113,7 @@ def frequency_maps(cases: Cases) -> Figure:
             ),
         ]  # fmt: skip
         for row, (name, pixels, scale, cmap, altitude) in enumerate(rows):
-            axes = figure.add_subplot(
-                3, columns, row * columns + column + 1, projection="mollweide"
-            )
+            axes = figure.add_subplot(3, columns, row * columns + column + 1)
             image = mollweide(axes, pixels, norm=scale, cmap=cmap, highest_altitude=altitude)
             axes.set_title(f"{frequency} MHz, {name}", fontsize=10)
             axes.set_xticklabels([])
@@ -232,7 +231,7 @@ def scenario_maps(cases: Cases) -> Figure:
         for name in MAP_CASES
     ]
     for position, (title, pixels, altitude) in enumerate(panels, 1):
-        axes = figure.add_subplot(4, 3, position, projection="mollweide")
+        axes = figure.add_subplot(4, 3, position)
         image = mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
         axes.set_title(title, fontsize=11)
         axes.set_xticklabels([])

@@ -17,9 +17,9 @@ from lusee_bayes.report.figures.drawing import (
     ORANGE,
     SEQUENTIAL,
     colour_bar,
-    mollweide,
     orthographic,
 )
+from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.channel import ChannelResult
 
 
@@ -84,7 +84,7 @@ def maps(channel: ChannelResult) -> Figure:
     rows = (len(panels) + 1) // 2
     figure = Figure(figsize=(12, 3.6 * rows), layout="constrained")
     for position, (title, pixels, norm, cmap, unit) in enumerate(panels):
-        axes = figure.add_subplot(rows, 2, position + 1, projection="mollweide")
+        axes = figure.add_subplot(rows, 2, position + 1)
         image = mollweide(
             axes, pixels, norm=norm, cmap=cmap, highest_altitude=channel.highest_altitude
         )

@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from lusee_bayes.report.figures.drawing import GREY, colour_bar, mollweide
+from lusee_bayes.report.figures.drawing import GREY, colour_bar
+from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.finished_runs import FinishedRun
 
 # told apart without colour vision (Okabe-Ito), and by their lines
@@ -27,7 +28,7 @@ def maps(runs: Sequence[FinishedRun]) -> Figure:
         for column, (title, pixels, norm) in enumerate(
             (("mean", run.mean, positive), ("standard deviation", run.std, spread))
         ):
-            axes = figure.add_subplot(len(runs), 2, 2 * row + column + 1, projection="mollweide")
+            axes = figure.add_subplot(len(runs), 2, 2 * row + column + 1)
             image = mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
             colour_bar(figure, image, axes, label="K", shrink=0.85, extend="both")
             axes.set_title(f"{run.name}: {title}")

@@ -7,7 +7,8 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from lusee_bayes.report.figures.drawing import BLUE, GREY, ORANGE, SEQUENTIAL, colour_bar, mollweide
+from lusee_bayes.report.figures.drawing import BLUE, GREY, ORANGE, SEQUENTIAL, colour_bar
+from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.cube import CubeResult
 
 # channels whose maps are drawn
@@ -30,7 +31,7 @@ def maps(cube: CubeResult) -> Figure:
                 ("standard deviation", percent, spread, "% of the mean sky"),
             )
         ):
-            axes = figure.add_subplot(len(shown), 2, 2 * row + column + 1, projection="mollweide")
+            axes = figure.add_subplot(len(shown), 2, 2 * row + column + 1)
             image = mollweide(axes, pixels, norm=norm)
             colour_bar(figure, image, axes, label=unit, shrink=0.85, extend="both")
             axes.set_title(f"{cube.frequencies_mhz[k]:g} MHz: {title}")

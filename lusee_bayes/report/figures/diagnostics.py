@@ -7,7 +7,8 @@ import xarray as xr
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, ORANGE, colour_bar, mollweide
+from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, ORANGE, colour_bar
+from lusee_bayes.report.figures.mollweide import mollweide
 
 # residuals beyond that have the darkest colours
 WIDEST = 4.0
@@ -22,7 +23,7 @@ def draws(found: xr.Dataset) -> Figure:
     altitude = found["highest_altitude"].values
     figure = Figure(figsize=(12, 3.6 * ((len(maps) + 1) // 2)), layout="constrained")
     for k, pixels in enumerate(maps):
-        axes = figure.add_subplot((len(maps) + 1) // 2, 2, k + 1, projection="mollweide")
+        axes = figure.add_subplot((len(maps) + 1) // 2, 2, k + 1)
         image = mollweide(axes, pixels, norm=LogNorm(*positive), highest_altitude=altitude)
         axes.set_title(f"draw {k + 1}")
     colour_bar(figure, image, figure.axes, label="K", shrink=0.7, extend="both")

@@ -1,18 +1,15 @@
-"""What figures are drawn with: colours, projections of the sky and of beams, colour bars."""
+"""What figures are drawn with: colours, the projection of beams, colour bars."""
 
 from __future__ import annotations
 
-import healpy
 import numpy as np
-from jaxtyping import Complex, Float
-from matplotlib import colormaps
+from jaxtyping import Complex
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator
 
 from lusee_bayes.instrument.beams import HemisphereGrid
@@ -44,51 +41,6 @@ def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Complex[np.ndarray, 
     }.items():
         axes.text(px, py, name, ha="center", va="center", fontsize=8)
     axes.set_frame_on(False)
-    return image
-
-
-def mollweide(
-    axes: Axes,
-    pixels: Float[np.ndarray, " pixels"],
-    *,
-    norm: Normalize,
-    cmap: str = SEQUENTIAL,
-    highest_altitude: Float[np.ndarray, " pixels"] | None = None,
-):
-    """A Galactic HEALPix RING map on Mollweide axes: centre l = 0, longitude grows to the left.
-
-    ``highest_altitude``: draws a dashed line round the region that never rose.
-    """
-    # a degree between nodes, shaded smoothly: no finer than the eye needs, four times faster
-    lon = np.linspace(180.0, -180.0, 361)
-    lat = np.linspace(-90.0, 90.0, 181)
-    grid_lon, grid_lat = np.meshgrid(lon, lat)
-
-    def at(values):
-        return healpy.get_interp_val(values, grid_lon, grid_lat, lonlat=True)
-
-    x, y = np.radians(-grid_lon), np.radians(grid_lat)
-    # negative temperatures have no logarithm: they take the darkest colour
-    colours = colormaps[cmap].with_extremes(bad=colormaps[cmap](0.0))
-    image = axes.pcolormesh(
-        x, y, at(pixels), cmap=colours, norm=norm, shading="gouraud", rasterized=True
-    )
-    if highest_altitude is not None and (highest_altitude < 0).any():
-        rim = axes.contour(
-            x,
-            y,
-            at(highest_altitude),
-            [0.0],
-            colors="black",
-            linestyles="dashed",
-            linewidths=1.2,
-        )
-        # seen on dark maps and on light ones
-        rim.set_path_effects([withStroke(linewidth=2.4, foreground="white", alpha=0.7)])
-    axes.set_xticks(np.radians([-120, -60, 0, 60, 120]), ["120°", "60°", "0°", "300°", "240°"])
-    axes.set_yticks(np.radians([-60, -30, 0, 30, 60]))
-    axes.tick_params(labelsize=7)
-    axes.grid(alpha=0.25, lw=0.4)
     return image
 
 

@@ -16,8 +16,8 @@ from lusee_bayes.report.figures.drawing import (
     ORANGE,
     SEQUENTIAL,
     colour_bar,
-    mollweide,
 )
+from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.sample_result import SampleResult
 from lusee_bayes.sampling.calibration import LEVELS, N_BINS, Ranks
 from lusee_bayes.sampling.validation import Comparison
@@ -52,7 +52,7 @@ def uncertainty(run: SampleResult) -> Figure:
     altitude = highest_altitude(run.experiment.data.observation, nside)
     figure = Figure(figsize=(12, 7.2), layout="constrained")
     for position, (title, pixels, norm, cmap, unit) in enumerate(panels):
-        axes = figure.add_subplot(2, 2, position + 1, projection="mollweide")
+        axes = figure.add_subplot(2, 2, position + 1)
         image = mollweide(axes, pixels, norm=norm, cmap=cmap, highest_altitude=altitude)
         colour_bar(figure, image, axes, label=unit, shrink=0.85, extend="both")
         axes.set_title(title)
