@@ -75,8 +75,7 @@ def transaction(folder: str | Path, kind: str, discard: Sequence[str] = ()) -> I
     require_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     recover(folder)
-    prefix = f"{SCRATCH}{os.getpid()}-{socket.gethostname()}-"
-    stage = Path(tempfile.mkdtemp(prefix=prefix, dir=folder))
+    stage = scratch_folder(folder)
     try:
         yield stage
         files = sorted(str(p.relative_to(stage)) for p in stage.rglob("*") if p.is_file())
@@ -119,6 +118,17 @@ def recover(folder: str | Path) -> None:
             shutil.rmtree(folder / name, ignore_errors=True)
         _move(committed / MANIFEST, folder / MANIFEST)
     shutil.rmtree(committed, ignore_errors=True)
+    remove_left_scratch(folder)
+
+
+def scratch_folder(folder: Path) -> Path:
+    """Make a folder in ``folder`` for this process alone."""
+    prefix = f"{SCRATCH}{os.getpid()}-{socket.gethostname()}-"
+    return Path(tempfile.mkdtemp(prefix=prefix, dir=folder))
+
+
+def remove_left_scratch(folder: Path) -> None:
+    """Remove the scratch folders of processes of this host that have ended."""
     for scratch in folder.glob(f"{SCRATCH}*"):
         process, _, rest = scratch.name.removeprefix(SCRATCH).partition("-")
         # a process of another host is not to be seen from here

@@ -10,6 +10,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from lusee_bayes.core.compilation_cache import publish, use_compilation_cache
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import MANIFEST, recover, require_folder, transaction
 from lusee_bayes.core.progress import Stages
@@ -90,10 +91,13 @@ def run_folder(folder: str | Path, unfinished: str = "", resume: str = "") -> It
     require_folder(folder)
     recover(folder)
     before = _written_at(folder)
+    use_compilation_cache()
     try:
         yield folder
     except KeyboardInterrupt as interrupt:
         raise RunInterrupted(_state(folder, before, unfinished, resume)) from interrupt
+    finally:
+        publish()
 
 
 def _written_at(folder: Path) -> int | None:
