@@ -24,13 +24,14 @@ from jaxtyping import Complex, Float
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import N_BLOCKS, gram_matrix
+from lusee_bayes.core.linalg import N_BLOCKS, checked_cholesky, gram_matrix, solve_lower
 from lusee_bayes.core.rotations import Rotation
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_about_pole
 from lusee_bayes.linear.time_sums import time_sums
 from lusee_bayes.noise.covariance import (
     Covariance,
     DiagonalCovariance,
+    LowRankUpdate,
     TimeBandedCovariance,
     TimeBlockCovariance,
 )
@@ -86,17 +87,22 @@ def has_structure(coupling: Coupling, noise: Covariance) -> bool:
     bool
         True if both have structure in time.
     """
-    return coupling.has_time_structure and type(noise) in NORMAL_MATRICES
+    base = noise.base if isinstance(noise, LowRankUpdate) else noise
+    return coupling.has_time_structure and type(base) in NORMAL_MATRICES
 
 
-def _of_diagonal(coupling: CouplingMatrix, noise: DiagonalCovariance) -> Array:
-    weights = coupling.layout.scatter(1.0 / noise.variance)
-    return _summed(coupling, weights, _turntable_groups(coupling))
+def _within_times(coupling: CouplingMatrix, noise: Covariance) -> Array:
+    return summed(coupling, noise.time_weights(coupling.layout))
 
 
-def _of_blocks(coupling: CouplingMatrix, noise: TimeBlockCovariance) -> Array:
-    noise.factor()  # raises where a block is not positive definite
-    return _summed(coupling, _inverse_blocks(noise), _turntable_groups(coupling))
+def _with_templates(coupling: CouplingMatrix, noise: LowRankUpdate) -> Array:
+    """With N_0 + T T^T: A^T D A - V^T (1 + T^T D T)^-1 V, V = T^T D A, D = N_0^-1."""
+    base = noise.base.factor()
+    weighted = base.solve(noise.update.root)
+    v = jnp.stack([coupling.transpose_mv(column) for column in weighted.T])
+    small = jnp.eye(v.shape[0]) + noise.update.root.T @ weighted
+    lower = checked_cholesky(f"1 + T^T D T of {noise.update.name}", small)
+    return normal_matrix(coupling, noise.base) - gram_matrix(solve_lower(lower, v, transpose=False))
 
 
 def _of_bands(coupling: CouplingMatrix, noise: TimeBandedCovariance) -> Array:
@@ -105,18 +111,29 @@ def _of_bands(coupling: CouplingMatrix, noise: TimeBandedCovariance) -> Array:
 
 # how A^T N^-1 A is summed for each structure of N in time; those without an entry need A itself
 NORMAL_MATRICES: dict[type[Covariance], Callable[..., Array]] = {
-    DiagonalCovariance: _of_diagonal,
-    TimeBlockCovariance: _of_blocks,
+    DiagonalCovariance: _within_times,
+    TimeBlockCovariance: _within_times,
     TimeBandedCovariance: _of_bands,
+    LowRankUpdate: _with_templates,
 }
 
 
-@eqx.filter_jit
-def _inverse_blocks(noise: TimeBlockCovariance) -> Float[Array, "products products times"]:
-    """N^-1 of every time, zero where a sample is missing."""
-    present = noise.layout.present.T
-    both = present[:, :, None] & present[:, None, :]
-    return jnp.moveaxis(jnp.where(both, jnp.linalg.inv(noise.blocks), 0.0), 0, 2)
+def summed(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> Float[Array, "modes modes"]:
+    """Compute A^T W A for weights W within times.
+
+    Parameters
+    ----------
+    coupling : CouplingMatrix
+        A.
+    weights : (products, times) or (products, products, times) array
+        The diagonal of W, or its block of every time; zero where a sample is missing.
+
+    Returns
+    -------
+    (modes, modes) array
+        In Galactic modes; symmetric to the last bit.
+    """
+    return _summed(coupling, weights, _turntable_groups(coupling))
 
 
 def _turntable_groups(coupling: CouplingMatrix) -> tuple[tuple[int, ...], ...]:

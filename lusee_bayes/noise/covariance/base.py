@@ -21,6 +21,7 @@ from jaxtyping import Float, PRNGKeyArray
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.instrument.layout import DataLayout
 
 
 class Factor(eqx.Module):
@@ -88,6 +89,27 @@ class Covariance(eqx.Module):
     @abstractmethod
     def scaled(self, factor: float | Float[Array, ""]) -> Covariance:
         """Return ``factor * N`` for a positive factor."""
+
+    def time_weights(self, layout: DataLayout) -> Float[Array, "..."] | None:
+        """Return N^-1 on the full grid, if N couples no two times.
+
+        Parameters
+        ----------
+        layout : DataLayout
+            Of the data.
+
+        Returns
+        -------
+        (products, times) or (products, products, times) array, or None
+            The inverse variances, or the inverse of the block of every time, zero where a sample is
+            missing; None if N has no such structure.
+
+        Raises
+        ------
+        InputError
+            If N is not positive definite.
+        """
+        return None
 
     def solve(self, x: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:
         """Return N^-1 x."""

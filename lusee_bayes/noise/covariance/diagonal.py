@@ -75,6 +75,9 @@ class DiagonalCovariance(Covariance):
     def factor(self):
         return DiagonalFactor(namespace(self.variance).sqrt(self.variance))
 
+    def time_weights(self, layout):
+        return layout.scatter(1.0 / self.variance)
+
     def absorb(self, other):
         if isinstance(other, DiagonalCovariance):
             return DiagonalCovariance(self.variance + other.variance)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float
 
@@ -97,6 +98,10 @@ class TimeBlockCovariance(Covariance):
         lower = checked_cholesky("the noise covariance of one time", self.blocks)
         return TimeBlockFactor(lower, self.layout)
 
+    def time_weights(self, layout):
+        self.factor()  # raises where a block is not positive definite
+        return _inverse_blocks(self)
+
     def absorb(self, other):
         if isinstance(other, TimeBlockCovariance):
             self.layout.require_same(other.layout)
@@ -110,3 +115,10 @@ class TimeBlockCovariance(Covariance):
 
     def scaled(self, factor):
         return TimeBlockCovariance(factor * self.blocks, self.layout)
+
+
+@eqx.filter_jit
+def _inverse_blocks(noise: TimeBlockCovariance) -> Float[Array, "products products times"]:
+    present = noise.layout.present.T
+    both = present[:, :, None] & present[:, None, :]
+    return jnp.moveaxis(jnp.where(both, jnp.linalg.inv(noise.blocks), 0.0), 0, 2)
