@@ -13,24 +13,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2
 
-from lusee_bayes.core.arrays import Array
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.linear.left_out import LeftOut
+from lusee_bayes.linear.left_out_dense import DenseLeftOut
+from lusee_bayes.linear.left_out_structured import StructuredLeftOut
 from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.noise.covariance import Factor
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.noise.covariance import LowRankUpdate
 
 # a fit less probable than this is called bad; real skies are not drawn from the prior, and that
 # alone gives probabilities of 1e-3
 SIGNIFICANCE = 1e-6
 HOURS_A_DAY = 24.0
-# the largest group whose block of K^-1 is formed, and how many columns of N^-1 at a time
-LARGEST_GROUP, COLUMNS = 8000, 512
 
 
 @dataclass(frozen=True)
@@ -145,16 +144,17 @@ def probability(p: float) -> str:
     return f"= {p:.2g}" if p > 0 else "< 1e-300"
 
 
-def residuals(model: LinearGaussian, data: Visibilities) -> Residuals:
+def residuals(model: LinearGaussian, posterior: Posterior, data: Visibilities) -> Residuals:
     """Compare data with what the model predicts for them, group by group.
 
     Days of 24 hours are counted from the first sample. Runs of one turntable angle are one group.
-    Groups of more than ``LARGEST_GROUP`` data, but not all, are left out.
 
     Parameters
     ----------
     model : LinearGaussian
         Of these data.
+    posterior : Posterior
+        Of the model, given these data.
     data : Visibilities
         In K, with their times and turntable angles.
 
@@ -168,77 +168,47 @@ def residuals(model: LinearGaussian, data: Visibilities) -> Residuals:
     InputError
         If the model cannot be factorised.
     """
-    solver = model.factorise()
-    factor, half = solver.factor, solver.half()
-    centred = data.data if model.offset is None else data.data - model.offset
-    white = factor.whiten(centred)
-    u = np.asarray(factor.whiten_transpose(white - half.T @ (half @ white)))
-    root = np.asarray(factor.whiten_transpose(half.T))
-    total = float(np.asarray(centred) @ u)
-    kinds = [
-        [(name, index) for name, index in kind if _can_be_tested(len(index), len(u))]
-        for kind in _groups(data)
-    ]
-    diagonal, blocks = _inverse(
-        factor, len(u), [index for kind in kinds for _, index in kind if len(index) < len(u)]
-    )
-    left = iter(blocks)
-
-    def group(name: str, index: np.ndarray) -> Group:
-        squared, others = total, np.nan
-        if len(index) < len(u):
-            matrix = next(left) - root[index] @ root[index].T
-            squared = float(u[index] @ cho_solve(cho_factor(matrix, lower=True), u[index]))
-            others = float(chi2.sf(total - squared, len(u) - len(index)))
-        return Group(name, len(index), squared, float(chi2.sf(squared, len(index))), others)
-
-    products, days, angles = (tuple(group(*g) for g in kind) for kind in kinds)
-    # K (K^-1 d) = d, so that d - N u is what the sky explains
-    predicted = np.asarray(data.data) - np.asarray(model.noise.mv(jnp.asarray(u)))
-    z = u / np.sqrt(diagonal - (root**2).sum(1))
-    return Residuals(predicted, z, total, products, days, angles)
-
-
-def _groups(data: Visibilities) -> list[list[tuple[str, np.ndarray]]]:
-    """Names and data of every product, every day and every turntable angle."""
     layout, observation = data.layout, data.observation
+    left_out = leave_out(model, posterior, data)
+    u = left_out.u[layout.product, layout.time]
+    present = np.asarray(layout.present)
     day = np.floor(observation.hours / HOURS_A_DAY).astype(int)
     angles, angle_of_run = np.unique(observation.turntable_deg, return_inverse=True)
-    kinds = [
-        (data.labels, layout.product),
-        ([str(k) for k in range(day.max() + 1)], day[layout.time]),
-        ([f"{angle:g}" for angle in angles], angle_of_run[observation.run[layout.time]]),
+    angle = angle_of_run[observation.run]
+    total = float(np.asarray(data.data if model.offset is None else data.data - model.offset) @ u)
+
+    def group(name: str, n: int, squared: float) -> Group:
+        if n == len(u):
+            return Group(name, n, total, float(chi2.sf(total, n)), np.nan)
+        others = float(chi2.sf(total - squared, len(u) - n))
+        return Group(name, n, squared, float(chi2.sf(squared, n)), others)
+
+    products = [
+        group(name, int(present[k].sum()), left_out.product(k))
+        for k, name in enumerate(data.labels)
+        if present[k].any()
     ]
-    return [
-        [(name, np.flatnonzero(of == number)) for number, name in enumerate(names)]
-        for names, of in kinds
+    days = [
+        group(str(k), int(present[:, day == k].sum()), left_out.stretch(day == k))
+        for k in np.unique(day)
+        if present[:, day == k].any()
     ]
+    of_angles = [
+        group(f"{value:g}", int(present[:, angle == k].sum()), left_out.together(angle == k))
+        for k, value in enumerate(angles)
+        if present[:, angle == k].any()
+    ]
+    # K (K^-1 d) = d, so that d - N u is what the sky explains
+    predicted = np.asarray(data.data) - np.asarray(model.noise.mv(jnp.asarray(u)))
+    z = u / np.sqrt(left_out.inverse_diagonal[layout.product, layout.time])
+    return Residuals(predicted, z, total, tuple(products), tuple(days), tuple(of_angles))
 
 
-def _can_be_tested(n: int, n_all: int) -> bool:
-    return 0 < n <= LARGEST_GROUP or n == n_all
-
-
-def _inverse(
-    factor: Factor, size: int, groups: list[np.ndarray]
-) -> tuple[Float[np.ndarray, " data"], list[np.ndarray]]:
-    """The diagonal of N^-1 and its blocks for groups of data, a few columns at a time."""
-    diagonal, blocks = np.empty(size), [np.empty((len(index), len(index))) for index in groups]
-    place = np.full((len(groups), size), -1)
-    for row, index in zip(place, groups, strict=True):
-        row[index] = np.arange(len(index))
-    for first in range(0, size, COLUMNS):
-        columns = np.arange(first, min(first + COLUMNS, size))
-        unit = np.zeros((size, COLUMNS))
-        unit[columns, columns - first] = 1.0
-        solved = np.asarray(_solve(factor, jnp.asarray(unit)))
-        diagonal[columns] = solved[columns, columns - first]
-        for row, index, block in zip(place, groups, blocks, strict=True):
-            here = columns[row[columns] >= 0]
-            block[:, row[here]] = solved[np.ix_(index, here - first)]
-    return diagonal, blocks
-
-
-@eqx.filter_jit
-def _solve(factor: Factor, x: Float[Array, "data columns"]) -> Float[Array, "data columns"]:
-    return factor.solve(x)
+def leave_out(model: LinearGaussian, posterior: Posterior, data: Visibilities) -> LeftOut:
+    """Choose how groups are left out: through the structure of A, where N has none but templates."""
+    noise = model.noise.base if isinstance(model.noise, LowRankUpdate) else model.noise
+    within_times = noise.time_weights(data.layout) is not None
+    diagonal = posterior.basis is None and model.prior.diagonal_root() is not None
+    if model.coupling.has_time_structure and within_times and diagonal:
+        return StructuredLeftOut(model, posterior, data.data)
+    return DenseLeftOut(model, data.data, data.layout)

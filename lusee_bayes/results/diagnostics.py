@@ -62,7 +62,7 @@ def diagnostics(
     """
     scenario, posterior, data = experiment.scenario, inference.posterior, experiment.data
     nside = channel.nside
-    found = residuals(judged.model, data)
+    found = residuals(judged.model, judged.posterior, data)
     layout = data.layout
     draws = np.asarray(posterior.sample(draw_key(scenario), N_DRAWS))
     rows = region_rows(nside, scenario.lmax)

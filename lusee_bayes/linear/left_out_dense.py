@@ -1,0 +1,84 @@
+"""Groups of data against their prediction by all others, with A and N of any kind as matrices.
+
+With N = L L^T and (A S A^T + N)^-1 = L^-T (1 - H^T H) L^-1 (:meth:`Solver.half`), the columns of
+L^-1 that belong to a group give K_ss.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.linalg import cho_factor, cho_solve
+
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.linear.left_out import LeftOut
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.noise.covariance import Factor
+
+# columns of L^-1 at a time: all groups share one compiled program
+COLUMNS = 512
+
+
+class DenseLeftOut(LeftOut):
+    """The model of some data, ready to leave out groups of them.
+
+    Parameters
+    ----------
+    model : LinearGaussian
+        Of any kind.
+    data : (data,) array
+        In K.
+    layout : DataLayout
+        The product and the time of every datum.
+
+    Raises
+    ------
+    InputError
+        If the model cannot be factorised.
+    """
+
+    def __init__(self, model: LinearGaussian, data: Float[Array, " data"], layout: DataLayout):
+        solver = model.factorise()
+        self._factor, self._half, self._layout = solver.factor, solver.half(), layout
+        white = solver.factor.whiten(data if model.offset is None else data - model.offset)
+        rest = white - self._half.T @ (self._half @ white)
+        self._u = np.asarray(solver.factor.whiten_transpose(rest))
+        self.u = layout.scatter(self._u)
+        self.inverse_diagonal = np.full(self.u.shape, np.nan)
+
+    def stretch(self, times):
+        return self._chi2(np.flatnonzero(times[self._layout.time]))
+
+    def together(self, times):
+        return self.stretch(times)
+
+    def product(self, number):
+        return self._chi2(np.flatnonzero(self._layout.product == number))
+
+    def _chi2(self, index: Int[np.ndarray, " group"]) -> float:
+        columns = []
+        for first in range(0, len(index), COLUMNS):
+            chosen = index[first : first + COLUMNS]
+            unit = np.zeros((len(self._u), COLUMNS))
+            unit[chosen, np.arange(len(chosen))] = 1.0
+            white, inside = _columns(self._factor, self._half, jnp.asarray(unit))
+            columns.append(
+                (np.asarray(white)[:, : len(chosen)], np.asarray(inside)[:, : len(chosen)])
+            )
+        white, inside = (np.concatenate(parts, axis=1) for parts in zip(*columns, strict=True))
+        block = white.T @ white - inside.T @ inside
+        where = (self._layout.product[index], self._layout.time[index])
+        self.inverse_diagonal[where] = np.diagonal(block)
+        return float(self._u[index] @ cho_solve(cho_factor(block), self._u[index]))
+
+
+@eqx.filter_jit
+def _columns(
+    factor: Factor, half: Float[Array, "rank data"], unit: Float[Array, "data columns"]
+) -> tuple[Array, Array]:
+    """L^-1 and H L^-1 times columns of the unit matrix."""
+    white = factor.whiten(unit)
+    return white, half @ white

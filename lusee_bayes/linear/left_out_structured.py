@@ -1,0 +1,308 @@
+"""Groups of data against their prediction by all others, through the structure of A.
+
+With K = A S A^T + N the covariance of data under the model and u = K^-1 d = N^-1 (d - A mean), a
+group s differs from its prediction by K_ss^-1 u_s, K_ss being a block of K^-1. For noise
+N = N_0 + T T^T, with N_0 within times and T some templates, put their amplitudes beside the modes:
+A' = [A, T], C' the posterior covariance of both. With D = (N_0^-1)_ss ::
+
+    K_ss = D - D A' C' A'^T D,    chi^2_s = u_s^T K_ss^-1 u_s.
+
+The rows of a stretch of time are A = U R: a few smooth functions U of time for every product. With
+D = c c^T, c^T U = Q B (QR), W = C'^(T/2) R^T B^T and the whitened w = c^-1 u ::
+
+    chi^2_s = |w|^2 - |b|^2 + b^T (1 - W^T W)^-1 b,    b = Q^T w,
+
+and a datum's own entry of K_ss comes from the same Q and W. A product, or all data of a turntable
+angle, have more data than there are modes; they are taken out of the normal matrix instead, ::
+
+    chi^2_s = |w|^2 + h^T (C'^-1 - A'^T D A')^-1 h,    h = A'^T u_s.
+
+Nothing of the size data x modes is formed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.instrument.coupling import turned_about_pole
+from lusee_bayes.linear.left_out import LeftOut
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.normal_matrix import summed
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.noise.covariance import LowRankUpdate
+
+# what smooth functions of time may miss of any phase exp(i m phi), |m| <= lmax, or tilt
+SMOOTH = 1e-12
+# stretches of no more times than that are taken as they are
+FEW_TIMES = 16
+
+
+@dataclass(frozen=True)
+class Part:
+    """Data of a stretch of time that N_0 couples with each other, but with no other data.
+
+    Attributes
+    ----------
+    where : tuple
+        Their places on the grid (products, times).
+    columns : slice
+        Those of the stretch that they have a part in.
+    root : (data,) or (times, products, products) array
+        c: of independent data, or of the products of each time.
+    functions : (data, columns) array
+        U.
+    """
+
+    where: tuple
+    columns: slice
+    root: Float[np.ndarray, "..."]
+    functions: Float[np.ndarray, "data columns"]
+
+    def coloured(self, x: Float[np.ndarray, "data columns"], *, transpose: bool = False):
+        """c x, or c^T x."""
+        if self.root.ndim == 1:
+            return self.root[:, None] * x
+        by_time = x.reshape(self.root.shape[1], len(self.root), -1).swapaxes(0, 1)
+        turned = (self.root.swapaxes(1, 2) if transpose else self.root) @ by_time
+        return turned.swapaxes(0, 1).reshape(x.shape)
+
+    def diagonal(self) -> Float[np.ndarray, " data"]:
+        """The diagonal of D = c c^T."""
+        return self.root**2 if self.root.ndim == 1 else (self.root**2).sum(2).T.ravel()
+
+
+class StructuredLeftOut(LeftOut):
+    """The model of some data, ready to leave out groups of them.
+
+    Parameters
+    ----------
+    model : LinearGaussian
+        With structure in time, noise within times (and templates), and a prior that is diagonal in
+        the modes.
+    posterior : Posterior
+        Of these data, through the normal matrix.
+    data : (data,) array
+        In K.
+
+    """
+
+    def __init__(self, model: LinearGaussian, posterior: Posterior, data: Float[Array, " data"]):
+        base, templates = model.noise, np.zeros((model.n_data, 0))
+        if isinstance(base, LowRankUpdate):
+            base, templates = base.base, np.asarray(base.update.root)
+        self._model = model
+        self._coupling = jax.tree.map(np.asarray, model.coupling)
+        self._scale = np.asarray(model.prior.diagonal_root())
+        self._lower = np.asarray(posterior.lower)
+        scatter = self._coupling.layout.scatter
+        u = np.asarray(model.noise.solve(data - model.predict(posterior.mean)))
+        self.u = scatter(u)
+        self.inverse_diagonal = np.full(self.u.shape, np.nan)
+        # D, N_0 u and T on the full grid, zero where a sample is missing
+        self._weights = np.asarray(base.time_weights(model.coupling.layout))
+        self._y = scatter(np.asarray(base.mv(u)))
+        self._t = scatter(templates)
+        # q with q q^T = 1 + T^T D T, and V = T^T D A in white coordinates
+        weighted = weigh(self._weights, self._t)
+        n = templates.shape[1]
+        self._q = np.linalg.cholesky(np.eye(n) + np.einsum("kta,ktb->ab", weighted, self._t))
+        self._v = self._pulled(weighted)
+        # C'^(1/2) of every amplitude
+        across = cho_solve((self._q, True), self._v)
+        self._amplitudes = np.concatenate([-self._whitened(across), _solve(self._q, np.eye(n))])
+
+    def stretch(self, times):
+        outside, inside, halves = 0.0, [], []
+        for run, span in self._coupling.pointing.runs():
+            here = np.flatnonzero(times[span]) + span.start
+            if not here.size:
+                continue
+            functions = smooth_functions(self._phases(here), self._coupling.pointing.azimuth[here])
+            half = self._half(self._rows(run, here, functions))
+            for part in self._parts(here, functions):
+                q, b = np.linalg.qr(part.coloured(part.functions, transpose=True))
+                w = half[:, part.columns] @ b.T
+                white = part.coloured(self._y[part.where].reshape(-1, 1), transpose=True)[:, 0]
+                halves.append(w)
+                inside.append(q.T @ white)
+                outside += white @ white - inside[-1] @ inside[-1]
+                seen = part.coloured(q)
+                left = part.diagonal() - ((seen @ (w.T @ w)) * seen).sum(1)
+                self.inverse_diagonal[part.where] = left.reshape(self.u[part.where].shape)
+        return float(outside + _between(np.concatenate(halves, axis=1), np.concatenate(inside)))
+
+    def together(self, times):
+        squared = float((self.u * self._y)[:, times].sum())
+        return squared + self._taken_out(self._weights * times, self.u * times)
+
+    def product(self, number):
+        own, mixing = self._weights[number], 0.0
+        if self._weights.ndim == 2:
+            mixing = np.zeros(self.u.shape)
+            mixing[number] = own > 0
+        else:
+            own = self._weights[number, number]
+            mixing = np.divide(
+                self._weights[number], own, out=np.zeros(self.u.shape), where=own > 0
+            )
+        here = own > 0
+        white = np.divide(self.u[number], np.sqrt(own), out=np.zeros(len(own)), where=here)
+        if here.sum() > len(self._scale) // 2:
+            weights = mixing * own
+            if self._weights.ndim == 3:
+                weights = mixing[:, None] * mixing[None] * own
+            return float(white @ white + self._taken_out(weights, mixing * self.u[number]))
+        rows, amplitudes = [], np.einsum("jt,jta->ta", mixing, self._t)
+        for run, span in self._coupling.pointing.runs():
+            factors = self._coupling.pointing.tilt_factors()[span]
+            used = np.flatnonzero(mixing[:, span].any(1))
+            beams = self._coupling.body_beams[run][used]
+            each = mixing[used][:, span].T[:, :, None] * factors[:, None]
+            tilted = each.reshape(len(each), -1) @ beams.reshape(-1, beams.shape[-1])
+            turned = turned_about_pole(tilted[None], self._coupling.pointing.azimuth[span])[0]
+            rows.append(self._coupling.pointing.pole_from_galactic.T(turned))
+        half = self._half(np.concatenate(rows))[:, : self.u.shape[1]]
+        half = half + self._amplitudes @ amplitudes.T
+        return float(_between((half * np.sqrt(own))[:, here], white[here]))
+
+    def _phases(self, here: Int[np.ndarray, " times"]) -> Float[np.ndarray, "times functions"]:
+        """cos and sin of m phi(t) times every power of the tilt: all that A knows of time."""
+        factors = self._coupling.pointing.tilt_factors()[here]
+        angle = self._coupling.pointing.azimuth[here, None] * np.arange(self._coupling.lmax + 1.0)
+        waves = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+        return (factors[:, :, None] * waves[:, None]).reshape(len(here), -1)
+
+    def _rows(
+        self, run: int, here: Int[np.ndarray, " times"], functions: Float[np.ndarray, "times n"]
+    ) -> Float[np.ndarray, "rows modes"]:
+        """R: for every product U^T A, whose rows are combinations of those of A."""
+        coupling, n = self._coupling, self._coupling.lmax + 1
+        ell, m = mode_numbers(coupling.lmax)
+        n_products, n_powers = coupling.body_beams.shape[1:3]
+        phases = (functions.T @ self._phases(here)).reshape(-1, n_powers, 2, n)
+        cosine, sine = phases.transpose(2, 3, 1, 0)  # (orders, powers, functions)
+        # by order: W_lm, and W_l,-m, of every product and degree
+        beams = coupling.by_order[run].reshape(n, n_products, n_powers, 2 * n).swapaxes(2, 3)
+        plus, minus = beams[:, :, :n], beams[:, :, n:]
+        cosine, sine = cosine[:, None], sine[:, None]
+        even = plus @ cosine - minus @ sine
+        odd = minus @ cosine + plus @ sine
+        order = np.abs(m)
+        packed = np.where((m >= 0)[:, None, None], even[order, :, ell], odd[order, :, ell])
+        rows = packed.transpose(1, 2, 0).reshape(-1, len(m))
+        return coupling.pointing.pole_from_galactic.T(rows)
+
+    def _parts(
+        self, here: Int[np.ndarray, " times"], functions: Float[np.ndarray, "times n"]
+    ) -> list[Part]:
+        n_products, n = len(self.u), functions.shape[1]
+        weights = self._weights[..., here]
+        if weights.ndim == 2 and not len(self._q):
+            return [
+                Part((k, here), slice(k * n, (k + 1) * n), np.sqrt(weights[k]), functions)
+                for k in range(n_products)
+            ]
+        root = np.sqrt(weights).ravel() if weights.ndim == 2 else roots_of_blocks(weights)
+        every = np.kron(np.eye(n_products), functions)
+        amplitudes = self._t[:, here].reshape(len(every), -1)
+        where = np.ix_(np.arange(n_products), here)
+        return [Part(where, slice(None), root, np.concatenate([every, amplitudes], axis=1))]
+
+    def _half(self, rows: Float[np.ndarray, "rows modes"]) -> Float[np.ndarray, "rank columns"]:
+        """C'^(1/2) of combinations of modes, and then of every amplitude."""
+        n = len(self._q)
+        modes = np.pad(self._whitened(rows * self._scale), ((0, n), (0, 0)))
+        return np.concatenate([modes, self._amplitudes], axis=1)
+
+    def _whitened(self, rows: Float[np.ndarray, "rows modes"]) -> Float[np.ndarray, "modes rows"]:
+        return _solve(self._lower, rows.T)
+
+    def _pulled(self, grid: Float[np.ndarray, "products times columns"]) -> np.ndarray:
+        """Columns of A^T in white coordinates, as rows."""
+        gather = self._coupling.layout.gather
+        columns = np.moveaxis(grid, 2, 0)
+        pulled = [self._model.coupling.transpose_mv(jnp.asarray(gather(x))) for x in columns]
+        return np.reshape(pulled, (len(columns), len(self._scale))) * self._scale
+
+    def _taken_out(self, weights: np.ndarray, pull: Float[np.ndarray, "products times"]) -> float:
+        """h^T (C'^-1 - A'^T D A')^-1 h of a group, given its D and how u pulls at its data."""
+        n, weighted = len(self._scale), weigh(weights, self._t)
+        information = np.asarray(summed(self._model.coupling, jnp.asarray(weights)))
+        across = self._v - self._pulled(weighted)
+        precision = np.empty((n + len(self._q),) * 2)
+        precision[:n, :n] = (
+            self._lower @ self._lower.T - self._scale[:, None] * information * self._scale
+        )
+        precision[:n, :n] += self._v.T @ cho_solve((self._q, True), self._v)
+        precision[n:, :n], precision[:n, n:] = across, across.T
+        precision[n:, n:] = self._q @ self._q.T - np.einsum("kta,ktb->ab", weighted, self._t)
+        h = np.concatenate(
+            [self._pulled(pull[..., None])[0], np.einsum("kt,kta->a", pull, self._t)]
+        )
+        return float(h @ cho_solve(cho_factor(precision, lower=True, overwrite_a=True), h))
+
+
+def smooth_functions(
+    phases: Float[np.ndarray, "times functions"], azimuth: Float[np.ndarray, " times"]
+) -> Float[np.ndarray, "times n"]:
+    """Find few orthonormal functions of time that make up all of the given ones.
+
+    Parameters
+    ----------
+    phases : (times, functions) array
+        To be made up, to ``SMOOTH``.
+    azimuth : (times,) array
+        phi(t) in radians, whose polynomials they are; turns of 2 pi do not matter.
+
+    Returns
+    -------
+    (times, n) array
+        The unit matrix where the times are few, or the functions not smooth.
+    """
+    n_times = len(phases)
+    x = np.unwrap(azimuth)
+    x = (2.0 * x - x.min() - x.max()) / max(np.ptp(x), 1e-300)
+    for n in range(FEW_TIMES, n_times, 4):
+        basis = np.linalg.qr(np.polynomial.chebyshev.chebvander(x, n - 1))[0]
+        missed = phases - basis @ (basis.T @ phases)
+        if np.abs(missed).max() <= SMOOTH * np.abs(phases).max():
+            return basis
+    return np.eye(n_times)
+
+
+def weigh(weights: np.ndarray, grid: Float[np.ndarray, "products times n"]) -> np.ndarray:
+    """D x, for D of independent data or of the products of each time."""
+    if weights.ndim == 2:
+        return weights[..., None] * grid
+    return np.einsum("kjt,jtn->ktn", weights, grid)
+
+
+def roots_of_blocks(
+    blocks: Float[np.ndarray, "products products times"],
+) -> Float[np.ndarray, "times products products"]:
+    """Cholesky factors of blocks that are zero where a sample is missing."""
+    by_time = np.moveaxis(blocks, 2, 0)
+    present = np.diagonal(by_time, axis1=1, axis2=2) > 0
+    missing = np.eye(len(blocks)) * ~present[:, None]
+    return np.linalg.cholesky(by_time + missing) * present[:, None] * present[:, :, None]
+
+
+def _between(half: Float[np.ndarray, "rank n"], b: Float[np.ndarray, " n"]) -> float:
+    """b^T (1 - W^T W)^-1 b, in whichever of the two spaces is smaller."""
+    rank, n = half.shape
+    if n <= rank:
+        return float(b @ cho_solve(cho_factor(np.eye(n) - half.T @ half), b))
+    h = half @ b
+    return float(b @ b + h @ cho_solve(cho_factor(np.eye(rank) - half @ half.T), h))
+
+
+def _solve(lower: Float[np.ndarray, "n n"], x: Float[np.ndarray, "n columns"]) -> np.ndarray:
+    return solve_triangular(lower, x, lower=True)
