@@ -29,6 +29,13 @@ def namespace(*arrays: Any) -> ModuleType:
     return jnp if _of_jax(arrays) else np
 
 
+def as_complex(real: Array, imaginary: Array) -> Array:
+    """Return real + i imaginary."""
+    if namespace(real, imaginary) is np:
+        return real + 1j * imaginary
+    return jax.lax.complex(jnp.asarray(real), jnp.asarray(imaginary))
+
+
 def compiled(function: F) -> F:
     """Compile a function for JAX arrays; with NumPy arrays alone it runs as it is.
 
@@ -43,9 +50,65 @@ def compiled(function: F) -> F:
     return either
 
 
+def scan(
+    xp: ModuleType, step: Callable[[Any, Any], tuple[Any, Any]], start: Any, parts: Any
+) -> tuple[Any, Any]:
+    """Return what jax.lax.scan does; with NumPy by a loop.
+
+    Parameters
+    ----------
+    xp : module
+        numpy or jax.numpy, that of all arrays that the steps use.
+    step : callable
+        ``step(carry, part)`` gives the next carry and an array, or None.
+    start : tree of arrays
+        The first carry.
+    parts : tree of arrays
+        Their first axis is looped over.
+
+    Returns
+    -------
+    tree of arrays
+        The last carry.
+    array or None
+        The arrays of all steps, stacked.
+    """
+    if xp is not np:
+        return jax.lax.scan(step, start, parts)
+    leaves, structure = jax.tree.flatten(parts)
+    carry, found = start, []
+    for k in range(len(leaves[0])):
+        carry, value = step(carry, structure.unflatten([leaf[k, ...] for leaf in leaves]))
+        found.append(value)
+    return carry, None if found[0] is None else np.stack(found)
+
+
+def placed(array: Array, where: Any, values: Array) -> Array:
+    """Return the array with values at an index; a NumPy array is changed in place."""
+    if namespace(array, values) is not np:
+        return array.at[where].set(values)
+    array[where] = values
+    return array
+
+
 def on_device(tree: T) -> T:
     """Return the same tree with JAX arrays in place of NumPy's."""
     return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, tree)
+
+
+def on_host(tree: T) -> T:
+    """Return the same tree with NumPy arrays in place of JAX's, on a CPU without copying them."""
+    return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, tree)
+
+
+def on_processor(tree: T) -> T:
+    """Return the same tree in NumPy's arrays on a machine without accelerator, else in JAX's.
+
+    NumPy and LAPACK need no compiling; what is being traced stays as it is.
+    """
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)):
+        return tree
+    return on_host(tree) if jax.default_backend() == "cpu" else on_device(tree)
 
 
 def _of_jax(tree: Any) -> bool:

@@ -63,6 +63,8 @@ def _open() -> tuple[Path, Path] | None:
             except OSError:
                 shutil.copy2(path, own / path.name)
     jax.config.update("jax_compilation_cache_dir", str(own))
+    # the names of XLA's own caches, which lie in the folder, would enter the names of programs
+    jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     atexit.register(_close, shared, own)

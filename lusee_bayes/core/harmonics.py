@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-import healpy
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.special import sph_legendre_p_all
@@ -21,6 +20,7 @@ from scipy.special import sph_legendre_p_all
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_finite
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.lazy import healpy
 
 SQRT2 = np.sqrt(2.0)
 
@@ -170,9 +170,14 @@ def sum_over_m(values: Float[Array, "*batch modes"]) -> Float[np.ndarray, "*batc
     return np.add.reduceat(np.asarray(values), np.arange(lmax + 1) ** 2, axis=-1)
 
 
+def mean_over_m(values: Float[Array, "*batch modes"]) -> Float[np.ndarray, "*batch ells"]:
+    """Average a quantity that is given per mode over the modes of each ell = 0..lmax."""
+    return sum_over_m(values) / (2.0 * np.arange(lmax_of(values.shape[-1]) + 1) + 1.0)
+
+
 def power_spectrum(modes: Float[Array, "*batch modes"]) -> Float[np.ndarray, "*batch ells"]:
     """Return C_ell = sum_m a_lm^2 / (2 ell + 1) for ell = 0..lmax; the mean is not subtracted."""
-    return sum_over_m(np.asarray(modes) ** 2) / (2.0 * np.arange(lmax_of(modes.shape[-1]) + 1) + 1)
+    return mean_over_m(np.asarray(modes) ** 2)
 
 
 def per_mode(spectrum: Float[Array, "*batch ells"]) -> Float[Array, "*batch modes"]:

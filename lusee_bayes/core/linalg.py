@@ -1,4 +1,4 @@
-"""Linear algebra on JAX at less than XLA's own cost.
+"""Linear algebra: LAPACK's for NumPy arrays; for JAX arrays, at less than XLA's own cost.
 
 XLA has no symmetric rank-k update on the CPU: ``W.T @ W`` computes both triangles. Splitting the
 columns and forming only the blocks on and below the diagonal does 5/8 of the work. XLA also solves
@@ -15,8 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotrf, dpotri, dtrtri
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
 
@@ -26,6 +28,16 @@ N_BLOCKS = 4
 
 # largest triangle that is inverted by substitution
 MAX_SUBSTITUTED = 160
+
+
+def cholesky(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+    """Return the lower Cholesky factor, NaN where there is none; reads the lower triangle only."""
+    if namespace(matrix) is np:
+        if matrix.ndim > 2:
+            return np.stack([cholesky(block) for block in matrix])
+        upper, failed = dpotrf(matrix.T, lower=0)
+        return np.full(matrix.shape, np.nan) if failed else upper.T
+    return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 
 def checked_cholesky(name: str, matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
@@ -48,10 +60,10 @@ def checked_cholesky(name: str, matrix: Float[Array, "*batch n n"]) -> Float[Arr
         If a matrix is not positive definite; the message gives its lowest eigenvalue. Not inside
         a JAX transformation, where the factor holds NaN instead.
     """
-    lower = jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
-    if not is_traced(lower) and not bool(jnp.isfinite(lower).all()):
-        lowest = float(jnp.linalg.eigvalsh(matrix).min())
-        largest = float(jnp.abs(matrix).max())
+    lower = cholesky(matrix)
+    if not is_traced(lower) and not np.isfinite(np.asarray(lower)).all():
+        lowest = float(np.linalg.eigvalsh(np.asarray(matrix)).min())
+        largest = float(np.abs(np.asarray(matrix)).max())
         raise InputError(
             f"{name} is not positive definite: its lowest eigenvalue is {lowest:.3g} "
             f"(largest entry {largest:.3g}); check the term's amplitude and symmetry"
@@ -63,6 +75,11 @@ def solve_lower(
     lower: Float[Array, "*batch n n"], x: Float[Array, "*batch n columns"], *, transpose: bool
 ) -> Float[Array, "*batch n columns"]:
     """Return L^-1 x, or L^-T x with ``transpose``, for lower triangular L."""
+    if namespace(lower, x) is np:
+        if lower.ndim > 2:
+            return np.linalg.solve(lower.swapaxes(-1, -2) if transpose else lower, x)
+        trans = "T" if transpose else "N"
+        return solve_triangular(lower, x, lower=True, trans=trans, check_finite=False)
     return jax.lax.linalg.triangular_solve(
         lower, x, left_side=True, lower=True, transpose_a=transpose
     )
@@ -70,6 +87,8 @@ def solve_lower(
 
 def gram_matrix(w: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
     """Return W^T W, symmetric to the last bit."""
+    if namespace(w) is np:
+        return w.T @ w
     return symmetric_product(w.T, w)
 
 
@@ -81,11 +100,16 @@ def symmetric_product(
     Only the lower triangle is computed, so that the result is symmetric to the last bit.
     """
     n = right.shape[1]
+    if namespace(left, right) is np:
+        lower = np.tril(left @ right)
+        return lower + np.tril(lower, -1).T
     return _from_strips([left[first:end] @ right[:, :end] for first, end in _strips(n)])
 
 
 def invert_lower(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Return L^-1 for lower triangular L; entries above the diagonal are not read."""
+    if namespace(lower) is np:
+        return np.tril(dtrtri(lower.T, lower=0)[0].T)
     n = lower.shape[0]
     if n <= MAX_SUBSTITUTED:
         return solve_lower(jnp.tril(lower), jnp.eye(n), transpose=False)
@@ -98,6 +122,9 @@ def invert_lower(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 def inverse_from_cholesky(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Return (L L^T)^-1 for lower triangular L, symmetric to the last bit."""
+    if namespace(lower) is np:
+        inverse, _ = dpotri(lower.T, lower=0)
+        return np.triu(inverse) + np.triu(inverse, 1).T
     x = invert_lower(lower)
     # columns of L^-1 begin at their own row
     return _from_strips(

@@ -86,10 +86,19 @@ class Rotation(eqx.Module):
 
     def __call__(self, modes: Float[Array, "*batch modes"]) -> Float[Array, "*batch modes"]:
         """Turn the field, or fields, with these coefficients."""
-        turned = []
-        for ell, block in enumerate(self.blocks):
-            turned.append(modes[..., ell**2 : (ell + 1) ** 2] @ block.T)
-        return namespace(*turned).concatenate(turned, axis=-1)
+        xp = namespace(modes, self)
+        if xp is np:
+            turned = np.empty(modes.shape)
+            for ell, block in enumerate(self.blocks):
+                here = (..., slice(ell**2, (ell + 1) ** 2))
+                turned[here] = modes[here] @ block.T
+            return turned
+        starts = (ell**2 for ell in range(len(self.blocks)))
+        turned = [
+            modes[..., i : i + len(block)] @ block.T
+            for i, block in zip(starts, self.blocks, strict=True)
+        ]
+        return xp.concatenate(turned, axis=-1)
 
 
 def euler_zyz(matrix: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:

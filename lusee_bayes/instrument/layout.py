@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import is_traced
@@ -101,7 +101,7 @@ class DataLayout(eqx.Module):
         flat = grid.reshape(self.n_products * self.n_times, *grid.shape[2:])
         return flat if self.index is None else flat[self.index]
 
-    def scatter(self, data: Float[Array, "data *rest"]) -> Float[Array, "products times *rest"]:
+    def scatter(self, data: Shaped[Array, "data *rest"]) -> Shaped[Array, "products times *rest"]:
         """Put the entries of d onto the full grid; missing samples are zero."""
         rest = data.shape[1:]
         if self.index is None:

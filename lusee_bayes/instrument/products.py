@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.arrays import Array, as_complex, namespace
 
 N_ANTENNAS = 4
 
@@ -75,5 +75,5 @@ def to_matrix(
                 imag = xp.zeros_like(real)
             else:
                 imag = products[position[Product(min(i, j), max(i, j), "I")]]
-            rows.append(real + 1j * (imag if i < j else -imag))
+            rows.append(as_complex(real, imag if i < j else -imag))
     return xp.stack(rows).reshape(n, n, *products.shape[1:])

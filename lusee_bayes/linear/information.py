@@ -15,17 +15,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, compiled, namespace, on_processor, placed
 from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import gram_matrix, solve_lower
+from lusee_bayes.core.linalg import cholesky, gram_matrix, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
-from lusee_bayes.linear.normal_matrix import has_structure, normal_matrix
+from lusee_bayes.linear.normal_matrix import has_structure, is_within_times, normal_matrix
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.linear.solver import CONVERGENCE
 from lusee_bayes.noise.covariance import Covariance, Factor
@@ -113,27 +111,32 @@ class Information(eqx.Module):
         require_float64("the data", data)
         require_shape("the data", data, (noise.size,))
         require_finite("the data", data)
+        if is_within_times(noise):
+            coupling, prior, noise, offset, data = on_processor(
+                (coupling, prior, noise, offset, data)
+            )
         factor = noise.factor()
         if has_structure(coupling, noise):
             matrix = normal_matrix(coupling, noise)
         else:
             coupling = DenseCoupling(coupling.dense())
             matrix = gram_matrix(factor.whiten(coupling.dense()))
-        centred = jnp.asarray(data) if offset is None else data - offset
-        zero, n_data = jnp.zeros(prior.size), jnp.asarray(float(noise.size))
-        vector, misfit = _gradient_and_misfit(coupling, factor, centred, zero)
-        first = cls(matrix, vector, zero, misfit, factor.log_det(), n_data)
+        xp = namespace(matrix)
+        centred = xp.asarray(data) if offset is None else data - offset
+        zero, n_data = xp.zeros(prior.size), xp.asarray(float(noise.size))
+        vector, misfit = gradient_and_misfit(coupling, factor, centred, zero)
+        first = cls(matrix, vector, zero, misfit, xp.asarray(factor.log_det()), n_data)
         root = _diagonal_root(prior, n_modes=matrix.shape[0])
         lower = _precision_root(matrix, root)
-        mean = prior.colour(_condition(first, root, lower, jnp.asarray(1))[0])
-        vector, misfit = _gradient_and_misfit(coupling, factor, centred, mean)
+        mean = prior.colour(_condition(first, root, lower, 1)[0])
+        vector, misfit = gradient_and_misfit(coupling, factor, centred, mean)
         perturbations = None
         if n_perturbations:
             if key is None:
                 raise InputError("give a key for the perturbations")
             drawn = noise.sample(key, n_perturbations)
-            perturbations = jnp.stack(
-                [_gradient_and_misfit(coupling, factor, n, zero)[0] for n in drawn]
+            perturbations = xp.stack(
+                [gradient_and_misfit(coupling, factor, n, zero)[0] for n in drawn]
             )
         information = cls(matrix, vector, mean, misfit, first.log_det, n_data, perturbations)
         return information, information._posterior(prior, lower, 2)
@@ -165,6 +168,7 @@ class Information(eqx.Module):
         shift = sky - self.reference
         pulled = self.matrix @ shift
         misfit = self.misfit - 2.0 * (self.vector @ shift) + shift @ pulled
+        misfit = namespace(misfit).asarray(misfit)
         return replace(self, vector=self.vector - pulled, reference=sky, misfit=misfit)
 
     def chi2(self, sky: Float[Array, " modes"]) -> Float[Array, ""]:
@@ -210,7 +214,7 @@ class Information(eqx.Module):
 
     def _posterior(self, prior: Prior, lower: Array, refinements: int) -> Posterior:
         root = _diagonal_root(prior, self.n_modes)
-        u, log_evidence, moved = _condition(self, root, lower, jnp.asarray(refinements))
+        u, log_evidence, moved = _condition(self, root, lower, refinements)
         if not is_traced(moved) and not float(moved) <= CONVERGENCE:
             raise InputError(
                 f"the posterior mean did not converge: its last step was {float(moved):.2g} "
@@ -228,50 +232,48 @@ def _diagonal_root(prior: Prior, n_modes: int) -> Float[Array, " modes"]:
     return root
 
 
-@eqx.filter_jit
-def _gradient_and_misfit(
+@compiled
+def gradient_and_misfit(
     coupling: Coupling, factor: Factor, data: Array, sky: Array
 ) -> tuple[Array, Array]:
-    """A^T N^-1 (d - A m) and |L^-1 (d - A m)|^2."""
+    """Return A^T N^-1 (d - A m) and ``|L^-1 (d - A m)|^2``."""
     white = factor.whiten(data - coupling @ sky)
     solved = factor.whiten_transpose(white)
-    return coupling.transpose_mv(solved), white @ white
+    return coupling.transpose_mv(solved), namespace(white).asarray(white @ white)
 
 
-@eqx.filter_jit
+@compiled
 def _precision_root(matrix: Float[Array, "modes modes"], root: Float[Array, " modes"]) -> Array:
     """L of the precision 1 + G M G of u = m / root."""
-    normal = root[:, None] * matrix * root[None] + jnp.eye(len(root))
-    return jax.lax.linalg.cholesky(normal, symmetrize_input=False)
+    scaled = root[:, None] * matrix * root[None]
+    diagonal = np.diag_indices(len(root))
+    return cholesky(placed(scaled, diagonal, scaled[diagonal] + 1.0))
 
 
-@eqx.filter_jit
+@compiled
 def _condition(
-    information: Information, root: Array, lower: Array, refinements: Array
+    information: Information, root: Array, lower: Array, refinements: int
 ) -> tuple[Array, Array, Array]:
     """Mean of u, ln p(d), and the last step in standard deviations.
 
     u is found as a correction to that of m0; components without prior power are zero.
     """
-    start = jnp.where(root > 0, information.reference / jnp.where(root > 0, root, 1.0), 0.0)
+    xp = namespace(information)
+    start = xp.where(root > 0, information.reference / xp.where(root > 0, root, 1.0), 0.0)
     here = information.recentred(start * root)
-
-    def refine(_, state):
-        correction, _ = state
+    correction, moved = xp.zeros_like(root), xp.asarray(np.inf)
+    for _ in range(refinements):
         pull = here.vector - here.matrix @ (root * correction)
         gradient = root * pull - (start + correction)
         half = solve_lower(lower, gradient[:, None], transpose=False)
-        step = solve_lower(lower, half, transpose=True)[:, 0]
-        return correction + step, jnp.linalg.norm(half)
-
-    zero = (jnp.zeros_like(root), jnp.asarray(jnp.inf))
-    correction, moved = jax.lax.fori_loop(0, refinements, refine, zero)
+        correction = correction + solve_lower(lower, half, transpose=True)[:, 0]
+        moved = xp.asarray(xp.linalg.norm(half))
     u = start + correction
     log_evidence = -0.5 * (
         here.recentred(u * root).misfit
         + u @ u
         + here.log_det
-        + 2.0 * jnp.log(jnp.diagonal(lower)).sum()
+        + 2.0 * xp.log(xp.diagonal(lower)).sum()
         + here.n_data * np.log(2.0 * np.pi)
     )
-    return u, log_evidence, moved
+    return u, xp.asarray(log_evidence), moved

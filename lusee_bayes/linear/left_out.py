@@ -22,7 +22,7 @@ class LeftOut(ABC):
     u : (products, times) array
         K^-1 (d - offset), in 1/K; zero where a sample is missing.
     inverse_diagonal : (products, times) array
-        The diagonal of K^-1, in 1/K^2, of the data that :meth:`stretch` has left out; NaN elsewhere.
+        The diagonal of K^-1, in 1/K^2, of the data that :meth:`stretch` has left out; else NaN.
     """
 
     u: Float[np.ndarray, "products times"]

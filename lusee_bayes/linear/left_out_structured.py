@@ -24,13 +24,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, on_host
 from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.instrument.coupling import turned_about_pole
 from lusee_bayes.linear.left_out import LeftOut
@@ -95,19 +93,19 @@ class StructuredLeftOut(LeftOut):
     """
 
     def __init__(self, model: LinearGaussian, posterior: Posterior, data: Float[Array, " data"]):
+        model, posterior = on_host(model), on_host(posterior)
         base, templates = model.noise, np.zeros((model.n_data, 0))
         if isinstance(base, LowRankUpdate):
             base, templates = base.base, np.asarray(base.update.root)
-        self._model = model
-        self._coupling = jax.tree.map(np.asarray, model.coupling)
-        self._scale = np.asarray(model.prior.diagonal_root())
-        self._lower = np.asarray(posterior.lower)
+        self._coupling = model.coupling
+        self._scale = model.prior.diagonal_root()
+        self._lower = posterior.lower
         scatter = self._coupling.layout.scatter
-        u = np.asarray(model.noise.solve(data - model.predict(posterior.mean)))
+        u = np.asarray(model.noise.solve(np.asarray(data) - model.predict(posterior.mean)))
         self.u = scatter(u)
         self.inverse_diagonal = np.full(self.u.shape, np.nan)
         # D, N_0 u and T on the full grid, zero where a sample is missing
-        self._weights = np.asarray(base.time_weights(model.coupling.layout))
+        self._weights = np.asarray(base.time_weights(self._coupling.layout))
         self._y = scatter(np.asarray(base.mv(u)))
         self._t = scatter(templates)
         # q with q q^T = 1 + T^T D T, and V = T^T D A in white coordinates
@@ -229,13 +227,13 @@ class StructuredLeftOut(LeftOut):
         """Columns of A^T in white coordinates, as rows."""
         gather = self._coupling.layout.gather
         columns = np.moveaxis(grid, 2, 0)
-        pulled = [self._model.coupling.transpose_mv(jnp.asarray(gather(x))) for x in columns]
+        pulled = [self._coupling.transpose_mv(gather(x)) for x in columns]
         return np.reshape(pulled, (len(columns), len(self._scale))) * self._scale
 
     def _taken_out(self, weights: np.ndarray, pull: Float[np.ndarray, "products times"]) -> float:
         """h^T (C'^-1 - A'^T D A')^-1 h of a group, given its D and how u pulls at its data."""
         n, weighted = len(self._scale), weigh(weights, self._t)
-        information = np.asarray(summed(self._model.coupling, jnp.asarray(weights)))
+        information = np.asarray(summed(self._coupling, weights))
         across = self._v - self._pulled(weighted)
         precision = np.empty((n + len(self._q),) * 2)
         precision[:n, :n] = (

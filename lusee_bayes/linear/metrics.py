@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import equinox as eqx
-import healpy
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.harmonics import lmax_of, sum_over_m
-from lusee_bayes.core.linalg import solve_lower
+from lusee_bayes.core.harmonics import mean_over_m, sum_over_m
+from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.linalg import invert_lower
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 
 
@@ -95,8 +92,7 @@ def prior_fraction_per_ell(posterior: Posterior) -> Float[np.ndarray, " ells"]:
     InputError
         As :meth:`Posterior.std`.
     """
-    fraction = np.asarray(posterior.prior_fraction())
-    return sum_over_m(fraction) / (2.0 * np.arange(lmax_of(fraction.size) + 1) + 1.0)
+    return mean_over_m(posterior.prior_fraction())
 
 
 def effective_resolution_deg(prior_fraction: Float[np.ndarray, " ells"]) -> float | None:
@@ -116,39 +112,8 @@ def effective_resolution_deg(prior_fraction: Float[np.ndarray, " ells"]) -> floa
     return 180.0 / (int(beyond[0]) + 1) if beyond.size else None
 
 
-@eqx.filter_jit
-def whitened_residuals(
-    model: LinearGaussian, posterior: Posterior, data: Float[Array, " data"]
-) -> Float[Array, " data"]:
-    """Compute L^-1 (d - A mean - offset), with N = L L^T.
-
-    Parameters
-    ----------
-    model : LinearGaussian
-        A, N and the offset.
-    posterior : Posterior
-        Its mean is compared with the data.
-    data : (data,) array
-        d, in K.
-
-    Returns
-    -------
-    (data,) array
-        In standard deviations of the noise, in the order of the factor of N.
-
-    Raises
-    ------
-    InputError
-        If N is not positive definite.
-    """
-    residual = data - model.coupling @ posterior.mean
-    return model.noise.factor().whiten(
-        residual if model.offset is None else residual - model.offset
-    )
-
-
 def expected_chi2(posterior: Posterior, n_data: int) -> float:
-    """Compute the expectation of ``|whitened residual|^2`` if the model holds.
+    """Compute the expectation of ``|L^-1 (d - A mean - offset)|^2``, N = L L^T, if the model holds.
 
     Parameters
     ----------
@@ -162,8 +127,8 @@ def expected_chi2(posterior: Posterior, n_data: int) -> float:
     float
         N_data - rank + tr Lambda^-1.
     """
-    inverse = solve_lower(posterior.lower, jnp.eye(posterior.lower.shape[0]), transpose=False)
-    return float(n_data - posterior.lower.shape[0] + (inverse**2).sum())
+    inverse = invert_lower(np.asarray(posterior.lower))
+    return float(n_data - len(inverse) + (inverse**2).sum())
 
 
 def highest_altitude(observation: Observation, nside: int) -> Float[np.ndarray, " pixels"]:

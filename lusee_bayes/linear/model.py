@@ -14,19 +14,16 @@ import equinox as eqx
 import jax
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, on_processor
 from lusee_bayes.core.checks import nearest, require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.coupling import Coupling, as_coupling
-from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.normal_matrix import has_structure
+from lusee_bayes.linear.information import Information, gradient_and_misfit
+from lusee_bayes.linear.normal_matrix import has_structure, is_within_times
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.linear.solver import FORMS, Solver, factorise
 from lusee_bayes.noise.covariance import Covariance
 from lusee_bayes.sky.priors import Prior
-
-# a larger A is not formed if N has structure in time: some 60,000 data at lmax 47
-DENSE_BYTES = 1.2e9
 
 
 class LinearGaussian(eqx.Module):
@@ -97,6 +94,32 @@ class LinearGaussian(eqx.Module):
         seen = self.coupling @ sky
         return seen if self.offset is None else seen + self.offset
 
+    def chi2(self, sky: Float[Array, " unknowns"], data: Float[Array, " data"]) -> Float[Array, ""]:
+        """Compute ``|L^-1 (d - A m - offset)|^2``, with N = L L^T.
+
+        Parameters
+        ----------
+        sky : (unknowns,) array
+            m, in K.
+        data : (data,) array
+            d, in K.
+
+        Returns
+        -------
+        () array
+            chi^2 of the residuals.
+
+        Raises
+        ------
+        InputError
+            If N is not positive definite.
+        """
+        model = self
+        if is_within_times(self.noise):
+            model, sky, data = on_processor((self, sky, data))
+        centred = data if model.offset is None else data - model.offset
+        return gradient_and_misfit(model.coupling, model.noise.factor(), centred, sky)[1]
+
     def sample(self, key: PRNGKeyArray) -> tuple[Float[Array, " unknowns"], Float[Array, " data"]]:
         """Draw a sky from the prior, and data of that sky.
 
@@ -154,7 +177,8 @@ class LinearGaussian(eqx.Module):
             d, in K.
         form : {"map", "data", "root", "structured"}, optional
             As for :meth:`factorise`, or "structured": through A^T N^-1 A without A. That is the
-            default where A would be larger than ``DENSE_BYTES`` and N has structure in time.
+            default where A and N have structure in time, the prior is diagonal in the modes, and
+            the data are as many as these.
 
         Returns
         -------
@@ -167,15 +191,16 @@ class LinearGaussian(eqx.Module):
             If the data are not float64, not finite or of another length, the model cannot be
             factorised, or the mean does not converge.
         """
-        if form == "structured" or (form is None and self.too_large):
+        if form == "structured" or (form is None and self.is_structured):
             return self.inform(data)[1]
         return self.factorise(form).condition(data)
 
     @property
-    def too_large(self) -> bool:
-        """Whether A would be larger than ``DENSE_BYTES`` and the posterior does not need it."""
-        size = 8 * self.n_data * self.prior.size
-        return size > DENSE_BYTES and has_structure(self.coupling, self.noise)
+    def is_structured(self) -> bool:
+        """Whether the posterior is found without A by default; see :meth:`condition`."""
+        diagonal = self.prior.diagonal_root() is not None
+        enough = self.n_data >= self.prior.size
+        return diagonal and enough and has_structure(self.coupling, self.noise)
 
     def inform(
         self,

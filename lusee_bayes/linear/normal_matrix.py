@@ -21,13 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.arrays import Array, compiled, namespace, placed, scan
+from lusee_bayes.core.checks import is_traced, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import N_BLOCKS, checked_cholesky, gram_matrix, solve_lower
+from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, solve_lower
 from lusee_bayes.core.rotations import Rotation
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_about_pole
-from lusee_bayes.linear.time_sums import time_sums
+from lusee_bayes.linear.time_sums import CHUNK, time_sums
 from lusee_bayes.noise.covariance import (
     Covariance,
     DiagonalCovariance,
@@ -36,6 +37,9 @@ from lusee_bayes.noise.covariance import (
     TimeBlockCovariance,
 )
 from lusee_bayes.noise.covariance.time_banded import TimeBandedFactor
+
+# strips of orders where they are compiled: more save products with zeros
+N_STRIPS = 6
 
 
 def normal_matrix(coupling: Coupling, noise: Covariance) -> Float[Array, "modes modes"]:
@@ -87,8 +91,27 @@ def has_structure(coupling: Coupling, noise: Covariance) -> bool:
     bool
         True if both have structure in time.
     """
-    base = noise.base if isinstance(noise, LowRankUpdate) else noise
-    return coupling.has_time_structure and type(base) in NORMAL_MATRICES
+    return coupling.has_time_structure and type(_base(noise)) in NORMAL_MATRICES
+
+
+def is_within_times(noise: Covariance) -> bool:
+    """Tell whether noise couples no two times, but for templates.
+
+    Parameters
+    ----------
+    noise : Covariance
+        N.
+
+    Returns
+    -------
+    bool
+        True for independent noise and blocks in time, and these with templates.
+    """
+    return NORMAL_MATRICES.get(type(_base(noise))) is _within_times
+
+
+def _base(noise: Covariance) -> Covariance:
+    return noise.base if isinstance(noise, LowRankUpdate) else noise
 
 
 def _within_times(coupling: CouplingMatrix, noise: Covariance) -> Array:
@@ -99,8 +122,8 @@ def _with_templates(coupling: CouplingMatrix, noise: LowRankUpdate) -> Array:
     """With N_0 + T T^T: A^T D A - V^T (1 + T^T D T)^-1 V, V = T^T D A, D = N_0^-1."""
     base = noise.base.factor()
     weighted = base.solve(noise.update.root)
-    v = jnp.stack([coupling.transpose_mv(column) for column in weighted.T])
-    small = jnp.eye(v.shape[0]) + noise.update.root.T @ weighted
+    v = namespace(weighted).stack([coupling.transpose_mv(column) for column in weighted.T])
+    small = np.eye(v.shape[0]) + noise.update.root.T @ weighted
     lower = checked_cholesky(f"1 + T^T D T of {noise.update.name}", small)
     return normal_matrix(coupling, noise.base) - gram_matrix(solve_lower(lower, v, transpose=False))
 
@@ -133,104 +156,140 @@ def summed(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> Float[Arra
     (modes, modes) array
         In Galactic modes; symmetric to the last bit.
     """
-    return _summed(coupling, weights, _turntable_groups(coupling))
-
-
-def _turntable_groups(coupling: CouplingMatrix) -> tuple[tuple[int, ...], ...]:
-    """Runs of one turntable angle: they see the sky with the same beams."""
-    angles = np.asarray(coupling.pointing.turntable)
-    return tuple(tuple(np.flatnonzero(angles == a).tolist()) for a in np.unique(angles))
-
-
-@eqx.filter_jit
-def _summed(
-    coupling: CouplingMatrix, weights: Array, groups: tuple[tuple[int, ...], ...]
-) -> Float[Array, "modes modes"]:
-    """For noise within times; weights: (products, times), or (products, products, times)."""
-    pointing, n = coupling.pointing, coupling.lmax + 1
-    runs = dict(pointing.runs())
-    n_products, n_powers = coupling.body_beams.shape[1:3]
-    betas, sums = [], []
-    for group in groups:
+    xp, pointing = namespace(coupling, weights), coupling.pointing
+    runs, total = dict(pointing.runs()), 0.0
+    for group in _turntable_groups(coupling, weights):
         spans = [runs[run] for run in group]
-        beams = coupling.by_order[group[0]].reshape(n, n_products, n_powers, 2 * n)
-        betas.append(jax.lax.complex(beams[..., :n], beams[..., n:]))
-        flat = jnp.concatenate([weights[..., span] for span in spans], axis=-1)
-        azimuth = jnp.concatenate([pointing.azimuth[span] for span in spans])
-        tilt = jnp.concatenate([pointing.tilt[span] for span in spans])
-        flat = flat.reshape(-1, azimuth.shape[0])
-        f = time_sums(flat, azimuth, tilt, pointing.order, coupling.lmax)
-        sums.append(f.reshape(*weights.shape[:-1], *f.shape[1:]))
-    return _to_galactic(pointing.pole_from_galactic, _from_sums(betas, sums))
-
-
-def _from_sums(betas: list[Array], sums: list[Array]) -> Float[Array, "modes modes"]:
-    """The matrix in the mean-pole frame, one strip of orders after the other.
-
-    betas : (orders, products, powers, degrees) of each group of runs; sums : F of each. Only
-    columns of orders up to the strip's own last one are computed; the others are mirror images.
-    """
-    n = betas[0].shape[0]
-    # by growing order m: a_lm, l = m..lmax, then a_l,-m
-    modes = [(m, s, ell) for m in range(n) for s in ((0, 1) if m else (0,)) for ell in range(m, n)]
-    m, s, ell = np.array(modes).T
-    strips = []
-    for first, end in pairwise(np.linspace(0, n, N_BLOCKS + 1).astype(int).tolist()):
-        if first == end:
-            continue
-        columns = m < end
-        column = (s * end * n + m * n + ell)[columns]
-        _, rows = jax.lax.scan(
-            lambda _, order, end=end, column=column: (
-                None,
-                _rows_of_order(order, betas, sums, end)[:, column],
-            ),
-            None,
-            jnp.arange(first, end),
+        here = [
+            xp.concatenate([x[..., span] for span in spans], axis=-1)
+            for x in (weights, pointing.azimuth, pointing.tilt.T)
+        ]
+        missing = -here[1].shape[0] % CHUNK
+        padded = [xp.pad(x, ((0, 0),) * (x.ndim - 1) + ((0, missing),)) for x in here]
+        part = _of_one_angle(
+            coupling.by_order[group[0]], *padded, coupling.body_beams.shape[1], pointing.order
         )
-        inside = columns & (m >= first)
-        row = ((m - first) * 2 * n + s * n + ell)[inside]
-        strip = rows.reshape(-1, rows.shape[-1])[row]
-        strips.append(jnp.pad(strip, ((0, 0), (0, len(modes) - strip.shape[1]))))
-    lower = jnp.tril(jnp.concatenate(strips))
-    whole = lower + jnp.tril(lower, -1).T
-    packed = np.argsort(ell * (ell + 1) + np.where(s == 0, m, -m))
-    return whole[packed][:, packed]
+        total = total + part
+    return _to_galactic(pointing.pole_from_galactic, total)
+
+
+def _turntable_groups(
+    coupling: CouplingMatrix, weights: Float[Array, "..."]
+) -> tuple[tuple[int, ...], ...]:
+    """Runs of one turntable angle, which see the sky with the same beams, if they have weight."""
+    angles, runs = np.asarray(coupling.pointing.turntable), dict(coupling.pointing.runs())
+    every = np.unique(angles)
+    if not is_traced(weights):
+        weighs = [bool(np.asarray(weights[..., span]).any()) for span in runs.values()]
+        every = np.unique(angles[weighs])
+    return tuple(tuple(np.flatnonzero(angles == angle).tolist()) for angle in every)
+
+
+@compiled
+def _of_one_angle(
+    by_order: Float[Array, "orders beams degrees"],
+    weights: Float[Array, "..."],
+    azimuth: Float[Array, " times"],
+    tilt: Float[Array, "2 times"],
+    n_products: int,
+    order: int,
+) -> Float[Array, "modes modes"]:
+    """The part of the samples at one turntable angle, in the mean-pole frame."""
+    n = by_order.shape[0]
+    beams = by_order.reshape(n, n_products, -1, 2, n).swapaxes(2, 3)
+    f = time_sums(weights.reshape(-1, azimuth.shape[0]), azimuth, tilt.T, order, n - 1)
+    return _from_sums(beams, f.reshape(*weights.shape[:-1], *f.shape[1:]))
+
+
+def _from_sums(
+    beams: Float[Array, "orders products 2 powers degrees"], f: Complex[Array, "..."]
+) -> Float[Array, "modes modes"]:
+    """The matrix of beams (W_lm, W_l,-m) and Fourier sums, one strip of orders after the other.
+
+    Only columns of orders up to the strip's own last one, and rows of degrees from its first one,
+    are computed; the others are mirror images, or zero.
+    """
+    xp, n = namespace(beams, f), beams.shape[0]
+    # of every packed mode: degree, order, and whether it is a_l,-m
+    ell, m = mode_numbers(n - 1)
+    m, s = np.abs(m), (m < 0).astype(int)
+    whole = xp.zeros((len(m),) * 2)
+    n_strips = n if xp is np else min(N_STRIPS, n)
+    for first, end in pairwise(np.linspace(0, n, n_strips + 1).astype(int).tolist()):
+
+        def add(_, number, first=first, end=end):
+            return None, _rows_of_order(number, beams, f, first, end)
+
+        _, strip = scan(xp, add, None, np.arange(first, end))
+        rows, columns = np.flatnonzero((m >= first) & (m < end)), np.flatnonzero(m < end)
+        row = ((m - first) * 2 + s) * (n - first) + ell - first
+        column = (s * end + m) * n + ell
+        strip = strip.reshape(-1, strip.shape[-1])[row[rows][:, None], column[columns][None]]
+        whole = placed(whole, (rows[:, None], columns[None]), strip)
+        whole = placed(whole, (columns[:, None], rows[None]), strip.T)
+    return whole
 
 
 def _rows_of_order(
-    m: Array, betas: list[Array], sums: list[Array], end: int
+    m: Array,
+    beams: Float[Array, "orders products 2 powers degrees"],
+    f: Complex[Array, "..."],
+    first: int,
+    end: int,
 ) -> Float[Array, "rows columns"]:
-    """Rows a_lm, then a_l,-m, of one order; columns a_l'm', then a_l',-m', of orders below end."""
-    n = betas[0].shape[0]
-    others = jnp.arange(end)
-    plus, minus, left = [], [], []
-    for beta, f in zip(betas, sums, strict=True):
-        p = _weighted(jnp.take(f, m - others + 2 * (n - 1), axis=-1), beta[:end].conj())
-        q = _weighted(jnp.take(f, m + others + 2 * (n - 1), axis=-1), beta[:end])
-        plus.append(((p + q) / 2.0).reshape(-1, end * n))
-        minus.append(((p - q) / 2.0).reshape(-1, end * n))
-        left.append(beta[m].reshape(-1, n))
-    b = jnp.concatenate(left)
-    # real and imaginary parts of b^T u by products of real matrices
-    both = jnp.concatenate(
-        [jnp.concatenate([b.real.T, b.imag.T], 1), jnp.concatenate([b.imag.T, -b.real.T], 1)]
-    )
-    u, v = (both @ jnp.concatenate([x.real, -x.imag]) for x in map(jnp.concatenate, (plus, minus)))
-    return jnp.concatenate(
-        [jnp.concatenate([u[:n], -v[n:]], 1), jnp.concatenate([u[n:], v[:n]], 1)]
-    )
+    """Rows a_lm, then a_l,-m, of one order; columns a_l'm', then a_l',-m', of orders below end.
+
+    Rows of degrees from ``first``; columns of all degrees, with zeros where there is no mode.
+    """
+    xp, n, others = namespace(beams, f), beams.shape[0], np.arange(end)
+    difference = xp.take(f, m - others + 2 * (n - 1), axis=-1)
+    total = xp.take(f, m + others + 2 * (n - 1), axis=-1)
+    plus, minus = _weighted((total + difference) / 2.0, (total - difference) / 2.0, beams[:end])
+    real, imaginary = own = beams[m][..., first:].swapaxes(0, 1)
+    # real and imaginary parts of complex products by products of real matrices
+    both = xp.concatenate([xp.stack([real, -imaginary], 1), xp.stack([imaginary, real], 1)], -1)
+    both = both.reshape(-1, 2 * own.shape[-1]).T
+    # (rows, orders, degrees) of either
+    u, v = ((both @ x).swapaxes(0, 1) for x in (plus, minus))
+    r = n - first
+    u, v = u.reshape(2 * r, -1), v.reshape(2 * r, -1)
+    return xp.concatenate([xp.concatenate([u[:r], -v[r:]], 1), xp.concatenate([u[r:], v[:r]], 1)])
 
 
 def _weighted(
-    f: Complex[Array, "..."], beta: Complex[Array, "orders products powers degrees"]
-) -> Complex[Array, "products powers orders degrees"]:
-    """sum over the other beam of F times its coefficients, order by order."""
-    if f.ndim == 4:  # products do not mix
-        return jnp.einsum("kpqm,mkql->kpml", f, beta)
-    return jnp.einsum("kjpqm,mjql->kpml", f, beta)
+    even: Complex[Array, "..."],
+    odd: Complex[Array, "..."],
+    beams: Float[Array, "orders products 2 powers degrees"],
+) -> list[Float[Array, "orders parts degrees"]]:
+    """(P + Q) / 2 and (P - Q) / 2 without the row's own beam, real and imaginary parts.
+
+    With the other beam W + i W', and F(m + m') + F(m - m') = 2 even, their difference 2 odd::
+
+        (P + Q) / 2 = even W + i odd W',    (P - Q) / 2 = -odd W - i even W'.
+    """
+    xp, (n_orders, n_products, _, n_powers, n) = namespace(even, beams), beams.shape
+    factors = [
+        xp.stack([xp.stack([even.real, -odd.imag]), xp.stack([even.imag, odd.real])]),
+        xp.stack([xp.stack([-odd.real, even.imag]), xp.stack([-odd.imag, -even.real])]),
+    ]
+    if even.ndim == 5:
+        # part, other part, product, other product, power, other power, order
+        factors = [x.transpose(6, 2, 0, 4, 3, 1, 5) for x in factors]
+        factors = [x.reshape(n_orders, n_products * 2 * n_powers, -1) for x in factors]
+        return [x @ beams.reshape(n_orders, -1, n) for x in factors]
+    beams = beams.reshape(n_orders, n_products, -1, n)
+    factors = [x.transpose(5, 2, 0, 3, 1, 4).reshape(*beams.shape[:3], -1) for x in factors]
+    if xp is np:
+        products = [x @ beams for x in factors]
+    else:  # XLA multiplies many small matrices a sixth as fast as it adds these terms
+        products = [
+            sum(x[..., q, None] * beams[:, :, None, q] for q in range(beams.shape[2]))
+            for x in factors
+        ]
+    return [x.reshape(n_orders, -1, n) for x in products]
 
 
+@compiled
 def _to_galactic(
     pole_from_galactic: Rotation, matrix: Float[Array, "modes modes"]
 ) -> Float[Array, "modes modes"]:

@@ -8,15 +8,12 @@ lambda has the sign (-1)^(l + m), share half of them.
 
 from __future__ import annotations
 
-import equinox as eqx
-import healpy
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.harmonics import azimuth_functions, lmax_of, mode_numbers, polar_functions
+from lusee_bayes.core.lazy import healpy
 
 
 def pixel_std(covariance: Float[Array, "modes modes"], nside: int) -> Float[np.ndarray, " pixels"]:
@@ -34,44 +31,69 @@ def pixel_std(covariance: Float[Array, "modes modes"], nside: int) -> Float[np.n
     (pixels,) array
         In K, in RING order.
     """
+    covariance = np.asarray(covariance)
     lmax = lmax_of(covariance.shape[0])
+    heights, place, azimuth = _rings(nside, lmax)
+    # rings from the equator on are in the south
+    polar = polar_functions(heights[: len(heights) // 2 + 1], lmax)
+    ell, m = mode_numbers(lmax)
+    sign = (-1.0) ** (ell + m)
+    by_order = np.argsort(m, kind="stable")
+    first = np.searchsorted(m[by_order], np.arange(-lmax, lmax + 1))
+    both = np.empty((2 * lmax + 1, len(heights), 2 * lmax + 1))
+    for order, rows in enumerate(np.split(by_order, first[1:])):
+        y, part = polar[:, rows], covariance[rows][:, by_order]
+        for sums, mirror in ((both[order, : len(polar)], 1.0), (both[order, ::-1], sign)):
+            mirror = np.broadcast_to(mirror, sign.shape)
+            seen = (y * mirror[rows]) @ part * (polar * mirror)[:, by_order]
+            # the equator is its own mirror image
+            sums[: len(polar)] = np.add.reduceat(seen, first, axis=1)
+    between = both.transpose(1, 0, 2)
+    return np.sqrt(_on_pixels(((azimuth @ between) * azimuth).sum(2), place))
+
+
+def independent_pixel_std(
+    variance: Float[Array, " modes"], nside: int
+) -> Float[np.ndarray, " pixels"]:
+    """Compute :func:`pixel_std` of coefficients that are independent of each other.
+
+    Parameters
+    ----------
+    variance : (modes,) array
+        Of the real harmonic coefficients, in K^2.
+    nside : int
+        HEALPix resolution.
+
+    Returns
+    -------
+    (pixels,) array
+        In K, in RING order.
+    """
+    variance = np.asarray(variance)
+    lmax = lmax_of(len(variance))
+    heights, place, azimuth = _rings(nside, lmax)
+    _, m = mode_numbers(lmax)
+    weighted = polar_functions(heights, lmax) ** 2 * variance
+    by_order = np.argsort(m, kind="stable")
+    first = np.searchsorted(m[by_order], np.arange(-lmax, lmax + 1))
+    of_orders = np.add.reduceat(weighted[:, by_order], first, axis=1)
+    return np.sqrt(_on_pixels((azimuth**2 @ of_orders[:, :, None])[:, :, 0], place))
+
+
+def _rings(nside: int, lmax: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Heights of the rings, and the pixels of each with their azimuthal functions.
+
+    Rings are padded to the longest one, by their last pixel.
+    """
     theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
     heights, first, count = np.unique(theta, return_index=True, return_counts=True)
-    # rings are padded to the longest one; those from the equator on are in the south
     place = np.minimum(np.arange(count.max())[None], count[:, None] - 1) + first[:, None]
-    north = polar_functions(heights[: len(heights) // 2 + 1], lmax)
-    azimuth = azimuth_functions(phi, lmax)[place]
-    variance = _variance(covariance, jnp.asarray(north), jnp.asarray(azimuth))
-    found = np.empty(len(theta))
-    found[place] = np.asarray(variance)
-    return np.sqrt(found)
+    return heights, place, azimuth_functions(phi, lmax)[place]
 
 
-@eqx.filter_jit
-def _variance(
-    covariance: Float[Array, "modes modes"],
-    polar: Float[Array, "north modes"],
-    azimuth: Float[Array, "rings pixels orders"],
-) -> Float[Array, "rings pixels"]:
-    """Variances ring by ring. ``polar``: of the northern rings, the equator last."""
-    lmax = lmax_of(covariance.shape[0])
-    ell, m = mode_numbers(lmax)
-    sign = jnp.asarray((-1.0) ** (ell + m))
-    order_of = jnp.asarray(m[:, None] == np.arange(-lmax, lmax + 1)[None], dtype=jnp.float64)
-    # the modes of every order, and the weight zero where there are none
-    rows = np.zeros((2 * lmax + 1, lmax + 1), dtype=int)
-    inside = np.zeros(rows.shape)
-    rows[m + lmax, ell], inside[m + lmax, ell] = np.arange(len(m)), 1.0
-
-    def of_order(order):
-        row, there = order
-        y = polar[:, row] * there[None]
-        part = covariance[row]
-        mirrored = (y * sign[row][None]) @ part
-        north = ((y @ part) * polar) @ order_of
-        return north, (mirrored * (polar * sign[None])) @ order_of
-
-    north, south = jax.lax.map(of_order, (jnp.asarray(rows), jnp.asarray(inside)))
-    # (orders, rings, orders); the equator is its own mirror image
-    both = jnp.concatenate([north, south[:, -2::-1]], axis=1)
-    return jnp.einsum("rpm,mrn,rpn->rp", azimuth, both, azimuth)
+def _on_pixels(
+    values: Float[np.ndarray, "rings longest"], place: np.ndarray
+) -> Float[np.ndarray, " pixels"]:
+    found = np.empty(place.max() + 1)
+    found[place] = values
+    return found

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower
@@ -66,14 +66,10 @@ class Posterior(eqx.Module):
             If rounding in the map-space form makes one of them wrong by more than ``PRECISION``.
         """
         white, rounding = _white_std(self)
-        if not is_traced(rounding) and float(rounding) > PRECISION:
-            raise InputError(
-                f"standard deviations of the map-space form would be wrong by {rounding:.1g} of "
-                f"themselves (accepted: {PRECISION:g}): the data are too precise for the normal "
-                "equations; use form='data'"
-            )
+        _require_precise(rounding)
         scale = self.prior.diagonal_root()
-        return self.std_of(jnp.eye(self.prior.size)) if scale is None else scale * white
+        eye = namespace(self).eye(self.prior.size)
+        return self.std_of(eye) if scale is None else scale * white
 
     def std_of(self, directions: Float[Array, "n unknowns"]) -> Float[Array, " n"]:
         """Compute the standard deviation of linear combinations of the unknowns.
@@ -88,11 +84,12 @@ class Posterior(eqx.Module):
         (n,) array
             In K, if the directions have no unit.
         """
+        xp = namespace(self)
         parts = [
-            _std_of(self, jnp.asarray(directions[i : i + CHUNK]))
+            _std_of(self, xp.asarray(directions[i : i + CHUNK]))
             for i in range(0, directions.shape[0], CHUNK)
         ]
-        return jnp.concatenate(parts)
+        return xp.concatenate(parts)
 
     def covariance(self) -> Float[Array, "unknowns unknowns"]:
         """Compute C as a matrix.
@@ -101,8 +98,15 @@ class Posterior(eqx.Module):
         -------
         (unknowns, unknowns) array
             In K^2.
+
+        Raises
+        ------
+        InputError
+            As :meth:`std`.
         """
-        return _covariance(self)
+        covariance, rounding = _covariance(self)
+        _require_precise(rounding)
+        return covariance
 
     def root(self) -> Float[Array, "unknowns white"]:
         """Compute R with C = R R^T: a draw is mean + R z, z ~ N(0, 1).
@@ -112,7 +116,7 @@ class Posterior(eqx.Module):
         (unknowns, white) array
             In K.
         """
-        return _times_root(self, jnp.eye(self.prior.rank)).T
+        return _times_root(self, namespace(self).eye(self.prior.rank)).T
 
     def whiten(self, skies: Float[Array, "n unknowns"]) -> Float[Array, "n white"]:
         """Compute z = R^-1 (m - mean): standard normals, if the skies are draws of this posterior.
@@ -137,7 +141,7 @@ class Posterior(eqx.Module):
             raise InputError(
                 "only draws of harmonic coefficients with C_ell > 0 at every ell can be whitened"
             )
-        return _whiten(self, jnp.asarray(skies))
+        return _whiten(self, namespace(self).asarray(skies))
 
     def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
         """Draw from the posterior.
@@ -155,6 +159,8 @@ class Posterior(eqx.Module):
             One draw, or with ``n`` that many, in K.
         """
         z = jax.random.normal(key, (1 if n is None else n, self.prior.rank), dtype=jnp.float64)
+        if namespace(self) is np:
+            z = np.asarray(z)
         draws = self.mean[None] + _times_root(self, z)
         return draws[0] if n is None else draws
 
@@ -172,8 +178,8 @@ class Posterior(eqx.Module):
         InputError
             As :meth:`std`.
         """
-        prior = self.prior.variance()
-        return jnp.where(prior > 0, self.std() ** 2 / jnp.where(prior > 0, prior, 1.0), 0.0)
+        xp, prior = namespace(self), self.prior.variance()
+        return xp.where(prior > 0, self.std() ** 2 / xp.where(prior > 0, prior, 1.0), 0.0)
 
     def rms_shift_from(self, other: Posterior) -> Float[Array, ""]:
         """Compute the distance of two posterior means.
@@ -188,12 +194,12 @@ class Posterior(eqx.Module):
         () array
             Rms over modes, in standard deviations of this posterior.
         """
-        shift = self.white_mean - other.white_mean
+        xp, shift = namespace(self), self.white_mean - other.white_mean
         inside = shift if self.basis is None else self.basis.T @ shift
-        squared = ((inside @ jnp.tril(self.lower)) ** 2).sum()
+        squared = ((inside @ xp.tril(self.lower)) ** 2).sum()
         if self.basis is not None:
             squared = squared + ((shift - self.basis @ inside) ** 2).sum()
-        return jnp.sqrt(squared / shift.shape[0])
+        return xp.asarray(xp.sqrt(squared / shift.shape[0]))
 
     def information_bits(self) -> Float[Array, ""]:
         """Compute the information about the sky gained from the data: ln|Lambda| / 2 in bits.
@@ -203,31 +209,48 @@ class Posterior(eqx.Module):
         () array
             In bits.
         """
-        return jnp.log(jnp.diagonal(self.lower)).sum() / np.log(2.0)
+        xp = namespace(self)
+        return xp.asarray(xp.log(xp.diagonal(self.lower)).sum() / np.log(2.0))
 
 
-@eqx.filter_jit
-def _white_std(posterior: Posterior) -> tuple[Float[Array, " white"], Float[Array, ""]]:
-    """Standard deviations of u, and the relative error that rounding of Lambda makes in them.
+def _require_precise(rounding: Float[Array, ""]) -> None:
+    if not is_traced(rounding) and float(rounding) > PRECISION:
+        raise InputError(
+            f"standard deviations of the map-space form would be wrong by {rounding:.1g} of "
+            f"themselves (accepted: {PRECISION:g}): the data are too precise for the normal "
+            "equations; use form='data'"
+        )
+
+
+def _rounding(posterior: Posterior, variance: Float[Array, " white"]) -> Float[Array, ""]:
+    """The relative error that rounding of Lambda makes in standard deviations.
 
     Lambda_jj (Lambda^-1)_jj, the inflation of a mode's variance by all others, is the condition
     number that counts: rescaling modes does not change it. Times eps it predicts the difference
     between the two forms to within a factor 1.5 (fiducial: 1e-6).
     """
-    white = _std_of(posterior, None)
+    xp = namespace(posterior)
     if posterior.basis is not None:
-        return white, jnp.zeros(())
-    inflation = (jnp.tril(posterior.lower) ** 2).sum(1) * white**2
-    return white, np.finfo(np.float64).eps * inflation.max()
+        return xp.zeros(())
+    inflation = (xp.tril(posterior.lower) ** 2).sum(1) * variance
+    return xp.asarray(np.finfo(np.float64).eps * inflation.max())
 
 
-@eqx.filter_jit
+@compiled
+def _white_std(posterior: Posterior) -> tuple[Float[Array, " white"], Float[Array, ""]]:
+    """Standard deviations of u, and their :func:`_rounding`."""
+    white = _std_of(posterior, None)
+    return white, _rounding(posterior, white**2)
+
+
+@compiled
 def _std_of(
     posterior: Posterior, directions: Float[Array, "n unknowns"] | None
 ) -> Float[Array, " n"]:
     """Standard deviations of given directions of m, or with None of every component of u."""
+    xp = namespace(posterior)
     if directions is None:
-        white = jnp.eye(posterior.prior.rank)
+        white = xp.eye(posterior.prior.rank)
     else:
         white = posterior.prior.colour_columns(directions)
     inside = white if posterior.basis is None else white @ posterior.basis
@@ -236,21 +259,25 @@ def _std_of(
     if posterior.basis is not None:
         outside = white - inside @ posterior.basis.T
         variance = variance + (outside**2).sum(1)
-    return jnp.sqrt(variance)
+    return xp.sqrt(variance)
 
 
-@eqx.filter_jit
-def _covariance(posterior: Posterior) -> Float[Array, "unknowns unknowns"]:
-    rank = posterior.prior.rank
+@compiled
+def _covariance(
+    posterior: Posterior,
+) -> tuple[Float[Array, "unknowns unknowns"], Float[Array, ""]]:
+    """C, and the :func:`_rounding` of its diagonal."""
+    xp, rank = namespace(posterior), posterior.prior.rank
     if posterior.basis is None:
         white = inverse_from_cholesky(posterior.lower)
     else:
         half = solve_lower(posterior.lower, posterior.basis.T, transpose=False)
-        white = half.T @ half + jnp.eye(rank) - posterior.basis @ posterior.basis.T
-    return posterior.prior.colour(posterior.prior.colour(white).T)
+        white = half.T @ half + xp.eye(rank) - posterior.basis @ posterior.basis.T
+    rounding = _rounding(posterior, xp.diagonal(white))
+    return posterior.prior.colour(posterior.prior.colour(white).T), rounding
 
 
-@eqx.filter_jit
+@compiled
 def _times_root(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array, "n unknowns"]:
     """R z = G (L^-T z), or with a basis: z outside its span, L^-T Q^T z inside."""
     inside = z if posterior.basis is None else z @ posterior.basis
@@ -260,12 +287,12 @@ def _times_root(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array
     return posterior.prior.colour(drawn)
 
 
-@eqx.filter_jit
+@compiled
 def _whiten(posterior: Posterior, skies: Float[Array, "n unknowns"]) -> Float[Array, "n white"]:
     """The inverse of :func:`_times_root`, for skies less the mean."""
     u = skies / posterior.prior.diagonal_root()[None] - posterior.white_mean[None]
     inside = u if posterior.basis is None else u @ posterior.basis
-    white = inside @ jnp.tril(posterior.lower)
+    white = inside @ namespace(posterior).tril(posterior.lower)
     if posterior.basis is None:
         return white
     return u + (white - inside) @ posterior.basis.T

@@ -11,13 +11,15 @@ all others too; it is recognised by the others fitting once it is left out.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
+from lusee_bayes.core.arrays import Array, on_host
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.left_out import LeftOut
 from lusee_bayes.linear.left_out_dense import DenseLeftOut
@@ -26,6 +28,8 @@ from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import LowRankUpdate
 
+# a larger A is not formed, and its groups of data are not judged: 60,000 data at lmax 47
+DENSE_BYTES = 1.2e9
 # a fit less probable than this is called bad; real skies are not drawn from the prior, and that
 # alone gives probabilities of 1e-3
 SIGNIFICANCE = 1e-6
@@ -67,11 +71,12 @@ class Residuals:
         A mean + offset, in K.
     z : (data,) array
         Each datum less its prediction by all others, in standard deviations: N(0, 1), though not
-        independent.
+        independent. NaN where groups are not judged.
     chi2 : float
         Of all data under the model.
     products, days, angles : tuple of Group
-        The data of every product, day and turntable angle.
+        The data of every product, day and turntable angle; none where they are not judged, since
+        noise that couples times would need an A of more than ``DENSE_BYTES``.
     """
 
     predicted: Float[np.ndarray, " data"]
@@ -84,7 +89,7 @@ class Residuals:
     @property
     def p(self) -> float:
         """Probability of a larger chi^2 of all data."""
-        return float(chi2.sf(self.chi2, len(self.z)))
+        return float(chdtrc(len(self.z), self.chi2))
 
     def suspects(self) -> list[tuple[str, Group]]:
         """Find the groups without which all other data fit.
@@ -121,6 +126,11 @@ class Residuals:
         if self.p > SIGNIFICANCE:
             return f"The data fit the model (p {probability(self.p)})."
         text = f"The data do not fit the model (p {probability(self.p)})."
+        if not self.products:
+            return (
+                text + " Which product, day or turntable angle is to blame for it is not judged: "
+                "that would need the whole of A, since the noise couples different times."
+            )
         suspects = self.suspects()
         if not suspects:
             return text + " No single product, day or turntable angle is to blame for it."
@@ -168,47 +178,74 @@ def residuals(model: LinearGaussian, posterior: Posterior, data: Visibilities) -
     InputError
         If the model cannot be factorised.
     """
+    model = on_host(model)
     layout, observation = data.layout, data.observation
     left_out = leave_out(model, posterior, data)
+    if left_out is None:
+        predicted = model.predict(posterior.mean)
+        u = np.asarray(model.noise.solve(data.data - predicted))
+        total = float(np.asarray(_without_offset(model, data)) @ u)
+        return Residuals(np.asarray(predicted), np.full(len(u), np.nan), total, (), (), ())
     u = left_out.u[layout.product, layout.time]
     present = np.asarray(layout.present)
     day = np.floor(observation.hours / HOURS_A_DAY).astype(int)
     angles, angle_of_run = np.unique(observation.turntable_deg, return_inverse=True)
     angle = angle_of_run[observation.run]
-    total = float(np.asarray(data.data if model.offset is None else data.data - model.offset) @ u)
+    total = float(np.asarray(_without_offset(model, data)) @ u)
 
-    def group(name: str, n: int, squared: float) -> Group:
+    def group(name: str, members: np.ndarray, leave: Callable[[], float]) -> Group:
+        n = int(members.sum())
         if n == len(u):
-            return Group(name, n, total, float(chi2.sf(total, n)), np.nan)
-        others = float(chi2.sf(total - squared, len(u) - n))
-        return Group(name, n, squared, float(chi2.sf(squared, n)), others)
+            return Group(name, n, total, float(chdtrc(n, total)), np.nan)
+        squared = leave()
+        others = float(chdtrc(len(u) - n, total - squared))
+        return Group(name, n, squared, float(chdtrc(n, squared)), others)
 
     products = [
-        group(name, int(present[k].sum()), left_out.product(k))
+        group(name, present[k], partial(left_out.product, k))
         for k, name in enumerate(data.labels)
         if present[k].any()
     ]
-    days = [
-        group(str(k), int(present[:, day == k].sum()), left_out.stretch(day == k))
-        for k in np.unique(day)
-        if present[:, day == k].any()
-    ]
+    # every day is left out, even if there is but one: that gives each datum's own variance
+    of_days = {k: left_out.stretch(day == k) for k in np.unique(day) if present[:, day == k].any()}
+    days = [group(str(k), present[:, day == k], partial(of_days.get, k)) for k in of_days]
     of_angles = [
-        group(f"{value:g}", int(present[:, angle == k].sum()), left_out.together(angle == k))
+        group(f"{value:g}", present[:, angle == k], partial(left_out.together, angle == k))
         for k, value in enumerate(angles)
         if present[:, angle == k].any()
     ]
     # K (K^-1 d) = d, so that d - N u is what the sky explains
-    predicted = np.asarray(data.data) - np.asarray(model.noise.mv(jnp.asarray(u)))
+    predicted = np.asarray(data.data) - np.asarray(model.noise.mv(u))
     z = u / np.sqrt(left_out.inverse_diagonal[layout.product, layout.time])
     return Residuals(predicted, z, total, tuple(products), tuple(days), tuple(of_angles))
 
 
-def leave_out(model: LinearGaussian, posterior: Posterior, data: Visibilities) -> LeftOut:
-    """Choose how groups are left out: through the structure of A, where N has none but templates."""
+def _without_offset(model: LinearGaussian, data: Visibilities) -> Float[Array, " data"]:
+    return data.data if model.offset is None else data.data - model.offset
+
+
+def leave_out(model: LinearGaussian, posterior: Posterior, data: Visibilities) -> LeftOut | None:
+    """Choose how groups are left out: through the structure of A, or dense.
+
+    Parameters
+    ----------
+    model : LinearGaussian
+        Of these data.
+    posterior : Posterior
+        Of the model, given these data.
+    data : Visibilities
+        In K.
+
+    Returns
+    -------
+    LeftOut or None
+        None if A would be needed and be larger than ``DENSE_BYTES``.
+    """
     noise = model.noise.base if isinstance(model.noise, LowRankUpdate) else model.noise
     within_times = noise.time_weights(data.layout) is not None
     diagonal = posterior.basis is None and model.prior.diagonal_root() is not None
     if model.coupling.has_time_structure and within_times and diagonal:
         return StructuredLeftOut(model, posterior, data.data)
+    if 8 * model.n_data * model.prior.size > DENSE_BYTES:
+        return None
     return DenseLeftOut(model, data.data, data.layout)

@@ -6,11 +6,9 @@ p is y_p^T R m: an integral of the sky with the kernel R(p, q) = y_p^T R y_q ove
 
 from __future__ import annotations
 
-import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.linear.posterior import Posterior
@@ -41,10 +39,10 @@ def resolution_rows(
     """
     if posterior.prior.diagonal_root() is None:
         raise InputError("resolution needs a prior over harmonic coefficients")
-    return _rows(posterior, jnp.asarray(directions))
+    return _rows(posterior, namespace(posterior).asarray(directions))
 
 
-@eqx.filter_jit
+@compiled
 def _rows(posterior: Posterior, directions: Float[Array, "n modes"]) -> Float[Array, "n modes"]:
     """y D (1 - C_w) D^-1 in white coordinates, D the prior's standard deviations."""
     scale = posterior.prior.diagonal_root()
@@ -54,5 +52,6 @@ def _rows(posterior: Posterior, directions: Float[Array, "n modes"]) -> Float[Ar
     known = inside - solve_lower(posterior.lower, half, transpose=True).T
     if posterior.basis is not None:
         known = known @ posterior.basis.T
-    divisor = jnp.where(scale > 0, scale, 1.0)
-    return jnp.where((scale > 0)[None], known / divisor[None], 0.0)
+    xp = namespace(posterior)
+    divisor = xp.where(scale > 0, scale, 1.0)
+    return xp.where((scale > 0)[None], known / divisor[None], 0.0)

@@ -12,12 +12,10 @@ from __future__ import annotations
 
 from math import factorial
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, as_complex, namespace, scan
 from lusee_bayes.core.rotations import tilt_powers
 
 # times that are summed at once: it bounds the memory
@@ -55,27 +53,29 @@ def time_sums(
     n_chunks = -(-azimuth.shape[0] // CHUNK)
     missing = n_chunks * CHUNK - azimuth.shape[0]
 
+    xp = namespace(weights, azimuth, tilt)
+
     def chunked(x: Array) -> Array:
-        padded = jnp.pad(x, ((0, missing), *((0, 0),) * (x.ndim - 1)))
+        padded = xp.pad(x, ((0, missing), *((0, 0),) * (x.ndim - 1)))
         return padded.reshape(n_chunks, CHUNK, *x.shape[1:])
 
     def add(total, part):
         w, phi, e = part
         ex, ey = -e[:, 0], -e[:, 1]
-        monomials = jnp.stack([ex**a * ey**b for a, b in powers])
-        angle = phi[:, None] * jnp.arange(2.0 * lmax + 1.0)[None]
-        phases = jnp.concatenate([jnp.cos(angle), jnp.sin(angle)], axis=1)
+        monomials = xp.stack([ex**a * ey**b for a, b in powers])
+        angle = phi[:, None] * np.arange(2.0 * lmax + 1.0)[None]
+        phases = xp.concatenate([xp.cos(angle), xp.sin(angle)], axis=1)
         weighted = (w.T[:, None] * monomials[None]).reshape(-1, CHUNK)
         return total + weighted @ phases, None
 
-    start = jnp.zeros((weights.shape[0] * len(powers), 2 * (2 * lmax + 1)))
+    start = xp.zeros((weights.shape[0] * len(powers), 2 * (2 * lmax + 1)))
     parts = (chunked(weights.T), chunked(azimuth), chunked(tilt))
-    sums, _ = jax.lax.scan(add, start, parts)
-    cosine, sine = jnp.split(sums.reshape(weights.shape[0], len(powers), -1), 2, axis=-1)
-    positive = jax.lax.complex(cosine, sine)
-    full = jnp.concatenate([positive[..., :0:-1].conj(), positive], axis=-1)
+    sums, _ = scan(xp, add, start, parts)
+    cosine, sine = xp.split(sums.reshape(weights.shape[0], len(powers), -1), 2, axis=-1)
+    positive = as_complex(cosine, sine)
+    full = xp.concatenate([positive[..., :0:-1].conj(), positive], axis=-1)
     table, scale = _pairs(order)
-    return full[:, table] * jnp.asarray(scale, dtype=full.dtype)[None, :, :, None]
+    return full[:, table] * scale.astype(full.dtype)[None, :, :, None]
 
 
 def _pairs(order: int) -> tuple[np.ndarray, np.ndarray]:

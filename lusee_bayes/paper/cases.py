@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.version import __version__, versions
 from lusee_bayes.experiment.experiment import build
@@ -117,7 +118,7 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
     experiment = build(scenario)
     setup, data = experiment.setup, experiment.data
     inference = infer(experiment)
-    channel = channel_of_posterior(experiment, inference)
+    channel = channel_of_posterior(experiment, inference, on_host(inference.posterior).covariance())
     spectra, maps = channel.spectra(), channel.maps()
     variances = data.layout.scatter(radiometer(setup).diagonal())
     grid = HemisphereGrid.gauss_legendre(*BEAM_NODES)

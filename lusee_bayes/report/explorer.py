@@ -6,12 +6,12 @@ import base64
 import json
 from pathlib import Path
 
-import healpy
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
 from matplotlib import colormaps
 
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.report import html
 from lusee_bayes.report.figures.drawing import DIVERGING, SEQUENTIAL
 from lusee_bayes.results.diagnostics import KERNEL_NSIDE, KERNEL_STEP

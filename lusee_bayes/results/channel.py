@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jaxtyping import Float, PRNGKeyArray, Shaped
 
-from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.harmonics import modes_to_map, power_spectrum, sum_over_m
+from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, per_mode, power_spectrum
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference
 from lusee_bayes.experiment.scenario import Scenario
@@ -25,9 +24,7 @@ from lusee_bayes.linear.metrics import (
     ell_cross,
     expected_chi2,
     highest_altitude,
-    prior_fraction_per_ell,
     signal_to_noise,
-    whitened_residuals,
 )
 from lusee_bayes.linear.pixel_variance import pixel_std
 
@@ -192,6 +189,7 @@ class ChannelResult:
 def channel_of_posterior(
     experiment: Experiment,
     inference: Inference,
+    covariance: Float[np.ndarray, "modes modes"],
     *,
     n_draws: int = 0,
     judged: Inference | None = None,
@@ -203,6 +201,8 @@ def channel_of_posterior(
     experiment : Experiment
     inference : Inference
         The posterior, and the model of the data.
+    covariance : (modes, modes) array
+        Of the posterior, in K^2.
     n_draws : int
         How many draws of the posterior to keep.
     judged : Inference, optional
@@ -210,21 +210,25 @@ def channel_of_posterior(
     """
     scenario, data, posterior = experiment.scenario, experiment.data, inference.posterior
     judged = inference if judged is None else judged
-    residuals = np.asarray(whitened_residuals(inference.model, posterior, data.data))
+    prior_variance = np.asarray(inference.model.prior.variance())
+    variance = np.diagonal(covariance)
+    fraction = np.divide(
+        variance, prior_variance, out=np.zeros(len(variance)), where=prior_variance > 0
+    )
     return ChannelResult(
         frequency_mhz=scenario.frequency_mhz,
         mean=np.asarray(posterior.mean),
-        std=np.asarray(posterior.std()),
-        prior_std=np.sqrt(np.asarray(inference.model.prior.variance())),
-        prior_fraction=prior_fraction_per_ell(posterior),
-        pixel_std=pixel_std(posterior.covariance(), scenario.map_nside),
+        std=np.sqrt(variance),
+        prior_std=np.sqrt(prior_variance),
+        prior_fraction=mean_over_m(fraction),
+        pixel_std=pixel_std(covariance, scenario.map_nside),
         highest_altitude=highest_altitude(data.observation, scenario.map_nside),
-        draws=np.asarray(posterior.sample(draw_key(scenario), n_draws)),
+        draws=np.asarray(on_host(posterior).sample(draw_key(scenario), n_draws)),
         truth=_array(data.truth),
         independent=None,
         log_evidence=float(posterior.log_evidence),
         information_bits=float(posterior.information_bits()),
-        chi2=float(residuals @ residuals),
+        chi2=float(inference.model.chi2(posterior.mean, data.data)),
         chi2_expected=expected_chi2(judged.posterior, inference.model.n_data),
         refinement=float(posterior.refinement),
         n_data=inference.model.n_data,
@@ -300,18 +304,17 @@ def channel_of_information(
     if covariance is None:
         spread = np.asarray(draws) - np.asarray(mean)
         std = np.sqrt((spread**2).mean(0))
-        covariance = jnp.asarray(spread.T @ spread / len(spread))
+        covariance = spread.T @ spread / len(spread)
     else:
         std = np.sqrt(np.diagonal(np.asarray(covariance)))
         expected = float(information.n_data - (information.matrix * covariance).sum())
-    n_per_ell = 2 * np.arange(len(observed.spectrum)) + 1
-    prior_std = np.sqrt(np.repeat(observed.spectrum, n_per_ell))
+    prior_std = np.sqrt(per_mode(observed.spectrum))
     return ChannelResult(
         frequency_mhz=observed.frequency_mhz,
         mean=np.asarray(mean),
         std=std,
         prior_std=prior_std,
-        prior_fraction=sum_over_m(std**2 / prior_std**2) / n_per_ell,
+        prior_fraction=mean_over_m(std**2 / prior_std**2),
         pixel_std=pixel_std(covariance, round(np.sqrt(observed.highest_altitude.size / 12))),
         highest_altitude=observed.highest_altitude,
         draws=np.asarray(draws),

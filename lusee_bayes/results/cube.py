@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 
-import healpy
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
-from scipy import stats as distributions
+from scipy.special import chdtrc
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.harmonics import mode_numbers, synthesis_matrix
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import peak_memory_gb
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
@@ -23,7 +23,7 @@ from lusee_bayes.results.channel import (
 from lusee_bayes.results.joint_components import (
     Components,
 )
-from lusee_bayes.sampling.uncertainty import LANDMARKS
+from lusee_bayes.sky.landmarks import LANDMARKS
 
 # chi^2 of a channel that is further from its mean, in standard deviations of the widest
 # distribution it can have, is called bad
@@ -81,7 +81,7 @@ class CubeResult:
         if self.components is None or np.isnan(self.components.chi2):
             return None
         n_data = sum(channel.n_data for channel in self.channels)
-        return float(distributions.chi2.sf(self.components.chi2, n_data))
+        return float(chdtrc(n_data, self.components.chi2))
 
     def verdict(self) -> str:
         """What the residuals say, in a sentence."""

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jax
 
+from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.process_group import ProcessGroup
 from lusee_bayes.core.progress import Stages
@@ -87,7 +88,7 @@ def cube_result(
         if scenario.joint:
             files.write(channel, wanted, known.to_dataset())
             return
-        posterior = inference.posterior
+        posterior = on_host(inference.posterior)
         found = channel_of_information(
             known.observed,
             information,

@@ -8,18 +8,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import healpy
-import jax
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
+from lusee_bayes.core.harmonics import (
+    azimuth_functions,
+    mode_numbers,
+    modes_to_map,
+    pixel_matrix,
+    polar_functions,
+)
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference
-from lusee_bayes.experiment.model import base_model
+from lusee_bayes.linear.pixel_variance import independent_pixel_std, pixel_std
 from lusee_bayes.linear.residuals import Group, residuals
 from lusee_bayes.linear.resolution import resolution_rows
 from lusee_bayes.results.channel import ChannelResult, draw_key
@@ -31,18 +37,12 @@ N_DRAWS = 4
 KERNEL_STEP = 1.0 / 127.0
 
 
-def require_judgeable(experiment: Experiment) -> None:
-    """InputError for more data than can be judged one by one, which needs the whole of A."""
-    if base_model(experiment.setup, experiment.data).too_large:
-        raise InputError(
-            f"{experiment.data.layout.size} data are too many to judge each by all others, which "
-            f"needs the whole of A; use --frequencies {experiment.scenario.frequency_mhz:g} for a "
-            "map without that"
-        )
-
-
 def diagnostics(
-    experiment: Experiment, inference: Inference, judged: Inference, channel: ChannelResult
+    experiment: Experiment,
+    inference: Inference,
+    judged: Inference,
+    channel: ChannelResult,
+    covariance: Float[np.ndarray, "modes modes"],
 ) -> xr.Dataset:
     """Work out what a report shows beyond the map itself.
 
@@ -54,37 +54,41 @@ def diagnostics(
     judged : Inference
         The model that predicts the data: given the earlier ones, where there are any.
     channel : ChannelResult
+    covariance : (modes, modes) array
+        Of the posterior, in K^2.
 
     Returns
     -------
     xarray.Dataset
         On dims pixel (HEALPix RING of the maps), region, kernel_pixel, draw, product, time, group.
     """
-    scenario, posterior, data = experiment.scenario, inference.posterior, experiment.data
-    nside = channel.nside
+    scenario, data = experiment.scenario, experiment.data
+    posterior, nside, lmax = on_host(inference.posterior), channel.nside, experiment.scenario.lmax
     found = residuals(judged.model, judged.posterior, data)
-    layout = data.layout
     draws = np.asarray(posterior.sample(draw_key(scenario), N_DRAWS))
-    rows = region_rows(nside, scenario.lmax)
-    rows_std = np.asarray(posterior.std_of(rows))
-    centres = pixel_matrix(region_nside(nside), scenario.lmax)
-    kernels = np.asarray(resolution_rows(posterior, centres))
-    kernels = kernels @ pixel_matrix(KERNEL_NSIDE, scenario.lmax).T
+    centres = pixel_matrix(region_nside(nside), lmax)
+    kernels = resolution_rows(posterior, centres) @ pixel_matrix(KERNEL_NSIDE, lmax).T
     peaks = np.abs(kernels).max(axis=1)
     safe = np.where(peaks > 0, peaks, 1.0)
+    # the prior leaves the monopole wide open, which any data settle; with it the prior's share
+    # would be close to zero everywhere
+    rest, rest_prior = covariance.copy(), channel.prior_std**2
+    rest[0], rest[:, 0], rest_prior[0] = 0.0, 0.0, 0.0
+    share = (pixel_std(rest, nside) / independent_pixel_std(rest_prior, nside)) ** 2
+    rows = region_rows(nside, lmax)
+    region_share = variances(rows, rest) / (rows**2 @ rest_prior)
 
     def on_grid(values: Float[np.ndarray, " data"]) -> Float[np.ndarray, "products times"]:
-        grid = np.asarray(layout.scatter(jax.numpy.asarray(values)))
-        return np.where(np.asarray(layout.present), grid, np.nan)
+        return np.where(data.layout.present, data.layout.scatter(values), np.nan)
 
     kelvin = {"units": "K"}
     variables = {
-        "prior_fraction": ("pixel", prior_fraction(inference, pixel_matrix(nside, scenario.lmax))),
+        "prior_fraction": ("pixel", share),
         "highest_altitude": ("pixel", channel.highest_altitude, {"units": "sin"}),
         "draws": (("draw", "pixel"), np.stack([modes_to_map(d, nside) for d in draws]), kelvin),
-        "region_mean": ("region", rows @ np.asarray(posterior.mean), kelvin),
-        "region_std": ("region", rows_std, kelvin),
-        "region_prior_fraction": ("region", prior_fraction(inference, rows)),
+        "region_mean": ("region", rows @ channel.mean, kelvin),
+        "region_std": ("region", np.sqrt(variances(rows, covariance)), kelvin),
+        "region_prior_fraction": ("region", region_share),
         "psf": (("region", "kernel_pixel"), kernels / safe[:, None]),
         "psf_peak": ("region", peaks, {"units": "1/sr"}),
         "data": (("product", "time"), data.grid(), kelvin),
@@ -144,30 +148,25 @@ def region_of(nside: int) -> np.ndarray:
 def region_rows(nside: int, lmax: int) -> Float[np.ndarray, "regions modes"]:
     """Rows that average the pixels of a map over each region."""
     of = region_of(nside)
-    n = healpy.nside2npix(region_nside(nside))
-    rows = np.zeros((n, (lmax + 1) ** 2))
-    np.add.at(rows, of, pixel_matrix(nside, lmax))
-    return rows / np.bincount(of, minlength=n)[:, None]
+    theta, phi = healpy.pix2ang(nside, np.arange(len(of)))
+    heights, ring = np.unique(theta, return_inverse=True)
+    # pixels of a region on one ring have lambda_l|m|(theta) in common
+    part = of * len(heights) + ring
+    by_part = np.argsort(part, kind="stable")
+    _, first = np.unique(part[by_part], return_index=True)
+    parts = by_part[first]
+    sums = np.add.reduceat(azimuth_functions(phi, lmax)[by_part], first)
+    _, m = mode_numbers(lmax)
+    rows = polar_functions(heights, lmax)[ring[parts]] * sums[:, m + lmax]
+    _, first = np.unique(of[parts], return_index=True)
+    return np.add.reduceat(rows, first) / np.bincount(of)[:, None]
 
 
-def prior_fraction(
-    inference: Inference, rows: Float[np.ndarray, "directions modes"]
-) -> Float[np.ndarray, " directions"]:
-    """Share of the variance that is left from the prior, of what is not the monopole.
-
-    The prior leaves the monopole wide open, which any data settle; with it the share would be close
-    to zero everywhere.
-
-    Parameters
-    ----------
-    inference : Inference
-    rows : (directions, modes) array
-        Linear combinations of the coefficients, such as pixels.
-    """
-    rows = rows.copy()
-    rows[:, 0] = 0.0
-    prior = rows**2 @ np.asarray(inference.model.prior.variance())
-    return np.asarray(inference.posterior.std_of(rows)) ** 2 / prior
+def variances(
+    rows: Float[np.ndarray, "n modes"], covariance: Float[np.ndarray, "modes modes"]
+) -> Float[np.ndarray, " n"]:
+    """Variances of linear combinations of the coefficients."""
+    return np.einsum("rm,rm->r", rows @ covariance, rows)
 
 
 def _groups(kinds: dict[str, tuple[Group, ...]]) -> dict[str, tuple[str, np.ndarray]]:

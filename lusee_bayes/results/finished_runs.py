@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import healpy
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.results.diagnostics import read_diagnostics
 
 NEEDED = ("summary.json", "spectra.csv", "diagnostics.nc", "mean.fits", "std.fits")

@@ -140,7 +140,7 @@ def forecast(variation: Variation) -> Forecast:
             setup = without_ports(setup, variation.lost)
         model = full_model(setup)
         # the covariance is that of any data; these are the shortest to write
-        posterior = model.factorise().condition(jnp.zeros(model.n_data))
+        posterior = model.condition(jnp.zeros(model.n_data))
         return Forecast(
             variation=variation,
             days=setup.observation.n_times * setup.observation.step_s / 86400.0,

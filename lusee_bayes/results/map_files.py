@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-import healpy
 import numpy as np
 from astropy.io import fits
 from jaxtyping import Float
 
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.version import __version__, versions
 from lusee_bayes.experiment.scenario import Scenario
 

@@ -9,6 +9,7 @@ import jax
 import pandas as pd
 import xarray as xr
 
+from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages, peak_memory_gb
 from lusee_bayes.core.version import versions
@@ -19,7 +20,7 @@ from lusee_bayes.experiment.terms import beam_rms_difference
 from lusee_bayes.linear.metrics import effective_resolution_deg
 from lusee_bayes.linear.updating import composed, deviation_model
 from lusee_bayes.results.channel import ChannelResult, channel_of_posterior
-from lusee_bayes.results.diagnostics import diagnostics, require_judgeable
+from lusee_bayes.results.diagnostics import diagnostics
 from lusee_bayes.results.fluxes import flux_lines, flux_table
 from lusee_bayes.results.updatable import Updatable, read_updatable
 
@@ -135,7 +136,6 @@ def map_result(
     """
     stages = stages or Stages()
     scenario, data = experiment.scenario, experiment.data
-    require_judgeable(experiment)
     earlier = None if onto is None else read_updatable(onto, scenario)
     digests = (data.digest(),)
     with stages("posterior"):
@@ -148,15 +148,16 @@ def map_result(
             found = judged = Inference(found.model, posterior, found.rounds, found.around)
         jax.block_until_ready(found.posterior.white_mean)
     with stages("standard deviations"):
+        covariance = on_host(found.posterior).covariance()
         channel = channel_of_posterior(
-            experiment, found, n_draws=scenario.output.draws, judged=judged
+            experiment, found, covariance, n_draws=scenario.output.draws, judged=judged
         )
     fluxes = None
     if experiment.setup.responses and scenario.sources.treatment != "ignored":
         with stages("fluxes"):
             fluxes = flux_table(experiment, found)
     with stages("diagnostics"):
-        page = diagnostics(experiment, found, judged, channel)
+        page = diagnostics(experiment, found, judged, channel, covariance)
     return MapResult(experiment, found, judged, channel, page, fluxes, digests, stages.seconds)
 
 

@@ -32,7 +32,6 @@ from lusee_bayes.sampling.program_sites import site_names
 from lusee_bayes.sampling.programs import Program, is_collapsed
 from lusee_bayes.sampling.uncertainty import (
     INTERVAL,
-    LANDMARKS,
     pixel_interval_of_draws,
     pixel_mean_of_draws,
     pixel_std_of_draws,
@@ -40,6 +39,7 @@ from lusee_bayes.sampling.uncertainty import (
     summary,
 )
 from lusee_bayes.sampling.whitening import Whitening
+from lusee_bayes.sky.landmarks import LANDMARKS
 from lusee_bayes.systematics import SCALES, Systematic
 from lusee_bayes.systematics.base import SKY
 from lusee_bayes.systematics.chart import Chart

@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 
 import arviz_base
 import arviz_stats
-import healpy
 import numpy as np
 import pandas as pd
 from arviz_stats.base import array_stats
@@ -19,17 +18,11 @@ from jaxtyping import Bool, Float
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, pixel_matrix, power_spectrum, synthesis_matrix
+from lusee_bayes.core.lazy import healpy
 
 # pixels of which all draws are held at once
 CHUNK = 1024
 
-# directions of brightnesses in summaries and spectra: Galactic longitude and latitude in degrees
-LANDMARKS = {
-    "Galactic centre": (0.0, 0.0),
-    "anticentre": (180.0, 0.0),
-    "north Galactic pole": (0.0, 90.0),
-    "south Galactic pole": (0.0, -90.0),
-}
 # columns of summaries: the same with ArviZ 0.8 and 1.x
 INTERVAL = 0.9
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import healpy
 import numpy as np
 from astropy.io import fits
 from jaxtyping import Float
@@ -20,6 +19,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.fits_files import is_fits, opened
 from lusee_bayes.core.harmonics import from_healpy, lmax_of, n_modes, to_healpy
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.sky.files import SkyFile
 
 COLUMNS = ("index", "real", "imag")

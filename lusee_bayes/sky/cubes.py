@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import healpy
 import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.checks import require_finite
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import is_fits, opened
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.sky.files import SkyFile, modes_of_map
 
 STEPS = ("FREQ_START", "FREQ_END", "FREQ_STEP")

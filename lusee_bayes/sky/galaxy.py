@@ -14,10 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
-import healpy as hp
 import numpy as np
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.sky import free_free
 from lusee_bayes.sky.free_free import SUN_RADIUS_KPC
 
@@ -196,7 +196,7 @@ def line_of_sight(
 @lru_cache(maxsize=1)
 def _northern_slabs(nside: int) -> Slabs:
     """Slabs of the northern hemisphere's pixels with the equator: the same at all frequencies."""
-    theta, phi = hp.pix2ang(nside, np.arange(6 * nside**2 + 2 * nside))
+    theta, phi = healpy.pix2ang(nside, np.arange(6 * nside**2 + 2 * nside))
     return Slabs.towards(np.degrees(phi), 90.0 - np.degrees(theta))
 
 
@@ -207,7 +207,7 @@ def _fluctuations(nside: int, seed: int) -> np.ndarray:
     Drawn and normalised so that a finer map adds small scales to the same large ones.
     """
     lmax = 3 * nside - 1
-    ell, m = hp.Alm.getlm(lmax)
+    ell, m = healpy.Alm.getlm(lmax)
     reference = np.arange(2.0, FLUCTUATION_LMAX + 1.0)
     variance = np.sum((2.0 * reference + 1.0) * reference**FLUCTUATION_SLOPE) / (4.0 * np.pi)
     spectrum = np.zeros(lmax + 1)
@@ -217,7 +217,7 @@ def _fluctuations(nside: int, seed: int) -> np.ndarray:
     alm = np.empty(ell.size, dtype=np.complex128)
     alm[np.lexsort((m, ell))] = z / np.sqrt(2.0)  # rows are taken ell by ell
     alm[m == 0] = np.sqrt(2.0) * alm[m == 0].real
-    return hp.alm2map(alm * np.sqrt(spectrum[ell]), nside, lmax=lmax)
+    return healpy.alm2map(alm * np.sqrt(spectrum[ell]), nside, lmax=lmax)
 
 
 def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int = 1) -> np.ndarray:
@@ -256,14 +256,14 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int = 1) -> np.ndarr
             f"frequency_mhz is {frequency_mhz}, expected {MINIMUM_MHZ:g} to {MAXIMUM_MHZ:g}; "
             "give a frequency in MHz within LuSEE-Night's band"
         )
-    if not hp.isnsideok(nside, nest=True):
+    if not healpy.isnsideok(nside, nest=True):
         raise InputError(f"nside is {nside}, expected a power of two; use 64, for example")
     if seed < 0:
         raise InputError(f"seed is {seed}, expected an integer >= 0; use 1, for example")
 
     north = np.arange(6 * nside**2 + 2 * nside)  # with the equator, which is its own mirror
-    theta, phi = hp.pix2ang(nside, north)
-    south = hp.ang2pix(nside, np.pi - theta, phi)
+    theta, phi = healpy.pix2ang(nside, north)
+    south = healpy.ang2pix(nside, np.pi - theta, phi)
     temperature, depth = _northern_slabs(nside).brightness(frequency_mhz)
     pixels = np.stack([north, south])
     galactic, absorption = np.empty((2, 12 * nside**2))

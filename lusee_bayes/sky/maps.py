@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
-import healpy
 import numpy as np
 from astropy import units as u
 from astropy.io import fits
@@ -16,6 +15,7 @@ from jaxtyping import Float
 from lusee_bayes.core.checks import nearest, require_finite
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import is_fits, opened
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.sky.files import SkyFile, modes_of_map
 
 ULSA_DATASET = "smooth_absorb"

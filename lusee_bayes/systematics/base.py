@@ -9,13 +9,12 @@ from statistics import NormalDist
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import numpyro
 from jaxtyping import Float, PRNGKeyArray
-from numpyro import distributions as dist
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance

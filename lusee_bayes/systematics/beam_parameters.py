@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import jax.numpy as jnp
-import numpyro
-from numpyro import distributions as dist
 
+from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.instrument.beams import ProductBeams, parameter
 from lusee_bayes.instrument.coupling import Coupling
 from lusee_bayes.instrument.instrument import Instrument

@@ -7,11 +7,10 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import numpyro
 from jaxtyping import Float
-from numpyro import distributions as dist
 
 from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise import GainDrift, white_grid, with_gains

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import equinox as eqx
-import numpyro
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.lazy import numpyro
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.systematics.base import Scale, scalar, uncertain_scale
 

@@ -7,12 +7,11 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import numpyro
 from jaxtyping import Float
-from numpyro import distributions as dist
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_finite, require_positive, require_shape
+from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankCovariance
 from lusee_bayes.sky.priors import IndependentPrior

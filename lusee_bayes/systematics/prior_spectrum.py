@@ -7,12 +7,11 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import numpyro
 from jaxtyping import Float
-from numpyro import distributions as dist
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.sky.priors import HarmonicPrior
 from lusee_bayes.systematics.base import Scale, scalar, scalar_or_none, uncertain_scale

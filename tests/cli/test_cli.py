@@ -17,11 +17,11 @@ import xarray as xr
 from astropy.io import fits
 
 import lusee_bayes
-from lusee_bayes.cli import map_command
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
 from lusee_bayes.experiment.schema import OutputSection
 from lusee_bayes.results.map_result import MapResult
+from lusee_bayes.runs import map_run
 from lusee_bayes.runs import map_run as runs
 
 SMALL = [
@@ -138,7 +138,7 @@ def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
 def test_options_of_the_output_reach_the_scenario(flag, monkeypatch):
     """What they make is tested beside run_map."""
     given = []
-    monkeypatch.setattr(map_command, "run_map", lambda *a, **_: given.append(a) or _stop())
+    monkeypatch.setattr(map_run, "run_map", lambda *a, **_: given.append(a) or _stop())
     assert run("map", "fiducial", f"--{flag}", "--draws", 7, "-o", "x", "-q") == 130
     assert given[0][0].output == OutputSection(draws=7, **{flag: True})
 

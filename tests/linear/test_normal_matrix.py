@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lusee_bayes.core.arrays import on_device, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import pixel_matrix
 from lusee_bayes.instrument.beams import ProductBeams
@@ -15,7 +16,6 @@ from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation, Run
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.linear import information
-from lusee_bayes.linear import model as linear_gaussian
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.normal_matrix import normal_matrix
 from lusee_bayes.linear.pixel_variance import pixel_std
@@ -58,6 +58,9 @@ def noise_of(kind, layout):
     blocks = jnp.asarray(roots @ np.swapaxes(roots, 1, 2))
     if kind == "blocks":
         return TimeBlockCovariance(blocks, layout)
+    if kind == "templates":
+        root = jnp.asarray(rng.standard_normal((layout.size, 2)))
+        return TimeBlockCovariance(blocks, layout) + LowRankCovariance(root)
     # sums of what neighbouring times share: positive by construction
     shared = 0.3 * rng.standard_normal((layout.n_times + 2, N_PRODUCTS, N_PRODUCTS))
     band = np.zeros((layout.n_times, 3, N_PRODUCTS, N_PRODUCTS))
@@ -68,20 +71,16 @@ def noise_of(kind, layout):
     return TimeBandedCovariance(jnp.asarray(band), layout)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("kind", ["diagonal", "blocks", "banded"])
 @pytest.mark.parametrize(
-    ("order", "missing"),
-    [
-        pytest.param(0, True, marks=pytest.mark.long),
-        pytest.param(1, True, marks=pytest.mark.long),
-        (2, True),
-        pytest.param(2, False, marks=pytest.mark.long),
-    ],
+    "place", [on_host, pytest.param(on_device, marks=[pytest.mark.long, pytest.mark.essential])]
 )
-def test_equals_the_product_of_matrices(kind, order, missing):
-    coupling = setting(order, missing)
-    noise = noise_of(kind, coupling.layout)
+@pytest.mark.parametrize(
+    "kind", ["diagonal", "blocks", "templates", pytest.param("banded", marks=pytest.mark.long)]
+)
+@pytest.mark.parametrize(("order", "missing"), [(0, True), (1, True), (2, True), (2, False)])
+def test_equals_the_product_of_matrices(place, kind, order, missing):
+    coupling = place(setting(order, missing))
+    noise = place(noise_of(kind, coupling.layout))
     a, n = np.asarray(coupling.dense()), np.asarray(noise.dense())
     expected = a.T @ np.linalg.solve(n, a)
     got = np.asarray(normal_matrix(coupling, noise))
@@ -111,8 +110,8 @@ def test_what_has_no_structure_is_refused():
     coupling = setting()
     layout = coupling.layout
     diagonal = noise_of("diagonal", layout)
-    low_rank = diagonal + LowRankCovariance(jnp.ones((layout.size, 1)))
-    for noise in (DenseCovariance(diagonal.dense()), low_rank):
+    dense = DenseCovariance(diagonal.dense())
+    for noise in (dense, dense + LowRankCovariance(jnp.ones((layout.size, 1)))):
         with pytest.raises(InputError, match="no structure in time"):
             normal_matrix(coupling, noise)
     with pytest.raises(InputError, match="response of its own"):
@@ -176,13 +175,13 @@ def test_perturbations_are_draws_with_the_normal_matrix_as_covariance():
         gaussian.inform(jnp.zeros(gaussian.n_data), None, 2)
 
 
-def test_a_large_matrix_is_not_formed(monkeypatch):
-    gaussian = model()
+@pytest.mark.parametrize("kind", ["diagonal", "low rank"])
+def test_the_matrix_is_not_formed_where_there_is_structure(kind, monkeypatch):
+    gaussian = model(kind)
     data = jnp.asarray(np.random.default_rng(2).standard_normal(gaussian.n_data))
-    expected = np.asarray(gaussian.condition(data).mean)
-    monkeypatch.setattr(linear_gaussian, "DENSE_BYTES", 8 * gaussian.n_data)
+    expected = np.asarray(gaussian.condition(data, "map").mean)
     monkeypatch.setattr(CouplingMatrix, "dense", None)
-    assert gaussian.too_large
+    assert gaussian.is_structured
     np.testing.assert_allclose(gaussian.condition(data).mean, expected, rtol=0, atol=1e-11)
 
 

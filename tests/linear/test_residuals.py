@@ -83,7 +83,7 @@ FLAGS[3, 5], FLAGS[:, 11] = True, True
 )
 def test_groups_and_single_data_by_hand(case):
     model, data = simulated(*case["overrides"], flags=case.get("flags"))
-    found = residuals(model, data)
+    found = residuals(model, model.condition(data.data), data)
     layout, run = data.layout, data.observation.run
     hours = data.observation.hours
     assert [g.name for g in found.products] == list(data.labels)
@@ -113,7 +113,7 @@ def test_groups_and_single_data_by_hand(case):
 
 def test_one_group_is_everything():
     model, data = simulated("observation.runs=[{cycles: 0.02}]")
-    found = residuals(model, data)
+    found = residuals(model, model.condition(data.data), data)
     (angle,) = found.angles
     assert (angle.chi2, angle.n) == (found.chi2, data.layout.size)
     assert np.isnan(angle.others_p)
@@ -136,7 +136,7 @@ def test_what_is_wrong_is_pointed_at(kind, name):
         "turntable angle": data.observation.run[None] == 1,
     }[kind] & np.ones((16, 24), dtype=bool)
     bad = corrupted(data, where, 40.0 * np.sqrt(float(model.noise.diagonal().mean())))
-    found = residuals(model, bad)
+    found = residuals(model, model.condition(bad.data), bad)
     assert "do not fit" in found.verdict()
     assert (kind, name) in [(k, group.name) for k, group in found.suspects()]
     assert f"{kind} {name}" in found.verdict()

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import jax
+import numpy as np
 from jaxtyping import Float, PRNGKeyArray
-from numpyro import handlers
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.lazy import numpyro
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms.term import Around, Term, Truth
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -33,7 +34,7 @@ class GainTerm(Term):
         if setup.scenario.noise.gain is None:
             return {}
         # the scales where they are not known; the prior is the program's own
-        with handlers.seed(rng_seed=jax.random.fold_in(key, SCALE_DRAW)):
+        with numpyro.handlers.seed(rng_seed=jax.random.fold_in(key, SCALE_DRAW)):
             drift = gain_drifts(setup, Around()).scales()
         return {"gain_sigma": float(drift.sigma), "gain_correlation_h": float(drift.correlation_h)}
 

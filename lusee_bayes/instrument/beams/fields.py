@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.arrays import Array, as_complex, namespace
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
@@ -22,7 +22,7 @@ def wavenumber(frequency_mhz: float | Float[Array, ""]) -> float | Float[Array, 
 def phasor(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
     """Return exp(i angle)."""
     xp = namespace(angle)
-    return xp.cos(angle) + 1j * xp.sin(angle)
+    return as_complex(xp.cos(angle), xp.sin(angle))
 
 
 class AntennaFields(eqx.Module):

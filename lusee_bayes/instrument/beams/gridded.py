@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from jaxtyping import Complex, Float
-from scipy.interpolate import CubicSpline, make_interp_spline
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
@@ -47,7 +47,7 @@ def at_frequency(
     if len(exact):
         return [np.asarray(part[exact[0]]) for part in parts]
     degree = min(3, len(known_mhz) - 1)
-    splines = [make_interp_spline(known_mhz, part, k=degree) for part in parts]
+    splines = [scipy.interpolate.make_interp_spline(known_mhz, part, k=degree) for part in parts]
     return [np.asarray(spline(frequency_mhz)) for spline in splines]
 
 
@@ -75,7 +75,7 @@ def on_grid(
     (grid_theta, grid_phi) array
     """
     same = len(grid.theta) == len(theta) and bool((grid.theta == theta).all())
-    rows = rows if same else CubicSpline(theta, rows)(grid.theta)
+    rows = rows if same else scipy.interpolate.CubicSpline(theta, rows)(grid.theta)
     n = rows.shape[1]
     steps = angle_deg * n / 360.0
     if grid.n_phi == n and steps == round(steps):

@@ -17,7 +17,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core.arrays import Array, compiled, namespace
+from lusee_bayes.core.arrays import Array, as_complex, compiled, namespace
 from lusee_bayes.core.checks import require_finite, require_positive
 from lusee_bayes.instrument.beams.fields import AntennaFields, phasor, wavenumber
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
@@ -127,8 +127,10 @@ class Monopoles(eqx.Module):
         ground = phasor(-2.0 * k * self.height_m * cos)
         direct = self._current_integral(k, along * sin + up * cos)
         bounced = self._current_integral(k, along * sin - up * cos) * ground
-        e_theta = (along * cos - up * sin) * direct - p * (along * cos + up * sin) * bounced
-        e_phi = across * (direct + s * bounced)
+        to_direct = (along * cos - up * sin).astype(direct.dtype)
+        to_bounced = (along * cos + up * sin).astype(direct.dtype)
+        e_theta = to_direct * direct - p * to_bounced * bounced
+        e_phi = across.astype(direct.dtype) * (direct + s * bounced)
         return e_theta, e_phi
 
     def _current_integral(
@@ -145,7 +147,8 @@ class Monopoles(eqx.Module):
         sinc_a, sinc_b = xp.sinc(a / np.pi), xp.sinc(b / np.pi)
         real = xp.sin(b) * sinc_a + xp.sin(a) * sinc_b
         imaginary = xp.cos(a) * sinc_b - xp.cos(b) * sinc_a
-        return (real + 1j * imaginary) * (self.length_m / 2.0)
+        half = self.length_m / 2.0
+        return as_complex(real * half, imaginary * half)
 
 
 def monopole_beams(

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import nearest, require_float64
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of
@@ -158,4 +158,5 @@ def product_modes(
 def mean_auto_integral(fields: AntennaFields) -> Float[Array, ""]:
     """Return the integral of the Stokes I auto beam in steradian, averaged over antennas."""
     autos = to_real(stokes_beam(fields))[auto_indices(fields.n_antennas)]
-    return fields.grid.integrate(autos).mean()
+    integrals = fields.grid.integrate(autos)
+    return namespace(integrals).asarray(integrals.mean())

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.arrays import Array, as_complex, namespace
 from lusee_bayes.core.checks import is_traced, require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import wavenumber
@@ -58,7 +58,7 @@ class Regolith(eqx.Module):
         real = self.surface_permittivity + rise * (
             self.deep_permittivity - self.surface_permittivity
         )
-        return real - 1j * (real * self.loss_tangent)
+        return as_complex(real, -real * self.loss_tangent)
 
     def reflection(
         self,
@@ -88,6 +88,7 @@ class Regolith(eqx.Module):
         """
         thickness = wavenumber(frequency_mhz) * DEPTH_M / (N_LAYERS - 1)  # in radians of vacuum
         xp = namespace(self, cos_theta, frequency_mhz)
+        thickness = xp.asarray(thickness, dtype=np.complex128)
         cosine = xp.asarray(cos_theta, dtype=np.complex128)
         sin2 = 1.0 - cosine**2
         eps = [xp.ones((), dtype=np.complex128), *self.permittivities()]

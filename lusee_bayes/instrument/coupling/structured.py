@@ -15,9 +15,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -245,7 +242,7 @@ def turned_about_pole(
     xp = namespace(beams, azimuth)
     angle = azimuth[:, None] * np.arange(0.0, m.max() + 1.0)[None]
     cosine, sine = xp.cos(angle), xp.sin(angle)
-    signed = sine[:, np.abs(m)] * np.sign(m)[None]
+    signed = sine[:, np.abs(m)] * np.sign(m).astype(np.float64)[None]
     return beams * cosine[None, :, np.abs(m)] - mirrored * signed[None]
 
 
@@ -320,9 +317,25 @@ def _forward(coupling: CouplingMatrix, sky: Float[Array, " modes"]) -> Float[Arr
     return data if coupling.response is None else data * coupling.response
 
 
-@eqx.filter_jit
+@compiled
 def _backward(coupling: CouplingMatrix, data: Float[Array, " data"]) -> Float[Array, " modes"]:
-    """The transpose of :func:`_forward`, which is linear in the sky."""
-    sky = jax.ShapeDtypeStruct((coupling.shape[1],), jnp.float64)
-    (transposed,) = jax.linear_transpose(lambda a: _forward(coupling, a), sky)(data)
-    return transposed
+    """The transpose of :func:`_forward`, step by step."""
+    n = coupling.lmax + 1
+    data = data if coupling.response is None else data * coupling.response
+    grid = coupling.layout.scatter(data)
+    cosine, sine = _phases(coupling.pointing, coupling.lmax)
+    factors = coupling.pointing.tilt_factors()
+    both = 0.0
+    for run, span in coupling.pointing.runs():
+        weighted = grid[:, span].T[:, :, None] * factors[span][:, None]
+        weighted = weighted.reshape(weighted.shape[0], -1)
+        x_and_y = namespace(weighted).stack(
+            [cosine[span].T @ weighted, sine[span].T @ weighted], axis=-1
+        )
+        both = both + coupling.by_order[run].swapaxes(1, 2) @ x_and_y
+    # (orders, degrees): of pairs, and of what they are crossed to
+    straight, crossed = both[..., 0], both[..., 1]
+    plus, minus = straight[:, :n] - crossed[:, n:], straight[:, n:] + crossed[:, :n]
+    ell, m = mode_numbers(coupling.lmax)
+    packed = namespace(both).where(m >= 0, plus[np.abs(m), ell], minus[np.abs(m), ell])
+    return coupling.pointing.pole_from_galactic.T(packed)

@@ -12,10 +12,10 @@ from N_0^-1, which would leave a small difference of large numbers.
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import require_finite, require_float64, require_positive, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
@@ -75,7 +75,8 @@ class LowRankCovariance(Covariance):
 
     def absorb(self, other):
         if isinstance(other, LowRankCovariance):
-            return LowRankCovariance(jnp.concatenate([self.root, other.root], axis=1), self.name)
+            xp = namespace(self, other)
+            return LowRankCovariance(xp.concatenate([self.root, other.root], axis=1), self.name)
         if isinstance(other, LowRankUpdate):
             return None
         if self.root.shape[1] >= self.size:  # no structure left: a dense sum is cheaper
@@ -84,7 +85,7 @@ class LowRankCovariance(Covariance):
 
     def scaled(self, factor):
         require_positive("the factor of a low-rank term", factor)
-        return LowRankCovariance(jnp.sqrt(factor) * self.root, self.name)
+        return LowRankCovariance(namespace(self, factor).sqrt(factor) * self.root, self.name)
 
 
 class LowRankUpdate(Covariance):
@@ -117,7 +118,7 @@ class LowRankUpdate(Covariance):
     def factor(self):
         base = self.base.factor()
         v = base.whiten(self.update.root)
-        small = jnp.eye(v.shape[1]) + v.T @ v
+        small = np.eye(v.shape[1]) + v.T @ v
         lower = checked_cholesky(f"1 + V^T V of {self.update.name}", small)
         return LowRankFactor(base, v, lower)
 
@@ -153,7 +154,7 @@ class LowRankFactor(Factor):
         """B x, or B^T x with ``transpose``."""
         columns = x.reshape(x.shape[0], -1)
         inner = self.v.T @ columns
-        plus_one = self.lower + jnp.eye(self.lower.shape[0])
+        plus_one = self.lower + np.eye(self.lower.shape[0])
         if transpose:
             inner = solve_lower(self.lower, inner, transpose=False)
             inner = solve_lower(plus_one, inner, transpose=True)
@@ -174,4 +175,5 @@ class LowRankFactor(Factor):
         return self.base.colour(shrunk + self.v @ (self.v.T @ shrunk))
 
     def log_det(self):
-        return self.base.log_det() + 2.0 * jnp.log(jnp.diagonal(self.lower)).sum()
+        xp = namespace(self)
+        return self.base.log_det() + 2.0 * xp.log(xp.diagonal(self.lower)).sum()

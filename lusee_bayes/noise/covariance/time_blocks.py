@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import (
     require_finite,
     require_float64,
@@ -40,10 +39,13 @@ class TimeBlockFactor(Factor):
         return self.layout.from_times(white, x.shape)
 
     def colour(self, z):
-        return self.layout.from_times(jnp.tril(self.lower) @ self.layout.by_time(z), z.shape)
+        return self.layout.from_times(
+            namespace(self).tril(self.lower) @ self.layout.by_time(z), z.shape
+        )
 
     def log_det(self):
-        return 2.0 * jnp.log(jnp.diagonal(self.lower, axis1=1, axis2=2)).sum()
+        xp = namespace(self)
+        return 2.0 * xp.log(xp.diagonal(self.lower, axis1=1, axis2=2)).sum()
 
 
 class TimeBlockCovariance(Covariance):
@@ -74,8 +76,7 @@ class TimeBlockCovariance(Covariance):
         if layout.index is not None:
             present = layout.present.T
             both = present[:, :, None] & present[:, None, :]
-            unit = jnp.eye(n)[None]
-            blocks = jnp.where(both, blocks, unit)
+            blocks = namespace(blocks, layout).where(both, blocks, np.eye(n)[None])
         require_finite("the noise blocks", blocks)
         require_symmetric("the noise covariance of one time", blocks)
         self.blocks = blocks
@@ -89,10 +90,10 @@ class TimeBlockCovariance(Covariance):
         return self.layout.from_times(self.blocks @ self.layout.by_time(x), x.shape)
 
     def diagonal(self):
-        return self.layout.gather(jnp.diagonal(self.blocks, axis1=1, axis2=2).T)
+        return self.layout.gather(namespace(self).diagonal(self.blocks, axis1=1, axis2=2).T)
 
     def dense(self):
-        return self.mv(jnp.eye(self.size))
+        return self.mv(np.eye(self.size))
 
     def factor(self):
         lower = checked_cholesky("the noise covariance of one time", self.blocks)
@@ -109,7 +110,7 @@ class TimeBlockCovariance(Covariance):
             return TimeBlockCovariance(self.blocks + other.blocks, self.layout)
         if isinstance(other, DiagonalCovariance):
             added = self.layout.scatter(other.variance).T
-            blocks = self.blocks + added[:, :, None] * jnp.eye(self.layout.n_products)[None]
+            blocks = self.blocks + added[:, :, None] * np.eye(self.layout.n_products)[None]
             return TimeBlockCovariance(blocks, self.layout)
         return None
 
@@ -117,8 +118,9 @@ class TimeBlockCovariance(Covariance):
         return TimeBlockCovariance(factor * self.blocks, self.layout)
 
 
-@eqx.filter_jit
+@compiled
 def _inverse_blocks(noise: TimeBlockCovariance) -> Float[Array, "products products times"]:
     present = noise.layout.present.T
     both = present[:, :, None] & present[:, None, :]
-    return jnp.moveaxis(jnp.where(both, jnp.linalg.inv(noise.blocks), 0.0), 0, 2)
+    xp = namespace(noise)
+    return xp.moveaxis(xp.where(both, xp.linalg.inv(noise.blocks), 0.0), 0, 2)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import healpy
 import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.paper.claims.base import (
     SHOWN_FREQUENCIES,
     Cases,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-import healpy
 import numpy as np
 from jaxtyping import Float
 from matplotlib import colormaps
@@ -18,6 +17,7 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
 
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.report.figures.drawing import SEQUENTIAL
 
 # points of a view from left to right: as many as a map of a figure has on paper or screen
