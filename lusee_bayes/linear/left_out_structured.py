@@ -23,6 +23,7 @@ Nothing of the size data x modes is formed.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -39,6 +40,8 @@ from lusee_bayes.noise.covariance import LowRankUpdate
 
 # what smooth functions of time may miss of any phase exp(i m phi), |m| <= lmax, or tilt
 SMOOTH = 1e-12
+# C^(1/2) A^T is kept up to this size (a month at lmax 47: 0.1 GB), and made of so many times at once
+KEPT_BYTES, CHUNK = 2.5e8, 64
 # stretches of no more times than that are taken as they are
 FEW_TIMES = 16
 
@@ -115,7 +118,9 @@ class StructuredLeftOut(LeftOut):
         self._v = self._pulled(weighted)
         # C'^(1/2) of every amplitude
         across = cho_solve((self._q, True), self._v)
-        self._amplitudes = np.concatenate([-self._whitened(across), _solve(self._q, np.eye(n))])
+        self._amplitudes = np.concatenate(
+            [-_solve(self._lower, across.T), _solve(self._q, np.eye(n))]
+        )
 
     def stretch(self, times):
         outside, inside, halves = 0.0, [], []
@@ -124,7 +129,7 @@ class StructuredLeftOut(LeftOut):
             if not here.size:
                 continue
             functions = smooth_functions(self._phases(here), self._coupling.pointing.azimuth[here])
-            half = self._half(self._rows(run, here, functions))
+            half = self._half(self._modes(run, here, functions))
             for part in self._parts(here, functions):
                 q, b = np.linalg.qr(part.coloured(part.functions, transpose=True))
                 w = half[:, part.columns] @ b.T
@@ -158,7 +163,15 @@ class StructuredLeftOut(LeftOut):
             if self._weights.ndim == 3:
                 weights = mixing[:, None] * mixing[None] * own
             return float(white @ white + self._taken_out(weights, mixing * self.u[number]))
-        rows, amplitudes = [], np.einsum("jt,jta->ta", mixing, self._t)
+        half = self._half(self._mixed(mixing))[:, : self.u.shape[1]]
+        half = half + self._amplitudes @ np.einsum("jt,jta->at", mixing, self._t)
+        return float(_between((half * np.sqrt(own))[:, here], white[here]))
+
+    def _mixed(self, mixing: Float[np.ndarray, "products times"]) -> np.ndarray:
+        """C^(1/2) of the products' rows of every time, added with these factors."""
+        if self._kept is not None:
+            return np.einsum("jt,jtm->mt", mixing, self._kept, optimize=True)
+        rows = []
         for run, span in self._coupling.pointing.runs():
             factors = self._coupling.pointing.tilt_factors()[span]
             used = np.flatnonzero(mixing[:, span].any(1))
@@ -167,9 +180,29 @@ class StructuredLeftOut(LeftOut):
             tilted = each.reshape(len(each), -1) @ beams.reshape(-1, beams.shape[-1])
             turned = turned_about_pole(tilted[None], self._coupling.pointing.azimuth[span])[0]
             rows.append(self._coupling.pointing.pole_from_galactic.T(turned))
-        half = self._half(np.concatenate(rows))[:, : self.u.shape[1]]
-        half = half + self._amplitudes @ amplitudes.T
-        return float(_between((half * np.sqrt(own))[:, here], white[here]))
+        return self._whitened(np.concatenate(rows))
+
+    @cached_property
+    def _kept(self) -> Float[np.ndarray, "products times modes"] | None:
+        """C^(1/2) of the row of every datum, which days and products share; None if it is large."""
+        n_modes = len(self._scale)
+        if 8 * self.u.size * n_modes > KEPT_BYTES:
+            return None
+        kept = np.empty((*self.u.shape, n_modes))
+        for run, span in self._coupling.pointing.runs():
+            for first in range(span.start, span.stop, CHUNK):
+                here = np.arange(first, min(first + CHUNK, span.stop))
+                rows = self._rows(run, here, np.eye(len(here)))
+                kept[:, here] = self._whitened(rows).T.reshape(len(kept), -1, n_modes)
+        return kept
+
+    def _modes(
+        self, run: int, here: Int[np.ndarray, " times"], functions: Float[np.ndarray, "times n"]
+    ) -> Float[np.ndarray, "modes columns"]:
+        """C^(1/2) of the rows of functions of time, for every product."""
+        if len(here) == functions.shape[1] and self._kept is not None:
+            return self._kept[:, here].reshape(-1, len(self._scale)).T
+        return self._whitened(self._rows(run, here, functions))
 
     def _phases(self, here: Int[np.ndarray, " times"]) -> Float[np.ndarray, "times functions"]:
         """cos and sin of m phi(t) times every power of the tilt: all that A knows of time."""
@@ -214,14 +247,16 @@ class StructuredLeftOut(LeftOut):
         where = np.ix_(np.arange(n_products), here)
         return [Part(where, slice(None), root, np.concatenate([every, amplitudes], axis=1))]
 
-    def _half(self, rows: Float[np.ndarray, "rows modes"]) -> Float[np.ndarray, "rank columns"]:
+    def _half(self, modes: Float[np.ndarray, "modes columns"]) -> Float[np.ndarray, "rank columns"]:
         """C'^(1/2) of combinations of modes, and then of every amplitude."""
-        n = len(self._q)
-        modes = np.pad(self._whitened(rows * self._scale), ((0, n), (0, 0)))
+        if not len(self._q):
+            return modes
+        modes = np.pad(modes, ((0, len(self._q)), (0, 0)))
         return np.concatenate([modes, self._amplitudes], axis=1)
 
     def _whitened(self, rows: Float[np.ndarray, "rows modes"]) -> Float[np.ndarray, "modes rows"]:
-        return _solve(self._lower, rows.T)
+        """C^(1/2) of combinations of modes."""
+        return _solve(self._lower, (rows * self._scale).T)
 
     def _pulled(self, grid: Float[np.ndarray, "products times columns"]) -> np.ndarray:
         """Columns of A^T in white coordinates, as rows."""
@@ -303,4 +338,4 @@ def _between(half: Float[np.ndarray, "rank n"], b: Float[np.ndarray, " n"]) -> f
 
 
 def _solve(lower: Float[np.ndarray, "n n"], x: Float[np.ndarray, "n columns"]) -> np.ndarray:
-    return solve_triangular(lower, x, lower=True)
+    return solve_triangular(lower, x, lower=True, check_finite=False)

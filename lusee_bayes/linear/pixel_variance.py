@@ -36,18 +36,20 @@ def pixel_std(covariance: Float[Array, "modes modes"], nside: int) -> Float[np.n
     heights, place, azimuth = _rings(nside, lmax)
     # rings from the equator on are in the south
     polar = polar_functions(heights[: len(heights) // 2 + 1], lmax)
+    by_order, first = _orders(lmax)
     ell, m = mode_numbers(lmax)
-    sign = (-1.0) ** (ell + m)
-    by_order = np.argsort(m, kind="stable")
-    first = np.searchsorted(m[by_order], np.arange(-lmax, lmax + 1))
+    covariance, polar = covariance[by_order][:, by_order], polar[:, by_order]
+    odd = ((ell + m) % 2 == 1)[by_order]
+    mirrored = np.where(odd, -polar, polar)
     both = np.empty((2 * lmax + 1, len(heights), 2 * lmax + 1))
-    for order, rows in enumerate(np.split(by_order, first[1:])):
-        y, part = polar[:, rows], covariance[rows][:, by_order]
-        for sums, mirror in ((both[order, : len(polar)], 1.0), (both[order, ::-1], sign)):
-            mirror = np.broadcast_to(mirror, sign.shape)
-            seen = (y * mirror[rows]) @ part * (polar * mirror)[:, by_order]
-            # the equator is its own mirror image
-            sums[: len(polar)] = np.add.reduceat(seen, first, axis=1)
+    for order, rows in enumerate(np.split(np.arange(len(m)), first[1:])):
+        even_part, odd_part = (
+            polar[:, some] @ covariance[some] for some in (rows[~odd[rows]], rows[odd[rows]])
+        )
+        # the equator is its own mirror image
+        north, south = both[order, : len(polar)], both[order, ::-1][: len(polar)]
+        north[:] = np.add.reduceat((even_part + odd_part) * polar, first, axis=1)
+        south[:] = np.add.reduceat((even_part - odd_part) * mirrored, first, axis=1)
     between = both.transpose(1, 0, 2)
     return np.sqrt(_on_pixels(((azimuth @ between) * azimuth).sum(2), place))
 
@@ -72,12 +74,17 @@ def independent_pixel_std(
     variance = np.asarray(variance)
     lmax = lmax_of(len(variance))
     heights, place, azimuth = _rings(nside, lmax)
-    _, m = mode_numbers(lmax)
+    by_order, first = _orders(lmax)
     weighted = polar_functions(heights, lmax) ** 2 * variance
-    by_order = np.argsort(m, kind="stable")
-    first = np.searchsorted(m[by_order], np.arange(-lmax, lmax + 1))
     of_orders = np.add.reduceat(weighted[:, by_order], first, axis=1)
     return np.sqrt(_on_pixels((azimuth**2 @ of_orders[:, :, None])[:, :, 0], place))
+
+
+def _orders(lmax: int) -> tuple[np.ndarray, np.ndarray]:
+    """The packed modes by growing m, and where each m begins."""
+    _, m = mode_numbers(lmax)
+    by_order = np.argsort(m, kind="stable")
+    return by_order, np.searchsorted(m[by_order], np.arange(-lmax, lmax + 1))
 
 
 def _rings(nside: int, lmax: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -215,6 +215,10 @@ def channel_of_posterior(
     fraction = np.divide(
         variance, prior_variance, out=np.zeros(len(variance)), where=prior_variance > 0
     )
+    if judged is inference:  # each mode that the data determine takes one from N_data
+        expected = inference.model.n_data - float((1.0 - fraction)[prior_variance > 0].sum())
+    else:
+        expected = expected_chi2(judged.posterior, inference.model.n_data)
     return ChannelResult(
         frequency_mhz=scenario.frequency_mhz,
         mean=np.asarray(posterior.mean),
@@ -229,7 +233,7 @@ def channel_of_posterior(
         log_evidence=float(posterior.log_evidence),
         information_bits=float(posterior.information_bits()),
         chi2=float(inference.model.chi2(posterior.mean, data.data)),
-        chi2_expected=expected_chi2(judged.posterior, inference.model.n_data),
+        chi2_expected=expected,
         refinement=float(posterior.refinement),
         n_data=inference.model.n_data,
         n_missing=data.n_missing,

@@ -25,7 +25,7 @@ from lusee_bayes.core.harmonics import (
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference
-from lusee_bayes.linear.pixel_variance import independent_pixel_std, pixel_std
+from lusee_bayes.linear.pixel_variance import independent_pixel_std
 from lusee_bayes.linear.residuals import Group, residuals
 from lusee_bayes.linear.resolution import resolution_rows
 from lusee_bayes.results.channel import ChannelResult, draw_key
@@ -74,7 +74,10 @@ def diagnostics(
     # would be close to zero everywhere
     rest, rest_prior = covariance.copy(), channel.prior_std**2
     rest[0], rest[:, 0], rest_prior[0] = 0.0, 0.0, 0.0
-    share = (pixel_std(rest, nside) / independent_pixel_std(rest_prior, nside)) ** 2
+    monopole = 1.0 / np.sqrt(4.0 * np.pi)
+    with_monopole = 2.0 * modes_to_map(covariance[0], nside) - monopole * covariance[0, 0]
+    left = channel.pixel_std**2 - monopole * with_monopole
+    share = left / independent_pixel_std(rest_prior, nside) ** 2
     rows = region_rows(nside, lmax)
     region_share = variances(rows, rest) / (rows**2 @ rest_prior)
 

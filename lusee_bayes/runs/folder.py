@@ -14,6 +14,7 @@ from lusee_bayes.core.compilation_cache import publish, use_compilation_cache
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import MANIFEST, recover, require_folder, transaction
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.report.figures.drawing import save
 from lusee_bayes.report.pages import PAGES, REPORT
 
 FIGURES = "figures"
@@ -139,7 +140,7 @@ def write_run(folder: Path, result: Any, kind: RunKind, stages: Stages) -> list[
             (stage / FIGURES).mkdir()
             with stages("figures"):
                 for name, draw in kind.figures.items():
-                    draw(result).savefig(stage / FIGURES / f"{name}.png", dpi=kind.dpi)
+                    save(draw(result), stage / FIGURES / f"{name}.png", kind.dpi)
         with stages("files"):
             for output in kind.outputs:
                 if output.wanted(result):

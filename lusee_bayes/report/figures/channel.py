@@ -18,6 +18,7 @@ from lusee_bayes.report.figures.drawing import (
     SEQUENTIAL,
     colour_bar,
     orthographic,
+    without_minor_ticks,
 )
 from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.channel import ChannelResult
@@ -46,7 +47,7 @@ def data_vector(data: Visibilities) -> Figure:
 def beams(setup: Setup) -> Figure:
     """An auto and two crosses from above: zenith in the centre, North up, horizon at the rim."""
     frequency = setup.scenario.frequency_mhz
-    grid = HemisphereGrid.gauss_legendre(64, 180)
+    grid = HemisphereGrid.gauss_legendre(48, 120)
     fields = setup.beam_source.fields(frequency, grid)
     patterns = np.asarray(stokes_beam(fields))
     names = {0: "auto 00", 2: "|cross 02|", 1: "|cross 01|"}
@@ -113,6 +114,7 @@ def fidelity(channel: ChannelResult) -> Figure:
         axes[1].semilogy(ell, spectra["snr"][1:], color=BLUE)
         axes[1].axhline(1.0, color=GREY, lw=0.8, ls=":")
         axes[1].set(ylabel=r"$\mathrm{SNR}_\ell$")
+        without_minor_ticks(axes[1].yaxis)
         cross = ell_cross(spectra["snr"])
         if cross is not None:
             axes[1].axvline(cross, color=ORANGE, lw=1, ls="--", label=f"first below 1: {cross}")
@@ -139,6 +141,7 @@ def spectra(channel: ChannelResult) -> Figure:
         if name in columns:
             axes.semilogy(ell, columns[name], color=colour, ls=line, label=label)
     axes.set(xlabel=r"multipole $\ell$", ylabel=r"$C_\ell$ [K$^2$]", xlim=(0, ell[-1]))
+    without_minor_ticks(axes.yaxis)
     axes.legend(frameon=False)
     axes.set_title(f"Power at {channel.frequency_mhz:g} MHz")
     return figure

@@ -7,7 +7,14 @@ import xarray as xr
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, ORANGE, colour_bar
+from lusee_bayes.report.figures.drawing import (
+    BLUE,
+    DIVERGING,
+    GREY,
+    ORANGE,
+    colour_bar,
+    without_minor_ticks,
+)
 from lusee_bayes.report.figures.mollweide import mollweide
 
 # residuals beyond that have the darkest colours
@@ -61,6 +68,7 @@ def residuals(found: xr.Dataset) -> Figure:
     ):
         p = np.maximum(found[key].values[of_products], LEAST_P)
         right.semilogx(p, rows, ls="", marker=marker, color=colour, ms=5, label=text)
+    without_minor_ticks(right.xaxis)
     right.axvline(1.0, color=GREY, lw=0.5)
     right.set(xlabel=f"p-value (drawn down to {LEAST_P:g})", xlim=(LEAST_P / 3, 3))
     right.grid(axis="y", lw=0.3)

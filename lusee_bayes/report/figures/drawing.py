@@ -2,21 +2,41 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from jaxtyping import Complex
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.image import imsave
 from matplotlib.patches import Circle
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import LogLocator, NullLocator
 
 from lusee_bayes.instrument.beams import HemisphereGrid
 
 # safe for colour-blind readers: perceptually uniform, and a blue-orange pair (Okabe-Ito) for lines
 SEQUENTIAL, DIVERGING = "inferno", "PuOr_r"
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#666666"
+# of PNGs: a fifth larger than with 6, and written in a third of the time
+COMPRESSION = 2
+
+
+def save(figure: Figure, path: Path, dpi: int) -> None:
+    """Write a figure as a PNG; laid out and drawn once, where savefig alone draws it twice."""
+    figure.set_dpi(dpi)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    imsave(path, canvas.buffer_rgba(), dpi=dpi, pil_kwargs={"compress_level": COMPRESSION})
+
+
+def without_minor_ticks(axis: Axis) -> None:
+    """Leave out the minor ticks of a logarithmic axis of many decades: hundreds, slow to draw."""
+    axis.set_minor_locator(NullLocator())
 
 
 def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Complex[np.ndarray, "theta phi"]):

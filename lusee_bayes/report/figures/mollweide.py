@@ -62,7 +62,7 @@ def mollweide(
         line.set_path_effects(SEEN_ANYWHERE)
         line.set_clip_path(rim)
     _graticule(axes)
-    axes.set(xlim=(-1.02 * EDGE[0], 1.02 * EDGE[0]), ylim=(-1.03 * EDGE[1], 1.03 * EDGE[1]))
+    axes.set(xlim=(-1.09 * EDGE[0], 1.02 * EDGE[0]), ylim=(-1.03 * EDGE[1], 1.03 * EDGE[1]))
     axes.set_axis_off()
     return image
 
@@ -130,7 +130,8 @@ def _graticule(axes: Axes) -> None:
     # one path with gaps is drawn faster than ten
     x, y = (np.concatenate([np.append(line[k], np.nan) for line in lines]) for k in (0, 1))
     axes.plot(EDGE[0] * x, EDGE[1] * y, color="#b0b0b0", alpha=0.4, lw=0.4)
-    style = {"fontsize": 7, "va": "center"}
+    # their place is known: the layout need not measure them
+    style = {"fontsize": 7, "va": "center", "in_layout": False}
     for lon in MERIDIANS:
         text = f"{lon % 360:.0f}°"
         label = axes.text(-EDGE[0] * lon / 180.0, 0.06, text, ha="center", **style)
