@@ -40,7 +40,7 @@ from lusee_bayes.noise.covariance import LowRankUpdate
 
 # what smooth functions of time may miss of any phase exp(i m phi), |m| <= lmax, or tilt
 SMOOTH = 1e-12
-# C^(1/2) A^T is kept up to this size (a month at lmax 47: 0.1 GB), and made of so many times at once
+# C^(1/2) A^T is kept up to this size (a month at lmax 47: 0.1 GB); it is made by so many times
 KEPT_BYTES, CHUNK = 2.5e8, 64
 # stretches of no more times than that are taken as they are
 FEW_TIMES = 16
@@ -191,9 +191,9 @@ class StructuredLeftOut(LeftOut):
         kept = np.empty((*self.u.shape, n_modes))
         for run, span in self._coupling.pointing.runs():
             for first in range(span.start, span.stop, CHUNK):
-                here = np.arange(first, min(first + CHUNK, span.stop))
-                rows = self._rows(run, here, np.eye(len(here)))
-                kept[:, here] = self._whitened(rows).T.reshape(len(kept), -1, n_modes)
+                end = min(first + CHUNK, span.stop)
+                rows = self._rows(run, np.arange(first, end), np.eye(end - first))
+                kept[:, first:end] = self._whitened(rows).T.reshape(len(kept), -1, n_modes)
         return kept
 
     def _modes(

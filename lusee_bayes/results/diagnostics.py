@@ -72,14 +72,16 @@ def diagnostics(
     safe = np.where(peaks > 0, peaks, 1.0)
     # the prior leaves the monopole wide open, which any data settle; with it the prior's share
     # would be close to zero everywhere
-    rest, rest_prior = covariance.copy(), channel.prior_std**2
-    rest[0], rest[:, 0], rest_prior[0] = 0.0, 0.0, 0.0
+    rest_prior = np.where(np.arange(len(covariance)) > 0, channel.prior_std**2, 0.0)
     monopole = 1.0 / np.sqrt(4.0 * np.pi)
     with_monopole = 2.0 * modes_to_map(covariance[0], nside) - monopole * covariance[0, 0]
     left = channel.pixel_std**2 - monopole * with_monopole
     share = left / independent_pixel_std(rest_prior, nside) ** 2
     rows = region_rows(nside, lmax)
-    region_share = variances(rows, rest) / (rows**2 @ rest_prior)
+    seen = rows @ covariance
+    region_variance = (seen * rows).sum(1)
+    with_monopole = 2.0 * seen[:, 0] - rows[:, 0] * covariance[0, 0]
+    region_share = (region_variance - rows[:, 0] * with_monopole) / (rows**2 @ rest_prior)
 
     def on_grid(values: Float[np.ndarray, " data"]) -> Float[np.ndarray, "products times"]:
         return np.where(data.layout.present, data.layout.scatter(values), np.nan)
@@ -90,7 +92,7 @@ def diagnostics(
         "highest_altitude": ("pixel", channel.highest_altitude, {"units": "sin"}),
         "draws": (("draw", "pixel"), np.stack([modes_to_map(d, nside) for d in draws]), kelvin),
         "region_mean": ("region", rows @ channel.mean, kelvin),
-        "region_std": ("region", np.sqrt(variances(rows, covariance)), kelvin),
+        "region_std": ("region", np.sqrt(region_variance), kelvin),
         "region_prior_fraction": ("region", region_share),
         "psf": (("region", "kernel_pixel"), kernels / safe[:, None]),
         "psf_peak": ("region", peaks, {"units": "1/sr"}),
@@ -163,13 +165,6 @@ def region_rows(nside: int, lmax: int) -> Float[np.ndarray, "regions modes"]:
     rows = polar_functions(heights, lmax)[ring[parts]] * sums[:, m + lmax]
     _, first = np.unique(of[parts], return_index=True)
     return np.add.reduceat(rows, first) / np.bincount(of)[:, None]
-
-
-def variances(
-    rows: Float[np.ndarray, "n modes"], covariance: Float[np.ndarray, "modes modes"]
-) -> Float[np.ndarray, " n"]:
-    """Variances of linear combinations of the coefficients."""
-    return np.einsum("rm,rm->r", rows @ covariance, rows)
 
 
 def _groups(kinds: dict[str, tuple[Group, ...]]) -> dict[str, tuple[str, np.ndarray]]:

@@ -26,8 +26,8 @@ from lusee_bayes.results.channel import ChannelResult
 
 def data_vector(data: Visibilities) -> Figure:
     """The data vector as the paper draws it: products side by side, time running within each."""
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    axes = figure.subplots()
+    figure = Figure(figsize=(11, 4))
+    axes = figure.subplots(gridspec_kw={"left": 0.08, "right": 0.99, "bottom": 0.13, "top": 0.91})
     n_times = data.layout.n_times
     axes.plot(data.grid().ravel(), color=BLUE, lw=0.7)
     for k in range(1, data.layout.n_products):
@@ -54,12 +54,13 @@ def beams(setup: Setup) -> Figure:
     if not setup.scenario.beam.is_file:
         names = {0: "auto 00 (North)", 2: "|cross 02| (opposite)", 1: "|cross 01| (perpendicular)"}
     panels = [(name, patterns[0, k]) for k, name in names.items() if k < fields.n_antennas]
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    grid_of_axes = np.atleast_1d(figure.subplots(1, len(panels)))
+    figure = Figure(figsize=(11, 4))
+    places = {"left": 0.01, "right": 0.99, "bottom": 0.02, "top": 0.82, "wspace": 0.04}
+    grid_of_axes = np.atleast_1d(figure.subplots(1, len(panels), gridspec_kw=places))
     for axes, (title, pattern) in zip(grid_of_axes, panels, strict=True):
         image = orthographic(axes, grid, pattern)
         axes.set_title(title)
-    figure.colorbar(image, ax=figure.axes, label="beam / its peak", shrink=0.8)
+    figure.colorbar(image, ax=figure.axes, label="beam / its peak", shrink=0.8, pad=0.02)
     figure.suptitle(f"Beams at {frequency:g} MHz, zenith at the centre")
     return figure
 
@@ -83,13 +84,14 @@ def maps(channel: ChannelResult) -> Figure:
     bounds = Normalize(*np.percentile(spread, [0.5, 99.5]))
     panels.append(("posterior standard deviation", spread, bounds, SEQUENTIAL, "% of the mean sky"))
     rows = (len(panels) + 1) // 2
-    figure = Figure(figsize=(12, 3.6 * rows), layout="constrained")
-    for position, (title, pixels, norm, cmap, unit) in enumerate(panels):
-        axes = figure.add_subplot(rows, 2, position + 1)
+    figure = Figure(figsize=(12, 3.6 * rows))
+    places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.9, "wspace": 0.06}
+    grid_of_axes = figure.subplots(rows, 2, gridspec_kw=places | {"hspace": 0.12}).ravel()
+    for axes, (title, pixels, norm, cmap, unit) in zip(grid_of_axes, panels, strict=True):
         image = mollweide(
             axes, pixels, norm=norm, cmap=cmap, highest_altitude=channel.highest_altitude
         )
-        colour_bar(figure, image, axes, label=unit, shrink=0.85, extend="both")
+        colour_bar(figure, image, axes, label=unit, shrink=0.8, extend="both", pad=0.03)
         axes.set_title(title)
     figure.suptitle(
         f"{channel.frequency_mhz:g} MHz, Galactic coordinates; dashed: never above the horizon"
@@ -101,8 +103,11 @@ def fidelity(channel: ChannelResult) -> Figure:
     """rho_ell and SNR_ell where the truth is known, and how much of each ell the prior supplies."""
     spectra = channel.spectra()
     known = "snr" in spectra
-    figure = Figure(figsize=(12 if known else 5, 4), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(1, 3 if known else 1))
+    figure = Figure(figsize=(12 if known else 5, 4))
+    places = {"left": 0.06 if known else 0.14, "right": 0.98, "bottom": 0.13, "top": 0.9}
+    axes = np.atleast_1d(
+        figure.subplots(1, 3 if known else 1, gridspec_kw=places | {"wspace": 0.25})
+    )
     ell = spectra["ell"][1:]
     axes[-1].plot(ell, spectra["prior_fraction"][1:], color=BLUE)
     axes[-1].axhline(0.5, color=GREY, lw=0.8, ls=":")
@@ -128,8 +133,8 @@ def fidelity(channel: ChannelResult) -> Figure:
 def spectra(channel: ChannelResult) -> Figure:
     """C_ell of prior, posterior mean, truth and posterior variance."""
     columns = channel.spectra()
-    figure = Figure(figsize=(6, 4.5), layout="constrained")
-    axes = figure.subplots()
+    figure = Figure(figsize=(6, 4.5))
+    axes = figure.subplots(gridspec_kw={"left": 0.13, "right": 0.97, "bottom": 0.12, "top": 0.92})
     ell = columns["ell"]
     styles = {
         "cl_prior": ("prior", GREY, "-"),

@@ -28,12 +28,14 @@ def draws(found: xr.Dataset) -> Figure:
     maps = found["draws"].values
     positive = np.percentile(maps[maps > 0], [0.5, 99.8])
     altitude = found["highest_altitude"].values
-    figure = Figure(figsize=(12, 3.6 * ((len(maps) + 1) // 2)), layout="constrained")
-    for k, pixels in enumerate(maps):
-        axes = figure.add_subplot((len(maps) + 1) // 2, 2, k + 1)
+    rows = (len(maps) + 1) // 2
+    figure = Figure(figsize=(12, 3.6 * rows))
+    places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.9, "wspace": 0.02}
+    grid_of_axes = figure.subplots(rows, 2, gridspec_kw=places | {"hspace": 0.12}).ravel()
+    for k, (axes, pixels) in enumerate(zip(grid_of_axes, maps, strict=True)):
         image = mollweide(axes, pixels, norm=LogNorm(*positive), highest_altitude=altitude)
         axes.set_title(f"draw {k + 1}")
-    colour_bar(figure, image, figure.axes, label="K", shrink=0.7, extend="both")
+    colour_bar(figure, image, figure.axes, label="K", shrink=0.7, extend="both", pad=0.02)
     figure.suptitle(f"Draws of the posterior at {found.attrs['frequency_mhz']:g} MHz")
     return figure
 
@@ -41,8 +43,9 @@ def draws(found: xr.Dataset) -> Figure:
 def residuals(found: xr.Dataset) -> Figure:
     """Every datum against the prediction of all others, and what each product's removal mends."""
     labels, hours, z = found["product"].values, found["hours"].values, found["z"].values
-    figure = Figure(figsize=(12, 4.8), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
+    figure = Figure(figsize=(12, 4.8))
+    places = {"left": 0.06, "right": 0.98, "bottom": 0.11, "top": 0.82, "wspace": 0.03}
+    left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True, gridspec_kw=places)
     # samples are not evenly spaced where runs follow one another or nights are left out
     image = left.pcolormesh(
         np.append(np.arange(len(hours)), len(hours)) - 0.5,
@@ -58,7 +61,9 @@ def residuals(found: xr.Dataset) -> Figure:
     left.invert_yaxis()
     left.set(xlabel="time [days]", ylabel="product", title="Each datum given all others")
     left.set_facecolor("0.8")
-    figure.colorbar(image, ax=left, label="standard deviations", extend="both", shrink=0.9)
+    figure.colorbar(
+        image, ax=left, label="standard deviations", extend="both", shrink=0.9, pad=0.02
+    )
     of_products = found["group_kind"].values == "product"
     names = found["group_name"].values[of_products]
     rows = [list(labels).index(name) for name in names]
