@@ -104,7 +104,7 @@ def symmetric_product(
     """
     n = right.shape[1]
     if namespace(left, right) is np:
-        return _mirrored(left @ right)
+        return mirrored(left @ right)
     return _from_strips([left[first:end] @ right[:, :end] for first, end in _strips(n)])
 
 
@@ -125,7 +125,7 @@ def invert_lower(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def inverse_from_cholesky(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Return (L L^T)^-1 for lower triangular L, symmetric to the last bit."""
     if namespace(lower) is np:
-        return _mirrored(dpotri(lower.T, lower=0)[0].T)
+        return mirrored(dpotri(lower.T, lower=0)[0].T)
     x = invert_lower(lower)
     # columns of L^-1 begin at their own row
     return _from_strips(
@@ -133,8 +133,8 @@ def inverse_from_cholesky(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
     )
 
 
-def _mirrored(lower: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """The symmetric matrix of this lower triangle, in place; block by block, as caches like it."""
+def mirrored(lower: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Make a lower triangle symmetric, in place; block by block, as caches like it."""
     edges = [*range(0, len(lower), MIRRORED), len(lower)]
     for first, end in pairwise(edges):
         lower[:first, first:end] = lower[first:end, :first].T

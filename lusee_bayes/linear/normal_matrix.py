@@ -25,7 +25,7 @@ from lusee_bayes.core.arrays import Array, compiled, namespace, placed, scan
 from lusee_bayes.core.checks import is_traced, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mode_numbers
-from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, solve_lower
+from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, mirrored, solve_lower
 from lusee_bayes.core.rotations import Rotation
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_about_pole
 from lusee_bayes.linear.time_sums import CHUNK, time_sums
@@ -293,10 +293,24 @@ def _weighted(
 def _to_galactic(
     pole_from_galactic: Rotation, matrix: Float[Array, "modes modes"]
 ) -> Float[Array, "modes modes"]:
-    """R^T M R, symmetric to the last bit."""
+    """R^T M R, symmetric to the last bit. NumPy's M is overwritten."""
+    if namespace(pole_from_galactic, matrix) is np:
+        return _turned_in_place(pole_from_galactic, matrix)
     back = pole_from_galactic.T
     turned = back(back(matrix).T)
     return (turned + turned.T) / 2.0
+
+
+def _turned_in_place(
+    rotation: Rotation, matrix: Float[np.ndarray, "modes modes"]
+) -> Float[np.ndarray, "modes modes"]:
+    """R^T M R degree by degree, on and below the diagonal: what is worked on fits into a cache."""
+    spans = [slice(ell**2, (ell + 1) ** 2) for ell in range(len(rotation.blocks))]
+    for ell, (left, here) in enumerate(zip(rotation.blocks, spans, strict=True)):
+        rows = left.T @ matrix[here, : here.stop]
+        for right, there in zip(rotation.blocks[: ell + 1], spans[: ell + 1], strict=True):
+            matrix[here, there] = rows[:, there] @ right
+    return mirrored(matrix)
 
 
 @eqx.filter_jit

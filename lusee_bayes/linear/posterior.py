@@ -274,6 +274,9 @@ def _covariance(
         half = solve_lower(posterior.lower, posterior.basis.T, transpose=False)
         white = half.T @ half + xp.eye(rank) - posterior.basis @ posterior.basis.T
     rounding = _rounding(posterior, xp.diagonal(white))
+    root = posterior.prior.diagonal_root()
+    if root is not None:
+        return root[:, None] * white * root[None], rounding
     return posterior.prior.colour(posterior.prior.colour(white).T), rounding
 
 
