@@ -17,67 +17,31 @@ angle, have more data than there are modes; they are taken out of the normal mat
 
     chi^2_s = |w|^2 + h^T (C'^-1 - A'^T D A')^-1 h,    h = A'^T u_s.
 
-Nothing of the size data x modes is formed.
+For a long run nothing of the size data x modes is formed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from lusee_bayes.core.arrays import Array, on_host
 from lusee_bayes.core.harmonics import mode_numbers
-from lusee_bayes.instrument.coupling import turned_about_pole
+from lusee_bayes.instrument.coupling import CouplingMatrix, turned_about_pole
+from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.linear.left_out import LeftOut
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.normal_matrix import summed
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.linear.stretches import Part, roots_of_blocks, smooth_functions, weigh
 from lusee_bayes.noise.covariance import LowRankUpdate
 
-# what smooth functions of time may miss of any phase exp(i m phi), |m| <= lmax, or tilt
-SMOOTH = 1e-12
 # C^(1/2) A^T is kept up to this size (a month at lmax 47: 0.1 GB); it is made by so many times
 KEPT_BYTES, CHUNK = 2.5e8, 64
-# stretches of no more times than that are taken as they are
-FEW_TIMES = 16
-
-
-@dataclass(frozen=True)
-class Part:
-    """Data of a stretch of time that N_0 couples with each other, but with no other data.
-
-    Attributes
-    ----------
-    where : tuple
-        Their places on the grid (products, times).
-    columns : slice
-        Those of the stretch that they have a part in.
-    root : (data,) or (times, products, products) array
-        c: of independent data, or of the products of each time.
-    functions : (data, columns) array
-        U.
-    """
-
-    where: tuple
-    columns: slice
-    root: Float[np.ndarray, "..."]
-    functions: Float[np.ndarray, "data columns"]
-
-    def coloured(self, x: Float[np.ndarray, "data columns"], *, transpose: bool = False):
-        """c x, or c^T x."""
-        if self.root.ndim == 1:
-            return self.root[:, None] * x
-        by_time = x.reshape(self.root.shape[1], len(self.root), -1).swapaxes(0, 1)
-        turned = (self.root.swapaxes(1, 2) if transpose else self.root) @ by_time
-        return turned.swapaxes(0, 1).reshape(x.shape)
-
-    def diagonal(self) -> Float[np.ndarray, " data"]:
-        """The diagonal of D = c c^T."""
-        return self.root**2 if self.root.ndim == 1 else (self.root**2).sum(2).T.ravel()
 
 
 class StructuredLeftOut(LeftOut):
@@ -101,6 +65,9 @@ class StructuredLeftOut(LeftOut):
         if isinstance(base, LowRankUpdate):
             base, templates = base.base, np.asarray(base.update.root)
         self._coupling = model.coupling
+        shape = self._coupling.layout.n_products, self._coupling.layout.n_times
+        self._complete = replace(self._coupling, layout=DataLayout(*shape))
+        self._tilts = self._coupling.pointing.tilt_factors()
         self._scale = model.prior.diagonal_root()
         self._lower = posterior.lower
         scatter = self._coupling.layout.scatter
@@ -115,7 +82,7 @@ class StructuredLeftOut(LeftOut):
         weighted = weigh(self._weights, self._t)
         n = templates.shape[1]
         self._q = np.linalg.cholesky(np.eye(n) + np.einsum("kta,ktb->ab", weighted, self._t))
-        self._v = self._pulled(weighted)
+        self._v = self._pulled(self._complete, weighted)
         # C'^(1/2) of every amplitude
         across = cho_solve((self._q, True), self._v)
         self._amplitudes = np.concatenate(
@@ -144,7 +111,8 @@ class StructuredLeftOut(LeftOut):
 
     def together(self, times):
         squared = float((self.u * self._y)[:, times].sum())
-        return squared + self._taken_out(self._weights * times, self.u * times)
+        every = np.ones(len(self.u), dtype=bool)
+        return squared + self._taken_out(self._weights * times, self.u * times, every)
 
     def product(self, number):
         own, mixing = self._weights[number], 0.0
@@ -162,7 +130,8 @@ class StructuredLeftOut(LeftOut):
             weights = mixing * own
             if self._weights.ndim == 3:
                 weights = mixing[:, None] * mixing[None] * own
-            return float(white @ white + self._taken_out(weights, mixing * self.u[number]))
+            used = mixing.any(axis=1)
+            return float(white @ white + self._taken_out(weights, mixing * self.u[number], used))
         half = self._half(self._mixed(mixing))[:, : self.u.shape[1]]
         half = half + self._amplitudes @ np.einsum("jt,jta->at", mixing, self._t)
         return float(_between((half * np.sqrt(own))[:, here], white[here]))
@@ -173,7 +142,7 @@ class StructuredLeftOut(LeftOut):
             return np.einsum("jt,jtm->mt", mixing, self._kept, optimize=True)
         rows = []
         for run, span in self._coupling.pointing.runs():
-            factors = self._coupling.pointing.tilt_factors()[span]
+            factors = self._tilts[span]
             used = np.flatnonzero(mixing[:, span].any(1))
             beams = self._coupling.body_beams[run][used]
             each = mixing[used][:, span].T[:, :, None] * factors[:, None]
@@ -206,7 +175,7 @@ class StructuredLeftOut(LeftOut):
 
     def _phases(self, here: Int[np.ndarray, " times"]) -> Float[np.ndarray, "times functions"]:
         """cos and sin of m phi(t) times every power of the tilt: all that A knows of time."""
-        factors = self._coupling.pointing.tilt_factors()[here]
+        factors = self._tilts[here]
         angle = self._coupling.pointing.azimuth[here, None] * np.arange(self._coupling.lmax + 1.0)
         waves = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
         return (factors[:, :, None] * waves[:, None]).reshape(len(here), -1)
@@ -247,7 +216,7 @@ class StructuredLeftOut(LeftOut):
         where = np.ix_(np.arange(n_products), here)
         return [Part(where, slice(None), root, np.concatenate([every, amplitudes], axis=1))]
 
-    def _half(self, modes: Float[np.ndarray, "modes columns"]) -> Float[np.ndarray, "rank columns"]:
+    def _half(self, modes: Float[np.ndarray, "modes columns"]) -> Float[np.ndarray, "rank more"]:
         """C'^(1/2) of combinations of modes, and then of every amplitude."""
         if not len(self._q):
             return modes
@@ -258,74 +227,62 @@ class StructuredLeftOut(LeftOut):
         """C^(1/2) of combinations of modes."""
         return _solve(self._lower, (rows * self._scale).T)
 
-    def _pulled(self, grid: Float[np.ndarray, "products times columns"]) -> np.ndarray:
+    def _pulled(
+        self, coupling: CouplingMatrix, grid: Float[np.ndarray, "products times columns"]
+    ) -> Float[np.ndarray, "columns modes"]:
         """Columns of A^T in white coordinates, as rows."""
-        gather = self._coupling.layout.gather
-        columns = np.moveaxis(grid, 2, 0)
-        pulled = [self._coupling.transpose_mv(gather(x)) for x in columns]
-        return np.reshape(pulled, (len(columns), len(self._scale))) * self._scale
+        pulled = [coupling.transpose_mv(x.ravel()) for x in np.moveaxis(grid, 2, 0)]
+        return np.reshape(pulled, (grid.shape[2], len(self._scale))) * self._scale
 
-    def _taken_out(self, weights: np.ndarray, pull: Float[np.ndarray, "products times"]) -> float:
-        """h^T (C'^-1 - A'^T D A')^-1 h of a group, given its D and how u pulls at its data."""
-        n, weighted = len(self._scale), weigh(weights, self._t)
-        information = np.asarray(summed(self._coupling, weights))
-        across = self._v - self._pulled(weighted)
+    @cached_property
+    def _precision(self) -> Float[np.ndarray, "rank rank"]:
+        """C'^-1."""
+        n = len(self._scale)
         precision = np.empty((n + len(self._q),) * 2)
-        precision[:n, :n] = (
-            self._lower @ self._lower.T - self._scale[:, None] * information * self._scale
-        )
+        precision[:n, :n] = self._lower @ self._lower.T
         precision[:n, :n] += self._v.T @ cho_solve((self._q, True), self._v)
-        precision[n:, :n], precision[:n, n:] = across, across.T
-        precision[n:, n:] = self._q @ self._q.T - np.einsum("kta,ktb->ab", weighted, self._t)
-        h = np.concatenate(
-            [self._pulled(pull[..., None])[0], np.einsum("kt,kta->a", pull, self._t)]
-        )
-        return float(h @ cho_solve(cho_factor(precision, lower=True, overwrite_a=True), h))
+        precision[n:, :n], precision[:n, n:] = self._v, self._v.T
+        precision[n:, n:] = self._q @ self._q.T
+        return precision
+
+    def _taken_out(
+        self,
+        weights: Float[np.ndarray, "..."],
+        pull: Float[np.ndarray, "products times"],
+        used: Bool[np.ndarray, " products"],
+    ) -> float:
+        """h^T (C'^-1 - A'^T D A')^-1 h of a group, given its D and how u pulls at its data.
+
+        ``used``: the products that D and u have a part in.
+        """
+        n, weighted = len(self._scale), weigh(weights, self._t)
+        coupling = self._complete if used.all() else of_products(self._complete, used)
+        within = weights[used] if weights.ndim == 2 else weights[used][:, used]
+        left = self._precision.copy()
+        left[:n, :n] -= self._scale[:, None] * summed(coupling, within) * self._scale
+        if len(self._q):
+            taken = self._pulled(coupling, weighted[used])
+            left[n:, :n] -= taken
+            left[:n, n:] -= taken.T
+            left[n:, n:] -= np.einsum("kta,ktb->ab", weighted, self._t)
+        h = [
+            self._pulled(coupling, pull[used][..., None])[0],
+            np.einsum("kt,kta->a", pull, self._t),
+        ]
+        h = np.concatenate(h)
+        return float(h @ cho_solve(cho_factor(left, lower=True, overwrite_a=True), h))
 
 
-def smooth_functions(
-    phases: Float[np.ndarray, "times functions"], azimuth: Float[np.ndarray, " times"]
-) -> Float[np.ndarray, "times n"]:
-    """Find few orthonormal functions of time that make up all of the given ones.
-
-    Parameters
-    ----------
-    phases : (times, functions) array
-        To be made up, to ``SMOOTH``.
-    azimuth : (times,) array
-        phi(t) in radians, whose polynomials they are; turns of 2 pi do not matter.
-
-    Returns
-    -------
-    (times, n) array
-        The unit matrix where the times are few, or the functions not smooth.
-    """
-    n_times = len(phases)
-    x = np.unwrap(azimuth)
-    x = (2.0 * x - x.min() - x.max()) / max(np.ptp(x), 1e-300)
-    for n in range(FEW_TIMES, n_times, 4):
-        basis = np.linalg.qr(np.polynomial.chebyshev.chebvander(x, n - 1))[0]
-        missed = phases - basis @ (basis.T @ phases)
-        if np.abs(missed).max() <= SMOOTH * np.abs(phases).max():
-            return basis
-    return np.eye(n_times)
-
-
-def weigh(weights: np.ndarray, grid: Float[np.ndarray, "products times n"]) -> np.ndarray:
-    """D x, for D of independent data or of the products of each time."""
-    if weights.ndim == 2:
-        return weights[..., None] * grid
-    return np.einsum("kjt,jtn->ktn", weights, grid)
-
-
-def roots_of_blocks(
-    blocks: Float[np.ndarray, "products products times"],
-) -> Float[np.ndarray, "times products products"]:
-    """Cholesky factors of blocks that are zero where a sample is missing."""
-    by_time = np.moveaxis(blocks, 2, 0)
-    present = np.diagonal(by_time, axis1=1, axis2=2) > 0
-    missing = np.eye(len(blocks)) * ~present[:, None]
-    return np.linalg.cholesky(by_time + missing) * present[:, None] * present[:, :, None]
+def of_products(coupling: CouplingMatrix, used: Bool[np.ndarray, " products"]) -> CouplingMatrix:
+    """Take A of some products, at all times."""
+    n_runs, n_orders, _, n_degrees = coupling.by_order.shape
+    by_product = coupling.by_order.reshape(n_runs, n_orders, len(used), -1, n_degrees)
+    return replace(
+        coupling,
+        body_beams=coupling.body_beams[:, used],
+        by_order=by_product[:, :, used].reshape(n_runs, n_orders, -1, n_degrees),
+        layout=DataLayout(int(used.sum()), coupling.layout.n_times),
+    )
 
 
 def _between(half: Float[np.ndarray, "rank n"], b: Float[np.ndarray, " n"]) -> float:

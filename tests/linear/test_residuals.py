@@ -150,6 +150,7 @@ def test_what_no_group_explains():
     model, data = simulated()
     rng = np.random.default_rng(1)
     noise = 3.0 * np.sqrt(float(model.noise.diagonal().mean()))
-    found = residuals(model, corrupted(data, slice(None), noise * rng.standard_normal((16, 24))))
+    bad = corrupted(data, slice(None), noise * rng.standard_normal((16, 24)))
+    found = residuals(model, model.condition(bad.data), bad)
     assert found.suspects() == []
     assert "No single product, day or turntable angle" in found.verdict()

@@ -1,0 +1,68 @@
+"""Groups of data left out through the structure of A, against A and N as matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.linear import left_out_structured
+from lusee_bayes.linear.left_out_dense import DenseLeftOut
+from lusee_bayes.linear.left_out_structured import StructuredLeftOut
+from lusee_bayes.linear.stretches import FEW_TIMES, smooth_functions
+
+# noise a thousand times larger than the telescope's: what the dense route loses to cancellation is
+# then below the tolerance
+NOISY = "noise.radiometer.factor=1e6"
+# few modes: a product has more data than there are modes; many: it has fewer
+FEW = ["lmax=3", "observation.runs=[{cycles: 0.04}, {cycles: 0.03, turntable_deg: 40}]"]
+MANY = ["lmax=10", "observation.runs=[{cycles: 0.03}, {cycles: 0.02, turntable_deg: 40}]"]
+OFTEN = [*FEW, "observation.step_s=1200"]
+KINDS = {
+    "diagonal": [],
+    "blocks": ["noise.radiometer.form=exact"],
+    "templates": ["noise.beam={shift_mhz: 4}"],
+    "blocks and templates": ["noise.radiometer.form=exact", "noise.beam={shift_mhz: 4}"],
+}
+
+
+@pytest.mark.parametrize("kept", [0.0, left_out_structured.KEPT_BYTES])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("size", [FEW, MANY, OFTEN], ids=["few", "many", "often"])
+def test_it_is_what_matrices_say(size, kind, kept, monkeypatch):
+    if kept and size is OFTEN:
+        pytest.skip("smooth functions are not kept")
+    monkeypatch.setattr(left_out_structured, "KEPT_BYTES", kept)
+    e = build(load_scenario("fiducial", [*size, NOISY, *KINDS[kind]]))
+    model, observation = full_model(e.setup), e.data.observation
+    structured = StructuredLeftOut(model, model.condition(e.data.data), e.data.data)
+    dense = DenseLeftOut(model, e.data.data, e.data.layout)
+    np.testing.assert_allclose(structured.u, dense.u, rtol=0, atol=1e-9 * np.abs(dense.u).max())
+    day = observation.hours // 24
+    for k in np.unique(day):
+        assert structured.stretch(day == k) == pytest.approx(dense.stretch(day == k), rel=1e-8)
+    np.testing.assert_allclose(structured.inverse_diagonal, dense.inverse_diagonal, rtol=1e-8)
+    angle = np.array(observation.turntable_deg)[observation.run] == 40.0
+    assert structured.together(angle) == pytest.approx(dense.together(angle), rel=1e-8)
+    for product in (0, 2, 15):
+        expected = dense.product(product)
+        assert structured.product(product) == pytest.approx(expected, rel=1e-8)
+
+
+def test_smooth_functions_are_few_and_make_up_every_phase():
+    azimuth = np.linspace(2.9, 3.6, 300) % np.pi  # a turn in between does not matter
+    azimuth = np.where(azimuth < 1.0, azimuth + np.pi, azimuth)
+    angle = azimuth[:, None] * np.arange(11.0)
+    phases = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+    functions = smooth_functions(phases, azimuth)
+    n = functions.shape[1]
+    assert n < 40
+    np.testing.assert_allclose(functions.T @ functions, np.eye(n), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(functions @ (functions.T @ phases), phases, rtol=0, atol=1e-11)
+    # few times, or functions that are not smooth, are taken as they are
+    few = phases[:FEW_TIMES]
+    np.testing.assert_array_equal(smooth_functions(few, azimuth[:FEW_TIMES]), np.eye(FEW_TIMES))
+    rough = np.random.default_rng(0).standard_normal((60, 3))
+    np.testing.assert_array_equal(smooth_functions(rough, azimuth[:60]), np.eye(60))
