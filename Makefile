@@ -3,6 +3,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # numbers that must not depend on the machine's locale or on a display
 export MPLBACKEND := agg
+# what the package says to OpenBLAS (lusee_bayes/__init__.py), for programs that import NumPy first
+export OPENBLAS_THREAD_TIMEOUT ?= 20
 # modules are compiled once, not by every process
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -42,6 +44,7 @@ docs: $(VENV)/installed-docs
 	! grep -rlE '<(script|img|link|iframe)[^>]* (src|href)="?(https?:)?//' docs/_build/html --include='*.html'
 
 bench: $(VENV)/installed
+	$(BIN)/python benchmarks/commands.py
 	$(BIN)/python benchmarks/pipeline.py
 	$(BIN)/python benchmarks/structured_noise.py
 	$(BIN)/python benchmarks/sampling.py

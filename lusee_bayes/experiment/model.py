@@ -6,13 +6,13 @@ from dataclasses import replace
 
 from lusee_bayes.core.arrays import on_device
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.terms import TERMS, Around, measured_visibilities, point_sources
+from lusee_bayes.experiment.terms import TERMS, Around, measured_visibilities
 from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise import radiometer_noise
 from lusee_bayes.noise.covariance import Covariance
-from lusee_bayes.systematics import Marginalised, PointSources, Systematic
+from lusee_bayes.systematics import Marginalised, Systematic
 
 
 def radiometer(setup: Setup, data: Visibilities | None = None) -> Covariance:
@@ -54,22 +54,6 @@ def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     for _, systematic in systematics(setup, around):
         model = systematic.marginalised(model)
     return model
-
-
-def model_with_fluxes(setup: Setup, around: Around | None = None) -> LinearGaussian:
-    """:func:`full_model`, but with the sources' fluxes among the unknowns, behind the sky's.
-
-    Raises
-    ------
-    InputError
-        If the scenario has no sources.
-    """
-    around = around or Around()
-    model, sources = base_model(setup, around.data), point_sources(setup)
-    for _, systematic in systematics(setup, around):
-        if not isinstance(systematic, PointSources):
-            model = systematic.marginalised(model)
-    return sources.joint(model)
 
 
 def model_to_sample(

@@ -14,7 +14,8 @@ from matplotlib import colormaps
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.report import html
 from lusee_bayes.report.figures.drawing import DIVERGING, SEQUENTIAL
-from lusee_bayes.results.diagnostics import KERNEL_NSIDE, KERNEL_STEP
+from lusee_bayes.results.diagnostics import KERNEL_NSIDE
+from lusee_bayes.results.diagnostics_file import KERNEL_STEP
 
 LAYOUT = """<div class="controls">
 <label for="explorer-layer">show <select id="explorer-layer"></select></label>

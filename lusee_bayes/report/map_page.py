@@ -14,7 +14,7 @@ from lusee_bayes.linear.residuals import SIGNIFICANCE, probability
 from lusee_bayes.report import html
 from lusee_bayes.report.explorer import explorer
 from lusee_bayes.report.run_details import details
-from lusee_bayes.results.diagnostics import read_diagnostics
+from lusee_bayes.results.diagnostics_file import read_diagnostics
 
 NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "diagnostics.nc", "mean.fits", "std.fits")
 FIGURES = ("maps", "draws", "fidelity", "spectra", "data_vector", "residuals", "beams")

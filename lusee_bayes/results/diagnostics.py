@@ -6,15 +6,12 @@ pixel, posterior of regions, and point-spread functions.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import (
     azimuth_functions,
     mode_numbers,
@@ -33,8 +30,6 @@ from lusee_bayes.results.channel import ChannelResult, draw_key
 # regions and the directions of point-spread functions, and the maps these are drawn on
 REGION_NSIDE, KERNEL_NSIDE = 8, 16
 N_DRAWS = 4
-# point-spread functions are kept in units of this part of their peak
-KERNEL_STEP = 1.0 / 127.0
 
 
 def diagnostics(
@@ -113,29 +108,6 @@ def diagnostics(
             "frequency_mhz": scenario.frequency_mhz,
         },
     )
-
-
-def write_diagnostics(dataset: xr.Dataset, path: Path) -> None:
-    """Write to netCDF; point-spread functions with a byte for each value, of their peak."""
-    byte = {"dtype": "int8", "scale_factor": KERNEL_STEP, "_FillValue": -128, "zlib": True}
-    single = {name: {"dtype": "float32"} for name in ("draws", "prior_fraction")}
-    dataset.to_netcdf(path, engine="h5netcdf", encoding={"psf": byte, **single})
-
-
-def read_diagnostics(path: str | Path) -> xr.Dataset:
-    """What :func:`write_diagnostics` wrote. InputError for anything else."""
-    try:
-        with xr.open_dataset(path, engine="h5netcdf") as file:
-            dataset = file.load()
-    except (OSError, ValueError) as error:
-        raise InputError(f"'{path}' cannot be read as diagnostics: {error}") from error
-    if dataset.attrs.get("format") != formats.DIAGNOSTICS:
-        raise InputError(
-            f"'{path}' is not a file of diagnostics: its format is "
-            f"'{dataset.attrs.get('format')}', expected '{formats.DIAGNOSTICS}' (lusee-bayes map "
-            "writes one)"
-        )
-    return dataset
 
 
 def region_nside(nside: int) -> int:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.results.diagnostics import read_diagnostics
+from lusee_bayes.results.diagnostics_file import read_diagnostics
 
 NEEDED = ("summary.json", "spectra.csv", "diagnostics.nc", "mean.fits", "std.fits")
 

@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import Inference, prediction, rebuilds_gains
-from lusee_bayes.experiment.model import model_with_fluxes
+from lusee_bayes.experiment.inference import Inference
 from lusee_bayes.experiment.simulate import true_values
-from lusee_bayes.experiment.terms import Around, point_sources
+from lusee_bayes.experiment.terms import point_sources
+from lusee_bayes.linear.templates import template_amplitudes
 from lusee_bayes.sky import kelvin_steradian
 
 
@@ -21,7 +21,7 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     experiment : Experiment
         With sources that are not ignored.
     inference : Inference
-        The map, around which the gain term is built where the scenario says so.
+        Of these data alone.
 
     Returns
     -------
@@ -31,13 +31,12 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     """
     setup, data = experiment.setup, experiment.data
     sources = point_sources(setup)
-    around = Around(data)
-    if rebuilds_gains(setup):
-        around = Around(data, prediction(setup, inference.posterior))
-    posterior = model_with_fluxes(setup, around).condition(data.data)
-    n = sources.mean().shape[0]
-    mean = np.asarray(sources.mean() + posterior.mean[-n:])
-    std = np.asarray(posterior.std())[-n:]
+    amplitudes, covariance = template_amplitudes(
+        inference.model, inference.posterior, data.data, sources.templates()
+    )
+    prior_std = np.asarray(sources.std())
+    mean = np.asarray(sources.mean()) + prior_std * amplitudes
+    std = prior_std * np.sqrt(np.diagonal(covariance))
     jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
     truth = true_values(setup) if data.truth is not None else {}
     rows, at = [], 0

@@ -139,7 +139,7 @@ def map_result(
     earlier = None if onto is None else read_updatable(onto, scenario)
     digests = (data.digest(),)
     with stages("posterior"):
-        found = judged = infer(experiment)
+        found = judged = alone = infer(experiment)
         if earlier is not None:
             found, judged = _updated(earlier, found, experiment)
             digests = (*earlier.digests, *digests)
@@ -155,7 +155,7 @@ def map_result(
     fluxes = None
     if experiment.setup.responses and scenario.sources.treatment != "ignored":
         with stages("fluxes"):
-            fluxes = flux_table(experiment, found)
+            fluxes = flux_table(experiment, alone)
     with stages("diagnostics"):
         page = diagnostics(experiment, found, judged, channel, covariance)
     return MapResult(experiment, found, judged, channel, page, fluxes, digests, stages.seconds)

@@ -20,7 +20,7 @@ from lusee_bayes.report.figures import diagnostics as diagnostic_figures
 from lusee_bayes.results.channel_files import CHANNELS
 from lusee_bayes.results.cube import CubeResult
 from lusee_bayes.results.cube_channels import cube_result
-from lusee_bayes.results.diagnostics import write_diagnostics
+from lusee_bayes.results.diagnostics_file import write_diagnostics
 from lusee_bayes.results.map_files import cards, write_cube, write_map
 from lusee_bayes.results.map_result import MapResult, map_result
 from lusee_bayes.results.posterior_file import about, write_posterior

@@ -14,7 +14,6 @@ from lusee_bayes.core.checks import require_finite, require_positive, require_sh
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankCovariance
-from lusee_bayes.sky.priors import IndependentPrior
 from lusee_bayes.systematics.base import Systematic, scalar
 
 
@@ -93,10 +92,14 @@ class PointSources(Systematic):
         """Return the prior standard deviations in K sr."""
         return jnp.concatenate([jnp.full(s.n_blocks, s.std) for s in self.sources])
 
+    def templates(self) -> Float[Array, "data amplitudes"]:
+        """What fluxes one prior standard deviation above their means add to the data, in K."""
+        return self.columns() * self.std()[None]
+
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Add T P T^T to N, and the mean fluxes to the offset."""
         columns = self.columns()
-        noise = model.noise + LowRankCovariance(columns * self.std()[None], "the sources")
+        noise = model.noise + LowRankCovariance(self.templates(), "the sources")
         return _with_added(replace(model, noise=noise), columns @ self.mean())
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
@@ -110,29 +113,6 @@ class PointSources(Systematic):
             else:
                 signal = signal + source.columns @ numpyro.sample(source.site, prior.to_event(1))
         return _with_added(model, signal)
-
-    def joint(self, model: LinearGaussian) -> LinearGaussian:
-        """Make sky and fluxes one vector of unknowns: d = [A, T] (m, f - mean) + ... .
-
-        Parameters
-        ----------
-        model : LinearGaussian
-            The model without the sources.
-
-        Returns
-        -------
-        LinearGaussian
-            Its ``condition`` gives the posterior of both. The last unknowns are the fluxes minus
-            their prior means, in K sr.
-        """
-        columns, response = self.columns(), model.coupling.response
-        if response is not None:
-            columns = columns * response[:, None]
-        prior = IndependentPrior(jnp.concatenate([model.prior.diagonal_root(), self.std()]))
-        both = replace(
-            model, coupling=jnp.concatenate([model.coupling.dense(), columns], axis=1), prior=prior
-        )
-        return _with_added(both, columns @ self.mean())
 
 
 def _with_added(model: LinearGaussian, signal: Float[Array, " data"]) -> LinearGaussian:

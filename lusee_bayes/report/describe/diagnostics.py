@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lusee_bayes.results.diagnostics import read_diagnostics
+from lusee_bayes.results.diagnostics_file import read_diagnostics
 
 
 def describe_diagnostics(path: Path) -> str:
