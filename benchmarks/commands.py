@@ -17,17 +17,17 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpotrf
 
 N_DATA, N_MODES = 5232, 2304
-YEAR = ["--set", "observation.step_s=600", "--set", "observation.runs=[{cycles: 13.3683}]"]
+YEAR = ["--set", "observation.step_s=600", "--set", "observation.runs=[{{cycles: 13.3683}}]"]
 CHANNELS = ["--frequencies", "5:50:1", "--draws", "20"]
 COMMANDS = {
     "--help": ["--help"],
-    "info map/summary.json": ["info", "{map}/summary.json"],
-    "info map/posterior.nc": ["info", "{map}/posterior.nc"],
+    "info posterior.nc": ["info", "{map}/posterior.nc"],
+    "info diagnostics.nc": ["info", "{map}/diagnostics.nc"],
+    "info mean.fits": ["info", "{map}/mean.fits"],
     "map fiducial": ["map", "fiducial", "-o", "{map}"],
     "46 channels, each by itself": ["map", "fiducial", *CHANNELS, "-o", "{cube}"],
     "46 channels, joint": ["map", "fiducial", *CHANNELS, "--joint", "-o", "{joint}"],
@@ -70,9 +70,10 @@ def main() -> None:
     parser.add_argument("--only", action="append", help="names of commands; all by default")
     options = parser.parse_args()
     seconds_of_unit = unit()
-    table = Table(title=f"unit: {seconds_of_unit:.3f} s (dsyrk + dpotrf, {N_DATA} x {N_MODES})")
-    for heading in ("command", "cold [s]", "[units]", "warm [s]", "[units]", "peak [GB]"):
-        table.add_column(heading, justify="left" if heading == "command" else "right")
+    console = Console(width=100)
+    console.print(f"unit: {seconds_of_unit:.3f} s (dsyrk + dpotrf, {N_DATA} x {N_MODES})")
+    line = "{:28} {:>9} {:>8} {:>9} {:>8} {:>10}"
+    console.print(line.format("command", "cold [s]", "[units]", "warm [s]", "[units]", "peak [GB]"))
     with tempfile.TemporaryDirectory() as place:
         folders = {name: f"{place}/{name}" for name in ("map", "cube", "joint", "year")}
         cache = Path(place) / "cache"
@@ -87,8 +88,7 @@ def main() -> None:
                 cold = (f"{seconds:.1f}", f"{seconds / seconds_of_unit:.1f}")
             seconds, peak = run(command, cache)
             warm = (f"{seconds:.2f}", f"{seconds / seconds_of_unit:.1f}")
-            table.add_row(name, *cold, *warm, f"{peak:.2f}")
-    Console(width=100).print(table)
+            console.print(line.format(name, *cold, *warm, f"{peak:.2f}"))
 
 
 if __name__ == "__main__":

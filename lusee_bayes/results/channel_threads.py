@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from threading import Event, Lock
 
 import jax
+from threadpoolctl import threadpool_limits
 
 from lusee_bayes.core.process_group import ProcessGroup
 from lusee_bayes.core.progress import Stages
@@ -38,6 +41,7 @@ def each_channel(
     """
     mine = group.mine(channels)
     n_threads = min(THREADS_PER_DEVICE * len(jax.local_devices()), len(mine))
+    gc.freeze()  # modules stay: they need not be searched
     stopped, counting, finished = Event(), Lock(), 0
     with stages.progress(name, len(mine)) as done:
 
@@ -48,11 +52,15 @@ def each_channel(
                     if stopped.is_set():
                         return
                     function(mine[number])
+                    # what a channel was made of may refer to itself, and is large
+                    gc.collect()
                     with counting:
                         finished += 1
                         done(finished, f"{mine[number].frequency_mhz:g} MHz")
 
-        with ThreadPoolExecutor(max(n_threads, 1)) as pool:
+        # a channel on each of two processors takes less than two after another on both
+        each = max(1, (os.cpu_count() or 1) // max(n_threads, 1))
+        with threadpool_limits(each, "blas"), ThreadPoolExecutor(max(n_threads, 1)) as pool:
             threads = [pool.submit(run, thread) for thread in range(n_threads)]
             try:
                 for thread in as_completed(threads):
