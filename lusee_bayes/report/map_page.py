@@ -152,8 +152,9 @@ def _data(folder: Path, found: xr.Dataset) -> list[str]:
         ("day", "By day", "day"),
         ("angle", "By turntable angle", "turntable angle"),
     ):
-        rows = np.flatnonzero(kinds == kind)
-        note = ""
+        rows, note = np.flatnonzero(kinds == kind), ""
+        if not len(rows):  # too many data whose noise couples times: the verdict says so
+            continue
         if kind == "day" and len(rows) > WORST_DAYS:
             order = np.argsort(found["group_p"].values[rows])
             note = f" (the {WORST_DAYS} least probable of {len(rows)})"

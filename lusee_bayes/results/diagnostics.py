@@ -143,8 +143,8 @@ def _groups(kinds: dict[str, tuple[Group, ...]]) -> dict[str, tuple[str, np.ndar
     """One row for every group that was left out."""
     groups = [(kind, group) for kind, found in kinds.items() for group in found]
     return {
-        "group_kind": ("group", np.array([kind for kind, _ in groups])),
-        "group_name": ("group", np.array([group.name for _, group in groups])),
+        "group_kind": ("group", np.array([kind for kind, _ in groups], dtype=np.str_)),
+        "group_name": ("group", np.array([group.name for _, group in groups], dtype=np.str_)),
         "group_n": ("group", np.array([group.n for _, group in groups])),
         "group_chi2": ("group", np.array([group.chi2 for _, group in groups])),
         "group_p": ("group", np.array([group.p for _, group in groups])),

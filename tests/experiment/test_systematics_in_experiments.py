@@ -112,10 +112,11 @@ def test_the_gain_terms_model_is_the_papers():
     shifted = np.asarray(model.coupling.dense()).reshape(16, -1, 49)
     for k in range(16):
         factor = 1.0 + 1e-4 * (k in (0, 7, 12, 15))
-        np.testing.assert_allclose(shifted[k], factor * plain[k], rtol=1e-10, atol=1e-16)
+        np.testing.assert_allclose(shifted[k], factor * plain[k], rtol=1e-10, atol=1e-15)
     # and not in the ignored case, nor in the signal
     ignoring = full_model(experiment(GAIN, "noise.gain.treatment=ignored").setup)
-    np.testing.assert_array_equal(ignoring.coupling.dense(), plain.reshape(-1, 49))
+    rows = plain.reshape(-1, 49)  # by JAX here, by NumPy there: sums in another order
+    np.testing.assert_allclose(ignoring.coupling.dense(), rows, rtol=0, atol=1e-15)
     built = build(small_scenario(GAIN, cycles=0.2)).setup
     np.testing.assert_array_equal(built.signal, plain_setup.signal)
 

@@ -21,6 +21,7 @@ from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.linear import residuals as residuals_module
 from lusee_bayes.report.pages import write_report
 from lusee_bayes.results.diagnostics import region_of
 from lusee_bayes.results.diagnostics_file import read_diagnostics
@@ -206,6 +207,26 @@ def test_a_corrupted_product_is_pointed_at(tmp_path):
     assert re.search(r"<tr class=bad><td>12R</td>", page)
     found = read_diagnostics(tmp_path / "out" / "diagnostics.nc")
     assert "product 12R" in np.atleast_1d(found.attrs["suspects"])
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_a_page_without_groups(tmp_path, monkeypatch):
+    """Noise that couples times, and an A that would be too large to judge its data one by one."""
+    monkeypatch.setattr(residuals_module, "DENSE_BYTES", 0.0)
+    overrides = ["lmax=4", "observation.runs.0.cycles=0.1", "noise.gain={sigma: 0.01}"]
+    run = run_map(load_scenario("fiducial", overrides), tmp_path / "map")
+    found = read_diagnostics(run.folder / "diagnostics.nc")
+    assert found.sizes["group"] == 0 and np.isnan(found["z"]).all()
+    assert found.attrs["verdict"] == run.result.verdict()
+    # the rest is judged as ever: chi^2 of all data under the model, by matrices
+    model, data = run.result.judged.model, run.result.experiment.data.data
+    a = np.asarray(model.coupling.dense())
+    k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
+    expected = np.asarray(data) @ np.linalg.solve(k, np.asarray(data))
+    assert found.attrs["chi2"] == pytest.approx(expected, rel=1e-4)
+    page = (run.folder / "report.html").read_text()
+    assert "By product" not in page and run.result.verdict() in page
 
 
 @pytest.mark.long
