@@ -125,7 +125,9 @@ def test_marginalised_parameters_are_derivatives_of_a(instrument, base):
     expected = np.asarray(base.noise.dense())
     for name, std in STDS.items():
         at = instrument.value(name)
-        up, down = (np.asarray(instrument.dense({name: at + h})) for h in (1e-4, -1e-4))
+        up, down = (
+            np.asarray(instrument.dense({name: jnp.asarray(at + h)})) for h in (1e-4, -1e-4)
+        )
         direction = std * (up - down) / 2e-4
         expected = expected + (direction * np.asarray(base.prior.variance())) @ direction.T
     np.testing.assert_allclose(got.noise.dense(), expected, rtol=0, atol=1e-6 * expected.max())
