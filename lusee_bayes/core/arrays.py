@@ -20,6 +20,9 @@ import numpy as np
 
 Array = jax.Array | np.ndarray
 
+# rows that are added at once
+ACCUMULATED = 16
+
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
 
@@ -89,6 +92,16 @@ def placed(array: Array, where: Any, values: Array) -> Array:
         return array.at[where].set(values)
     array[where] = values
     return array
+
+
+def accumulated(total: Array, weight: Array | np.floating, part: Array) -> Array:
+    """Return total + weight * part; a NumPy total is changed in place."""
+    if namespace(total, weight, part) is not np:
+        return total + weight * part
+    for first in range(0, len(total), ACCUMULATED):  # products that fit into a cache
+        rows = slice(first, first + ACCUMULATED)
+        total[rows] += weight * part[rows]
+    return total
 
 
 def on_device(tree: T) -> T:

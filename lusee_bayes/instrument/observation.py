@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 
 import astropy.units as u
 import erfa
@@ -239,6 +240,10 @@ class Observation:
 
     def mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
         """Return the rotations that take Galactic unit vectors to MCMF ones at every time."""
+        return self._mcmf_from_galactic
+
+    @cached_property
+    def _mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
         if not self.fixed_axis:
             return mcmf_from_galactic(self.times)
         angle = 2.0 * np.pi * self.hours / LUSEEPY_MONTH_HOURS

@@ -21,7 +21,7 @@ from jaxtyping import Float, PRNGKeyArray
 from lusee_bayes.core.arrays import Array, compiled, namespace, on_processor, placed
 from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import cholesky, gram_matrix, solve_lower
+from lusee_bayes.core.linalg import cholesky, gram_matrix, scaled, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
 from lusee_bayes.linear.normal_matrix import has_structure, is_within_times, normal_matrix
 from lusee_bayes.linear.posterior import Posterior
@@ -245,9 +245,9 @@ def gradient_and_misfit(
 @compiled
 def _precision_root(matrix: Float[Array, "modes modes"], root: Float[Array, " modes"]) -> Array:
     """L of the precision 1 + G M G of u = m / root."""
-    scaled = root[:, None] * matrix * root[None]
+    precision = scaled(matrix, root)
     diagonal = np.diag_indices(len(root))
-    return cholesky(placed(scaled, diagonal, scaled[diagonal] + 1.0))
+    return cholesky(placed(precision, diagonal, precision[diagonal] + 1.0), overwrite=True)
 
 
 @compiled

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, on_device
 from lusee_bayes.core.conjugate_gradients import conjugate_gradients
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import solve_lower
@@ -111,6 +111,7 @@ class Term(eqx.Module):
         """
         if information.perturbations is None:
             raise InputError("draws by conjugate gradients need information with perturbations")
+        prior, information = on_device((prior, information))
         here = common_part(information, prior.residual_root(channel), key)
         here = here.recentred(prior.mixing[channel] @ reference)
         columns = prior.mixing[channel][:, None] * prior.roots
@@ -191,9 +192,9 @@ def solve_iteratively(
         If there are more or fewer channels than the prior has, one of them has no perturbations,
         or the iteration does not converge.
     """
-    k, roots = prior.n_components, prior.roots
+    k, roots = prior.n_components, jnp.asarray(prior.roots)
     n = roots.shape[1]
-    start = reference_maps(prior, reference)
+    start = jnp.asarray(reference_maps(prior, reference))
     noise_key, unit_key = jax.random.split(key)
     terms = [
         Term.of(prior, channel, information, start, jax.random.fold_in(noise_key, channel))

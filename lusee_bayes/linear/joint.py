@@ -22,16 +22,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import (
+    Array,
+    accumulated,
+    compiled,
+    namespace,
+    on_processor,
+    placed,
+)
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import inverse_from_cholesky
+from lusee_bayes.core.linalg import cholesky, inverse_from_cholesky, scaled
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.priors import IndependentPrior
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 
-@eqx.filter_jit
+@compiled
 def common_part(
     information: Information,
     residual_root: Float[Array, " modes"] | None,
@@ -57,21 +64,23 @@ def common_part(
     e = None if key is None else information.perturbations
     if residual_root is None:
         return replace(information, perturbations=e)
+    xp = namespace(information, residual_root)
     lower = residual_lower(information, residual_root)
     inverse = inverse_from_cholesky(lower)
     gradient = residual_root * information.vector
     solved = inverse @ gradient
-    log_det = 2.0 * jnp.log(jnp.diagonal(lower)).sum()
+    log_det = 2.0 * xp.log(xp.diagonal(lower)).sum()
     if e is not None:
         z = jax.random.normal(key, e.shape, dtype=jnp.float64)
         e = (z + (residual_root[None] * e - z) @ inverse) / residual_root[None]
-    unit = jnp.eye(residual_root.shape[0])
+    diagonal = np.diag_indices(residual_root.shape[0])
+    matrix = placed(-inverse, diagonal, 1.0 - inverse[diagonal])
     return Information(
-        (unit - inverse) / residual_root[:, None] / residual_root[None],
+        scaled(matrix, 1.0 / residual_root, overwrite=True),
         solved / residual_root,
         information.reference,
-        information.misfit - gradient @ solved,
-        information.log_det + log_det,
+        xp.asarray(information.misfit - gradient @ solved),
+        xp.asarray(information.log_det + log_det),
         information.n_data,
         e,
     )
@@ -81,9 +90,9 @@ def residual_lower(
     information: Information, residual_root: Float[Array, " modes"]
 ) -> Float[Array, "modes modes"]:
     """L L^T = 1 + P."""
-    p = residual_root[:, None] * information.matrix * residual_root[None]
-    normal = p + jnp.eye(p.shape[0])
-    return jax.lax.linalg.cholesky(normal, symmetrize_input=False)
+    normal = scaled(information.matrix, residual_root)
+    diagonal = np.diag_indices(len(residual_root))
+    return cholesky(placed(normal, diagonal, normal[diagonal] + 1.0), overwrite=True)
 
 
 class ComponentSums(eqx.Module):
@@ -130,12 +139,10 @@ class ComponentSums(eqx.Module):
         ComponentSums
             Zeros, with the component maps that fit the reference skies best as reference maps.
         """
-        k = prior.n_components
-        maps = reference_maps(prior, reference)
-        n, zero = maps.shape[1], jnp.zeros(())
-        matrices = jnp.zeros((k * (k + 1) // 2, n, n))
-        # distinct buffers: the sums are donated
-        return cls(matrices, jnp.zeros((k, n)), maps, zero, zero + 0.0, zero + 0.0)
+        k, maps = prior.n_components, reference_maps(prior, reference)
+        n, zero = maps.shape[1], np.zeros(())
+        matrices = np.zeros((k * (k + 1) // 2, n, n))
+        return cls(matrices, np.zeros((k, n)), maps, zero, zero, zero)
 
     def information(self) -> Information:
         """Information about all component maps in one vector, the first map first."""
@@ -159,37 +166,39 @@ def reference_maps(
     (components, modes) array
         The maps, in K.
     """
-    return jnp.asarray(np.linalg.pinv(np.asarray(prior.mixing)) @ np.asarray(reference))
+    return np.linalg.pinv(np.asarray(prior.mixing)) @ np.asarray(reference)
 
 
-@eqx.filter_jit(donate="all-except-first")
+@compiled
 def _with_channel(
-    channel: tuple[Information, Array, Array | None], sums: ComponentSums
+    sums: ComponentSums, information: Information, mixing: Array, residual_root: Array | None
 ) -> ComponentSums:
-    """Add a channel (information, mixing, residual root); the given sums are used up."""
-    information, mixing, residual_root = channel
     here = common_part(information, residual_root).recentred(mixing @ sums.reference)
-    first, second = np.tril_indices(mixing.shape[0])
-    weights = mixing[first] * mixing[second]
+    matrices = sums.matrices
+    for pair, (i, j) in enumerate(zip(*np.tril_indices(mixing.shape[0]), strict=True)):
+        total = accumulated(matrices[pair], mixing[i] * mixing[j], here.matrix)
+        matrices = placed(matrices, pair, total)
     return ComponentSums(
-        sums.matrices + weights[:, None, None] * here.matrix[None],
+        matrices,
         sums.vectors + mixing[:, None] * here.vector[None],
         sums.reference,
-        sums.misfit + here.misfit,
-        sums.log_det + here.log_det,
-        sums.n_data + here.n_data,
+        *(
+            namespace(sums).asarray(getattr(sums, name) + getattr(here, name))
+            for name in ("misfit", "log_det", "n_data")
+        ),
     )
 
 
-@eqx.filter_jit
+@compiled
 def _assembled(sums: ComponentSums) -> Information:
     k, n = sums.reference.shape
-    pair = {}
-    for number, (i, j) in enumerate(zip(*np.tril_indices(k), strict=True)):
-        pair[i, j] = pair[j, i] = sums.matrices[number]
-    rows = [jnp.concatenate([pair[i, j] for j in range(k)], axis=1) for i in range(k)]
+    matrix = namespace(sums).zeros((k * n, k * n))
+    for pair, (i, j) in enumerate(zip(*np.tril_indices(k), strict=True)):
+        for rows, columns in ((i, j), (j, i)):
+            where = slice(rows * n, (rows + 1) * n), slice(columns * n, (columns + 1) * n)
+            matrix = placed(matrix, where, sums.matrices[pair])
     return Information(
-        jnp.concatenate(rows),
+        matrix,
         sums.vectors.reshape(k * n),
         sums.reference.reshape(k * n),
         sums.misfit,
@@ -255,8 +264,8 @@ def summed(
     ComponentSums
         The sums with the channel.
     """
-    root = prior.residual_root(channel)
-    return _with_channel((information, prior.mixing[channel], root), sums)
+    sums, prior, information = on_processor((sums, prior, information))
+    return _with_channel(sums, information, prior.mixing[channel], prior.residual_root(channel))
 
 
 def component_posterior(information: Information, prior: SpectralPrior) -> Posterior:
@@ -279,4 +288,5 @@ def component_posterior(information: Information, prior: SpectralPrior) -> Poste
     InputError
         If the mean does not converge.
     """
+    information, prior = on_processor((information, prior))
     return information.posterior(IndependentPrior(prior.roots.reshape(-1)))

@@ -6,23 +6,21 @@ the channel's data alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, compiled, namespace, on_processor
 from lusee_bayes.core.checks import require_shape
-from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower, symmetric_product
+from lusee_bayes.core.linalg import inverse_from_cholesky, scaled, solve_lower, symmetric_product
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.joint import residual_lower
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 
-@eqx.filter_jit
+@compiled
 def paired(
     covariance: Float[Array, "unknowns unknowns"], prior: SpectralPrior
 ) -> Float[Array, "pairs modes modes"]:
@@ -42,7 +40,7 @@ def paired(
     """
     k = prior.n_components
     blocks = covariance.reshape(k, -1, k, covariance.shape[0] // k)
-    return jnp.stack(
+    return namespace(covariance).stack(
         [
             blocks[i, :, j] + blocks[j, :, i] if i > j else blocks[i, :, i]
             for i, j in zip(*np.tril_indices(k), strict=True)
@@ -50,8 +48,7 @@ def paired(
     )
 
 
-@dataclass(frozen=True)
-class ChannelSky:
+class ChannelSky(eqx.Module):
     """The posterior of one channel's sky, given the data of all channels.
 
     Attributes
@@ -115,19 +112,13 @@ def channel_sky(
         If ``maps`` has another number of components than the prior.
     """
     require_shape("the component maps", maps, (prior.n_components, None))
-    found = _channel_sky(
-        prior.mixing[channel],
-        prior.residual_root(channel),
-        information,
-        maps,
-        covariances,
-        draws,
-        jax.random.fold_in(key, channel),
-    )
-    return ChannelSky(*found)
+    n_draws, _, n_modes = draws.shape
+    z = jax.random.normal(jax.random.fold_in(key, channel), (n_draws, n_modes), dtype=jnp.float64)
+    prior, *given = on_processor((prior, information, maps, covariances, draws, z))
+    return _channel_sky(prior.mixing[channel], prior.residual_root(channel), *given)
 
 
-@eqx.filter_jit
+@compiled
 def _channel_sky(
     mixing: Array,
     residual_root: Array | None,
@@ -135,33 +126,31 @@ def _channel_sky(
     maps: Array,
     covariances: Array | None,
     draws: Array,
-    key: PRNGKeyArray,
-) -> tuple[Array, Array | None, Array, Array, Array]:
-    mean, skies = mixing @ maps, jnp.einsum("c,dcm->dm", mixing, draws)
+    z: Array,
+) -> ChannelSky:
+    xp = namespace(information)
+    mean, skies = mixing @ maps, mixing @ draws
     covariance = None
     if covariances is not None:
         first, second = np.tril_indices(mixing.shape[0])
-        covariance = jnp.tensordot(mixing[first] * mixing[second], covariances, 1)
+        covariance = xp.tensordot(mixing[first] * mixing[second], covariances, 1)
     if residual_root is not None:
         lower = residual_lower(information, residual_root)
 
-        def residual_mean(common: Array) -> Array:
-            """Mean of the residual, given the common part."""
-            shift = common - information.reference
-            gradient = residual_root * (information.vector - information.matrix @ shift)
-            half = solve_lower(lower, gradient[:, None], transpose=False)
-            return residual_root * solve_lower(lower, half, transpose=True)[:, 0]
-
-        z = jax.random.normal(key, skies.shape, dtype=jnp.float64)
-        deviations = residual_root[None] * solve_lower(lower, z.T, transpose=True).T
-        skies = skies + jax.vmap(residual_mean)(skies) + deviations
-        mean = mean + residual_mean(mean)
+        # of the mean and of every draw: the residual's mean, given the common part
+        common = xp.concatenate([mean[None], skies])
+        pull = information.vector - (common - information.reference) @ information.matrix
+        half = solve_lower(lower, (residual_root * pull).T, transpose=False)
+        # a draw deviates from it by L^-T z
+        half = half + xp.pad(z, ((1, 0), (0, 0))).T
+        found = common + residual_root * solve_lower(lower, half, transpose=True).T
+        mean, skies = found[0], found[1:]
         if covariance is not None:
-            scale = residual_root[:, None]
             inverse = inverse_from_cholesky(lower)
-            white = symmetric_product(inverse @ (covariance / scale / scale.T), inverse) + inverse
-            covariance = scale * white * scale.T
-    expected = jnp.asarray(jnp.nan)
+            white = scaled(covariance, 1.0 / residual_root, overwrite=True)
+            white = symmetric_product(inverse @ white, inverse) + inverse
+            covariance = scaled(white, residual_root, overwrite=True)
+    expected = xp.asarray(xp.nan)
     if covariance is not None:
-        expected = information.n_data - (information.matrix * covariance).sum()
-    return mean, covariance, skies, information.chi2(mean), expected
+        expected = information.n_data - xp.vdot(information.matrix, covariance)
+    return ChannelSky(mean, covariance, skies, information.chi2(mean), xp.asarray(expected))

@@ -13,22 +13,21 @@ Noise that couples different times is whitened in order of time, a few rows of A
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float, Int
 
-from lusee_bayes.core.arrays import Array, compiled, namespace, placed, scan
+from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import is_traced, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, mirrored, solve_lower
 from lusee_bayes.core.rotations import Rotation
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_about_pole
-from lusee_bayes.linear.time_sums import CHUNK, time_sums
+from lusee_bayes.linear.one_angle import of_one_angle, places
+from lusee_bayes.linear.time_sums import CHUNK
 from lusee_bayes.noise.covariance import (
     Covariance,
     DiagonalCovariance,
@@ -37,9 +36,6 @@ from lusee_bayes.noise.covariance import (
     TimeBlockCovariance,
 )
 from lusee_bayes.noise.covariance.time_banded import TimeBandedFactor
-
-# strips of orders where they are compiled: more save products with zeros
-N_STRIPS = 6
 
 
 def normal_matrix(coupling: Coupling, noise: Covariance) -> Float[Array, "modes modes"]:
@@ -166,11 +162,12 @@ def summed(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> Float[Arra
         ]
         missing = -here[1].shape[0] % CHUNK
         padded = [xp.pad(x, ((0, 0),) * (x.ndim - 1) + ((0, missing),)) for x in here]
-        part = _of_one_angle(
+        part = of_one_angle(
             coupling.by_order[group[0]], *padded, coupling.body_beams.shape[1], pointing.order
         )
         total = total + part
-    return _to_galactic(pointing.pole_from_galactic, total)
+    turn = pointing.pole_from_galactic
+    return _to_galactic(turn, total, places(len(turn.blocks) - 1))
 
 
 def _turntable_groups(
@@ -186,131 +183,35 @@ def _turntable_groups(
 
 
 @compiled
-def _of_one_angle(
-    by_order: Float[Array, "orders beams degrees"],
-    weights: Float[Array, "..."],
-    azimuth: Float[Array, " times"],
-    tilt: Float[Array, "2 times"],
-    n_products: int,
-    order: int,
-) -> Float[Array, "modes modes"]:
-    """The part of the samples at one turntable angle, in the mean-pole frame."""
-    n = by_order.shape[0]
-    beams = by_order.reshape(n, n_products, -1, 2, n).swapaxes(2, 3)
-    f = time_sums(weights.reshape(-1, azimuth.shape[0]), azimuth, tilt.T, order, n - 1)
-    return _from_sums(beams, f.reshape(*weights.shape[:-1], *f.shape[1:]))
-
-
-def _from_sums(
-    beams: Float[Array, "orders products 2 powers degrees"], f: Complex[Array, "..."]
-) -> Float[Array, "modes modes"]:
-    """The matrix of beams (W_lm, W_l,-m) and Fourier sums, one strip of orders after the other.
-
-    Only columns of orders up to the strip's own last one, and rows of degrees from its first one,
-    are computed; the others are mirror images, or zero.
-    """
-    xp, n = namespace(beams, f), beams.shape[0]
-    # of every packed mode: degree, order, and whether it is a_l,-m
-    ell, m = mode_numbers(n - 1)
-    m, s = np.abs(m), (m < 0).astype(int)
-    whole = xp.zeros((len(m),) * 2)
-    n_strips = n if xp is np else min(N_STRIPS, n)
-    for first, end in pairwise(np.linspace(0, n, n_strips + 1).astype(int).tolist()):
-
-        def add(_, number, first=first, end=end):
-            return None, _rows_of_order(number, beams, f, first, end)
-
-        _, strip = scan(xp, add, None, np.arange(first, end))
-        rows, columns = np.flatnonzero((m >= first) & (m < end)), np.flatnonzero(m < end)
-        row = ((m - first) * 2 + s) * (n - first) + ell - first
-        column = (s * end + m) * n + ell
-        strip = strip.reshape(-1, strip.shape[-1])[row[rows][:, None], column[columns][None]]
-        whole = placed(whole, (rows[:, None], columns[None]), strip)
-        whole = placed(whole, (columns[:, None], rows[None]), strip.T)
-    return whole
-
-
-def _rows_of_order(
-    m: Array,
-    beams: Float[Array, "orders products 2 powers degrees"],
-    f: Complex[Array, "..."],
-    first: int,
-    end: int,
-) -> Float[Array, "rows columns"]:
-    """Rows a_lm, then a_l,-m, of one order; columns a_l'm', then a_l',-m', of orders below end.
-
-    Rows of degrees from ``first``; columns of all degrees, with zeros where there is no mode.
-    """
-    xp, n, others = namespace(beams, f), beams.shape[0], np.arange(end)
-    difference = xp.take(f, m - others + 2 * (n - 1), axis=-1)
-    total = xp.take(f, m + others + 2 * (n - 1), axis=-1)
-    plus, minus = _weighted((total + difference) / 2.0, (total - difference) / 2.0, beams[:end])
-    real, imaginary = own = beams[m][..., first:].swapaxes(0, 1)
-    # real and imaginary parts of complex products by products of real matrices
-    both = xp.concatenate([xp.stack([real, -imaginary], 1), xp.stack([imaginary, real], 1)], -1)
-    both = both.reshape(-1, 2 * own.shape[-1]).T
-    # (rows, orders, degrees) of either
-    u, v = ((both @ x).swapaxes(0, 1) for x in (plus, minus))
-    r = n - first
-    u, v = u.reshape(2 * r, -1), v.reshape(2 * r, -1)
-    return xp.concatenate([xp.concatenate([u[:r], -v[r:]], 1), xp.concatenate([u[r:], v[:r]], 1)])
-
-
-def _weighted(
-    even: Complex[Array, "..."],
-    odd: Complex[Array, "..."],
-    beams: Float[Array, "orders products 2 powers degrees"],
-) -> list[Float[Array, "orders parts degrees"]]:
-    """(P + Q) / 2 and (P - Q) / 2 without the row's own beam, real and imaginary parts.
-
-    With the other beam W + i W', and F(m + m') + F(m - m') = 2 even, their difference 2 odd::
-
-        (P + Q) / 2 = even W + i odd W',    (P - Q) / 2 = -odd W - i even W'.
-    """
-    xp, (n_orders, n_products, _, n_powers, n) = namespace(even, beams), beams.shape
-    factors = [
-        xp.stack([xp.stack([even.real, -odd.imag]), xp.stack([even.imag, odd.real])]),
-        xp.stack([xp.stack([-odd.real, even.imag]), xp.stack([-odd.imag, -even.real])]),
-    ]
-    if even.ndim == 5:
-        # part, other part, product, other product, power, other power, order
-        factors = [x.transpose(6, 2, 0, 4, 3, 1, 5) for x in factors]
-        factors = [x.reshape(n_orders, n_products * 2 * n_powers, -1) for x in factors]
-        return [x @ beams.reshape(n_orders, -1, n) for x in factors]
-    beams = beams.reshape(n_orders, n_products, -1, n)
-    factors = [x.transpose(5, 2, 0, 3, 1, 4).reshape(*beams.shape[:3], -1) for x in factors]
-    if xp is np:
-        products = [x @ beams for x in factors]
-    else:  # XLA multiplies many small matrices a sixth as fast as it adds these terms
-        products = [
-            sum(x[..., q, None] * beams[:, :, None, q] for q in range(beams.shape[2]))
-            for x in factors
-        ]
-    return [x.reshape(n_orders, -1, n) for x in products]
-
-
-@compiled
 def _to_galactic(
-    pole_from_galactic: Rotation, matrix: Float[Array, "modes modes"]
+    pole_from_galactic: Rotation,
+    lower: Float[Array, "modes modes"],
+    place: Int[Array, " modes"],
 ) -> Float[Array, "modes modes"]:
-    """R^T M R, symmetric to the last bit. NumPy's M is overwritten."""
-    if namespace(pole_from_galactic, matrix) is np:
-        return _turned_in_place(pole_from_galactic, matrix)
+    """R^T M R, symmetric to the last bit.
+
+    Of M the lower triangle is given, with the packed mode k in row ``place[k]``. NumPy's is
+    overwritten.
+    """
+    if namespace(pole_from_galactic, lower) is np:
+        return _turned(pole_from_galactic, mirrored(lower), place)
+    matrix = jnp.tril(lower) + jnp.tril(lower, -1).T
     back = pole_from_galactic.T
-    turned = back(back(matrix).T)
+    turned = back(back(matrix[place[:, None], place[None]]).T)
     return (turned + turned.T) / 2.0
 
 
-def _turned_in_place(
-    rotation: Rotation, matrix: Float[np.ndarray, "modes modes"]
+def _turned(
+    rotation: Rotation, matrix: Float[np.ndarray, "modes modes"], place: Int[np.ndarray, " modes"]
 ) -> Float[np.ndarray, "modes modes"]:
     """R^T M R degree by degree, on and below the diagonal: what is worked on fits into a cache."""
+    turned = np.empty_like(matrix)
     spans = [slice(ell**2, (ell + 1) ** 2) for ell in range(len(rotation.blocks))]
     for ell, (left, here) in enumerate(zip(rotation.blocks, spans, strict=True)):
-        rows = left.T @ matrix[here, : here.stop]
+        rows = left.T @ matrix[place[here]].take(place[: here.stop], axis=1)
         for right, there in zip(rotation.blocks[: ell + 1], spans[: ell + 1], strict=True):
-            matrix[here, there] = rows[:, there] @ right
-    return mirrored(matrix)
+            turned[here, there] = rows[:, there] @ right
+    return mirrored(turned)
 
 
 @eqx.filter_jit
@@ -344,4 +245,4 @@ def _streamed(coupling: CouplingMatrix, factor: TimeBandedFactor) -> Float[Array
     )
     start = (jnp.zeros((window, n_modes)), jnp.zeros((n_modes, n_modes)))
     (_, total), _ = jax.lax.scan(add, start, parts)
-    return _to_galactic(pointing.pole_from_galactic, total)
+    return _to_galactic(pointing.pole_from_galactic, total, np.arange(n_modes))

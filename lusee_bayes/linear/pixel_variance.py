@@ -1,12 +1,14 @@
 """Variances of all pixels of a map, from the covariance of its harmonic coefficients.
 
 diag(Y C Y^T) ring by ring: on a ring of HEALPix pixels y_lm = lambda_l|m|(theta) f_m(phi), so that
-C shrinks to a matrix over m, m' of each ring before any pixel is looked at. N_modes^2 operations a
-ring, where products with Y take N_modes^2 a pixel; a ring and its mirror image in the south, where
-lambda has the sign (-1)^(l + m), share half of them.
+C shrinks to a matrix over m <= m' of each ring before any pixel is looked at. N_modes^2 operations
+a ring, where products with Y take N_modes^2 a pixel; a ring and its mirror image in the south,
+where lambda has the sign (-1)^(l + m), share half of them.
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
@@ -38,18 +40,25 @@ def pixel_std(covariance: Float[Array, "modes modes"], nside: int) -> Float[np.n
     polar = polar_functions(heights[: len(heights) // 2 + 1], lmax)
     by_order, first = _orders(lmax)
     ell, m = mode_numbers(lmax)
-    covariance, polar = covariance[by_order][:, by_order], polar[:, by_order]
-    odd = ((ell + m) % 2 == 1)[by_order]
+    polar, odd = polar[:, by_order], ((ell + m) % 2 == 1)[by_order]
     mirrored = np.where(odd, -polar, polar)
-    both = np.empty((2 * lmax + 1, len(heights), 2 * lmax + 1))
+    both = np.zeros((2 * lmax + 1, len(heights), 2 * lmax + 1))
     for order, rows in enumerate(np.split(np.arange(len(m)), first[1:])):
+        # the matrix is symmetric: those of m < m' count twice, those of m > m' are left out
+        begin, starts = rows[0], first[order:] - rows[0]
+        here = covariance[by_order[rows]].take(by_order[begin:], axis=1)
+        here[:, len(rows) :] *= 2.0
         even_part, odd_part = (
-            polar[:, some] @ covariance[some] for some in (rows[~odd[rows]], rows[odd[rows]])
+            polar[:, rows[some]] @ here[some] for some in (~odd[rows], odd[rows])
         )
         # the equator is its own mirror image
         north, south = both[order, : len(polar)], both[order, ::-1][: len(polar)]
-        north[:] = np.add.reduceat((even_part + odd_part) * polar, first, axis=1)
-        south[:] = np.add.reduceat((even_part - odd_part) * mirrored, first, axis=1)
+        total = even_part + odd_part
+        total *= polar[:, begin:]
+        north[:, order:] = np.add.reduceat(total, starts, axis=1)
+        np.subtract(even_part, odd_part, out=total)
+        total *= mirrored[:, begin:]
+        south[:, order:] = np.add.reduceat(total, starts, axis=1)
     between = both.transpose(1, 0, 2)
     return np.sqrt(_on_pixels(((azimuth @ between) * azimuth).sum(2), place))
 
@@ -87,6 +96,7 @@ def _orders(lmax: int) -> tuple[np.ndarray, np.ndarray]:
     return by_order, np.searchsorted(m[by_order], np.arange(-lmax, lmax + 1))
 
 
+@lru_cache(maxsize=2)
 def _rings(nside: int, lmax: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Heights of the rings, and the pixels of each with their azimuthal functions.
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, PRNGKeyArray
 from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower
+from lusee_bayes.core.linalg import inverse_from_cholesky, scaled, solve_lower
 from lusee_bayes.sky.priors import Prior
 
 # directions whose standard deviations are computed at once
@@ -232,7 +232,8 @@ def _rounding(posterior: Posterior, variance: Float[Array, " white"]) -> Float[A
     xp = namespace(posterior)
     if posterior.basis is not None:
         return xp.zeros(())
-    inflation = (xp.tril(posterior.lower) ** 2).sum(1) * variance
+    lower = posterior.lower if xp is np else xp.tril(posterior.lower)  # LAPACK's is clean
+    inflation = xp.einsum("ij,ij->i", lower, lower) * variance
     return xp.asarray(np.finfo(np.float64).eps * inflation.max())
 
 
@@ -276,7 +277,7 @@ def _covariance(
     rounding = _rounding(posterior, xp.diagonal(white))
     root = posterior.prior.diagonal_root()
     if root is not None:
-        return root[:, None] * white * root[None], rounding
+        return scaled(white, root, overwrite=True), rounding
     return posterior.prior.colour(posterior.prior.colour(white).T), rounding
 
 

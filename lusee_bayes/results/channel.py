@@ -311,7 +311,7 @@ def channel_of_information(
         covariance = spread.T @ spread / len(spread)
     else:
         std = np.sqrt(np.diagonal(np.asarray(covariance)))
-        expected = float(information.n_data - (information.matrix * covariance).sum())
+        expected = float(information.n_data - np.vdot(information.matrix, covariance))
     prior_std = np.sqrt(per_mode(observed.spectrum))
     return ChannelResult(
         frequency_mhz=observed.frequency_mhz,

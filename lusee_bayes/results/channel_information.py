@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
@@ -69,9 +68,9 @@ class ChannelInformation:
         arrays = {str(name): np.asarray(values) for name, values in dataset.data_vars.items()}
         noise = arrays.get("perturbations")
         information = Information(
-            *(jnp.asarray(arrays[name]) for name in ("matrix", "vector", "reference")),
-            *(jnp.asarray(float(dataset.attrs[name])) for name in OF_INFORMATION),
-            None if noise is None else jnp.asarray(noise),
+            *(arrays[name] for name in ("matrix", "vector", "reference")),
+            *(np.asarray(float(dataset.attrs[name])) for name in OF_INFORMATION),
+            noise,
         )
         observed = Observed(
             float(dataset.attrs["frequency_mhz"]),

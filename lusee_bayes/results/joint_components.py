@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from threading import get_ident
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lusee_bayes.core.arrays import Array
@@ -165,9 +164,7 @@ def _direct(
         whole = [
             leaf
             if leaf is start.reference
-            else jnp.asarray(
-                group.total(np.asarray(sum(np.asarray(part[k]) for part in [*parts, leaves])))
-            )
+            else group.total(np.asarray(sum(np.asarray(part[k]) for part in parts)))
             for k, leaf in enumerate(leaves)
         ]
         information = jax.tree.unflatten(shape, whole).information()

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import (
     nearest,
     require_finite,
@@ -243,11 +243,13 @@ class SpectralPrior(eqx.Module):
     @property
     def roots(self) -> Float[Array, "components modes"]:
         """Prior standard deviations of the component maps, in K."""
-        return jnp.sqrt(per_mode(self.spectra))
+        return namespace(self).sqrt(per_mode(self.spectra))
 
     def residual_root(self, channel: int) -> Float[Array, " modes"] | None:
         """Return prior standard deviations of a channel's residual, in K; None if it has none."""
-        return None if self.residual is None else jnp.sqrt(per_mode(self.residual[channel]))
+        if self.residual is None:
+            return None
+        return namespace(self).sqrt(per_mode(self.residual[channel]))
 
     def of_channel(self, channel: int) -> HarmonicPrior:
         """Return the prior of one channel by itself."""

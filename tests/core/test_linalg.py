@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from threading import Event, Thread
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +12,12 @@ import numpy as np
 import pytest
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.lapack import invert_factorised
 from lusee_bayes.core.linalg import (
     MAX_SUBSTITUTED,
     N_BLOCKS,
     checked_cholesky,
+    cholesky,
     gram_matrix,
     inverse_from_cholesky,
     invert_lower,
@@ -29,6 +32,9 @@ def spd(n: int, *batch: int) -> np.ndarray:
     return a @ a.swapaxes(-1, -2) / n
 
 
+ARRAYS = pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
+
+
 # as many columns as blocks, fewer, and numbers that do not split evenly
 @pytest.mark.parametrize("columns", [1, N_BLOCKS - 1, N_BLOCKS, N_BLOCKS + 1, 31])
 @pytest.mark.parametrize("rows", [1, 20])
@@ -40,21 +46,23 @@ def test_gram_matrix(rows, columns):
     np.testing.assert_allclose(got, w.T @ w, rtol=0, atol=1e-13)
 
 
-def test_symmetric_product():
+@ARRAYS
+def test_symmetric_product(xp):
     """A B with B = S A^T, which is symmetric without either being the other's transpose."""
     a, s = np.random.default_rng(1).normal(size=(13, 7)), spd(7)
-    got = np.asarray(symmetric_product(jnp.asarray(a), jnp.asarray(s @ a.T)))
+    got = np.asarray(symmetric_product(xp.asarray(a), xp.asarray(s @ a.T)))
     np.testing.assert_array_equal(got, got.T)
     np.testing.assert_allclose(got, a @ s @ a.T, rtol=0, atol=1e-13 * np.abs(got).max())
 
 
 @pytest.mark.parametrize("n", [1, 7, MAX_SUBSTITUTED + 1, 4 * MAX_SUBSTITUTED + 3])
-def test_inverses_of_triangles(n):
+@ARRAYS
+def test_inverses_of_triangles(n, xp):
     matrix = spd(n)
     lower = np.linalg.cholesky(matrix)
-    inverse = invert_lower(jnp.asarray(lower + np.triu(np.ones((n, n)), 1)))
+    inverse = invert_lower(xp.asarray(lower + np.triu(np.ones((n, n)), 1)))
     np.testing.assert_allclose(np.asarray(inverse) @ lower, np.eye(n), rtol=0, atol=1e-11)
-    whole = np.asarray(inverse_from_cholesky(jnp.asarray(lower)))
+    whole = np.asarray(inverse_from_cholesky(xp.asarray(lower)))
     np.testing.assert_array_equal(whole, whole.T)
     np.testing.assert_allclose(whole @ matrix, np.eye(n), rtol=0, atol=1e-10)
 
@@ -101,3 +109,34 @@ def test_batched_solves_side_by_side_end():
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
     )
     assert done.stdout == "80\n", done.stderr
+
+
+def test_factors_are_clean_and_in_place_on_request():
+    """L alone, whatever stands above the diagonal; a matrix stays unless it may be overwritten."""
+    matrix = spd(40)
+    given = matrix + np.triu(np.full((40, 40), np.nan), 1)
+    kept = given.copy()
+    lower = cholesky(given)
+    np.testing.assert_allclose(lower @ lower.T, matrix, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(given, kept)
+    assert cholesky(given, overwrite=True) is given
+    np.testing.assert_array_equal(given, lower)
+    assert np.isnan(cholesky(-matrix)).all()
+
+
+def test_other_threads_go_on_meanwhile():
+    """The interpreter's lock is free while LAPACK works: this thread counts, not just once."""
+    lower, started, ended = np.eye(1200), Event(), Event()
+
+    def invert() -> None:
+        started.set()
+        invert_factorised(lower)
+        ended.set()
+
+    worker, count = Thread(target=invert), 0
+    worker.start()
+    started.wait()
+    while not ended.is_set():
+        count += 1
+    worker.join()
+    assert count > 100

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import date
+from functools import lru_cache
 from typing import Annotated, Any
 
 from pydantic import Field, field_validator
@@ -41,11 +42,17 @@ class ObservationSection(Section):
 
     def observation(self) -> Observation:
         """Site, times and turntable angles."""
-        return Observation.from_runs(
-            tuple(Run(r.cycles, r.turntable_deg, r.night_only) for r in self.runs),
-            start=self.start,
-            step_s=self.step_s,
-            lon_deg=self.lon_deg,
-            lat_deg=self.lat_deg,
-            fixed_axis=self.fixed_axis,
-        )
+        return _observation(self)
+
+
+@lru_cache(maxsize=2)
+def _observation(section: ObservationSection) -> Observation:
+    """One for all channels, with their times' orientations."""
+    return Observation.from_runs(
+        tuple(Run(r.cycles, r.turntable_deg, r.night_only) for r in section.runs),
+        start=section.start,
+        step_s=section.step_s,
+        lon_deg=section.lon_deg,
+        lat_deg=section.lat_deg,
+        fixed_axis=section.fixed_axis,
+    )

@@ -93,7 +93,7 @@ class HemisphereGrid(eqx.Module):
             raise InputError(
                 f"{self.n_phi} azimuths cannot resolve lmax = {lmax}; give more than {2 * lmax}"
             )
-        _, m = mode_numbers(lmax)
+        ell, m = mode_numbers(lmax)
         xp = namespace(f)
         fourier = xp.fft.rfft(f, axis=-1)[..., : lmax + 1] * (2.0 * np.pi / self.n_phi)
         parts = xp.concatenate(
@@ -104,6 +104,8 @@ class HemisphereGrid(eqx.Module):
             ],
             axis=-1,
         )
-        polar = self.polar_weights(lmax)
-        polar = polar.reshape(*(1,) * (f.ndim - 2), *polar.shape)
-        return (parts[..., m + lmax] * polar).sum(-2)
+        # for every order a product with its functions of theta, zero where there is no mode
+        polar = np.zeros((2 * lmax + 1, len(self.theta), lmax + 1))
+        polar[m + lmax, :, ell] = self.polar_weights(lmax).T
+        by_order = xp.moveaxis(parts, -1, 0).reshape(2 * lmax + 1, -1, len(self.theta)) @ polar
+        return xp.moveaxis(by_order[m + lmax, :, ell], 0, -1).reshape(*f.shape[:-2], -1)
