@@ -112,6 +112,19 @@ class Slabs:
         direction = np.stack([up, up * [1.0, 1.0, -1.0]])
         chords = [(region.chord(direction), region) for region in free_free.REGIONS]
 
+        # The discs do not tell l from -l: they are computed once for both.
+        _, one, of_line = np.unique(
+            np.round(np.stack([cos_lon, sin_lat]), 12),
+            axis=1,
+            return_index=True,
+            return_inverse=True,
+        )
+        cos_lon, cos_lat, sin_lat, of_line = (
+            cos_lon[one],
+            cos_lat[one],
+            sin_lat[one],
+            of_line.ravel(),
+        )
         # Near a pole the same panels are used, shortened, so that the discs stay resolved.
         stretch = np.minimum(1.0, TOP_KPC / DEPTH_KPC / np.maximum(sin_lat, 1e-9))
         nodes, weights = _nodes()
@@ -125,17 +138,21 @@ class Slabs:
             n_squared = free_free.thick_disc(radius) * free_free.height_profile(
                 z, free_free.THICK_HEIGHT_KPC
             ) + free_free.thin_disc(radius) * free_free.height_profile(z, free_free.THIN_HEIGHT_KPC)
-            emitted[k] = emissivity_in_plane(radius) * emissivity_height_profile(z) * ds
+            disc = emissivity_in_plane(radius) * emissivity_height_profile(z) * ds
+            emitted[k], smooth = disc[of_line], n_squared[of_line]
 
             # The regions enter by the exact share of the slab inside them: no ragged outlines.
-            start, near = near * stretch, near + weight
+            begin, length = (near * stretch)[of_line], ds[of_line]
+            near = near + weight
             left, local = 1.0, 0.0
             for (enter, leave), region in chords:
-                overlap = np.minimum(leave, start + ds) - np.maximum(enter, start)
-                share = left * np.maximum(overlap, 0.0) / ds
+                if begin.min() > leave.max():  # beyond it
+                    continue
+                overlap = np.minimum(leave, begin + length) - np.maximum(enter, begin)
+                share = left * np.maximum(overlap, 0.0) / length
                 local = local + share * region.n_squared_cm6
                 left = left - share
-            column[k] = ds * (left * n_squared + local)
+            column[k] = length * (left * smooth + local)
         return cls(emitted, column)
 
     def brightness(
