@@ -14,13 +14,14 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import cython_lapack
+from scipy.linalg import cython_blas, cython_lapack
 
 
 @lru_cache
 def _routine(name: str) -> Callable[..., None]:
-    """A routine of LAPACK, all of whose arguments are pointers."""
-    capsule = cython_lapack.__pyx_capi__[name]
+    """A routine of LAPACK or BLAS, all of whose arguments are pointers."""
+    module = cython_lapack if name in cython_lapack.__pyx_capi__ else cython_blas
+    capsule = module.__pyx_capi__[name]
     api = ctypes.pythonapi
     api.PyCapsule_GetName.restype = ctypes.c_char_p
     api.PyCapsule_GetName.argtypes = [ctypes.py_object]
@@ -33,8 +34,7 @@ def _routine(name: str) -> Callable[..., None]:
 
 def _in_place(name: str, letters: bytes, matrix: Float[np.ndarray, "n n"]) -> int:
     """Call a routine with the arguments letters, n, matrix, n, info; return info."""
-    if matrix.dtype != np.float64 or not matrix.flags.c_contiguous:
-        raise ValueError(f"{name} needs float64 in C order, got {matrix.dtype}")
+    _require(matrix, matrix.flags.c_contiguous, "C")
     n, info = ctypes.c_int(len(matrix)), ctypes.c_int(0)
     words = [ctypes.c_char_p(letters[k : k + 1]) for k in range(len(letters))]
     pointers = (ctypes.byref(n), matrix.ctypes.data, ctypes.byref(n), ctypes.byref(info))
@@ -69,3 +69,30 @@ def invert_factorised(lower: Float[np.ndarray, "n n"]) -> None:
 def invert_triangle(lower: Float[np.ndarray, "n n"]) -> None:
     """Put L^-1 into the lower triangle of L, in C order; above it nothing is changed."""
     _in_place("dtrtri", b"UN", lower)
+
+
+def solve_triangle(
+    lower: Float[np.ndarray, "n n"], columns: Float[np.ndarray, "n columns"], *, transpose: bool
+) -> None:
+    """Put L^-1 x, or L^-T x, into x.
+
+    Parameters
+    ----------
+    lower : (n, n) array
+        L in C order; above the diagonal nothing is read.
+    columns : (n, columns) array
+        x in Fortran's order.
+    transpose : bool
+    """
+    _require(lower, lower.flags.c_contiguous, "C")
+    _require(columns, columns.flags.f_contiguous, "Fortran's")
+    n, n_columns = (ctypes.byref(ctypes.c_int(k)) for k in columns.shape)
+    words = [ctypes.c_char_p(letter) for letter in (b"L", b"U", b"N" if transpose else b"T", b"N")]
+    one, stride = ctypes.byref(ctypes.c_double(1.0)), ctypes.byref(ctypes.c_int(max(1, len(lower))))
+    matrices = lower.ctypes.data, stride, columns.ctypes.data, stride
+    _routine("dtrsm")(*words, n, n_columns, one, *matrices)
+
+
+def _require(matrix: np.ndarray, ordered: bool, order: str) -> None:
+    if matrix.dtype != np.float64 or not ordered:
+        raise ValueError(f"LAPACK needs float64 in {order} order, got {matrix.dtype}")

@@ -23,14 +23,15 @@ For a long run nothing of the size data x modes is formed.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve
 
 from lusee_bayes.core.arrays import Array, on_host
 from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.core.linalg import solve_lower
+from lusee_bayes.core.threads import once
 from lusee_bayes.instrument.coupling import CouplingMatrix, turned_about_pole
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.linear.left_out import LeftOut
@@ -86,7 +87,10 @@ class StructuredLeftOut(LeftOut):
         # C'^(1/2) of every amplitude
         across = cho_solve((self._q, True), self._v)
         self._amplitudes = np.concatenate(
-            [-_solve(self._lower, across.T), _solve(self._q, np.eye(n))]
+            [
+                -solve_lower(self._lower, across.T, transpose=False),
+                solve_lower(self._q, np.eye(n), transpose=False),
+            ]
         )
 
     def stretch(self, times):
@@ -151,7 +155,7 @@ class StructuredLeftOut(LeftOut):
             rows.append(self._coupling.pointing.pole_from_galactic.T(turned))
         return self._whitened(np.concatenate(rows))
 
-    @cached_property
+    @once
     def _kept(self) -> Float[np.ndarray, "products times modes"] | None:
         """C^(1/2) of the row of every datum, which days and products share; None if it is large."""
         n_modes = len(self._scale)
@@ -225,7 +229,7 @@ class StructuredLeftOut(LeftOut):
 
     def _whitened(self, rows: Float[np.ndarray, "rows modes"]) -> Float[np.ndarray, "modes rows"]:
         """C^(1/2) of combinations of modes."""
-        return _solve(self._lower, (rows * self._scale).T)
+        return solve_lower(self._lower, (rows * self._scale).T, transpose=False)
 
     def _pulled(
         self, coupling: CouplingMatrix, grid: Float[np.ndarray, "products times columns"]
@@ -234,7 +238,7 @@ class StructuredLeftOut(LeftOut):
         pulled = [coupling.transpose_mv(x.ravel()) for x in np.moveaxis(grid, 2, 0)]
         return np.reshape(pulled, (grid.shape[2], len(self._scale))) * self._scale
 
-    @cached_property
+    @once
     def _precision(self) -> Float[np.ndarray, "rank rank"]:
         """C'^-1."""
         n = len(self._scale)
@@ -292,7 +296,3 @@ def _between(half: Float[np.ndarray, "rank n"], b: Float[np.ndarray, " n"]) -> f
         return float(b @ cho_solve(cho_factor(np.eye(n) - half.T @ half), b))
     h = half @ b
     return float(b @ b + h @ cho_solve(cho_factor(np.eye(rank) - half @ half.T), h))
-
-
-def _solve(lower: Float[np.ndarray, "n n"], x: Float[np.ndarray, "n columns"]) -> np.ndarray:
-    return solve_triangular(lower, x, lower=True, check_finite=False)

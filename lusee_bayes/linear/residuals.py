@@ -11,15 +11,15 @@ all others too; it is recognised by the others fitting once it is left out.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtrc
 
 from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.threads import in_threads
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.left_out import LeftOut
 from lusee_bayes.linear.left_out_dense import DenseLeftOut
@@ -187,37 +187,46 @@ def residuals(model: LinearGaussian, posterior: Posterior, data: Visibilities) -
         total = float(np.asarray(_without_offset(model, data)) @ u)
         return Residuals(np.asarray(predicted), np.full(len(u), np.nan), total, (), (), ())
     u = left_out.u[layout.product, layout.time]
-    present = np.asarray(layout.present)
     day = np.floor(observation.hours / HOURS_A_DAY).astype(int)
     angles, angle_of_run = np.unique(observation.turntable_deg, return_inverse=True)
     angle = angle_of_run[observation.run]
     total = float(np.asarray(_without_offset(model, data)) @ u)
 
-    def group(name: str, members: np.ndarray, leave: Callable[[], float]) -> Group:
-        n = int(members.sum())
+    def group(name: str, n: int, squared: float) -> Group:
         if n == len(u):
             return Group(name, n, total, float(chdtrc(n, total)), np.nan)
-        squared = leave()
         others = float(chdtrc(len(u) - n, total - squared))
         return Group(name, n, squared, float(chdtrc(n, squared)), others)
 
-    products = [
-        group(name, present[k], partial(left_out.product, k))
-        for k, name in enumerate(data.labels)
-        if present[k].any()
-    ]
+    def groups(
+        names: Sequence[str], counts: np.ndarray, leave: Callable[[int], float]
+    ) -> tuple[Group, ...]:
+        """Of those that have data: number k has counts[k] of them, and leave(k) is its chi^2."""
+        some = np.flatnonzero(counts).tolist()
+        squared = in_threads(leave, some)
+        return tuple(group(names[k], int(counts[k]), x) for k, x in zip(some, squared, strict=True))
+
+    def unless_all(counts: np.ndarray, leave: Callable[[int], float]) -> Callable[[int], float]:
+        return lambda k: total if counts[k] == len(u) else leave(k)
+
+    of_product, of_day, of_angle = (
+        np.bincount(numbers, minlength=n)
+        for numbers, n in (
+            (layout.product, len(data.labels)),
+            (day[layout.time], day.max() + 1),
+            (angle[layout.time], len(angles)),
+        )
+    )
+    products = groups(data.labels, of_product, unless_all(of_product, left_out.product))
     # every day is left out, even if there is but one: that gives each datum's own variance
-    of_days = {k: left_out.stretch(day == k) for k in np.unique(day) if present[:, day == k].any()}
-    days = [group(str(k), present[:, day == k], partial(of_days.get, k)) for k in of_days]
-    of_angles = [
-        group(f"{value:g}", present[:, angle == k], partial(left_out.together, angle == k))
-        for k, value in enumerate(angles)
-        if present[:, angle == k].any()
-    ]
+    names = [str(k) for k in range(len(of_day))]
+    days = groups(names, of_day, lambda k: left_out.stretch(day == k))
+    together = unless_all(of_angle, lambda k: left_out.together(angle == k))
+    of_angles = groups([f"{value:g}" for value in angles], of_angle, together)
     # K (K^-1 d) = d, so that d - N u is what the sky explains
     predicted = np.asarray(data.data) - np.asarray(model.noise.mv(u))
     z = u / np.sqrt(left_out.inverse_diagonal[layout.product, layout.time])
-    return Residuals(predicted, z, total, tuple(products), tuple(days), tuple(of_angles))
+    return Residuals(predicted, z, total, products, days, of_angles)
 
 
 def _without_offset(model: LinearGaussian, data: Visibilities) -> Float[Array, " data"]:
