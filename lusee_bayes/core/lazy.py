@@ -28,5 +28,6 @@ class LazyModule:
 
 # healpy brings matplotlib and astropy.coordinates with it
 healpy = LazyModule("healpy")
+coordinates = LazyModule("astropy.coordinates")
 numpyro = LazyModule("numpyro")
 dist = LazyModule("numpyro.distributions")

@@ -15,11 +15,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from astropy.coordinates import SkyCoord
 from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import synthesis_matrix
+from lusee_bayes.core.lazy import coordinates
 
 BOLTZMANN = 1.380649e-23  # J/K
 LIGHT_SPEED = 299792458.0  # m/s
@@ -88,8 +88,8 @@ class PointSource:
 
     def galactic(self) -> tuple[float, float]:
         """Return Galactic longitude (0 to 360) and latitude in degrees."""
-        position = SkyCoord(self.ra_deg, self.dec_deg, unit="deg", frame="icrs").galactic
-        return float(position.l.deg), float(position.b.deg)
+        at = coordinates.SkyCoord(self.ra_deg, self.dec_deg, unit="deg", frame="icrs").galactic
+        return float(at.l.deg), float(at.b.deg)
 
     def kelvin_steradian(self, frequency_mhz: float | np.ndarray) -> float | np.ndarray:
         """Compute the brightness temperature integrated over the source, in K sr."""
@@ -138,7 +138,7 @@ def kelvin_steradian(
 
 def galactic_unit_vector(ra_deg: float, dec_deg: float) -> Float[np.ndarray, "3"]:
     """Return the Galactic unit vector of an ICRS (J2000) position in degrees."""
-    position = SkyCoord(ra_deg, dec_deg, unit="deg", frame="icrs").galactic
+    position = coordinates.SkyCoord(ra_deg, dec_deg, unit="deg", frame="icrs").galactic
     return np.asarray(position.cartesian.xyz.value, dtype=np.float64)
 
 

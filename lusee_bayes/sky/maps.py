@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +16,11 @@ from jaxtyping import Float
 from lusee_bayes.core.checks import nearest, require_finite
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import is_fits, opened
-from lusee_bayes.core.lazy import healpy
 from lusee_bayes.sky.files import SkyFile, modes_of_map
 
 ULSA_DATASET = "smooth_absorb"
+# what healpy writes into pixels without a value; healpy itself takes a second to import
+UNSEEN = -1.6375e30
 
 
 @dataclass(frozen=True)
@@ -62,10 +64,10 @@ class SkyMap(SkyFile):
         path = Path(path)
         hdf5 = h5py.is_hdf5(path)
         pixels = _read_hdf5(path, dataset or ULSA_DATASET) if hdf5 else _read_fits(path)
-        if pixels.ndim != 1 or not healpy.isnpixok(pixels.size):
+        if pixels.ndim != 1 or not _nside(pixels.size):
             raise InputError(f"{path}: {pixels.shape} values are not a HEALPix map of 12 NSIDE^2")
         require_finite(f"{path}: the map", pixels)
-        unseen = pixels == healpy.UNSEEN
+        unseen = pixels == UNSEEN
         if unseen.any():
             raise InputError(
                 f"{path}: {int(unseen.sum())} of {pixels.size} pixels are UNSEEN; give a full-sky "
@@ -79,9 +81,15 @@ class SkyMap(SkyFile):
     def summary(self) -> tuple[str, ...]:
         pixels = self.pixels
         return (
-            f"HEALPix sky map, NSIDE {healpy.npix2nside(pixels.size)}, RING, Galactic",
+            f"HEALPix sky map, NSIDE {_nside(pixels.size)}, RING, Galactic",
             f"mean {pixels.mean():.6g} K, from {pixels.min():.4g} to {pixels.max():.4g} K",
         )
+
+
+def _nside(n_pixels: int) -> int:
+    """NSIDE of 12 NSIDE^2 pixels; 0 if there is none."""
+    nside = math.isqrt(n_pixels // 12)
+    return nside if 12 * nside**2 == n_pixels else 0
 
 
 def _read_hdf5(path: Path, dataset: str) -> np.ndarray:
