@@ -7,8 +7,9 @@ processor of its own does more than two that share both for every product of mat
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cached_property
 from threading import RLock
 from typing import Any, TypeVar
@@ -36,15 +37,19 @@ def in_threads(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
     -------
     list
     """
-    processors = os.cpu_count() or 1
-    n_threads = min(len(items), processors, MOST)
+    n_threads = min(len(items), os.cpu_count() or 1, MOST)
     if n_threads < 2:
         return [function(item) for item in items]
-    with (
-        threadpool_limits(processors // n_threads, "blas"),
-        ThreadPoolExecutor(n_threads) as pool,
-    ):
+    with threads(n_threads) as pool:
         return list(pool.map(function, items))
+
+
+@contextmanager
+def threads(n: int) -> Iterator[ThreadPoolExecutor]:
+    """Start so many threads, each with its share of the processors for products of matrices."""
+    share = max(1, (os.cpu_count() or 1) // n)
+    with threadpool_limits(share, "blas"), ThreadPoolExecutor(n) as pool:
+        yield pool
 
 
 class once(cached_property):

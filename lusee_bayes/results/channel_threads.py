@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import gc
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from threading import Event, Lock
 
 import jax
-from threadpoolctl import threadpool_limits
 
 from lusee_bayes.core.process_group import ProcessGroup
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.threads import threads
 from lusee_bayes.experiment.scenario import Scenario
 
 # threads that share a device: while one waits for numbers the other makes some
@@ -59,11 +58,10 @@ def each_channel(
                         done(finished, f"{mine[number].frequency_mhz:g} MHz")
 
         # a channel on each of two processors takes less than two after another on both
-        each = max(1, (os.cpu_count() or 1) // max(n_threads, 1))
-        with threadpool_limits(each, "blas"), ThreadPoolExecutor(max(n_threads, 1)) as pool:
-            threads = [pool.submit(run, thread) for thread in range(n_threads)]
+        with threads(max(n_threads, 1)) as pool:
+            running = [pool.submit(run, thread) for thread in range(n_threads)]
             try:
-                for thread in as_completed(threads):
+                for thread in as_completed(running):
                     thread.result()
             finally:
                 stopped.set()
