@@ -174,7 +174,10 @@ def _turntable_groups(
     coupling: CouplingMatrix, weights: Float[Array, "..."]
 ) -> tuple[tuple[int, ...], ...]:
     """Runs of one turntable angle, which see the sky with the same beams, if they have weight."""
-    angles, runs = np.asarray(coupling.pointing.turntable), dict(coupling.pointing.runs())
+    runs = dict(coupling.pointing.runs())
+    if is_traced(coupling.pointing.turntable):  # which angles are the same is not known
+        return tuple((run,) for run in runs)
+    angles = np.asarray(coupling.pointing.turntable)
     every = np.unique(angles)
     if not is_traced(weights):
         weighs = [bool(np.asarray(weights[..., span]).any()) for span in runs.values()]

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,6 +93,16 @@ def test_equals_the_product_of_matrices(place, kind, order, missing):
             np.linalg.solve(n, np.asarray(setting(order - 1, missing).dense()))
         )
         assert np.abs(other).max() > 1e-4 * np.abs(expected).max()  # the order does matter here
+
+
+@pytest.mark.parametrize("kind", ["diagonal", "templates"])
+def test_inside_a_compiled_function_too(kind):
+    """Where nothing is known of the angles and the weights: programs are compiled with A and N."""
+    coupling = setting()
+    noise = noise_of(kind, coupling.layout)
+    expected = np.asarray(normal_matrix(on_host(coupling), on_host(noise)))
+    got = eqx.filter_jit(normal_matrix)(on_device(coupling), on_device(noise))
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
 def test_more_times_than_a_chunk():

@@ -424,7 +424,9 @@ def test_the_maps_are_those_of_the_draws(runs, tree):
 def test_the_maps_agree_with_the_analytic_ones_to_monte_carlo_error(runs, tree, experiment):
     """What lusee-bayes map writes beside what sample does, pixel by pixel; ESS by ArviZ."""
     mean, std = maps_of(runs[0], "mean", "std")
-    analytic = channel_of_posterior(experiment, infer(experiment)).maps()
+    inference = infer(experiment)
+    covariance = np.asarray(inference.posterior.covariance())
+    analytic = channel_of_posterior(experiment, inference, covariance).maps()
     analytic_mean, analytic_std = analytic["mean"], analytic["std"]
     values = tree["posterior"]["sky"].values @ pixel_matrix(NSIDE, 6).T
     scaled = (values - analytic_mean) / analytic_std
