@@ -10,7 +10,6 @@ import time
 from dataclasses import replace
 
 import healpy
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -191,8 +190,9 @@ def test_an_interrupted_run_goes_on_where_it_was(
     assert run(*command) == 0
     assert made == [30]
     assert not (tmp_path / "channels").exists()
-    xr.testing.assert_identical(
-        posterior_of(tmp_path).drop_attrs(), posterior_of(independent).drop_attrs()
+    # channels one after the other have two threads each for their sums, side by side they have one
+    xr.testing.assert_allclose(
+        posterior_of(tmp_path).drop_attrs(), posterior_of(independent).drop_attrs(), rtol=1e-12
     )
 
 
@@ -242,15 +242,6 @@ def test_measured_data_of_several_channels(tmp_path, capsys, numbers_alone):
 def test_bad_input_is_one_sentence(arguments, message, tmp_path, capsys):
     assert run("map", "fiducial", *SMALL, *arguments, "-o", tmp_path / "x", "-q") == 2
     assert message in capsys.readouterr().err
-
-
-@pytest.mark.long
-def test_too_many_data_for_a_single_map(monkeypatch, tmp_path, capsys, numbers_alone):
-    monkeypatch.setattr("lusee_bayes.linear.model.DENSE_BYTES", 1e3)
-    assert run("map", "fiducial", *SMALL, "-o", tmp_path / "x", "-q") == 2
-    assert "use --frequencies 25 for a map without that" in capsys.readouterr().err
-    assert run("map", "fiducial", *SMALL, "--frequencies", "25", "-o", tmp_path / "y", "-q") == 0
-    assert SkyCube.read(tmp_path / "y" / "mean.fits").frequencies_mhz == jnp.array([25.0])
 
 
 @pytest.mark.long
