@@ -6,8 +6,6 @@ pass it through, those of dtype and shape do not.
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -156,10 +154,3 @@ def require_symmetric(name: str, matrices: Any) -> None:
             f"{name} is not symmetric: entries differ by up to {asymmetry:.3g} from their mirror "
             f"images (largest entry {largest:.3g}); give (N + N.T) / 2 if that is what you mean"
         )
-
-
-def nearest(word: str, known: Iterable[str]) -> str:
-    """Return a hint that names the closest of ``known``, or all of them if none is close."""
-    known = list(known)
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    return f"did you mean '{close[0]}'?" if close else f"known: {', '.join(sorted(known))}"

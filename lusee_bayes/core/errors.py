@@ -1,5 +1,10 @@
 """What goes wrong in ways that a user can understand: one sentence, no traceback."""
 
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
 
 class InputError(ValueError):
     """Input that cannot be used. The message says what is wrong, where, and what to do."""
@@ -7,3 +12,10 @@ class InputError(ValueError):
 
 class ProcessLost(RuntimeError):
     """Raised when another process of the run has ended, so that this one cannot go on."""
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return a hint that names the closest of ``known``, or all of them if none is close."""
+    known = list(known)
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return f"did you mean '{close[0]}'?" if close else f"known: {', '.join(sorted(known))}"

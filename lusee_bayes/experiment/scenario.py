@@ -14,8 +14,7 @@ from typing import Annotated, Any
 import yaml
 from pydantic import Field, ValidationError, model_validator
 
-from lusee_bayes.core.checks import nearest
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.experiment.overrides import apply_override
 from lusee_bayes.experiment.scenario_errors import one_sentence
 from lusee_bayes.experiment.schema import (

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import nearest
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import SourceSection

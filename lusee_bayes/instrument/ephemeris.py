@@ -14,8 +14,7 @@ from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_bod
 from astropy.time import Time, TimeDelta
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import nearest
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.instrument.observation import Observation, unannounced_leap_seconds
 
 BODIES = (

@@ -113,7 +113,7 @@ class Observation:
                 f"run must count 0, 1, ... up to {len(self.turntable_deg) - 1} (one number for "
                 "each turntable angle) without going back"
             )
-        require_ephemeris(self.times)
+        _require_ephemeris(self.times.jd)
 
     @classmethod
     def from_runs(
@@ -154,13 +154,7 @@ class Observation:
         require_positive("step_s", step_s)
         if not runs:
             raise InputError("an observation needs at least one run, got none")
-        try:
-            with unannounced_leap_seconds():
-                t0 = Time(start, scale="utc")
-        except ValueError as error:
-            raise InputError(
-                f"start '{start}' is not a date; write it as 2027-01-15T00:00:00"
-            ) from error
+        t0 = utc_from_text("start", start)
         elapsed, offsets, numbers = 0.0, [], []
         for number, run in enumerate(runs):
             require_positive(f"the length in cycles of run {number}", run.cycles)
@@ -175,9 +169,8 @@ class Observation:
             numbers.append(np.full(n, number))
             elapsed += length
         seconds, run_of = np.concatenate(offsets), np.concatenate(numbers)
-        last = t0.jd + seconds[-1] / 86400.0
+        _require_ephemeris(np.array([t0.jd + seconds[-1] / 86400.0]))
         with unannounced_leap_seconds():
-            require_ephemeris(Time([t0.jd, last], format="jd", scale="utc"))
             times = t0 + seconds * u.s
         observation = cls(
             lon_deg,
@@ -282,23 +275,55 @@ def unannounced_leap_seconds() -> Iterator[None]:
         yield
 
 
-def require_ephemeris(times: Time) -> None:
-    """Check that times lie within lunarsky's kernel of the Moon's orientation.
+def utc_of(
+    jd1: Float[np.ndarray, " times"], jd2: Float[np.ndarray, " times"], scale: str = "utc"
+) -> Time:
+    """Return times of Julian dates in two parts, in UTC.
 
     Raises
     ------
     InputError
-        If one does not.
+        If one is not finite or outside the ephemeris.
     """
-    first, last = (Time(f"{year}-01-01", scale="tdb") for year in EPHEMERIS_YEARS)
-    jd = times.jd
-    outside = ~((jd >= first.jd) & (jd <= last.jd))
-    if outside.any():
-        at = Time(jd[outside][0], format="jd").isot[:19]
+    _require_ephemeris(jd1 + jd2)
+    with unannounced_leap_seconds():
+        return Time(jd1, jd2, format="jd", scale=scale).utc
+
+
+def utc_from_text(name: str, text: str) -> Time:
+    """Return the time of an ISO date in UTC.
+
+    Raises
+    ------
+    InputError
+        If it is none, or outside the ephemeris; the message begins with ``name``.
+    """
+    try:
+        with unannounced_leap_seconds():
+            time = Time(text, scale="utc")
+    except (ValueError, TypeError) as error:
         raise InputError(
-            f"sample times run outside the ephemeris ({EPHEMERIS_YEARS[0]}-{EPHEMERIS_YEARS[1]}): "
-            f"{at}; give a start inside it"
-        )
+            f"{name} '{text}' is not a date; write it as 2027-01-15T00:00:00"
+        ) from error
+    _require_ephemeris(np.atleast_1d(time.jd))
+    return time
+
+
+def _require_ephemeris(jd: Float[np.ndarray, " times"]) -> None:
+    """InputError unless Julian dates lie within lunarsky's kernel of the Moon's orientation."""
+    first, last = (Time(f"{year}-01-01", scale="tdb").jd for year in EPHEMERIS_YEARS)
+    outside = ~((jd >= first) & (jd <= last))
+    if not outside.any():
+        return
+    at = float(jd[outside][0])
+    date = f"Julian date {at:.6g}"
+    if 0.0 < at < 5373484.0:  # years of four digits
+        with unannounced_leap_seconds():
+            date = Time(at, format="jd").isot[:19]
+    raise InputError(
+        f"sample times run outside the ephemeris ({EPHEMERIS_YEARS[0]}-{EPHEMERIS_YEARS[1]}): "
+        f"{date}; give a start inside it"
+    )
 
 
 def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from astropy.time import Time
 from jaxtyping import Float
 
 from lusee_bayes.core import formats
@@ -16,10 +15,35 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
+from lusee_bayes.core.layouts import Attribute, Layout, Variable
+from lusee_bayes.core.netcdf_files import read_netcdf
+from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, unannounced_leap_seconds
+from lusee_bayes.instrument.observation import Observation, utc_of
 from lusee_bayes.instrument.products import labels
+
+# what a file of visibilities holds
+LAYOUT = Layout(
+    "visibilities",
+    {
+        "product": Variable(("product",), "text"),
+        "visibility": Variable(("product", "time"), finite=False),
+        "flag": Variable(("product", "time"), "boolean"),
+        "jd1": Variable(("time",)),
+        "jd2": Variable(("time",)),
+        "run": Variable(("time",), "integer", low=0.0),
+        "turntable_deg": Variable(("run_number",)),
+        "truth": Variable(("mode",), optional=True),
+    },
+    {
+        "frequency_mhz": Attribute(low=0.0),
+        "lon_deg": Attribute(low=-360.0, high=360.0),
+        "lat_deg": Attribute(low=-90.0, high=90.0),
+        "step_s": Attribute(low=0.0),
+    },
+)
+HINT = "make some with: lusee-bayes simulate SCENARIO"
 
 
 @dataclass(frozen=True)
@@ -146,45 +170,36 @@ def read_visibilities(path: str | Path) -> Visibilities:
         If the file is missing or of another kind, holds NaN that is not flagged, or has nothing
         but flagged samples.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"no data at '{path}'; make some with: lusee-bayes simulate SCENARIO")
-    try:
-        with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as file:
-            dataset = file.load()
-    except OSError as error:
-        raise InputError(f"{path} is not a netCDF file of visibilities ({error})") from error
-    if dataset.attrs.get("format") != formats.VISIBILITIES:
+    require_file(path, "data", HINT)
+    found = read_netcdf(path, formats.VISIBILITIES, LAYOUT, HINT)
+    here = found.arrays
+    n, products = round(np.sqrt(found.sizes["product"])), tuple(map(str, here["product"]))
+    if products != labels(n):
         raise InputError(
-            f"{path} is not a file of visibilities: its format is "
-            f"'{dataset.attrs.get('format', 'absent')}', expected '{formats.VISIBILITIES}'"
+            f"{path} has products {', '.join(products)}; expected {', '.join(labels(n))}"
         )
-    n = round(np.sqrt(dataset.sizes["product"]))
-    found = tuple(str(p) for p in dataset["product"].values)
-    if found != labels(n):
-        raise InputError(f"{path} has products {', '.join(found)}; expected {', '.join(labels(n))}")
-    flags = dataset["flag"].values.astype(bool)
-    values = dataset["visibility"].values
-    require_finite(f"{path}: visibility (where not flagged)", np.where(flags, 0.0, values))
-    try:
+    flags = here["flag"]
+    values = np.where(flags, 0.0, here["visibility"])
+    require_finite(f"{path}: visibility (where not flagged)", values)
+    if here["run"].max() >= found.sizes["run_number"]:
+        raise InputError(
+            f"{path}: run numbers go up to {here['run'].max()}, and turntable_deg has "
+            f"{found.sizes['run_number']} runs"
+        )
+    with naming(path):
         layout = DataLayout.from_flags(flags)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    with unannounced_leap_seconds():
-        times = Time(dataset["jd1"].values, dataset["jd2"].values, format="jd", scale="utc")
-    observation = Observation(
-        float(dataset.attrs["lon_deg"]),
-        float(dataset.attrs["lat_deg"]),
-        times,
-        dataset["run"].values,
-        tuple(float(t) for t in dataset["turntable_deg"].values),
-        float(dataset.attrs["step_s"]),
-    )
-    truth = dataset["truth"].values if "truth" in dataset else None
-    return Visibilities(
-        layout.gather(np.where(flags, 0.0, values)),
-        layout,
-        observation,
-        float(dataset.attrs["frequency_mhz"]),
-        truth,
-    )
+        observation = Observation(
+            found.values["lon_deg"],
+            found.values["lat_deg"],
+            utc_of(here["jd1"], here["jd2"]),
+            here["run"],
+            tuple(here["turntable_deg"].tolist()),
+            found.values["step_s"],
+        )
+        return Visibilities(
+            layout.gather(values),
+            layout,
+            observation,
+            found.values["frequency_mhz"],
+            here.get("truth"),
+        )

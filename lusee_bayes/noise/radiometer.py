@@ -18,13 +18,12 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import (
     is_traced,
-    nearest,
     require_finite,
     require_float64,
     require_positive,
     require_shape,
 )
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.products import all_products, auto_indices, to_matrix
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, TimeBlockCovariance

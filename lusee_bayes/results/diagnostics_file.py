@@ -7,7 +7,8 @@ from pathlib import Path
 import xarray as xr
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.netcdf_files import read_dataset
+from lusee_bayes.results.saved import DIAGNOSTICS
 
 # point-spread functions are kept in units of this part of their peak
 KERNEL_STEP = 1.0 / 127.0
@@ -22,15 +23,4 @@ def write_diagnostics(dataset: xr.Dataset, path: Path) -> None:
 
 def read_diagnostics(path: str | Path) -> xr.Dataset:
     """What :func:`write_diagnostics` wrote. InputError for anything else."""
-    try:
-        with xr.open_dataset(path, engine="h5netcdf") as file:
-            dataset = file.load()
-    except (OSError, ValueError) as error:
-        raise InputError(f"'{path}' cannot be read as diagnostics: {error}") from error
-    if dataset.attrs.get("format") != formats.DIAGNOSTICS:
-        raise InputError(
-            f"'{path}' is not a file of diagnostics: its format is "
-            f"'{dataset.attrs.get('format')}', expected '{formats.DIAGNOSTICS}' (lusee-bayes map "
-            "writes one)"
-        )
-    return dataset
+    return read_dataset(path, formats.DIAGNOSTICS, DIAGNOSTICS, "lusee-bayes map writes one")

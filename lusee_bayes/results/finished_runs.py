@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +11,11 @@ import xarray as xr
 from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import recover
-from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.files import recover, require_files
+from lusee_bayes.core.reading import read_json, read_table
 from lusee_bayes.results.diagnostics_file import read_diagnostics
+from lusee_bayes.results.saved import MAP_SUMMARY, SPECTRA
+from lusee_bayes.sky import SkyMap
 
 NEEDED = ("summary.json", "spectra.csv", "diagnostics.nc", "mean.fits", "std.fits")
 
@@ -36,20 +36,25 @@ class FinishedRun:
         """InputError if the folder is not one of a finished map run."""
         folder = Path(folder)
         recover(folder)
-        for name in NEEDED:
-            if not (folder / name).is_file():
-                raise InputError(
-                    f"'{folder}' has no {name}; give folders that lusee-bayes map has written"
-                )
-        with (folder / "spectra.csv").open(newline="") as file:
-            rows = list(csv.DictReader(file))
+        require_files(folder, NEEDED, "map")
+        summary = read_json(folder / "summary.json", MAP_SUMMARY)
+        diagnostics = read_diagnostics(folder / "diagnostics.nc")
+        if diagnostics.attrs["frequency_mhz"] != summary["frequency_mhz"]:
+            raise InputError(
+                f"'{folder}' holds files of different runs: summary.json is of "
+                f"{summary['frequency_mhz']:g} MHz, diagnostics.nc of "
+                f"{diagnostics.attrs['frequency_mhz']:g} MHz; make the map anew"
+            )
+        maps = {name: SkyMap.read(folder / f"{name}.fits").pixels for name in ("mean", "std")}
+        if maps["mean"].size != maps["std"].size:
+            raise InputError(f"'{folder}': mean.fits and std.fits are of different NSIDE")
         return cls(
             folder.resolve().name,
-            json.loads((folder / "summary.json").read_text()),
-            {name: np.array([float(row[name]) for row in rows]) for name in rows[0]},
-            healpy.read_map(folder / "mean.fits", dtype=np.float64),
-            healpy.read_map(folder / "std.fits", dtype=np.float64),
-            read_diagnostics(folder / "diagnostics.nc"),
+            summary,
+            read_table(folder / "spectra.csv", SPECTRA),
+            maps["mean"],
+            maps["std"],
+            diagnostics,
         )
 
 

@@ -7,14 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import jax.numpy as jnp
-import numpy as np
-import xarray as xr
 
+from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover
-from lusee_bayes.core.harmonics import power_spectrum
+from lusee_bayes.core.harmonics import n_modes, power_spectrum
+from lusee_bayes.core.netcdf_files import read_netcdf
+from lusee_bayes.core.reading import reading
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.results.saved import HINT, UPDATABLE
 from lusee_bayes.sky.priors import HarmonicPrior
 
 
@@ -33,28 +35,32 @@ def read_updatable(folder: str | Path, scenario: Scenario) -> Updatable:
     """
     recover(folder)
     path = Path(folder) / "posterior.nc"
-    if not path.is_file():
-        raise InputError(f"'{folder}' has no posterior.nc; give the folder of a finished map run")
-    with xr.open_dataset(path, engine="h5netcdf") as file:
-        saved = file.load()
-    if "precision_root" not in saved:
+    saved = read_netcdf(path, formats.POSTERIOR, UPDATABLE, HINT)
+    here, said = saved.arrays, saved.values
+    if "precision_root" not in here:
         raise InputError(
             f"{path} does not hold what an update needs; make that map anew with --updatable"
         )
     for name in ("frequency_mhz", "lmax"):
-        if saved.attrs[name] != getattr(scenario, name):
+        if said[name] != getattr(scenario, name):
             raise InputError(
-                f"{path} is of {name} {saved.attrs[name]:g}, the scenario of "
-                f"{getattr(scenario, name):g}; use --set {name}={saved.attrs[name]:g}"
+                f"{path} is of {name} {said[name]:.12g}, the scenario of "
+                f"{getattr(scenario, name):.12g}; use --set {name}={said[name]!r}"
             )
-    spectrum = power_spectrum(np.asarray(saved["prior_std"]))
+    n = n_modes(scenario.lmax)
+    if here["precision_root"].shape != (n, n) or len(here["mean"]) != n:
+        raise InputError(
+            f"{path} holds {len(here['mean'])} modes, expected {n} for lmax = {scenario.lmax}"
+        )
     none = jnp.zeros(())
     posterior = Posterior(
-        HarmonicPrior(jnp.asarray(spectrum)),
-        jnp.asarray(np.asarray(saved["white_mean"])),
-        jnp.asarray(np.asarray(saved["precision_root"])),
+        HarmonicPrior(jnp.asarray(power_spectrum(here["prior_std"]))),
+        jnp.asarray(here["white_mean"]),
+        jnp.asarray(here["precision_root"]),
         None,
-        none + float(saved.attrs["log_evidence"]),
+        none + said["log_evidence"],
         none,
     )
-    return Updatable(posterior, tuple(json.loads(saved.attrs["data_digests"])))
+    with reading(path, UPDATABLE.what):
+        digests = tuple(str(digest) for digest in json.loads(said["data_digests"]))
+    return Updatable(posterior, digests)

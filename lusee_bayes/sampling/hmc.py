@@ -21,8 +21,7 @@ from numpyro.infer import HMC, NUTS
 from numpyro.infer.hmc import HMCState
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import nearest
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.sampling.chains import STATISTICS, Chains
 from lusee_bayes.sampling.checkpoints import Checkpoints
 from lusee_bayes.sampling.program_sites import latent_sites, predicts

@@ -19,8 +19,7 @@ from jaxtyping import Float, Key, PRNGKeyArray
 from numpyro import handlers
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import nearest
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.sampling.promotion import numpyro_promotion
 

@@ -13,8 +13,8 @@ from astropy import units as u
 from astropy.io import fits
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import nearest, require_finite
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.checks import require_finite
+from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.fits_files import is_fits, opened
 from lusee_bayes.sky.files import SkyFile, modes_of_map
 

@@ -9,13 +9,12 @@ import pytest
 
 from lusee_bayes.core.checks import (
     is_traced,
-    nearest,
     require_finite,
     require_float64,
     require_positive,
     require_shape,
 )
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, nearest
 
 
 def test_input_error_is_a_value_error():

@@ -80,7 +80,7 @@ def nan(dataset):
             lambda d: d.assign_coords(product=["00R", "10R", *d["product"].values[2:]]),
             "has products 00R, 10R",
         ),
-        (lambda d: d.attrs.update(step_s=-1.0), "step_s must be positive"),
+        (lambda d: d.attrs.update(step_s=-1.0), "step_s is -1.0, expected a number from 0"),
     ],
 )
 def test_bad_files_are_refused(data, tmp_path, change, message):

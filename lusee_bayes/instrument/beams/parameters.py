@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import nearest
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.instrument.beams.monopoles import Monopoles
 
 

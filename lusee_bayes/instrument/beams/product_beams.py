@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import nearest, require_float64
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.checks import require_float64
+from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import lmax_of
 from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.products import auto_indices, labels, to_real

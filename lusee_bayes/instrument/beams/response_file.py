@@ -22,8 +22,8 @@ from jaxtyping import Complex, Float
 from scipy.constants import Boltzmann, physical_constants
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import nearest, require_finite
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.checks import require_finite
+from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.fits_files import read_images
 from lusee_bayes.instrument.beams.fields import SPEED_OF_LIGHT, AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid

@@ -5,17 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
+
+from lusee_bayes.core import formats
+from lusee_bayes.core.netcdf_files import read_netcdf
+from lusee_bayes.results.saved import CUBE, POSTERIOR
 
 
 def describe_posterior(path: Path) -> str:
     """A posterior at one frequency."""
-    with xr.open_dataset(path, engine="h5netcdf") as posterior:
-        mean, std = posterior["mean"].values, posterior["std"].values
-        attrs = posterior.attrs
-        extra = [name for name in ("truth", "draws", "covariance") if name in posterior]
-        draws = posterior.sizes.get("draw", 0)
-    constrained = int((std < 0.5 * posterior["prior_std"].values).sum())
+    found = read_netcdf(path, formats.POSTERIOR, POSTERIOR)
+    mean, std, attrs = found.arrays["mean"], found.arrays["std"], found.values
+    extra = [name for name in ("truth", "draws", "covariance") if name in found.there]
+    draws = found.sizes.get("draw", 0)
+    constrained = int((std < 0.5 * found.arrays["prior_std"]).sum())
     return "\n".join(
         [
             f"{path}: posterior over {mean.size} modes (lmax {attrs['lmax']}) at "
@@ -32,12 +34,11 @@ def describe_posterior(path: Path) -> str:
 
 def describe_posterior_cube(path: Path) -> str:
     """Posteriors at several frequencies."""
-    with xr.open_dataset(path, engine="h5netcdf") as posterior:
-        frequencies, attrs = posterior["frequency"].values, posterior.attrs
-        temperature = posterior["mean"].values[:, 0] / np.sqrt(4 * np.pi)
-        joint = "component_mean" in posterior
-        extra = [name for name in ("truth", "draws", "independent_mean") if name in posterior]
-        modes = posterior.sizes["mode"]
+    found = read_netcdf(path, formats.POSTERIOR_CUBE, CUBE)
+    frequencies, attrs = found.arrays["frequency"], found.values
+    temperature = found.arrays["mean"][:, 0] / np.sqrt(4 * np.pi)
+    joint, modes = "component_mean" in found.there, found.sizes["mode"]
+    extra = [name for name in ("truth", "draws", "independent_mean") if name in found.there]
     kind = "one posterior for all" if joint else "each by itself"
     return "\n".join(
         [

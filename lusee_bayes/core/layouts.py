@@ -1,0 +1,288 @@
+"""What a file has to hold, declared: names, dimensions, kinds, ranges, what may be absent.
+
+A reader declares a :class:`Layout` and gives :meth:`Layout.checked` what it has found, not yet
+read. Names, kinds, shapes and sizes are checked before a number is read, the numbers before one is
+used. Whatever is wrong becomes one sentence with the name of the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+
+from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.memory import gigabytes, memory_limit
+
+Kind = Literal["real", "integer", "boolean", "text"]
+# numpy's kinds of dtypes that each takes, and what it becomes
+KINDS: dict[str, tuple[str, type]] = {
+    "real": ("fiu", np.float64),
+    "integer": ("iu", np.int64),
+    "boolean": ("biu", np.bool_),
+    "text": ("UST", np.str_),
+}
+NAMES = {
+    "real": "real numbers",
+    "integer": "whole numbers",
+    "boolean": "true or false",
+    "text": "text",
+}
+
+
+@runtime_checkable
+class Unread(Protocol):
+    """An array in a file: known, but not read before ``numpy.asarray``."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+@dataclass(frozen=True)
+class Variable:
+    """An array of a file.
+
+    Attributes
+    ----------
+    dims : sequence of str or int
+        Names of lengths, which all arrays of the file share, or lengths.
+    kind : {"real", "integer", "boolean", "text"}
+        What it holds; it is read as float64, int64, bool or str.
+    low, high : float
+        The range of its numbers, ends included.
+    finite : bool
+        Whether every number is to be finite.
+    grows : bool
+        Whether every number is to be above the one before.
+    choices : sequence of str
+        All texts that may be there; any, if there are none.
+    optional : bool
+        Whether it may be absent.
+    """
+
+    dims: Sequence[str | int]
+    kind: Kind = "real"
+    low: float = -np.inf
+    high: float = np.inf
+    finite: bool = True
+    grows: bool = False
+    choices: Sequence[str] = ()
+    optional: bool = False
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """A number, or a text, that a file says of itself.
+
+    Attributes
+    ----------
+    kind : {"real", "integer", "boolean", "text"}
+    low, high : float
+        Its range, ends included.
+    choices : sequence of str
+        All texts that it may be; any, if there are none.
+    optional : bool
+        Whether it may be absent.
+    """
+
+    kind: Kind = "real"
+    low: float = -np.inf
+    high: float = np.inf
+    choices: Sequence[str] = ()
+    optional: bool = False
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a file holds, checked.
+
+    Attributes
+    ----------
+    arrays : dict of str to array
+        Without optional ones that are absent.
+    values : dict of str to float, int, bool or str
+        Likewise.
+    sizes : dict of str to int
+        The lengths by name.
+    there : frozenset of str
+        All arrays of the file, declared or not.
+    """
+
+    arrays: dict[str, np.ndarray]
+    values: dict[str, Any]
+    sizes: dict[str, int]
+    there: frozenset[str]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What files of one kind hold. More than that may be there, and is not looked at.
+
+    Attributes
+    ----------
+    what : str
+        Such as "visibilities of lusee-bayes simulate", for messages.
+    variables : mapping of str to Variable
+    attributes : mapping of str to Attribute
+    """
+
+    what: str
+    variables: Mapping[str, Variable] = field(default_factory=dict)
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+
+    def checked(
+        self, path: str | Path, arrays: Mapping[str, Unread], values: Mapping[str, Any]
+    ) -> Content:
+        """Read what is declared.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file, for messages.
+        arrays : mapping of str to array
+            What is there; numpy.asarray reads it.
+        values : mapping of str to object
+            Likewise, read.
+
+        Returns
+        -------
+        Content
+
+        Raises
+        ------
+        InputError
+            If the file lacks something, or something is not as declared.
+        """
+        self._require_names(path, arrays, values)
+        found = {
+            name: _checked_value(f"{path}: {name}", values[name], declared)
+            for name, declared in self.attributes.items()
+            if values.get(name) is not None
+        }
+        here = {name: declared for name, declared in self.variables.items() if name in arrays}
+        for name, declared in here.items():
+            _require_kind(f"{path}: {name}", arrays[name], declared)
+        sizes: dict[str, int] = {}
+        for name, declared in here.items():
+            _require_dims(f"{path}: {name}", tuple(arrays[name].shape), declared, sizes)
+        n_bytes = sum(8 * int(np.prod(arrays[n].shape, dtype=object)) for n in here)
+        if n_bytes > memory_limit():
+            raise InputError(
+                f"{path} says that it holds {gigabytes(n_bytes)} of numbers; this machine has "
+                f"{gigabytes(memory_limit())} of memory"
+            )
+        read = {
+            name: _checked_array(f"{path}: {name}", np.asarray(arrays[name]), declared)
+            for name, declared in here.items()
+        }
+        return Content(read, found, sizes, frozenset(map(str, arrays)))
+
+    def _require_names(self, path: str | Path, *there: Mapping[str, Any]) -> None:
+        for declared, given in zip((self.variables, self.attributes), there, strict=True):
+            for name, one in declared.items():
+                if one.optional or given.get(name) is not None:
+                    continue
+                known = f"it has {', '.join(map(str, given))}" if len(given) else "it has none"
+                raise InputError(f"{path} has no {name} ({known}); expected {self.what}")
+
+
+def _require_kind(where: str, array: Unread, declared: Variable) -> None:
+    kind, allowed = np.dtype(array.dtype).kind, KINDS[declared.kind][0]
+    # text of any length is kept as objects
+    if kind not in allowed and not (declared.kind == "text" and kind == "O"):
+        raise InputError(
+            f"{where} holds values of type {array.dtype}, expected {NAMES[declared.kind]}"
+        )
+
+
+def _require_dims(
+    where: str, shape: tuple[int, ...], declared: Variable, sizes: dict[str, int]
+) -> None:
+    expected = [sizes.get(d) if isinstance(d, str) else d for d in declared.dims]
+    fits = len(shape) == len(expected) and all(
+        e is None or e == n for e, n in zip(expected, shape, strict=True)
+    )
+    if not fits:
+        words = " x ".join(
+            f"{d}" if e is None or isinstance(d, int) else f"{e} ({d})"
+            for d, e in zip(declared.dims, expected, strict=True)
+        )
+        raise InputError(f"{where} has shape {shape}, expected {words or 'a single value'}")
+    if 0 in shape:
+        raise InputError(f"{where} is empty, of shape {shape}")
+    sizes.update({d: n for d, n in zip(declared.dims, shape, strict=True) if isinstance(d, str)})
+
+
+def _checked_array(where: str, values: np.ndarray, declared: Variable) -> np.ndarray:
+    if declared.kind == "text":
+        texts = np.array([_text(where, x) for x in values.ravel()]).reshape(values.shape)
+        for text in texts.ravel():
+            _require_choice(where, str(text), declared.choices)
+        return texts
+    if declared.kind == "boolean" and not np.isin(values, (0, 1)).all():
+        raise InputError(f"{where} holds other numbers than 0 and 1, expected true or false")
+    values = np.ascontiguousarray(values, dtype=KINDS[declared.kind][1])
+    if declared.kind == "boolean":
+        return values
+    bad = np.isinf(values) | (np.isnan(values) if declared.finite else False)
+    _require_none(where, values, bad, "NaN or infinity" if declared.finite else "infinity")
+    outside = (values < declared.low) | (values > declared.high)
+    _require_none(where, values, outside, f"a value outside {declared.low:g} to {declared.high:g}")
+    if declared.grows and not (np.diff(values) > 0).all():
+        place = int(np.flatnonzero(~(np.diff(values) > 0))[0])
+        raise InputError(
+            f"{where} does not grow: {values[place + 1]:.12g} follows {values[place]:.12g}"
+        )
+    return values
+
+
+def _require_none(where: str, values: np.ndarray, bad: np.ndarray, what: str) -> None:
+    if bad.any():
+        first = tuple(int(i) for i in np.argwhere(np.atleast_1d(bad))[0])
+        value = values[first] if values.ndim else values
+        raise InputError(
+            f"{where} holds {what}: {value:g} at {first}, {int(bad.sum())} of {bad.size} in all"
+        )
+
+
+def _checked_value(where: str, value: Any, declared: Attribute) -> Any:
+    if isinstance(value, np.ndarray | np.generic) and value.size == 1:
+        value = value.reshape(()).item()
+    if declared.kind == "text":
+        text = _text(where, value)
+        _require_choice(where, text, declared.choices)
+        return text
+    number = np.asarray(value)
+    if number.ndim or number.dtype.kind not in KINDS[declared.kind][0]:
+        raise InputError(f"{where} is {value!r}, expected {_one(declared.kind)}")
+    if declared.kind == "boolean":
+        return bool(number)
+    if not np.isfinite(number) or not declared.low <= number <= declared.high:
+        limits = f" from {declared.low:g} to {declared.high:g}"
+        limited = np.isfinite([declared.low, declared.high]).any()
+        raise InputError(
+            f"{where} is {value!r}, expected {_one(declared.kind)}{limits if limited else ''}"
+        )
+    return int(number) if declared.kind == "integer" else float(number)
+
+
+def _one(kind: Kind) -> str:
+    return {"real": "a number", "integer": "a whole number"}.get(kind, NAMES[kind])
+
+
+def _text(where: str, value: Any) -> str:
+    try:
+        text = value.decode() if isinstance(value, bytes) else value
+    except UnicodeDecodeError as error:
+        raise InputError(f"{where} holds text that is not UTF-8: {value!r}") from error
+    if not isinstance(text, str):
+        raise InputError(f"{where} is {value!r}, expected text")
+    return str(text)
+
+
+def _require_choice(where: str, text: str, choices: Sequence[str]) -> None:
+    if choices and text not in choices:
+        raise InputError(f"{where} is '{text}'; {nearest(text, choices)}")

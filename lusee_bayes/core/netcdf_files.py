@@ -1,0 +1,96 @@
+"""Read the package's own netCDF files by their declared layouts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import xarray as xr
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.layouts import Content, Layout
+from lusee_bayes.core.reading import reading, require_file
+
+FORMAT = "format"
+
+
+def format_of(path: str | Path) -> str | None:
+    """The attribute ``format`` of an HDF5 or netCDF file; None for files of other kinds.
+
+    Raises
+    ------
+    InputError
+        If there is no file, or it is HDF5 and damaged.
+    """
+    path = require_file(path, "file")
+    with reading(path, "HDF5"):
+        if not h5py.is_hdf5(path):
+            return None
+        with h5py.File(path) as file:
+            kind = file.attrs.get(FORMAT)
+    return kind.decode(errors="replace") if isinstance(kind, bytes) else kind
+
+
+def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") -> Content:
+    """Read one of the package's own files.
+
+    Dimensions are told by their names: an array whose dimensions are in another order is turned.
+
+    Parameters
+    ----------
+    path : str or Path
+    format_ : str
+        Its ``format``, one of :mod:`.formats`.
+    layout : Layout
+    hint : str
+        What to do if there is no such file.
+
+    Returns
+    -------
+    Content
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or of another kind, or not as declared.
+    """
+    with _opened(path, format_, layout, hint) as dataset:
+        return _checked(path, dataset, layout)
+
+
+def read_dataset(path: str | Path, format_: str, layout: Layout, hint: str = "") -> xr.Dataset:
+    """As :func:`read_netcdf`, with the file as a whole: what is not declared, too."""
+    with _opened(path, format_, layout, hint) as dataset:
+        _checked(path, dataset, layout)
+        return dataset.load()
+
+
+@contextmanager
+def _opened(path: str | Path, format_: str, layout: Layout, hint: str) -> Iterator[xr.Dataset]:
+    path = require_file(path, layout.what, hint)
+    found = format_of(path)
+    if found != format_:
+        raise InputError(
+            f"{path} is not a file of {layout.what}: its format is '{found or 'absent'}', expected "
+            f"'{format_}'" + (f"; {hint}" if hint else "")
+        )
+    with (
+        reading(path, layout.what),
+        xr.open_dataset(path, engine="h5netcdf", decode_times=False) as dataset,
+    ):
+        yield dataset
+
+
+def _checked(path: str | Path, dataset: xr.Dataset, layout: Layout) -> Content:
+    arrays = {str(name): variable for name, variable in dataset.variables.items()}
+    for name, declared in layout.variables.items():
+        if name not in arrays:
+            continue
+        array = dataset[name]
+        dims = [str(d) for d in declared.dims]
+        if array.dims != tuple(dims) and sorted(map(str, array.dims)) == sorted(dims):
+            array = array.transpose(*dims)
+        arrays[name] = array.variable
+    return layout.checked(path, arrays, dataset.attrs)

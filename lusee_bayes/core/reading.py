@@ -1,0 +1,200 @@
+"""The door for every file: what cannot be read is said in one sentence, with the file's name."""
+
+from __future__ import annotations
+
+import csv
+import json
+import stat
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.layouts import Content, Layout
+
+# a text file that is larger is none that a person or this package has written
+LARGEST_TEXT = 50_000_000
+
+
+def require_file(path: str | Path, what: str, hint: str = "") -> Path:
+    """Check that there is a regular file that may be read.
+
+    Parameters
+    ----------
+    path : str or Path
+    what : str
+        What it should be, for the message.
+    hint : str
+        What to do if there is none.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError
+        If there is none, or a folder, a pipe or a device.
+    """
+    path = Path(path)
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError as error:
+        raise InputError(f"no {what} at '{path}'" + (f"; {hint}" if hint else "")) from error
+    except (OSError, ValueError) as error:
+        # a name that is too long, holds a NUL, or lies behind a file
+        raise InputError(f"no {what} at '{path}': {_reason(error)}") from error
+    if not stat.S_ISREG(mode):
+        kind = "a folder" if stat.S_ISDIR(mode) else "neither a file nor a folder"
+        raise InputError(f"'{path}' is {kind}; give a file: {what}")
+    return path
+
+
+@contextmanager
+def reading(path: str | Path, what: str, hint: str = "") -> Iterator[Path]:
+    """Read a file within the block, and turn whatever a library raises there into one sentence.
+
+    Libraries raise errors of every kind for files that are cut short or damaged: HDF5 alone
+    OSError, KeyError, RuntimeError, ValueError and more. Keep to reading in the block.
+
+    Parameters
+    ----------
+    path : str or Path
+    what : str
+        What the file should be.
+    hint : str
+        What to do if there is none.
+
+    Yields
+    ------
+    Path
+
+    Raises
+    ------
+    InputError
+        As :func:`require_file`; for whatever the block raises, with its reason.
+    """
+    path = require_file(path, what, hint)
+    try:
+        with warnings.catch_warnings():
+            # what is said of a damaged file is said by the error, if by anything
+            warnings.simplefilter("ignore")
+            yield path
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(
+            f"{path} cannot be read as {what}: {_reason(error)}; it is cut short, damaged, or of "
+            "another kind"
+        ) from error
+
+
+@contextmanager
+def naming(path: str | Path) -> Iterator[None]:
+    """Put the name of a file before the message of an InputError of the block."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _reason(error: BaseException) -> str:
+    """The first line of an error, short."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, KeyError):
+        text = f"there is no {text}"
+    return text if len(text) <= 160 else f"{text[:157]}..."
+
+
+def read_text(path: str | Path, what: str, hint: str = "") -> str:
+    """Read a text file in UTF-8. InputError if it cannot be, or is too large to be one."""
+    with reading(path, what, hint) as file:
+        size = file.stat().st_size
+        if size > LARGEST_TEXT:
+            raise InputError(f"'{path}' has {size:,} bytes; expected {what}")
+        text = file.read_bytes().decode("utf-8-sig")
+    if "\0" in text:
+        raise InputError(f"'{path}' holds NUL bytes; expected {what}")
+    return text
+
+
+def read_json(path: str | Path, layout: Layout, hint: str = "") -> dict[str, Any]:
+    """Read an object in JSON, and check its values against a layout; others are kept as they are.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is no object, or lacks a value.
+    """
+    text = read_text(path, layout.what, hint)
+    with reading(path, layout.what):
+        found = json.loads(text)
+    if not isinstance(found, dict):
+        raise InputError(f"{path} holds a {type(found).__name__}; expected {layout.what}")
+    return found | layout.checked(path, {}, found).values
+
+
+def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np.ndarray]:
+    """Read a CSV table with a header: every column by its name, numbers where all are.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, rows are of different lengths, or a column is missing or not as
+        declared.
+    """
+    text = read_text(path, layout.what, hint)
+    with reading(path, layout.what):
+        rows = list(csv.reader(text.splitlines(), strict=True))
+    if len(rows) < 2:
+        raise InputError(f"{path} has no rows; expected {layout.what}")
+    header, *rows = rows
+    for number, row in enumerate(rows, start=2):
+        if len(row) != len(header):
+            raise InputError(
+                f"{path}: line {number} has {len(row)} entries for {len(header)} columns"
+            )
+    columns: dict[str, np.ndarray] = {}
+    for name, values in zip(header, zip(*rows, strict=True), strict=True):
+        try:
+            columns[name] = np.array([float(value) if value else np.nan for value in values])
+        except ValueError:
+            columns[name] = np.array(values)
+    return columns | layout.checked(path, columns, {}).arrays
+
+
+def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
+    """Read NumPy's .npz: arrays; values are arrays of one entry.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or is not as declared.
+    """
+    with reading(path, layout.what, hint) as file, np.load(file, allow_pickle=False) as arrays:
+        if not isinstance(arrays, np.lib.npyio.NpzFile):
+            raise InputError(f"{path} holds a single array; expected {layout.what}")
+        there = {name: _Member(arrays, name) for name in arrays.files}
+        values = {name: arrays[name] for name in layout.attributes if name in there}
+        return layout.checked(path, there, values)
+
+
+class _Member:
+    """An array of an .npz file, of which the header alone has been read."""
+
+    def __init__(self, arrays: np.lib.npyio.NpzFile, name: str):
+        self._arrays, self._name = arrays, name
+        with arrays.zip.open(f"{name}.npy") as file:
+            version = np.lib.format.read_magic(file)
+            header = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }[version](file)
+        self.shape, _, self.dtype = header
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self._arrays[self._name], dtype=dtype)

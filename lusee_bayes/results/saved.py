@@ -1,0 +1,110 @@
+"""What finished runs have left in their folders, declared: read back by reports and comparisons."""
+
+from __future__ import annotations
+
+from lusee_bayes.core.layouts import Attribute, Layout, Variable
+
+MODES = Variable(("mode",))
+WIDTHS = Variable(("mode",), low=0.0)
+NUMBER, COUNT, TEXT = Attribute(), Attribute("integer", low=0.0), Attribute("text")
+HINT = "give the folder of a finished run"
+
+POSTERIOR = Layout(
+    "a posterior of lusee-bayes map",
+    {
+        "mean": MODES,
+        "std": WIDTHS,
+        "prior_std": WIDTHS,
+        "truth": Variable(("mode",), optional=True),
+        "draws": Variable(("draw", "mode"), optional=True),
+    },
+    {"frequency_mhz": Attribute(low=0.0), "lmax": COUNT, "frame": TEXT, "versions": TEXT},
+)
+UPDATABLE = Layout(
+    "a posterior of lusee-bayes map --updatable",
+    {
+        **POSTERIOR.variables,
+        "precision_root": Variable(("mode", "mode_2"), optional=True),
+        "white_mean": Variable(("mode",), optional=True),
+    },
+    {
+        **POSTERIOR.attributes,
+        "log_evidence": Attribute(optional=True),
+        "data_digests": Attribute("text", optional=True),
+    },
+)
+CUBE = Layout(
+    "posteriors of lusee-bayes map --frequencies",
+    {
+        "frequency": Variable(("frequency",), low=0.0, grows=True),
+        "mean": Variable(("frequency", "mode")),
+        "std": Variable(("frequency", "mode"), low=0.0),
+    },
+    {"lmax": COUNT, "frame": TEXT, "versions": TEXT},
+)
+DIAGNOSTICS = Layout(
+    "diagnostics of lusee-bayes map",
+    {
+        "prior_fraction": Variable(("pixel",)),
+        "highest_altitude": Variable(("pixel",)),
+        "draws": Variable(("draw", "pixel")),
+        "region_mean": Variable(("region",)),
+        "region_std": Variable(("region",), low=0.0),
+        "region_prior_fraction": Variable(("region",)),
+        "psf": Variable(("region", "kernel_pixel")),
+        "psf_peak": Variable(("region",)),
+        "product": Variable(("product",), "text"),
+        "hours": Variable(("time",)),
+        "data": Variable(("product", "time"), finite=False),
+        "predicted": Variable(("product", "time"), finite=False),
+        "z": Variable(("product", "time"), finite=False),
+        "group_kind": Variable(("group",), "text", choices=("product", "day", "angle")),
+        "group_name": Variable(("group",), "text"),
+        "group_n": Variable(("group",), "integer", low=0.0),
+        "group_chi2": Variable(("group",)),
+        "group_p": Variable(("group",), low=0.0, high=1.0),
+        "group_others_p": Variable(("group",), low=0.0, high=1.0, finite=False),
+    },
+    {
+        "frequency_mhz": Attribute(low=0.0),
+        "verdict": TEXT,
+        "p": Attribute(low=0.0, high=1.0),
+        "chi2": NUMBER,
+    },
+)
+# summary.json, sampling.json; what is null is not known
+MAP_SUMMARY = Layout(
+    "the figures of a map run",
+    attributes={
+        "frequency_mhz": Attribute(low=0.0),
+        "ell_cross": Attribute("integer", optional=True),
+        "effective_resolution_deg": Attribute(optional=True),
+        "beam_rms_difference": Attribute(optional=True),
+        "never_observed_fraction": Attribute(low=0.0, high=1.0),
+        "peak_memory_gb": NUMBER,
+        **dict.fromkeys(("log_evidence", "information_bits", "chi2", "chi2_expected"), NUMBER),
+        **dict.fromkeys(("n_data", "n_missing", "n_modes", "rounds"), COUNT),
+        "mean_refinement_sigma": NUMBER,
+    },
+)
+SAMPLING = Layout(
+    "the figures of a sampled run",
+    attributes={
+        "program": TEXT,
+        "chains": COUNT,
+        "draws": COUNT,
+        "divergences": COUNT,
+        "mean_acceptance": Attribute(low=0.0, high=1.0),
+        "peak_memory_gb": NUMBER,
+    },
+)
+SPECTRA = Layout(
+    "spectra of a map",
+    {
+        "ell": Variable(("ell",), low=0.0),
+        **{
+            name: Variable(("ell",), finite=False)
+            for name in ("cl_prior", "cl_mean", "cl_posterior_variance", "prior_fraction")
+        },
+    },
+)
