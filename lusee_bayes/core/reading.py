@@ -138,6 +138,25 @@ def read_json(path: str | Path, layout: Layout, hint: str = "") -> dict[str, Any
     return found | layout.checked(path, {}, found).values
 
 
+def entries(
+    path: str | Path, found: dict[str, Any], name: str, layout: Layout
+) -> list[dict[str, Any]]:
+    """Check a list of objects that a JSON file holds under a name.
+
+    Raises
+    ------
+    InputError
+        If it is none, or one of the objects lacks a value.
+    """
+    listed = found.get(name)
+    if not isinstance(listed, list) or not all(isinstance(one, dict) for one in listed):
+        raise InputError(f"{path}: {name} is {type(listed).__name__}, expected a list of objects")
+    return [
+        one | layout.checked(f"{path}: {name} {number}", {}, one).values
+        for number, one in enumerate(listed)
+    ]
+
+
 def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np.ndarray]:
     """Read a CSV table with a header: every column by its name, numbers where all are.
 
@@ -159,8 +178,11 @@ def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np
                 f"{path}: line {number} has {len(row)} entries for {len(header)} columns"
             )
     columns: dict[str, np.ndarray] = {}
+    texts = {name for name, column in layout.variables.items() if column.kind == "text"}
     for name, values in zip(header, zip(*rows, strict=True), strict=True):
         try:
+            if name in texts:
+                raise ValueError
             columns[name] = np.array([float(value) if value else np.nan for value in values])
         except ValueError:
             columns[name] = np.array(values)

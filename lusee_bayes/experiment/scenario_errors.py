@@ -6,6 +6,8 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from lusee_bayes.core.errors import nearest
+
 
 def one_sentence(error: ValidationError, source: str, model: type[BaseModel]) -> str:
     """What was found, what was expected and where, for the first thing that is wrong.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from lusee_bayes.core.files import require_files
+from lusee_bayes.core.reading import entries, read_json
 from lusee_bayes.report import html
 from lusee_bayes.report.run_details import details
+from lusee_bayes.results.saved import CHANNEL_SUMMARY, CUBE_SUMMARY, JOINT_SUMMARY
 
 NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "mean.fits", "std.fits")
 FIGURES = {
@@ -55,8 +56,9 @@ def cube_page(folder: Path, name: str) -> str:
         If something is missing in the folder.
     """
     require_files(folder, (*NEEDED, *(f"figures/{figure}.png" for figure in FIGURES)), "map")
-    summary = json.loads((folder / "summary.json").read_text())
-    frequencies = summary["frequencies_mhz"]
+    summary = read_json(folder / "summary.json", CUBE_SUMMARY)
+    channels = entries(folder / "summary.json", summary, "channels", CHANNEL_SUMMARY)
+    frequencies = [channel["frequency_mhz"] for channel in channels]
     title = (
         f"{name}: the sky at {len(frequencies)} frequencies, "
         f"{frequencies[0]:g} to {frequencies[-1]:g} MHz"
@@ -67,8 +69,13 @@ def cube_page(folder: Path, name: str) -> str:
         name: [html.figure(folder / "figures" / f"{name}.png", *texts)]
         for name, texts in FIGURES.items()
     }
-    parts["maps"].append(html.paragraph(_how(summary)))
-    parts["chi2"].append(_table(summary))
+    joint = None
+    if summary.get("joint") is not None:
+        (joint,) = entries(
+            folder / "summary.json", {"joint": [summary["joint"]]}, "joint", JOINT_SUMMARY
+        )
+    parts["maps"].append(html.paragraph(_how(joint, summary.get("log_evidence"))))
+    parts["chi2"].append(_table(channels))
     return html.page(
         title,
         [
@@ -80,8 +87,7 @@ def cube_page(folder: Path, name: str) -> str:
     )
 
 
-def _how(summary: dict) -> str:
-    joint, evidence = summary["joint"], summary["log_evidence"]
+def _how(joint: dict | None, evidence: float | None) -> str:
     known = "" if evidence is None else f" ln evidence {evidence:.1f}."
     if joint is None:
         return f"Every channel has a posterior of its own.{known}"
@@ -95,7 +101,7 @@ def _how(summary: dict) -> str:
     )
 
 
-def _table(summary: dict) -> str:
+def _table(channels: list[dict]) -> str:
     header = ("MHz", "data", "missing", "chi²", "expected", "first ell with SNR < 1")
     rows = [
         (
@@ -104,8 +110,8 @@ def _table(summary: dict) -> str:
             c["n_missing"],
             f"{c['chi2']:.0f}",
             f"{c['chi2_expected']:.0f}" if "chi2_expected" in c else "unknown",
-            "" if c["ell_cross"] is None else c["ell_cross"],
+            "" if c.get("ell_cross") is None else c["ell_cross"],
         )
-        for c in summary["channels"]
+        for c in channels
     ]
     return html.folded("every channel", html.table(header, rows))

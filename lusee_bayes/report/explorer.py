@@ -16,6 +16,7 @@ from lusee_bayes.report import html
 from lusee_bayes.report.figures.drawing import DIVERGING, SEQUENTIAL
 from lusee_bayes.results.diagnostics import KERNEL_NSIDE
 from lusee_bayes.results.diagnostics_file import KERNEL_STEP
+from lusee_bayes.sky import SkyMap
 
 LAYOUT = """<div class="controls">
 <label for="explorer-layer">show <select id="explorer-layer"></select></label>
@@ -54,7 +55,7 @@ def explorer_data(folder: Path, diagnostics: xr.Dataset) -> dict[str, object]:
 
     def read(name: str) -> Float[np.ndarray, " pixels"] | None:
         path = folder / f"{name}.fits"
-        return healpy.read_map(path, dtype=np.float64) if path.is_file() else None
+        return SkyMap.read(path).pixels if path.is_file() else None
 
     mean, std, truth = read("mean"), read("std"), read("truth")
     sky = mean if truth is None else truth

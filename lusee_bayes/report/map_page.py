@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
 from lusee_bayes.core.files import require_files
+from lusee_bayes.core.reading import read_table
 from lusee_bayes.linear.residuals import SIGNIFICANCE, probability
 from lusee_bayes.report import html
 from lusee_bayes.report.explorer import explorer
 from lusee_bayes.report.run_details import details
-from lusee_bayes.results.diagnostics_file import read_diagnostics
+from lusee_bayes.results.finished_runs import FinishedRun
+from lusee_bayes.results.saved import SOURCES
 
 NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "diagnostics.nc", "mean.fits", "std.fits")
 FIGURES = ("maps", "draws", "fidelity", "spectra", "data_vector", "residuals", "beams")
@@ -45,8 +45,8 @@ def map_page(folder: Path, name: str) -> str:
         If something is missing in the folder.
     """
     require_files(folder, (*NEEDED, *(f"figures/{figure}.png" for figure in FIGURES)), "map")
-    summary = json.loads((folder / "summary.json").read_text())
-    found = read_diagnostics(folder / "diagnostics.nc")
+    run = FinishedRun.read(folder)
+    summary, found = run.summary, run.diagnostics
     title = f"{name}: the sky at {summary['frequency_mhz']:g} MHz"
     bad = found.attrs["p"] < SIGNIFICANCE
     return html.page(
@@ -55,7 +55,7 @@ def map_page(folder: Path, name: str) -> str:
             html.contents(SECTIONS),
             html.paragraph(found.attrs["verdict"], "verdict bad" if bad else "verdict"),
             html.section("map", SECTIONS[0][1], *_map(folder, summary, found)),
-            html.section("scales", SECTIONS[1][1], *_scales(folder, summary)),
+            html.section("scales", SECTIONS[1][1], *_scales(folder, run)),
             html.section("data", SECTIONS[2][1], *_data(folder, found)),
             html.section("numbers", SECTIONS[3][1], *_numbers(folder, summary)),
             html.section("run", SECTIONS[4][1], *details(folder, summary)),
@@ -92,12 +92,10 @@ def _map(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
     ]
 
 
-def _scales(folder: Path, summary: dict) -> list[str]:
-    cross, resolution = summary["ell_cross"], summary["effective_resolution_deg"]
+def _scales(folder: Path, run: FinishedRun) -> list[str]:
+    cross, resolution = run.summary["ell_cross"], run.summary["effective_resolution_deg"]
     text = []
-    with (folder / "spectra.csv").open(newline="") as file:
-        known = "snr" in next(csv.reader(file))
-    if known:
+    if "snr" in run.spectra:
         text.append(
             "SNR_ell stays above 1 at every ell."
             if cross is None
@@ -202,12 +200,9 @@ def _numbers(folder: Path, summary: dict) -> list[str]:
     parts = [html.table(("", ""), rows)]
     sources = folder / "sources.csv"
     if sources.is_file():
-        with sources.open(newline="") as file:
-            lines = list(csv.DictReader(file))
-        cells = [
-            (s["source"], s["block"], f"{float(s['flux_jy']):.4g}", f"{float(s['std_jy']):.2g}")
-            for s in lines
-        ]
+        table = read_table(sources, SOURCES)
+        rows_of_sources = zip(*(table[name] for name in SOURCES.variables), strict=True)
+        cells = [(name, block, f"{f:.4g}", f"{std:.2g}") for name, block, f, std in rows_of_sources]
         parts += [
             html.paragraph("Point sources beside the map"),
             html.table(("source", "block", "flux [Jy]", "+- [Jy]"), cells),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import read_manifest, recover, replacing
+from lusee_bayes.core.layouts import Layout
+from lusee_bayes.core.reading import read_json
 from lusee_bayes.report.cube_page import cube_page
 from lusee_bayes.report.map_page import map_page
 from lusee_bayes.report.sample_page import sample_page
@@ -55,5 +56,5 @@ def _kind(folder: Path) -> str | None:
     if not (folder / "posterior.nc").is_file():
         return None
     summary = folder / "summary.json"
-    several = summary.is_file() and "frequencies_mhz" in json.loads(summary.read_text())
-    return "cube" if several else "map"
+    found = read_json(summary, Layout("the figures of a run")) if summary.is_file() else {}
+    return "cube" if "frequencies_mhz" in found else "map"

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from pathlib import Path
 
+import numpy as np
+
 from lusee_bayes.core.files import require_files
+from lusee_bayes.core.reading import entries, read_json, read_table
 from lusee_bayes.report import html
 from lusee_bayes.report.run_details import details
+from lusee_bayes.results.saved import CHECK, SAMPLING, SUMMARY_TABLE, VALIDATION
 
 # name, text for those who do not see it, caption
 FIGURES = {
@@ -66,13 +68,14 @@ def sample_page(folder: Path, name: str) -> str:
         If something is missing in the folder.
     """
     require_files(folder, ("summary.csv", "sampling.json", "scenario.yaml"), "sample")
-    sampling = json.loads((folder / "sampling.json").read_text())
-    with (folder / "summary.csv").open(newline="") as file:
-        header, *rows = list(csv.reader(file))
-    worst = max(float(row[header.index("r_hat")]) for row in rows)
+    sampling = read_json(folder / "sampling.json", SAMPLING)
+    table = read_table(folder / "summary.csv", SUMMARY_TABLE)
+    header, rows = list(table), list(zip(*table.values(), strict=True))
+    worst = float(np.nanmax(table["r_hat"], initial=-np.inf))
+    agreement = f"R-hat at most {worst:.4f}" if np.isfinite(worst) else "too few draws for R-hat"
     verdict = (
-        f"{sampling['chains']} x {sampling['draws']} draws of {sampling['program']}: R-hat at most "
-        f"{worst:.4f}, {sampling['divergences']} divergences, mean acceptance "
+        f"{sampling['chains']} x {sampling['draws']} draws of {sampling['program']}: {agreement}, "
+        f"{sampling['divergences']} divergences, mean acceptance "
         f"{sampling['mean_acceptance']:.2f}."
     )
     bad = worst > 1.01 or sampling["divergences"] > 0
@@ -81,7 +84,8 @@ def sample_page(folder: Path, name: str) -> str:
     validation = folder / "validation.json"
     if validation.is_file():
         sections.insert(1, ("checks", "Checks"))
-        parts.append(html.section("checks", "Checks", _checks(json.loads(validation.read_text()))))
+        checks = entries(validation, read_json(validation, VALIDATION), "checks", CHECK)
+        parts.append(html.section("checks", "Checks", _checks(checks)))
     present = [
         html.figure(folder / "figures" / f"{figure}.png", *texts)
         for figure, texts in FIGURES.items()
@@ -99,10 +103,10 @@ def sample_page(folder: Path, name: str) -> str:
     )
 
 
-def _checks(validation: dict) -> str:
+def _checks(checks: list[dict]) -> str:
     rows, bad = [], []
-    for check in validation["checks"]:
-        bounds = [check["lower"], check["upper"]]
+    for check in checks:
+        bounds = [check.get("lower"), check.get("upper")]
         allowed = " to ".join("any" if b is None else f"{b:.4g}" for b in bounds)
         verdict = "ok" if check["passed"] else "failed"
         rows.append((check["name"], f"{check['value']:.4g}", allowed, verdict, check["meaning"]))
@@ -110,6 +114,6 @@ def _checks(validation: dict) -> str:
     return html.table(("check", "value", "allowed", "", "what it is"), rows, bad)
 
 
-def _short(row: list[str]) -> list[str]:
-    """Numbers of a row to five digits."""
-    return [row[0], *(f"{float(cell):.5g}" for cell in row[1:])]
+def _short(row: tuple[object, ...]) -> list[str]:
+    """Numbers of a row to five digits; what too few draws cannot tell is left out."""
+    return [str(row[0]), *("" if np.isnan(cell) else f"{cell:.5g}" for cell in row[1:])]

@@ -87,6 +87,46 @@ MAP_SUMMARY = Layout(
         "mean_refinement_sigma": NUMBER,
     },
 )
+CUBE_SUMMARY = Layout(
+    "the figures of a run of several frequencies",
+    attributes={"verdict": TEXT, "n_data": COUNT, "n_modes": COUNT, "peak_memory_gb": NUMBER},
+)
+CHANNEL_SUMMARY = Layout(
+    "the figures of a channel",
+    attributes={
+        "frequency_mhz": Attribute(low=0.0),
+        "n_data": COUNT,
+        "n_missing": COUNT,
+        "chi2": NUMBER,
+        "chi2_expected": Attribute(optional=True),
+        "ell_cross": Attribute("integer", optional=True),
+    },
+)
+JOINT_SUMMARY = Layout(
+    "the figures of a joint posterior",
+    attributes={"solver": TEXT, "iterations": COUNT, "refinement_sigma": NUMBER},
+)
+VALIDATION = Layout("the checks of a validation", attributes={"passed": Attribute("boolean")})
+CHECK = Layout(
+    "a check",
+    attributes={
+        "name": TEXT,
+        "value": NUMBER,
+        "lower": Attribute(optional=True),
+        "upper": Attribute(optional=True),
+        "passed": Attribute("boolean"),
+        "meaning": TEXT,
+    },
+)
+SUMMARY_TABLE = Layout(
+    "a summary of draws",
+    {
+        "quantity": Variable(("quantity",), "text"),
+        "mean": Variable(("quantity",), finite=False),
+        "sd": Variable(("quantity",), finite=False),
+        "r_hat": Variable(("quantity",), finite=False),
+    },
+)
 SAMPLING = Layout(
     "the figures of a sampled run",
     attributes={
@@ -96,6 +136,15 @@ SAMPLING = Layout(
         "divergences": COUNT,
         "mean_acceptance": Attribute(low=0.0, high=1.0),
         "peak_memory_gb": NUMBER,
+    },
+)
+SOURCES = Layout(
+    "fluxes of point sources",
+    {
+        "source": Variable(("source",), "text"),
+        "block": Variable(("source",), "text"),
+        "flux_jy": Variable(("source",)),
+        "std_jy": Variable(("source",), low=0.0),
     },
 )
 SPECTRA = Layout(
