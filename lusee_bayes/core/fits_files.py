@@ -1,17 +1,26 @@
-"""Read the images of FITS files by name; a damaged file raises an error."""
+"""Read FITS files by their declared layouts."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyWarning
 
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.layouts import Content, Layout
+from lusee_bayes.core.reading import reading
+
+# kinds of numbers that images hold, by BITPIX
+IMAGE_DTYPES = {8: "u1", 16: "i2", 32: "i4", 64: "i8", -32: "f4", -64: "f8"}
+
+# words that say how a file is built
+STRUCTURE = ("SIMPLE", "BITPIX", "NAXIS", "EXTEND", "COMMENT", "HISTORY")
 
 
 def is_fits(path: str | Path) -> bool:
@@ -28,56 +37,65 @@ def image_names(path: str | Path) -> list[str]:
     InputError
         If the file cannot be read or is cut short.
     """
-    return list(_open(Path(path), ())[1])
+    with opened(path) as hdus:
+        return [hdu.name.lower() for hdu in hdus]
 
 
-def read_images(
-    path: str | Path, names: Sequence[str], kind: str
-) -> tuple[dict[str, np.ndarray], fits.Header]:
-    """Read images by name.
+def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
+    """Read images, columns of tables and words of the primary header.
+
+    Variables are images by their names, or columns as ``table.column``; upper and lower case are
+    the same. Attributes are words of the primary header.
 
     Parameters
     ----------
     path : str or Path
-    names : sequence of str
-        Upper and lower case are the same.
-    kind : str
-        What the file should be, for the error message.
+    layout : Layout
+    hint : str
+        What to do if there is no such file.
 
     Returns
     -------
-    images : dict of str to array
-        With ``names`` as keys.
-    header : fits.Header
-        The primary header.
+    Content
 
     Raises
     ------
     InputError
-        If the file cannot be read, is cut short, or lacks one of the images.
+        If the file is missing or damaged, or not as declared.
     """
-    path = Path(path)
-    images, found, header = _open(path, names)
-    missing = [name for name in names if name not in images]
-    if missing:
-        raise InputError(
-            f"{path} has no image '{missing[0]}' (it has {', '.join(found.values())}); expected "
-            f"{kind}"
-        )
-    return images, header
+    with opened(path, layout.what, hint) as hdus:
+        there: dict[str, Any] = {}
+        for hdu in hdus:
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
+                for number, name in enumerate(hdu.columns.names):
+                    there[f"{hdu.name}.{name}".lower()] = hdu.data.field(number)
+            elif hdu.header.get("NAXIS", 0):
+                there[hdu.name.lower()] = _Image(hdu)
+        declared = {name.lower(): name for name in layout.variables}
+        arrays = {declared.get(name, name): array for name, array in there.items()}
+        words = hdus[0].header
+        said = {key: words[key] for key in words if key and not key.startswith(STRUCTURE)}
+        return layout.checked(path, arrays, said)
 
 
-def _open(
-    path: Path, names: Sequence[str]
-) -> tuple[dict[str, np.ndarray], dict[str, str], fits.Header]:
-    with opened(path) as hdus:
-        found = {hdu.name.lower(): hdu.name for hdu in hdus}
-        images = {n: np.array(hdus[n].data) for n in names if n.lower() in found}
-        return images, found, hdus[0].header.copy()
+class _Image:
+    """An image that is read when it is asked for."""
+
+    def __init__(self, hdu: fits.PrimaryHDU | fits.ImageHDU):
+        self._hdu = hdu
+        self.shape = tuple(hdu.shape)
+        self.dtype = np.dtype(IMAGE_DTYPES[hdu.header["BITPIX"]])
+
+    @cached_property
+    def _values(self) -> np.ndarray:
+        return np.asarray(self._hdu.data)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return self._values.astype(self.dtype if dtype is None else dtype)
 
 
 @contextmanager
-def opened(path: str | Path) -> Iterator[fits.HDUList]:
+def opened(path: str | Path, what: str = "FITS", hint: str = "") -> Iterator[fits.HDUList]:
     """Open a FITS file for the duration of a ``with`` block.
 
     Raises
@@ -85,13 +103,8 @@ def opened(path: str | Path) -> Iterator[fits.HDUList]:
     InputError
         If the file, or what the block reads of it, is cut short or damaged.
     """
-    try:
+    with reading(path, what, hint) as place, place.open("rb") as file:
         # astropy only warns of a file that is cut short
-        with warnings.catch_warnings(), Path(path).open("rb") as file:
-            warnings.simplefilter("error", AstropyWarning)
-            with fits.open(file, memmap=False) as hdus:
-                yield hdus
-    except InputError:
-        raise
-    except (OSError, TypeError, ValueError, AstropyWarning) as error:
-        raise InputError(f"{path} cannot be read as FITS, or is cut short: {error}") from error
+        warnings.simplefilter("error", AstropyWarning)
+        with fits.open(file, memmap=False) as hdus:
+            yield hdus

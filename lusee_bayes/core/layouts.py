@@ -17,16 +17,18 @@ import numpy as np
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.memory import gigabytes, memory_limit
 
-Kind = Literal["real", "integer", "boolean", "text"]
+Kind = Literal["real", "complex", "integer", "boolean", "text"]
 # numpy's kinds of dtypes that each takes, and what it becomes
 KINDS: dict[str, tuple[str, type]] = {
     "real": ("fiu", np.float64),
+    "complex": ("fiuc", np.complex128),
     "integer": ("iu", np.int64),
     "boolean": ("biu", np.bool_),
     "text": ("UST", np.str_),
 }
 NAMES = {
     "real": "real numbers",
+    "complex": "complex numbers",
     "integer": "whole numbers",
     "boolean": "true or false",
     "text": "text",
@@ -49,12 +51,14 @@ class Variable:
     ----------
     dims : sequence of str or int
         Names of lengths, which all arrays of the file share, or lengths.
-    kind : {"real", "integer", "boolean", "text"}
-        What it holds; it is read as float64, int64, bool or str.
+    kind : {"real", "complex", "integer", "boolean", "text"}
+        What it holds; it is read as float64, complex128, int64, bool or str.
     low, high : float
         The range of its numbers, ends included.
     finite : bool
-        Whether every number is to be finite.
+        Whether every number is to be finite; else there may be NaN.
+    missing : bool
+        Whether numbers may be of any kind, NaN and infinity too.
     grows : bool
         Whether every number is to be above the one before.
     choices : sequence of str
@@ -68,6 +72,7 @@ class Variable:
     low: float = -np.inf
     high: float = np.inf
     finite: bool = True
+    missing: bool = False
     grows: bool = False
     choices: Sequence[str] = ()
     optional: bool = False
@@ -225,10 +230,12 @@ def _checked_array(where: str, values: np.ndarray, declared: Variable) -> np.nda
     if declared.kind == "boolean" and not np.isin(values, (0, 1)).all():
         raise InputError(f"{where} holds other numbers than 0 and 1, expected true or false")
     values = np.ascontiguousarray(values, dtype=KINDS[declared.kind][1])
-    if declared.kind == "boolean":
+    if declared.kind == "boolean" or declared.missing:
         return values
     bad = np.isinf(values) | (np.isnan(values) if declared.finite else False)
     _require_none(where, values, bad, "NaN or infinity" if declared.finite else "infinity")
+    if declared.kind == "complex":
+        return values
     outside = (values < declared.low) | (values > declared.high)
     _require_none(where, values, outside, f"a value outside {declared.low:g} to {declared.high:g}")
     if declared.grows and not (np.diff(values) > 0).all():

@@ -113,7 +113,7 @@ class Observation:
                 f"run must count 0, 1, ... up to {len(self.turntable_deg) - 1} (one number for "
                 "each turntable angle) without going back"
             )
-        _require_ephemeris(self.times.jd)
+        require_ephemeris(self.times.jd)
 
     @classmethod
     def from_runs(
@@ -169,7 +169,7 @@ class Observation:
             numbers.append(np.full(n, number))
             elapsed += length
         seconds, run_of = np.concatenate(offsets), np.concatenate(numbers)
-        _require_ephemeris(np.array([t0.jd + seconds[-1] / 86400.0]))
+        require_ephemeris(np.array([t0.jd + seconds[-1] / 86400.0]))
         with unannounced_leap_seconds():
             times = t0 + seconds * u.s
         observation = cls(
@@ -285,7 +285,7 @@ def utc_of(
     InputError
         If one is not finite or outside the ephemeris.
     """
-    _require_ephemeris(jd1 + jd2)
+    require_ephemeris(jd1 + jd2)
     with unannounced_leap_seconds():
         return Time(jd1, jd2, format="jd", scale=scale).utc
 
@@ -305,12 +305,18 @@ def utc_from_text(name: str, text: str) -> Time:
         raise InputError(
             f"{name} '{text}' is not a date; write it as 2027-01-15T00:00:00"
         ) from error
-    _require_ephemeris(np.atleast_1d(time.jd))
+    require_ephemeris(np.atleast_1d(time.jd))
     return time
 
 
-def _require_ephemeris(jd: Float[np.ndarray, " times"]) -> None:
-    """InputError unless Julian dates lie within lunarsky's kernel of the Moon's orientation."""
+def require_ephemeris(jd: Float[np.ndarray, " times"]) -> None:
+    """Check that Julian dates lie within lunarsky's kernel of the Moon's orientation.
+
+    Raises
+    ------
+    InputError
+        If one does not.
+    """
     first, last = (Time(f"{year}-01-01", scale="tdb").jd for year in EPHEMERIS_YEARS)
     outside = ~((jd >= first) & (jd <= last))
     if not outside.any():

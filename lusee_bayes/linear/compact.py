@@ -20,10 +20,23 @@ from jaxtyping import Float
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers
+from lusee_bayes.core.layouts import Attribute, Layout, Variable
+from lusee_bayes.core.reading import read_arrays, reading
 from lusee_bayes.linear.posterior import Posterior
 
 # directions whose variance the data reduce by less than this share are left at the prior's
 TOLERANCE = 1e-2
+
+LAYOUT = Layout(
+    "a compact posterior",
+    {
+        "mean": Variable(("mode",)),
+        "prior_std": Variable(("mode",), low=0.0),
+        "directions": Variable(("mode", "rank")),
+        "variances": Variable(("rank",), low=0.0, high=1.0),
+    },
+    {"about": Attribute("text")},
+)
 
 
 @dataclass(frozen=True)
@@ -168,11 +181,10 @@ def read_compact(path: str | Path) -> tuple[CompactPosterior, dict[str, object]]
     InputError
         If the file is missing or of another kind.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            metadata = json.loads(str(file["about"]))
-            names = ("mean", "prior_std", "directions", "variances")
-            posterior = CompactPosterior(*(file[name] for name in names))
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"'{path}' cannot be read as a compact posterior: {error}") from error
-    return posterior, metadata
+    found = read_arrays(path, LAYOUT)
+    with reading(path, LAYOUT.what):
+        metadata = json.loads(found.values["about"])
+    if not isinstance(metadata, dict) or metadata.get("format") != formats.COMPACT_POSTERIOR:
+        raise InputError(f"{path} does not say that it is {LAYOUT.what}")
+    names = ("mean", "prior_std", "directions", "variances")
+    return CompactPosterior(*(found.arrays[name] for name in names)), metadata

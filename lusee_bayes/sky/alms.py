@@ -19,10 +19,29 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.fits_files import is_fits, opened
 from lusee_bayes.core.harmonics import from_healpy, lmax_of, n_modes, to_healpy
+from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.reading import read_arrays
 from lusee_bayes.sky.files import SkyFile
 
 COLUMNS = ("index", "real", "imag")
+TABLE = Layout(
+    "coefficients, as healpy.write_alm writes them",
+    {
+        "index": Variable(("coefficient",), "integer", low=1.0),
+        "real": Variable(("coefficient",)),
+        "imag": Variable(("coefficient",)),
+    },
+)
+NPZ = Layout(
+    "coefficients: freq (MHz) and alm (frequency, coefficient)",
+    {
+        "freq": Variable(("freq",), low=0.0),
+        "alm": Variable(("freq", "coefficient"), "complex"),
+    },
+)
+# far above what a run can hold
+LARGEST_LMAX = 4096
 
 
 @dataclass(frozen=True)
@@ -141,38 +160,33 @@ def write_alms(path: str | Path, modes: Float[Array, " modes"], header: dict[str
 
 
 def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            missing = [name for name in ("freq", "alm") if name not in file]
-            if missing:
-                raise InputError(
-                    f"{path} has no array '{missing[0]}' (it has {', '.join(file.files)}); "
-                    "expected freq (MHz) and alm (frequency, coefficient)"
-                )
-            frequencies, alm = file["freq"].astype(np.float64), file["alm"]
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path} cannot be read as NumPy's .npz: {error}") from error
-    if alm.ndim != 2 or len(alm) != len(frequencies) or healpy.Alm.getlmax(alm.shape[1]) < 0:
+    found = read_arrays(path, NPZ, "check sky.file").arrays
+    alm = found["alm"]
+    if healpy.Alm.getlmax(alm.shape[1]) < 0:
         raise InputError(
-            f"{path}: alm has shape {alm.shape}, expected {len(frequencies)} frequencies and "
-            "(lmax + 1) (lmax + 2) / 2 coefficients"
+            f"{path}: alm has {alm.shape[1]} coefficients, expected (lmax + 1) (lmax + 2) / 2"
         )
-    return frequencies, alm.astype(np.complex128)
+    return found["freq"], alm
 
 
 def _read_fits(path: Path) -> np.ndarray:
-    with opened(path) as hdus:
-        table = next(hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)).data
-        index, real, imag = (np.asarray(table[name]).ravel() for name in COLUMNS)
-    ell = np.floor(np.sqrt(index - 1.0)).astype(int)
+    with opened(path, "coefficients") as hdus:
+        table = next(hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU))
+        columns = {name: table.data.field(name) for name in COLUMNS}
+        found = TABLE.checked(path, columns, {}).arrays
+    index, real, imag = (found[name] for name in COLUMNS)
+    # what does not fit into memory, or is written twice, fills no lmax either
+    if index.max() > LARGEST_LMAX**2 or len(set(index.tolist())) < len(index):
+        raise InputError(
+            f"{path}: index must be ell^2 + ell + m + 1, each once, ell <= {LARGEST_LMAX}"
+        )
+    ell = np.floor(np.sqrt(index - 1.0) + 1e-9).astype(int)
     m = index - 1 - ell**2 - ell
     lmax = int(ell.max())
     alm = np.full(healpy.Alm.getsize(lmax), np.nan + 0j)
     if (m < 0).any() or (m > ell).any():
         raise InputError(f"{path}: index must be ell^2 + ell + m + 1 with 0 <= m <= ell")
-    alm[healpy.Alm.getidx(lmax, ell, m)] = real.astype(np.float64) + 1j * imag
+    alm[healpy.Alm.getidx(lmax, ell, m)] = real + 1j * imag
     if np.isnan(alm).any():
         raise InputError(
             f"{path}: {int(np.isnan(alm).sum())} coefficients up to ell = {lmax} are missing or "

@@ -12,13 +12,22 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import require_finite
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import is_fits, opened
+from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.sky.files import SkyFile, modes_of_map
 
 STEPS = ("FREQ_START", "FREQ_END", "FREQ_STEP")
+LAYOUT = Layout(
+    "sky maps of many frequencies: an image (frequency, pixel)",
+    {"maps": Variable(("frequency", "pixel"))},
+    {
+        "FREQ_START": Attribute(low=0.0, high=1e6),
+        "FREQ_END": Attribute(low=0.0, high=1e6),
+        "FREQ_STEP": Attribute(low=1e-6, high=1e6),
+    },
+)
 
 
 @dataclass(frozen=True)
@@ -56,11 +65,13 @@ class SkyCube(SkyFile):
             For a truncated file, steps of frequency that do not fit the maps, maps that are not
             HEALPix, and numbers that are not finite.
         """
-        with opened(path) as hdus:
-            start, end, step = (float(hdus[0].header[key]) for key in STEPS)
-            pixels = np.array(hdus[0].data, dtype=np.float64)
-        count = round((end - start) / step) + 1 if step > 0 else 0
-        if pixels.ndim != 2 or len(pixels) != count:
+        with opened(path, "sky maps of many frequencies") as hdus:
+            there = {} if hdus[0].data is None else {"maps": hdus[0].data}
+            found = LAYOUT.checked(path, there, dict(hdus[0].header))
+        start, end, step = (found.values[key] for key in STEPS)
+        pixels = found.arrays["maps"]
+        count = round((end - start) / step) + 1
+        if len(pixels) != count:
             raise InputError(
                 f"{path}: the image has shape {pixels.shape}, expected {count} maps for {start:g} "
                 f"to {end:g} MHz in steps of {step:g}"
@@ -69,7 +80,6 @@ class SkyCube(SkyFile):
             raise InputError(
                 f"{path}: {pixels.shape[1]} values are not a HEALPix map of 12 NSIDE^2"
             )
-        require_finite(f"{path}: the maps", pixels)
         return cls(str(path), start + step * np.arange(count), pixels)
 
     def map_at(self, frequency_mhz: float) -> Float[np.ndarray, " pixels"]:

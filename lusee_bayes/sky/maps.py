@@ -13,9 +13,10 @@ from astropy import units as u
 from astropy.io import fits
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import require_finite
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.fits_files import is_fits, opened
+from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.core.reading import reading
 from lusee_bayes.sky.files import SkyFile, modes_of_map
 
 ULSA_DATASET = "smooth_absorb"
@@ -64,9 +65,8 @@ class SkyMap(SkyFile):
         path = Path(path)
         hdf5 = h5py.is_hdf5(path)
         pixels = _read_hdf5(path, dataset or ULSA_DATASET) if hdf5 else _read_fits(path)
-        if pixels.ndim != 1 or not _nside(pixels.size):
-            raise InputError(f"{path}: {pixels.shape} values are not a HEALPix map of 12 NSIDE^2")
-        require_finite(f"{path}: the map", pixels)
+        if not _nside(pixels.size):
+            raise InputError(f"{path}: {pixels.size} values are not a HEALPix map of 12 NSIDE^2")
         unseen = pixels == UNSEEN
         if unseen.any():
             raise InputError(
@@ -92,15 +92,19 @@ def _nside(n_pixels: int) -> int:
     return nside if 12 * nside**2 == n_pixels else 0
 
 
+def _layout(name: str) -> Layout:
+    return Layout("a HEALPix sky map", {name: Variable(("pixel",))})
+
+
 def _read_hdf5(path: Path, dataset: str) -> np.ndarray:
-    with h5py.File(path) as file:
+    with reading(path, "a sky map in HDF5"), h5py.File(path) as file:
         names = [name for name, item in file.items() if isinstance(item, h5py.Dataset)]
         if dataset not in names:
             raise InputError(
                 f"{path} has no dataset '{dataset}' (it has {', '.join(sorted(names))}); "
                 f"{nearest(dataset, names)} Set sky.dataset"
             )
-        return file[dataset][...].astype(np.float64)
+        return _layout(dataset).checked(path, {dataset: file[dataset]}, {}).arrays[dataset]
 
 
 def _read_fits(path: Path) -> np.ndarray:
@@ -111,7 +115,9 @@ def _read_fits(path: Path) -> np.ndarray:
                 f"{path} has no binary table; expected a HEALPix FITS map (or ULSA HDF5)"
             )
         header, column = tables[0].header, tables[0].columns[0]
-        values = np.array(tables[0].data.field(0), dtype=np.float64).ravel()
+        # healpy writes rows of 1024 pixels
+        given = {column.name: np.ravel(tables[0].data.field(0))}
+        values = _layout(column.name).checked(path, given, {}).arrays[column.name]
     ordering = str(header.get("ORDERING", "absent")).strip().upper()
     if ordering != "RING":
         raise InputError(

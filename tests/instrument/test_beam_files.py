@@ -232,12 +232,15 @@ def break_gain(images):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"without": ("EPhi_imag",)}, "has no image 'EPhi_imag'"),
-        ({"change": break_shape}, r"EPhi_imag has shape \(5, 45, 61\), expected \(5, 46, 61\)"),
-        ({"change": break_order}, "do not grow"),
+        ({"without": ("EPhi_imag",)}, "has no EPhi_imag"),
+        (
+            {"change": break_shape},
+            r"EPhi_imag has shape \(5, 45, 61\), expected 5 \(freq\) x 46",
+        ),
+        ({"change": break_order}, "freq does not grow: 40 follows 50"),
         ({"change": break_numbers}, "EPhi_real"),
-        ({"change": break_gain}, "gain_conv has 4 values for 5"),
-        ({"header": {"THETA_MAX": 180.0}}, "theta 0.0 to 180.0"),
+        ({"change": break_gain}, r"gain_conv has shape \(4,\), expected 5 \(freq\)"),
+        ({"header": {"THETA_MAX": 180.0}}, "theta 0 to 180"),
     ],
 )
 def test_files_that_cannot_be_used(tmp_path, options, message):

@@ -94,7 +94,7 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="no data at .*lusee-bayes simulate"):
         read_visibilities(tmp_path / "none.nc")
     (tmp_path / "text.nc").write_text("hello")
-    with pytest.raises(InputError, match="not a netCDF file"):
+    with pytest.raises(InputError, match="not a file of visibilities"):
         read_visibilities(tmp_path / "text.nc")
 
 

@@ -86,14 +86,20 @@ def test_gaps_are_missing_samples_and_counted(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"without": ("combinations",)}, "has no image 'combinations'"),
+        ({"without": ("combinations",)}, "has no combinations"),
         ({"header": {k: v for k, v in HEADER.items() if k != "DELTAT_SEC"}}, "no DELTAT_SEC"),
-        ({"header": HEADER | {"LUNAR_DAY": "tomorrow"}}, "LUNAR_DAY is 'tomorrow'"),
-        ({"pairs": [[0, 0], [0, 4]]}, "the ports 0 and 4"),
+        ({"header": HEADER | {"LUNAR_DAY": "tomorrow"}}, "LUNAR_DAY 'tomorrow' is not a date"),
+        ({"pairs": [[0, 0], [0, 4]]}, "combinations holds a value outside 0 to 3: 4"),
         ({"pairs": [[0, 1], [1, 0]]}, "the same pair of ports twice"),
-        ({"data": np.zeros((12, 15, 2))}, r"data has shape \(12, 15, 2\), expected \(times, 16"),
-        ({"header": HEADER | {"DELTAT_SEC": -7200.0}}, "step_s"),
-        ({"header": HEADER | {"LUN_LAT_DEG": 123.0}}, "lat_deg must lie in -90..90"),
+        ({"data": np.zeros((12, 15, 2))}, r"data has 15 products, expected 16"),
+        (
+            {"header": HEADER | {"DELTAT_SEC": -7200.0}},
+            "DELTAT_SEC is -7200.0, expected",
+        ),
+        (
+            {"header": HEADER | {"LUN_LAT_DEG": 123.0}},
+            "LUN_LAT_DEG is 123.0, expected a",
+        ),
     ],
 )
 def test_files_that_cannot_be_used(tmp_path, options, message):
@@ -343,11 +349,14 @@ twice = np.array([[2461000.0, 0.5], [2461000.0, 0.5], [2461000.0, 0.6]])
         ({"products": ["13I", "13X"]}, "no product '13X'"),
         ({"products": ["13I", "13I"]}, "the same product twice"),
         ({"products": ["13I", "31R"]}, "no product '31R'"),
-        ({"products": ["13I", "00R", "11R"]}, r"data has shape \(5, 2, 2\), expected 5 times, 3"),
-        ({"header": {"BUNIT": "K"}}, r"the unit \(BUNIT\) of data is K, expected V\^2/Hz"),
-        ({"header": {"TMOON_K": None}}, "the header has no TMOON_K"),
+        (
+            {"products": ["13I", "00R", "11R"]},
+            r"data has shape \(5, 2, 2\), expected 5 \(time\) x 3",
+        ),
+        ({"header": {"BUNIT": "K"}}, r"BUNIT is 'K'; known: V\^2/Hz"),
+        ({"header": {"TMOON_K": None}}, "has no TMOON_K"),
         ({"header": {"TIMESYS": "LOCAL"}}, "TIMESYS is LOCAL"),
-        ({"images": {"time": np.arange(5.0)}}, "expected .times, 2.: JD1 and JD2"),
+        ({"images": {"time": np.arange(5.0)}}, r"time has shape \(5,\), expected time x 2"),
         ({"images": {"time": backwards, "data": np.ones((3, 2, 2))}}, "times must grow"),
         ({"images": {"time": twice, "data": np.ones((3, 2, 2))}}, "times must grow"),
     ],

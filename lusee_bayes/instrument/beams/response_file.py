@@ -22,22 +22,35 @@ from jaxtyping import Complex, Float
 from scipy.constants import Boltzmann, physical_constants
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import require_finite
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.fits_files import read_images
+from lusee_bayes.core.fits_files import read_fits
+from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.instrument.beams.fields import SPEED_OF_LIGHT, AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
 from lusee_bayes.instrument.beams.gridded import at_frequency, on_grid
 from lusee_bayes.instrument.beams.luseepy_rules import BandLimitedGrid
 from lusee_bayes.instrument.beams.product_beams import ProductBeams, product_beams
 from lusee_bayes.instrument.beams.receiver import Receiver, loading_matrix
-from lusee_bayes.instrument.beams.scalar_file import require_growing
 from lusee_bayes.instrument.products import N_ANTENNAS, to_real
 
 VACUUM_OHM = physical_constants["characteristic impedance of vacuum"][0]
 LENGTHS = ("H_theta", "H_phi")
 MATRICES = ("ZA", "Rsky", "Rmoon", "Rloss")
 AXES = ("freq", "theta", "phi")
+PARTS = ("real", "imag")
+LAYOUT = Layout(
+    "a four-port response of luseepy, FITS version 3",
+    {
+        "freq": Variable(("freq",), low=0.0, grows=True),
+        **{name: Variable((name,), grows=True) for name in AXES[1:]},
+        **{f"{name}_{part}": Variable((N_ANTENNAS, *AXES)) for name in LENGTHS for part in PARTS},
+        **{
+            f"{name}_{part}": Variable(("freq", N_ANTENNAS, N_ANTENNAS))
+            for name in MATRICES
+            for part in PARTS
+        },
+    },
+)
 # files hold the matrices in single precision; three of them are added up
 RESISTANCE_TOLERANCE = 1e-6
 UNITS = ("K", "V2/Hz")
@@ -225,21 +238,8 @@ def read_response(path: str | Path) -> PortResponse:
         than the hemisphere above the horizon, frequencies that do not grow, numbers that are not
         finite, or resistances that do not add up.
     """
-    path = Path(path)
-    names = [f"{name}_{part}" for name in (*LENGTHS, *MATRICES) for part in ("real", "imag")]
-    kind = "a four-port response of luseepy, FITS version 3"
-    images, _ = read_images(path, (*names, *AXES), kind)
-    images = {name: image.astype(np.float64) for name, image in images.items()}
+    images = read_fits(path, LAYOUT, "check beam.file").arrays
     frequencies, theta_deg, phi_deg = (images[name] for name in AXES)
-    shapes = dict.fromkeys(LENGTHS, (N_ANTENNAS, *(images[name].size for name in AXES)))
-    shapes |= dict.fromkeys(MATRICES, (len(frequencies), N_ANTENNAS, N_ANTENNAS))
-    for name in names:
-        expected = shapes[name.rsplit("_", 1)[0]]
-        if images[name].shape != expected:
-            raise InputError(f"{path}: {name} has shape {images[name].shape}, expected {expected}")
-    for name, values in images.items():
-        require_finite(f"{path}: {name}", values)
-    require_growing(path, frequencies)
     for name, degrees, last in (("theta", theta_deg, 90.0), ("phi", phi_deg, 360.0)):
         if not np.allclose(degrees, np.linspace(0.0, last, len(degrees)), rtol=0, atol=1e-9):
             raise InputError(

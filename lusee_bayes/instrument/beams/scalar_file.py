@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import require_finite
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.fits_files import image_names, read_images
+from lusee_bayes.core.fits_files import read_fits
+from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
 from lusee_bayes.instrument.beams.gridded import at_frequency, on_grid
@@ -30,6 +30,20 @@ from lusee_bayes.instrument.products import to_real
 
 FIELDS = ("Etheta_real", "Etheta_imag", "EPhi_real", "EPhi_imag")
 IMPEDANCE = ("Z_real", "Z_imag")
+FIELD, NUMBERS = Variable(("freq", "theta", "phi")), Variable(("freq",), optional=True)
+LAYOUT = Layout(
+    "a scalar beam file of luseepy, FITS version 2",
+    {
+        **dict.fromkeys(FIELDS, FIELD),
+        "freq": Variable(("freq",), low=0.0, grows=True),
+        "gain_conv": Variable(("freq",)),
+        **dict.fromkeys(IMPEDANCE, NUMBERS),
+    },
+    {
+        **{key: Attribute("integer", low=2.0) for key in ("THETA_N", "PHI_N")},
+        **{key: Attribute() for key in ("THETA_MIN", "THETA_MAX", "PHI_MIN", "PHI_MAX")},
+    },
+)
 # luseepy turns the pattern by 90 degrees from port to port: North, West, South, East for an arm
 # that points North
 ROTATIONS_DEG = (0.0, 90.0, 180.0, 270.0)
@@ -190,43 +204,24 @@ def read_scalar_beam(path: str | Path) -> ScalarBeam:
         than the hemisphere above the horizon, frequencies that do not grow, or numbers that are
         not finite.
     """
-    path = Path(path)
-    known = image_names(path)
-    impedance = IMPEDANCE if {name.lower() for name in IMPEDANCE} <= set(known) else ()
-    names = (*FIELDS, "gain_conv", "freq", *impedance)
-    found, header = read_images(path, names, "a scalar beam file of luseepy, FITS version 2")
-    images = {name: image.astype(np.float64) for name, image in found.items()}
-    fields = [images[name] for name in FIELDS]
-    frequencies = images["freq"]
-    shape = (len(frequencies), header.get("THETA_N"), header.get("PHI_N"))
-    for name, image in zip(FIELDS, fields, strict=True):
-        if image.shape != shape:
-            raise InputError(
-                f"{path}: {name} has shape {image.shape}, expected {shape} (frequencies, THETA_N, "
-                "PHI_N)"
-            )
-    for name in ("gain_conv", *impedance):
-        if images[name].shape != frequencies.shape:
-            raise InputError(
-                f"{path}: {name} has {images[name].size} values for {len(frequencies)} in freq"
-            )
-    require_growing(path, frequencies)
-    ends = [header.get(key) for key in ("THETA_MIN", "THETA_MAX", "PHI_MIN", "PHI_MAX")]
+    found = read_fits(path, LAYOUT, "check beam.file")
+    images, said, sizes = found.arrays, found.values, found.sizes
+    ends = [said[key] for key in ("THETA_MIN", "THETA_MAX", "PHI_MIN", "PHI_MAX")]
     if ends != [0.0, 90.0, 0.0, 360.0]:
         raise InputError(
-            f"{path} covers theta {ends[0]} to {ends[1]} and phi {ends[2]} to {ends[3]} degrees; "
-            "expected 0 to 90 and 0 to 360"
+            f"{path} covers theta {ends[0]:g} to {ends[1]:g} and phi {ends[2]:g} to {ends[3]:g} "
+            "degrees; expected 0 to 90 and 0 to 360"
         )
-    for name, values in images.items():
-        require_finite(f"{path}: {name}", values)
+    if (sizes["theta"], sizes["phi"]) != (said["THETA_N"], said["PHI_N"]):
+        raise InputError(
+            f"{path}: the fields have {sizes['theta']} x {sizes['phi']} directions, the header "
+            f"says {said['THETA_N']} x {said['PHI_N']} (THETA_N, PHI_N)"
+        )
     # the last azimuth is the first once more
-    e_theta, e_phi = ((fields[k] + 1j * fields[k + 1])[:, :, :-1] for k in (0, 2))
-    theta = np.linspace(0.0, np.pi / 2.0, shape[1])
-    z = images["Z_real"] + 1j * images["Z_imag"] if impedance else None
-    return ScalarBeam(str(path), frequencies, theta, e_theta, e_phi, images["gain_conv"], z)
-
-
-def require_growing(path: Path, frequencies: Float[np.ndarray, " frequencies"]) -> None:
-    """Check that each frequency is above the one before; InputError otherwise."""
-    if not (np.diff(frequencies) > 0).all():
-        raise InputError(f"{path}: the frequencies in freq do not grow")
+    e_theta, e_phi = (
+        (images[real] + 1j * images[imaginary])[:, :, :-1]
+        for real, imaginary in (FIELDS[:2], FIELDS[2:])
+    )
+    theta = np.linspace(0.0, np.pi / 2.0, sizes["theta"])
+    z = images["Z_real"] + 1j * images["Z_imag"] if set(IMPEDANCE) <= set(images) else None
+    return ScalarBeam(str(path), images["freq"], theta, e_theta, e_phi, images["gain_conv"], z)

@@ -9,21 +9,40 @@ LUN_LONG_DEG, DELTAT_SEC, TMOON_K, TANT_K. Divided by sqrt(U_aa U_bb), visibilit
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from astropy.io import fits
-from astropy.time import STANDARD_TIME_SCALES, Time
+from astropy.time import STANDARD_TIME_SCALES
 from jaxtyping import Float
 
+from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.fits_files import read_images
-from lusee_bayes.instrument.observation import Observation, unannounced_leap_seconds
+from lusee_bayes.core.fits_files import read_fits
+from lusee_bayes.core.layouts import Attribute, Layout, Variable
+from lusee_bayes.core.reading import naming
+from lusee_bayes.instrument.observation import Observation, utc_of
 from lusee_bayes.instrument.products import N_ANTENNAS, all_products, labels
-from lusee_bayes.instrument.waterfalls.waterfall import Waterfall
+from lusee_bayes.instrument.waterfalls.waterfall import SITE_AND_STEP, Waterfall
 
-IMAGES = ("data", "freq", "time", "products", "blackbody_normalization_real")
-KEYS = ("DELTAT_SEC", "LUN_LAT_DEG", "LUN_LONG_DEG", "TMOON_K")
 UNIT = "V^2/Hz"
+LAYOUT = Layout(
+    "a waterfall of luseepy's four-port simulator",
+    {
+        "freq": Variable(("freq",), low=0.0, grows=True),
+        "time": Variable(("time", 2)),
+        "products.label": Variable(("product",), "text"),
+        # a sample that is not finite is missing
+        "data": Variable(("time", "product", "freq"), missing=True),
+        "blackbody_normalization_real": Variable(("freq", N_ANTENNAS, N_ANTENNAS)),
+    },
+    {
+        **SITE_AND_STEP,
+        "TMOON_K": Attribute(low=0.0),
+        "TANT_K": Attribute(low=0.0, optional=True),
+        "TIMESYS": Attribute("text", optional=True),
+        "BUNIT": Attribute("text", choices=(UNIT,)),
+    },
+)
 
 
 def read_four_port(path: Path) -> Waterfall:
@@ -43,30 +62,15 @@ def read_four_port(path: Path) -> Waterfall:
         For a truncated file, a missing image or header entry, shapes or a unit that do not fit,
         unknown products, or times that do not grow.
     """
-    images, header = read_images(path, IMAGES, "a waterfall of luseepy's four-port simulator")
-    missing = [key for key in KEYS if key not in header]
-    if missing:
-        raise InputError(f"{path}: the header has no {missing[0]}; expected {', '.join(KEYS)}")
-    unit = str(header.get("BUNIT", "absent")).strip()
-    if unit != UNIT:
-        raise InputError(f"{path}: the unit (BUNIT) of data is {unit}, expected {UNIT}")
-    data, frequencies = images["data"].astype(np.float64), images["freq"].astype(np.float64)
-    places = _places(path, images["products"])
-    times = images["time"].astype(np.float64)
-    if data.shape != (len(times), len(places), len(frequencies)):
-        raise InputError(
-            f"{path}: data has shape {data.shape}, expected {len(times)} times, {len(places)} "
-            f"products and {len(frequencies)} channels"
-        )
-    enclosure = images["blackbody_normalization_real"].astype(np.float64)
-    if enclosure.shape != (len(frequencies), N_ANTENNAS, N_ANTENNAS):
-        raise InputError(
-            f"{path}: blackbody_normalization_real has shape {enclosure.shape}, expected "
-            f"{(len(frequencies), N_ANTENNAS, N_ANTENNAS)}"
-        )
+    found = read_fits(path, LAYOUT)
+    images, said = found.arrays, found.values
+    data, frequencies = images["data"], images["freq"]
+    places = _places(path, images["products.label"])
+    enclosure = images["blackbody_normalization_real"]
     per_kelvin = enclosure.diagonal(axis1=1, axis2=2)
+    require_positive(f"{path}: the diagonal of blackbody_normalization_real", per_kelvin)
     root = np.sqrt(per_kelvin)
-    grid = np.full((len(all_products()), len(times), len(frequencies)), np.nan)
+    grid = np.full((len(all_products()), len(data), len(frequencies)), np.nan)
     for column, place in enumerate(places):
         product = all_products()[place]
         grid[place] = data[:, column] / (root[:, product.i] * root[:, product.j])
@@ -74,19 +78,16 @@ def read_four_port(path: Path) -> Waterfall:
         str(path),
         grid,
         frequencies,
-        _observation(path, header, times),
+        _observation(path, said, images["time"]),
         per_kelvin,
-        float(header["TMOON_K"]),
-        float(header.get("TANT_K", 0.0)),
+        said["TMOON_K"],
+        said.get("TANT_K", 0.0),
     )
 
 
 def _places(path: Path, products: np.ndarray) -> list[int]:
     """The number of the product in each column, in the package's order."""
-    if products.dtype.names is None or "label" not in products.dtype.names:
-        raise InputError(f"{path}: products has no column 'label'")
-    named = [str(label).strip() for label in np.asarray(products["label"]).astype(str)]
-    known = labels()
+    named, known = [str(label).strip() for label in products], labels()
     for label in named:
         if label not in known:
             raise InputError(
@@ -97,23 +98,19 @@ def _places(path: Path, products: np.ndarray) -> list[int]:
     return [known.index(label) for label in named]
 
 
-def _observation(path: Path, header: fits.Header, times: Float[np.ndarray, "..."]) -> Observation:
-    if times.ndim != 2 or times.shape[1] != 2:
-        raise InputError(f"{path}: time has shape {times.shape}, expected (times, 2): JD1 and JD2")
-    scale = str(header.get("TIMESYS", "UTC")).strip().lower()
+def _observation(
+    path: Path, said: dict[str, Any], times: Float[np.ndarray, "times 2"]
+) -> Observation:
+    scale = said.get("TIMESYS", "UTC").strip().lower()
     if scale not in STANDARD_TIME_SCALES:
         known = ", ".join(s.upper() for s in STANDARD_TIME_SCALES)
         raise InputError(f"{path}: TIMESYS is {scale.upper()}; expected one of {known}")
-    try:
-        with unannounced_leap_seconds():
-            utc = Time(times[:, 0], times[:, 1], format="jd", scale=scale).utc
+    with naming(path):
         return Observation(
-            float(header["LUN_LONG_DEG"]),
-            float(header["LUN_LAT_DEG"]),
-            utc,
+            said["LUN_LONG_DEG"],
+            said["LUN_LAT_DEG"],
+            utc_of(times[:, 0], times[:, 1], scale),
             np.zeros(len(times), dtype=int),
             (0.0,),
-            float(header["DELTAT_SEC"]),
+            said["DELTAT_SEC"],
         )
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error

@@ -10,24 +10,40 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import astropy.units as u
 import numpy as np
 from astropy.io import fits
 from astropy.time import Time
-from jaxtyping import Complex
+from jaxtyping import Complex, Int
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
-from lusee_bayes.core.fits_files import read_images
+from lusee_bayes.core.fits_files import read_fits
+from lusee_bayes.core.layouts import Attribute, Layout, Variable
+from lusee_bayes.core.reading import naming
 from lusee_bayes.core.version import __version__
-from lusee_bayes.instrument.observation import Observation, unannounced_leap_seconds
+from lusee_bayes.instrument.observation import (
+    Observation,
+    require_ephemeris,
+    unannounced_leap_seconds,
+    utc_from_text,
+)
 from lusee_bayes.instrument.products import N_ANTENNAS, Product, all_products
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.instrument.waterfalls.waterfall import Waterfall
+from lusee_bayes.instrument.waterfalls.waterfall import SITE_AND_STEP, Waterfall
 
-IMAGES = ("data", "freq", "combinations")
-KEYS = ("LUNAR_DAY", "DELTAT_SEC", "LUN_LAT_DEG", "LUN_LONG_DEG")
+LAYOUT = Layout(
+    "a waterfall of luseepy's simulator",
+    {
+        "freq": Variable(("freq",), low=0.0, grows=True),
+        # a sample that is not finite is missing
+        "data": Variable(("time", "product", "freq"), missing=True),
+        "combinations": Variable(("pair", 2), "integer", low=0.0, high=N_ANTENNAS - 1.0),
+    },
+    {"LUNAR_DAY": Attribute("text"), **SITE_AND_STEP},
+)
 
 
 def read_scalar(path: Path) -> Waterfall:
@@ -47,32 +63,25 @@ def read_scalar(path: Path) -> Waterfall:
         For a truncated file, a missing image or header entry, columns that do not fit the
         products, ports beyond 0..3, or a bad date.
     """
-    images, header = read_images(path, IMAGES, "a waterfall of luseepy's simulator")
-    missing = [key for key in KEYS if key not in header]
-    if missing:
-        raise InputError(f"{path}: the header has no {missing[0]}; expected {', '.join(KEYS)}")
-    data, frequencies = images["data"].astype(np.float64), images["freq"].astype(np.float64)
-    columns = _columns(path, images["combinations"])
-    if data.ndim != 3 or data.shape[1:] != (len(columns), len(frequencies)):
+    found = read_fits(path, LAYOUT)
+    data, frequencies = found.arrays["data"], found.arrays["freq"]
+    columns = _columns(path, found.arrays["combinations"])
+    if data.shape[1] != len(columns):
         raise InputError(
-            f"{path}: data has shape {data.shape}, expected (times, {len(columns)}, "
-            f"{len(frequencies)}) for the products in combinations and the channels in freq"
+            f"{path}: data has {data.shape[1]} products, expected {len(columns)} for the pairs of "
+            "ports in combinations"
         )
     places = {product: k for k, product in enumerate(all_products())}
     grid = np.full((len(places), len(data), len(frequencies)), np.nan)
     for column, (product, sign) in enumerate(columns):
         grid[places[product]] = sign * data[:, column]
-    return Waterfall(str(path), grid, frequencies, _observation(path, header, len(data)))
+    return Waterfall(str(path), grid, frequencies, _observation(path, found.values, len(data)))
 
 
-def _columns(path: Path, combinations: np.ndarray) -> list[tuple[Product, float]]:
+def _columns(path: Path, combinations: Int[np.ndarray, "pairs 2"]) -> list[tuple[Product, float]]:
     """The product in each column of the data, and its sign: V_ji is V_ij conjugated."""
-    if combinations.ndim != 2 or combinations.shape[1] != 2:
-        raise InputError(f"{path}: combinations has shape {combinations.shape}, expected (n, 2)")
     columns: list[tuple[Product, float]] = []
-    for i, j in combinations.astype(int):
-        if not (0 <= i <= 3 and 0 <= j <= 3):
-            raise InputError(f"{path}: combinations names the ports {i} and {j}; there are 0 to 3")
+    for i, j in combinations:
         low, high = (int(min(i, j)), int(max(i, j)))
         columns.append((Product(low, high, "R"), 1.0))
         if i != j:
@@ -83,23 +92,21 @@ def _columns(path: Path, combinations: np.ndarray) -> list[tuple[Product, float]
     return columns
 
 
-def _observation(path: Path, header: fits.Header, n_times: int) -> Observation:
-    start = str(header["LUNAR_DAY"]).split(" to ")[0]
-    try:
+def _observation(path: Path, said: dict[str, Any], n_times: int) -> Observation:
+    start = said["LUNAR_DAY"].split(" to ")[0]
+    with naming(path):
+        first = utc_from_text("LUNAR_DAY", start)
+        require_ephemeris(first.jd + np.array([(n_times - 1) * said["DELTAT_SEC"] / 86400.0]))
         with unannounced_leap_seconds():
-            times = Time(start, scale="utc") + header["DELTAT_SEC"] * np.arange(n_times) * u.s
-    except ValueError as error:
-        raise InputError(
-            f"{path}: LUNAR_DAY is '{header['LUNAR_DAY']}', expected '2025-02-01 00:00:00 to ...'"
-        ) from error
-    return Observation(
-        float(header["LUN_LONG_DEG"]),
-        float(header["LUN_LAT_DEG"]),
-        times,
-        np.zeros(n_times, dtype=int),
-        (0.0,),
-        float(header["DELTAT_SEC"]),
-    )
+            times = first + said["DELTAT_SEC"] * np.arange(n_times) * u.s
+        return Observation(
+            said["LUN_LONG_DEG"],
+            said["LUN_LAT_DEG"],
+            times,
+            np.zeros(n_times, dtype=int),
+            (0.0,),
+            said["DELTAT_SEC"],
+        )
 
 
 def write_waterfall(

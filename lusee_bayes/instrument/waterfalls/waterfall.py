@@ -8,11 +8,18 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.layouts import Attribute
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import N_ANTENNAS, all_products
 from lusee_bayes.instrument.visibilities import Visibilities
 
+# words of the header that both kinds of files have
+SITE_AND_STEP = {
+    "LUN_LONG_DEG": Attribute(low=-360.0, high=360.0),
+    "LUN_LAT_DEG": Attribute(low=-90.0, high=90.0),
+    "DELTAT_SEC": Attribute(low=1e-6, high=1e9),
+}
 # two frequencies that differ by less, relatively, are one
 SAME_FREQUENCY = 1e-9
 
