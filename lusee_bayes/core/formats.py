@@ -1,5 +1,13 @@
 """Names of the package's own file formats: every file says which one it is, in ``format``."""
 
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+
+from lusee_bayes.core.reading import reading, require_file
+
 VISIBILITIES = "lusee_bayes visibilities 1"
 POSTERIOR = "lusee_bayes posterior 1"
 POSTERIOR_CUBE = "lusee_bayes posterior cube 1"
@@ -7,3 +15,20 @@ COMPACT_POSTERIOR = "lusee_bayes compact posterior 1"
 SAMPLES = "lusee_bayes samples 1"
 DIAGNOSTICS = "lusee_bayes diagnostics 1"
 PAPER_CASE = "lusee_bayes paper case 1"
+
+
+def format_of(path: str | Path) -> str | None:
+    """The attribute ``format`` of an HDF5 or netCDF file; None for files of other kinds.
+
+    Raises
+    ------
+    InputError
+        If there is no file, or it is HDF5 and damaged.
+    """
+    path = require_file(path, "file")
+    with reading(path, "HDF5"):
+        if not h5py.is_hdf5(path):
+            return None
+        with h5py.File(path) as file:
+            kind = file.attrs.get("format")
+    return kind.decode(errors="replace") if isinstance(kind, bytes) else kind

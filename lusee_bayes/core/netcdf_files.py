@@ -6,31 +6,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import h5py
 import xarray as xr
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.formats import format_of
 from lusee_bayes.core.layouts import Content, Layout
 from lusee_bayes.core.reading import reading, require_file
-
-FORMAT = "format"
-
-
-def format_of(path: str | Path) -> str | None:
-    """The attribute ``format`` of an HDF5 or netCDF file; None for files of other kinds.
-
-    Raises
-    ------
-    InputError
-        If there is no file, or it is HDF5 and damaged.
-    """
-    path = require_file(path, "file")
-    with reading(path, "HDF5"):
-        if not h5py.is_hdf5(path):
-            return None
-        with h5py.File(path) as file:
-            kind = file.attrs.get(FORMAT)
-    return kind.decode(errors="replace") if isinstance(kind, bytes) else kind
 
 
 def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") -> Content:

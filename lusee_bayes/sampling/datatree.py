@@ -14,6 +14,8 @@ from numpyro.infer import Predictive
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers
+from lusee_bayes.core.layouts import Attribute, Layout, Variable
+from lusee_bayes.core.reading import reading, require_file
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
@@ -23,6 +25,24 @@ from lusee_bayes.sampling.promotion import numpyro_promotion
 from lusee_bayes.systematics.base import SKY
 
 DATA = "data"
+# what a file of samples holds at least
+STATISTIC = ("chain", "draw")
+GROUPS = Layout(
+    "samples of lusee-bayes sample",
+    {
+        "sample_stats.diverging": Variable(STATISTIC, "boolean"),
+        "sample_stats.n_steps": Variable(STATISTIC, low=0.0),
+        "sample_stats.acceptance_rate": Variable(STATISTIC),
+        "sample_stats.energy": Variable(STATISTIC, missing=True),
+        "posterior.sky": Variable(("chain", "draw", "mode"), optional=True),
+        "observed_data.data": Variable(("datum",)),
+    },
+    {
+        "program": Attribute("text"),
+        "frequency_mhz": Attribute(low=0.0, optional=True),
+        "identity": Attribute("text", optional=True),
+    },
+)
 
 
 def to_datatree(
@@ -154,13 +174,16 @@ def read_datatree(path: str | Path) -> xr.DataTree:
     InputError
         For any other file.
     """
-    try:
-        tree = xr.load_datatree(path, engine="h5netcdf")
-    except (OSError, ValueError) as error:
-        raise InputError(f"'{path}' cannot be read as samples: {error}") from error
-    if tree.attrs.get("format") != formats.SAMPLES:
+    path, what = require_file(path, "samples"), "samples of lusee-bayes sample"
+    found = formats.format_of(path)
+    if found != formats.SAMPLES:
         raise InputError(
-            f"'{path}' is not a file of samples: its format is '{tree.attrs.get('format')}', "
-            f"expected '{formats.SAMPLES}' (lusee-bayes sample writes one)"
+            f"{path} is not a file of samples: its format is '{found or 'absent'}', expected "
+            f"'{formats.SAMPLES}' (lusee-bayes sample writes one)"
         )
+    with reading(path, what):
+        tree = xr.load_datatree(path, engine="h5netcdf")
+    GROUPS.checked(
+        path, {f"{g}.{v}": tree[g][v] for g in tree.children for v in tree[g]}, tree.attrs
+    )
     return tree

@@ -139,8 +139,8 @@ def test_coefficients_that_cannot_be_used(tmp_path, modes):
     with pytest.raises(InputError, match=r"no freq \(it has alm\)"):
         SkyAlms.read(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", alm=np.zeros((2, 44), complex), freq=[1.0, 2.0])
-    with pytest.raises(InputError, match=r"alm has shape \(2, 44\)"):
+    with pytest.raises(InputError, match=r"alm has 44 coefficients"):
         SkyAlms.read(tmp_path / "b.npz")
     (tmp_path / "c.npz").write_text("nothing")
-    with pytest.raises(InputError, match=r"cannot be read as NumPy's \.npz"):
+    with pytest.raises(InputError, match=r"cannot be read as coefficients"):
         SkyAlms.read(tmp_path / "c.npz")

@@ -7,11 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from pkgutil import resolve_name
 
-import h5py
-
 from lusee_bayes.core import formats
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import image_names, is_fits
+from lusee_bayes.core.reading import reading, require_file
 
 # the package's own netCDF files, by their attribute ``format``. What describes a kind is named by
 # path and imported when there is such a file: each needs libraries that others do not
@@ -32,7 +30,7 @@ def _has_image(*names: str) -> Callable[[Path], bool]:
 def _is_compact(path: Path) -> bool:
     if not zipfile.is_zipfile(path):
         return False
-    with zipfile.ZipFile(path) as file:
+    with reading(path, "NumPy's .npz"), zipfile.ZipFile(path) as file:
         return "directions.npy" in file.namelist()
 
 
@@ -54,18 +52,8 @@ def describe(path: str | Path) -> str:
     InputError
         If the file is missing, or of none of these kinds.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"no file at '{path}'")
-    kind = OWN_FORMATS.get(_netcdf_format(path) or "")
+    path = require_file(path, "file")
+    kind = OWN_FORMATS.get(formats.format_of(path) or "")
     if kind is None:
         kind = next(kind for recognises, kind in KINDS if recognises(path))
     return str(resolve_name(f"{__name__}.{kind}")(path))
-
-
-def _netcdf_format(path: Path) -> str | None:
-    if not h5py.is_hdf5(path):
-        return None
-    with h5py.File(path) as file:
-        kind = file.attrs.get("format")
-    return kind.decode() if isinstance(kind, bytes) else kind
