@@ -23,7 +23,7 @@ KINDS: dict[str, tuple[str, type]] = {
     "real": ("fiu", np.float64),
     "complex": ("fiuc", np.complex128),
     "integer": ("iu", np.int64),
-    "boolean": ("biuf", np.bool_),
+    "boolean": ("biu", np.bool_),
     "text": ("UST", np.str_),
 }
 NAMES = {

@@ -55,7 +55,8 @@ def exact(setting):
 def chains_of(sites):
     rng = np.random.default_rng(0)
     shape = next(iter(sites.values())).shape[:2]
-    return Chains(sites, {name: rng.random(shape) for name in STATISTICS})
+    statistics = {name: rng.random(shape) for name in STATISTICS}
+    return Chains(sites, statistics | {"diverging": rng.random(shape) > 0.5})
 
 
 @pytest.fixture(scope="module")
@@ -330,12 +331,12 @@ def test_files_that_are_no_samples_are_refused(setting, tmp_path):
     np.savez(tmp_path / "arrays.nc", x=np.ones(3))
     for name, message in [
         ("gone.nc", "no samples at .*gone.nc"),
-        ("text.nc", "text.nc' cannot be read as samples"),
-        ("empty.nc", "empty.nc' cannot be read as samples"),
-        ("arrays.nc.npz", "arrays.nc.npz' cannot be read as samples"),
+        ("text.nc", "its format is 'absent', expected"),
+        ("empty.nc", "its format is 'absent', expected"),
+        ("arrays.nc.npz", "its format is 'absent', expected"),
         ("data.nc", "its format is 'lusee_bayes visibilities 1', expected 'lusee_bayes samples 1'"),
-        ("bare.nc", "its format is 'None', expected"),
-        (".", "cannot be read as HDF5"),
+        ("bare.nc", "its format is 'absent', expected"),
+        (".", "is a folder; give a file: samples"),
     ]:
         with pytest.raises(InputError, match=message):
             read_datatree(tmp_path / name)
