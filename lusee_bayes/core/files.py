@@ -18,21 +18,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from lusee_bayes.core.destinations import require_folder, require_target
 from lusee_bayes.core.errors import InputError
 
 # names inside a folder of results: scratch folders (with the process's number and its host, since
 # several may share a disk), the new results that are still to be moved into place, and the list of
 # what the last run has written
 SCRATCH, COMMITTED, MANIFEST = ".partial-", ".committed", "manifest.json"
-
-
-def require_folder(folder: Path) -> None:
-    """InputError if ``folder``, or what it would lie in, is a file."""
-    for place in (folder, *folder.parents):
-        if place.exists():
-            if not place.is_dir():
-                raise InputError(f"'{place}' is a file; give a folder for the results")
-            return
 
 
 def require_files(folder: Path, names: Sequence[str], command: str) -> None:
@@ -228,8 +220,14 @@ def replacing(path: str | Path) -> Iterator[Path]:
     Path
         A scratch name beside ``path``; what is written there takes its place when all is done. If
         anything fails or is interrupted before that, the previous file stays as it was.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written, or something else than a file has its name.
     """
     path = Path(path)
+    require_target(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,9 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from lusee_bayes.core.compilation_cache import publish, use_compilation_cache
+from lusee_bayes.core.destinations import locked, require_folder
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import MANIFEST, recover, require_folder, transaction
+from lusee_bayes.core.files import MANIFEST, recover, transaction
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.report.figures.drawing import save
 from lusee_bayes.report.pages import PAGES, REPORT
@@ -65,7 +66,9 @@ class RunKind:
 
 
 @contextmanager
-def run_folder(folder: str | Path, unfinished: str = "", resume: str = "") -> Iterator[Path]:
+def run_folder(
+    folder: str | Path, unfinished: str = "", resume: str = "", *, alone: bool = True
+) -> Iterator[Path]:
     """Open a folder for a run, and say what it holds if the run is interrupted.
 
     Parameters
@@ -75,6 +78,8 @@ def run_folder(folder: str | Path, unfinished: str = "", resume: str = "") -> It
         The folder in it that holds unfinished work.
     resume : str
         How the run is gone on with.
+    alone : bool
+        Keep other runs out. Of several processes of one run, the first does.
 
     Yields
     ------
@@ -90,15 +95,31 @@ def run_folder(folder: str | Path, unfinished: str = "", resume: str = "") -> It
     """
     folder = Path(folder)
     require_folder(folder)
-    recover(folder)
-    before = _written_at(folder)
-    use_compilation_cache()
+    made = _made(folder)
+    lock = locked(folder) if alone else nullcontext()
     try:
-        yield folder
-    except KeyboardInterrupt as interrupt:
-        raise RunInterrupted(_state(folder, before, unfinished, resume)) from interrupt
+        with lock:
+            recover(folder)
+            before = _written_at(folder)
+            use_compilation_cache()
+            try:
+                yield folder
+            except KeyboardInterrupt as interrupt:
+                raise RunInterrupted(_state(folder, before, unfinished, resume)) from interrupt
+            finally:
+                publish()
     finally:
-        publish()
+        # nothing written: nothing left
+        for place in made:
+            with suppress(OSError):
+                place.rmdir()
+
+
+def _made(folder: Path) -> list[Path]:
+    """Make a folder and those that it lies in; which ones were not there, the innermost first."""
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    return missing
 
 
 def _written_at(folder: Path) -> int | None:

@@ -103,7 +103,7 @@ def run_map(
     require_single_frequency("--updatable", output.updatable)
     require_single_frequency("--onto", onto is not None)
     resume = "the same command goes on from the channels that are done"
-    with run_folder(folder, CHANNELS, resume) as place:
+    with run_folder(folder, CHANNELS, resume, alone=group.is_first) as place:
         cube = cube_result(scenario, place, data=data, truth=truth, group=group, stages=stages)
         files = write_run(place, cube, CUBE, stages) if group.is_first else []
         return MapRun(cube, place, files)
