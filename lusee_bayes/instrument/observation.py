@@ -237,11 +237,14 @@ class Observation:
 
     @cached_property
     def _mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
-        if not self.fixed_axis:
-            return mcmf_from_galactic(self.times)
-        angle = 2.0 * np.pi * self.hours / LUSEEPY_MONTH_HOURS
-        about_z = SpatialRotation.from_rotvec(np.outer(-angle, [0.0, 0.0, 1.0])).as_matrix()
-        return about_z @ mcmf_from_galactic(self.times[:1])[0]
+        if self.fixed_axis:
+            angle = 2.0 * np.pi * self.hours / LUSEEPY_MONTH_HOURS
+            about_z = SpatialRotation.from_rotvec(np.outer(-angle, [0.0, 0.0, 1.0])).as_matrix()
+            rotations = about_z @ mcmf_from_galactic(self.times[:1])[0]
+        else:
+            rotations = mcmf_from_galactic(self.times)
+        rotations.setflags(write=False)  # all channels share them
+        return rotations
 
     def topocentric_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from MCMF to the East, North and up of the site, its rows."""

@@ -139,11 +139,13 @@ def _channel_sky(
 
         # of the mean and of every draw: the residual's mean, given the common part
         common = xp.concatenate([mean[None], skies])
-        pull = information.vector - (common - information.reference) @ information.matrix
-        half = solve_lower(lower, (residual_root * pull).T, transpose=False)
+        pull = (
+            information.vector[None] - (common - information.reference[None]) @ information.matrix
+        )
+        half = solve_lower(lower, (residual_root[None] * pull).T, transpose=False)
         # a draw deviates from it by L^-T z
         half = half + xp.pad(z, ((1, 0), (0, 0))).T
-        found = common + residual_root * solve_lower(lower, half, transpose=True).T
+        found = common + residual_root[None] * solve_lower(lower, half, transpose=True).T
         mean, skies = found[0], found[1:]
         if covariance is not None:
             inverse = inverse_from_cholesky(lower)

@@ -159,7 +159,8 @@ def _direct(
     each_channel(add, channels, group, stages, "joint sums")
     with stages("joint posterior"):
         leaves, shape = jax.tree.flatten(start)
-        parts = [jax.tree.leaves(sums) for sums in by_thread.values()]
+        # with the empty ones: a process may have no channels
+        parts = [jax.tree.leaves(sums) for sums in (start, *by_thread.values())]
         # everything but the maps that all is written about is a sum
         whole = [
             leaf

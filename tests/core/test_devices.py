@@ -1,6 +1,7 @@
 """Runs spread over devices and processes: the same numbers, and nobody left waiting."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -254,9 +255,11 @@ def test_a_killed_process_ends_the_run(victim, what, folder):
         assert time.monotonic() - start < 8
         assert launcher.returncode == 1
         assert not any(map(alive, pids))
-    assert err == (
+    # JAX may notice the death, and say so in its own log, before the launcher has stopped it
+    said = [line for line in err.splitlines() if not re.match(r"[EF]\d{4} ", line)]
+    assert "\n".join(said) == (
         f"lusee-bayes: process {victim} of 0..1 was ended by SIGKILL, and the others were stopped; "
-        "the same command goes on from what is finished\n"
+        "the same command goes on from what is finished"
     )
     assert out == ""
 

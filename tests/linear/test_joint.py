@@ -7,8 +7,10 @@ import pytest
 from reference_linear import z_of
 from scipy import stats
 
+from lusee_bayes.core.arrays import on_device, on_host
 from lusee_bayes.core.conjugate_gradients import conjugate_gradients
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.linear import joint, joint_skies
 from lusee_bayes.linear.iterative_joint import solve_iteratively
 from lusee_bayes.linear.joint import solve_directly
 from lusee_bayes.linear.joint_skies import channel_sky, paired
@@ -117,7 +119,11 @@ def case(request):
 
 @pytest.mark.long
 @pytest.mark.essential
-def test_the_direct_solution_is_the_textbooks(case):
+@pytest.mark.parametrize("place", [on_host, on_device])
+def test_the_direct_solution_is_the_textbooks(case, place, monkeypatch):
+    """In NumPy, as on a machine without accelerator, and in JAX."""
+    for module in (joint, joint_skies):
+        monkeypatch.setattr(module, "on_processor", place)
     prior, _, channels, reference, mean, covariance, evidence = case
     posterior = solve_directly(prior, channels, reference)
     np.testing.assert_allclose(posterior.log_evidence, evidence, rtol=1e-8)
