@@ -8,13 +8,14 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes.cli.options import Quiet, Verbose, say
+from lusee_bayes.cli.options import Force, Quiet, Verbose, say
 from lusee_bayes.core.progress import Stages
 
 
 def compare_command(
     *folders: Path,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("output/comparison"),
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -28,6 +29,8 @@ def compare_command(
         Results of map, two or more.
     output
         Folder for comparison.html, comparison.csv and the figures.
+    force
+        Replace results of another run in the folder.
     quiet
         Print nothing but errors.
     verbose
@@ -38,7 +41,7 @@ def compare_command(
     from lusee_bayes.runs.compare_run import run_compare
 
     console = Console(quiet=quiet, soft_wrap=True)
-    run = run_compare(folders, output, stages=Stages(console, verbose=verbose))
+    run = run_compare(folders, output, replace=force, stages=Stages(console, verbose=verbose))
     say(console, *(f"  {path}" for path in run.files))
     console.print(comparison_table(run.runs))
     if not same_data(run.runs):

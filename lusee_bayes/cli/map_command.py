@@ -8,8 +8,11 @@ from pathlib import Path
 from rich.console import Console
 
 from lusee_bayes.cli.options import (
+    Count,
     Flag,
+    Force,
     Frequencies,
+    Number,
     Output,
     Overrides,
     Quiet,
@@ -28,16 +31,17 @@ def map_command(
     data: Path | None = None,
     truth: Flag = False,
     output: Output = None,
-    draws: int | None = None,
+    draws: Number | None = None,
     covariance: Flag = False,
     compact: Flag = False,
     updatable: Flag = False,
     onto: Path | None = None,
     frequencies: Frequencies = None,
     joint: Flag = False,
-    processes: int = 1,
-    devices: int | None = None,
+    processes: Count = 1,
+    devices: Count | None = None,
     set_: Overrides | None = None,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> int | None:
@@ -83,6 +87,8 @@ def map_command(
         Make so many devices of the CPU, and share the channels among them.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
+    force
+        Replace results of another run in the folder.
     quiet
         Print nothing but errors.
     verbose
@@ -115,7 +121,14 @@ def map_command(
     with join() as group:
         stages = Stages(console if group.is_first else None, verbose=verbose)
         run = run_map(
-            resolved, folder, data=data, truth=truth, onto=onto, group=group, stages=stages
+            resolved,
+            folder,
+            data=data,
+            truth=truth,
+            onto=onto,
+            group=group,
+            replace=force,
+            stages=stages,
         )
         if group.is_first:
             say(console, *(f"  {path}" for path in run.files), *run.result.lines())

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from math import isclose
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 from rich.console import Console
 
 from lusee_bayes.core.errors import InputError
@@ -20,8 +21,34 @@ Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")]
 # 10,25 or 5:50:5
 Frequencies = Annotated[str | None, Parameter(name="--frequencies")]
 Verbose = Annotated[bool, Parameter(name=["--verbose", "-v"], negative="")]
+
+
+def _whole(least: int) -> Callable[[object, Sequence[Token]], int]:
+    """A converter for whole numbers of at least ``least``: no fractions, no other digits."""
+
+    def convert(_: object, tokens: Sequence[Token]) -> int:
+        token = tokens[0]
+        text = token.value
+        plain = text.removeprefix("-")
+        if not (plain.isascii() and plain.isdigit() and len(plain) < 10) or int(text) < least:
+            raise InputError(
+                f"{token.keyword} {text[:40]}: expected a whole number from {least} to 999999999"
+            )
+        return int(text)
+
+    return convert
+
+
+# so many of something: none of them is possible, or at least one
+Number = Annotated[int, Parameter(converter=_whole(0))]
+Count = Annotated[int, Parameter(converter=_whole(1))]
 Flag = Annotated[bool, Parameter(negative="")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
+Force = Annotated[bool, Parameter(name="--force", negative="")]
+
+
+# channels of one run: far more than 25 kHz apart over the band
+MOST_CHANNELS = 4096
 
 
 def load(
@@ -81,9 +108,16 @@ def parse_frequencies(text: str) -> list[float]:
         else:
             first, last, step = (float(part) for part in text.split(":"))
             count = round((last - first) / step)
+            if count >= MOST_CHANNELS:
+                raise InputError(
+                    f"--frequencies {text}: {count + 1} channels; at most {MOST_CHANNELS} are "
+                    "possible in one run"
+                )
             found = [first + k * step for k in range(count + 1)]
             if not step > 0 or not (found and isclose(found[-1], last, rel_tol=1e-5, abs_tol=1e-8)):
                 raise ValueError
+    except InputError:
+        raise
     except (ValueError, ZeroDivisionError, OverflowError):
         found = []
     if not found or any(b <= a for a, b in pairwise(found)):

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes.cli.options import Overrides, Quiet, Verbose, say
+from lusee_bayes.cli.options import Force, Overrides, Quiet, Verbose, say
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 
@@ -19,6 +19,7 @@ def plan_command(
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("output/plan"),
     vary: Annotated[list[str] | None, Parameter(negative="")] = None,
     set_: Overrides | None = None,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -41,6 +42,8 @@ def plan_command(
         needed, instead of turntable, duration, nights, duty cycle and lost antennas.
     set_
         key.path=value; overrides an entry of every scenario, as often as needed.
+    force
+        Replace results of another run in the folder.
     quiet
         Print nothing but errors.
     verbose
@@ -56,7 +59,7 @@ def plan_command(
         twice = next(s for s in sources if sources.count(s) > 1)
         raise InputError(f"the scenario '{twice}' is given twice; give each once")
     variations = [v for s in sources for v in variations_of(s, vary, set_ or [], console)]
-    run = run_plan(variations, output, stages=Stages(console, verbose=verbose))
+    run = run_plan(variations, output, replace=force, stages=Stages(console, verbose=verbose))
     for source in sources:
         console.print(forecast_table([f for f in run.forecasts if f.variation.source == source]))
     say(console, *(f"  {path}" for path in run.files))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 
-import yaml
 from rich.console import Console
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.yaml_files import parse_yaml
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation, baseline
 from lusee_bayes.results.variations import default_variations
@@ -33,11 +33,8 @@ def own_variations(source: str, vary: list[str], overrides: list[str]) -> list[V
     found = [Variation(source, AS_GIVEN, AS_GIVEN, load_scenario(source, overrides))]
     for text in vary:
         key, _, listed = text.partition("=")
-        try:
-            values = yaml.safe_load(f"[{listed}]")
-        except yaml.YAMLError:
-            values = []
-        if not key or not values:
+        values = parse_yaml(f"[{listed}]", f"--vary {text}")
+        if not key or not isinstance(values, list) or not values:
             raise InputError(
                 f"--vary takes key.path=value,value,... (as "
                 f"noise.radiometer.duty_cycle=0.25,0.5), got '{text}'"

@@ -8,8 +8,11 @@ from typing import Literal
 from rich.console import Console
 
 from lusee_bayes.cli.options import (
+    Count,
     Flag,
+    Force,
     Frequencies,
+    Number,
     Output,
     Overrides,
     Quiet,
@@ -28,12 +31,13 @@ def sample_command(
     data: Path | None = None,
     output: Output = None,
     resume: Flag = False,
-    chains: int = 4,
-    draws: int = 1000,
-    warmup: int = 150,
+    chains: Count = 4,
+    draws: Count = 1000,
+    warmup: Number = 150,
     algorithm: Literal["nuts", "hmc"] = "nuts",
     frequencies: Frequencies = None,
     set_: Overrides | None = None,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -72,6 +76,8 @@ def sample_command(
         its own, and their maps together in cubes. With --resume, finished ones are taken over.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
+    force
+        Replace results of another run in the folder.
     quiet
         Print nothing but errors.
     verbose
@@ -95,6 +101,7 @@ def sample_command(
         sampler=sampler,
         data=data,
         resume=resume,
+        replace=force,
         stages=Stages(console, verbose=verbose),
     )
     say(console, *(f"  {path}" for path in run.files))

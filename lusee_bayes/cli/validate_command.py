@@ -7,7 +7,10 @@ from pathlib import Path
 from rich.console import Console
 
 from lusee_bayes.cli.options import (
+    Count,
     Flag,
+    Force,
+    Number,
     Output,
     Overrides,
     Quiet,
@@ -25,11 +28,12 @@ def validate_command(
     data: Path | None = None,
     output: Output = None,
     resume: Flag = False,
-    chains: int = 4,
-    draws: int = 1000,
-    warmup: int = 150,
-    simulations: int = 500,
+    chains: Count = 4,
+    draws: Count = 1000,
+    warmup: Number = 150,
+    simulations: Count = 500,
     set_: Overrides | None = None,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> int:
@@ -59,6 +63,8 @@ def validate_command(
         Data sets for simulation-based calibration.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
+    force
+        Replace results of another run in the folder.
     quiet
         Print nothing but errors.
     verbose
@@ -79,6 +85,7 @@ def validate_command(
         simulations=simulations,
         data=data,
         resume=resume,
+        replace=force,
         stages=Stages(console, verbose=verbose),
     )
     say(console, *(f"  {path}" for path in run.files))

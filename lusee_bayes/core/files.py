@@ -14,9 +14,9 @@ import signal
 import socket
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from lusee_bayes.core.destinations import require_folder, require_target
 from lusee_bayes.core.errors import InputError
@@ -37,7 +37,12 @@ def require_files(folder: Path, names: Sequence[str], command: str) -> None:
 
 
 @contextmanager
-def transaction(folder: str | Path, kind: str, discard: Sequence[str] = ()) -> Iterator[Path]:
+def transaction(
+    folder: str | Path,
+    kind: str,
+    discard: Sequence[str] = (),
+    origin: Mapping[str, str] | None = None,
+) -> Iterator[Path]:
     """Write a run's results into a folder: all of them take effect at once, or none does.
 
     Files that an earlier run has left there and this one does not write are removed; files that no
@@ -51,6 +56,8 @@ def transaction(folder: str | Path, kind: str, discard: Sequence[str] = ()) -> I
         The kind of run, kept in ``manifest.json``.
     discard : sequence of str
         Folders inside ``folder`` that hold unfinished work, removed with the old results.
+    origin : mapping, optional
+        What the results are made of, kept in ``manifest.json``.
 
     Yields
     ------
@@ -72,7 +79,12 @@ def transaction(folder: str | Path, kind: str, discard: Sequence[str] = ()) -> I
         yield stage
         files = sorted(str(p.relative_to(stage)) for p in stage.rglob("*") if p.is_file())
         _require_free(folder, files)
-        manifest = {"kind": kind, "files": files, "discard": list(discard)}
+        manifest = {
+            "kind": kind,
+            "files": files,
+            "discard": list(discard),
+            "origin": dict(origin or {}),
+        }
         (stage / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n")
         with uninterrupted():
             os.replace(stage, folder / COMMITTED)
@@ -154,7 +166,7 @@ def _require_free(folder: Path, files: Sequence[str]) -> None:
 
 
 def read_manifest(folder: Path) -> dict | None:
-    """What the last run has written into a folder: ``kind`` and ``files``; None if it is not said.
+    """What the last run has written into a folder, and of what; None if it is not said.
 
     Raises
     ------
@@ -167,14 +179,25 @@ def read_manifest(folder: Path) -> dict | None:
     try:
         manifest = json.loads(path.read_text())
         found = {name: manifest[name] for name in ("kind", "files", "discard")}
-        if not all(isinstance(name, str) for name in (*found["files"], *found["discard"])):
-            raise TypeError("names of files are expected")
-        return found
-    except (ValueError, KeyError, TypeError) as error:
+        if not all(map(_is_inside, (*found["files"], *found["discard"]))):
+            raise TypeError("names of files in the folder are expected")
+        origin = manifest.get("origin", {})
+        if not isinstance(origin, dict):
+            raise TypeError("what the results are made of is no object")
+        return found | {"origin": origin}
+    except (ValueError, KeyError, TypeError, RecursionError, OSError) as error:
         raise InputError(
             f"'{path}' cannot be read ({type(error).__name__}: {error}); delete it, and the next "
             "run replaces the files of its own names"
         ) from error
+
+
+def _is_inside(name: object) -> bool:
+    """Whether it is the name of something inside the folder, and not of the folder itself."""
+    if not isinstance(name, str) or not name or "\0" in name:
+        return False
+    path = PurePosixPath(name)
+    return not path.is_absolute() and ".." not in path.parts and bool(path.parts)
 
 
 def _alive(process: str) -> bool:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import yaml
-
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.yaml_files import parse_yaml
 
 
 def apply_override(tree: dict[str, Any], override: str) -> None:
@@ -21,10 +20,7 @@ def apply_override(tree: dict[str, Any], override: str) -> None:
     node: Any = tree
     for parent in parents:
         node = _step(node, parent, override)
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InputError(f"--set {override}: the value is not valid YAML") from error
+    value = parse_yaml(text, f"--set {override}: the value")
     if isinstance(node, list):
         node[_position(node, last, override)] = value
     else:
@@ -42,6 +38,6 @@ def _step(node: Any, key: str, override: str) -> Any:
 
 
 def _position(node: list[Any], key: str, override: str) -> int:
-    if not key.isdigit() or int(key) >= len(node):
+    if not (key.isascii() and key.isdigit() and len(key) < 10) or int(key) >= len(node):
         raise InputError(f"--set {override}: '{key}' is not one of the entries 0..{len(node) - 1}")
     return int(key)

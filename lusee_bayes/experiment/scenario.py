@@ -6,15 +6,17 @@ defaults included; running that file again gives the same numbers.
 
 from __future__ import annotations
 
+import os
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.yaml_files import parse_yaml, read_yaml
 from lusee_bayes.experiment.overrides import apply_override
 from lusee_bayes.experiment.scenario_errors import one_sentence
 from lusee_bayes.experiment.schema import (
@@ -27,6 +29,7 @@ from lusee_bayes.experiment.schema import (
     OutputSection,
     PriorSection,
     Section,
+    Seed,
     SkySection,
     SourcesSection,
     SpectralSection,
@@ -44,10 +47,10 @@ class Scenario(Section):
     """
 
     frequency_mhz: Frequency = 25.0
-    frequencies_mhz: tuple[Frequency, ...] = ()
+    frequencies_mhz: Annotated[tuple[Frequency, ...], Field(max_length=4096)] = ()
     joint: bool = False
     lmax: Annotated[int, Field(ge=1, le=383)] = 47
-    nside: Annotated[int, Field(ge=1)] | None = None
+    nside: Annotated[int, Field(ge=1, le=8192)] | None = None
     observation: ObservationSection = ObservationSection()
     beam: BeamSection = MonopoleBeamSection()
     sky: SkySection = GalaxySection()
@@ -56,7 +59,7 @@ class Scenario(Section):
     sources: SourcesSection = SourcesSection()
     spectral: SpectralSection = SpectralSection()
     output: OutputSection = OutputSection()
-    seed: Annotated[int, Field(ge=0)] = 1
+    seed: Seed = 1
 
     @model_validator(mode="after")
     def _frequencies_grow(self) -> Scenario:
@@ -68,6 +71,13 @@ class Scenario(Section):
             n = len(self.frequencies_mhz)
             check_components(self.spectral.components, n, self.spectral.residual)
         return self
+
+    @field_validator("nside")
+    @classmethod
+    def _nside_is_healpix(cls, nside: int | None) -> int | None:
+        if nside is not None and nside & (nside - 1):
+            raise ValueError("a power of two is expected, as HEALPix's ring maps have it")
+        return nside
 
     @model_validator(mode="after")
     def _sources_are_there_once(self) -> Scenario:
@@ -165,22 +175,15 @@ def _validate(tree: dict[str, Any], source: str | Path) -> Scenario:
 
 
 def _read_yaml(source: str | Path) -> dict[str, Any]:
-    path = Path(source)
-    if path.is_file():
-        text = path.read_text()
-    elif str(source) in scenario_names():
-        text = (
-            resources.files("lusee_bayes.experiment") / "scenarios" / f"{source}.yaml"
-        ).read_text()
+    names = scenario_names()
+    if os.path.exists(source):
+        tree = read_yaml(source, "a scenario")
+    elif str(source) in names:
+        tree = parse_yaml((FOLDER / f"{source}.yaml").read_text(), str(source))
     else:
         raise InputError(
-            f"no scenario '{source}': neither a file nor a name; "
-            f"{nearest(str(source), scenario_names())}"
+            f"no scenario '{source}': neither a file nor a name; {nearest(str(source), names)}"
         )
-    try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InputError(f"{source} is not valid YAML: {' '.join(str(error).split())}") from error
     tree = {} if tree is None else tree
     if not isinstance(tree, dict):
         raise InputError(f"{source} must hold keys and values, got a {type(tree).__name__}")

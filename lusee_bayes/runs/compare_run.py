@@ -12,6 +12,7 @@ from lusee_bayes.report.comparison_page import comparison_page
 from lusee_bayes.report.figures import comparison as comparison_figures
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, read_runs
 from lusee_bayes.runs.folder import FIGURES, Output, RunKind, run_folder, write_run
+from lusee_bayes.runs.origins import origin_of
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,11 @@ class ComparisonRun:
 
 
 def run_compare(
-    folders: Sequence[str | Path], folder: str | Path, *, stages: Stages | None = None
+    folders: Sequence[str | Path],
+    folder: str | Path,
+    *,
+    replace: bool = False,
+    stages: Stages | None = None,
 ) -> ComparisonRun:
     """Set finished map runs side by side, and write page, table and figures in one transaction.
 
@@ -34,6 +39,8 @@ def run_compare(
         Of finished map runs, two or more.
     folder : path
         Of the results.
+    replace : bool
+        Replace results of another run in the folder.
     stages : Stages, optional
         Told what is being done.
 
@@ -43,9 +50,10 @@ def run_compare(
         For fewer than two folders, or one that is not of a finished map run.
     """
     stages = stages or Stages()
-    with run_folder(folder) as place:
+    origin = origin_of()
+    with run_folder(folder, COMPARISON, origin, replace=replace) as place:
         runs = read_runs(folders)
-        return ComparisonRun(runs, place, write_run(place, runs, COMPARISON, stages))
+        return ComparisonRun(runs, place, write_run(place, runs, COMPARISON, origin, stages))
 
 
 def _write_page(runs: list[FinishedRun], folder: Path) -> None:

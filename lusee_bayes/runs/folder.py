@@ -17,6 +17,7 @@ from lusee_bayes.core.files import MANIFEST, recover, transaction
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.report.figures.drawing import save
 from lusee_bayes.report.pages import PAGES, REPORT
+from lusee_bayes.runs.origins import Origin, require_own
 
 FIGURES = "figures"
 
@@ -67,17 +68,26 @@ class RunKind:
 
 @contextmanager
 def run_folder(
-    folder: str | Path, unfinished: str = "", resume: str = "", *, alone: bool = True
+    folder: str | Path,
+    kind: RunKind,
+    origin: Origin,
+    resume: str = "",
+    *,
+    replace: bool = False,
+    alone: bool = True,
 ) -> Iterator[Path]:
     """Open a folder for a run, and say what it holds if the run is interrupted.
 
     Parameters
     ----------
     folder : path
-    unfinished : str
-        The folder in it that holds unfinished work.
+    kind : RunKind
+    origin : mapping
+        What the results are made of (:func:`.origin_of`).
     resume : str
         How the run is gone on with.
+    replace : bool
+        Replace results of another run.
     alone : bool
         Keep other runs out. Of several processes of one run, the first does.
 
@@ -89,7 +99,8 @@ def run_folder(
     Raises
     ------
     InputError
-        If ``folder``, or what it would lie in, is a file.
+        If ``folder``, or what it would lie in, is a file; if another run works in it, or has left
+        its results there.
     RunInterrupted
         Instead of KeyboardInterrupt.
     """
@@ -100,12 +111,17 @@ def run_folder(
     try:
         with lock:
             recover(folder)
+            if not replace:
+                require_own(folder, kind.name, origin)
             before = _written_at(folder)
             use_compilation_cache()
             try:
                 yield folder
+            except RunInterrupted:
+                # of a run in a folder inside this one
+                raise
             except KeyboardInterrupt as interrupt:
-                raise RunInterrupted(_state(folder, before, unfinished, resume)) from interrupt
+                raise RunInterrupted(_state(folder, before, kind.unfinished, resume)) from interrupt
             finally:
                 publish()
     finally:
@@ -138,7 +154,9 @@ def _state(folder: Path, before: int | None, unfinished: str, resume: str) -> st
     return f"{earlier} in '{folder}'"
 
 
-def write_run(folder: Path, result: Any, kind: RunKind, stages: Stages) -> list[Path]:
+def write_run(
+    folder: Path, result: Any, kind: RunKind, origin: Origin, stages: Stages
+) -> list[Path]:
     """Draw all figures and write all files of a run, in one transaction.
 
     Parameters
@@ -147,6 +165,8 @@ def write_run(folder: Path, result: Any, kind: RunKind, stages: Stages) -> list[
     result : object
         What the outputs and figures of ``kind`` take.
     kind : RunKind
+    origin : mapping
+        What the results are made of (:func:`.origin_of`).
     stages : Stages
         Told what is being done.
 
@@ -156,7 +176,7 @@ def write_run(folder: Path, result: Any, kind: RunKind, stages: Stages) -> list[
         The files, in the folder.
     """
     discard = [kind.unfinished] if kind.unfinished else []
-    with transaction(folder, kind.name, discard) as stage:
+    with transaction(folder, kind.name, discard, origin) as stage:
         if kind.figures:
             (stage / FIGURES).mkdir()
             with stages("figures"):

@@ -31,6 +31,7 @@ from lusee_bayes.runs.folder import (
     run_folder,
     write_run,
 )
+from lusee_bayes.runs.origins import origin_of
 from lusee_bayes.sky import write_alms
 
 
@@ -60,6 +61,7 @@ def run_map(
     truth: bool = False,
     onto: Path | None = None,
     group: ProcessGroup | None = None,
+    replace: bool = False,
     stages: Stages | None = None,
 ) -> MapRun:
     """Make a posterior map of a scenario, or of given data, and write its folder.
@@ -81,6 +83,8 @@ def run_map(
         Folder of an updatable run, to whose data these are added.
     group : ProcessGroup, optional
         The processes that share the channels; only the first one writes.
+    replace : bool
+        Replace results of another run in the folder.
     stages : Stages, optional
         Told what is being done.
 
@@ -96,16 +100,17 @@ def run_map(
             "use: lusee-bayes sample"
         )
     if not scenario.frequencies_mhz:
-        return _run_single(scenario, folder, data, truth, onto, stages)
+        return _run_single(scenario, folder, data, truth, onto, replace, stages)
     output = scenario.output
     require_single_frequency("--covariance", output.covariance)
     require_single_frequency("--compact", output.compact)
     require_single_frequency("--updatable", output.updatable)
     require_single_frequency("--onto", onto is not None)
     resume = "the same command goes on from the channels that are done"
-    with run_folder(folder, CHANNELS, resume, alone=group.is_first) as place:
+    origin = origin_of(scenario, data, truth=truth or None)
+    with run_folder(folder, CUBE, origin, resume, replace=replace, alone=group.is_first) as place:
         cube = cube_result(scenario, place, data=data, truth=truth, group=group, stages=stages)
-        files = write_run(place, cube, CUBE, stages) if group.is_first else []
+        files = write_run(place, cube, CUBE, origin, stages) if group.is_first else []
         return MapRun(cube, place, files)
 
 
@@ -115,15 +120,17 @@ def _run_single(
     data: Path | None,
     truth: bool,
     onto: Path | None,
+    replace: bool,
     stages: Stages,
 ) -> MapRun:
-    with run_folder(folder) as place:
+    origin = origin_of(scenario, data, truth=truth or None, onto=onto)
+    with run_folder(folder, MAP, origin, replace=replace) as place:
         measured = None if data is None else read_data(data, scenario)
         experiment = build(scenario, measured, stages)
         if truth:
             experiment = with_truth(experiment)
         result = map_result(experiment, onto=onto, stages=stages)
-        return MapRun(result, place, write_run(place, result, MAP, stages))
+        return MapRun(result, place, write_run(place, result, MAP, origin, stages))
 
 
 def _write_maps(result: MapResult, folder: Path) -> None:

@@ -16,6 +16,7 @@ from lusee_bayes.paper.claim_table import claim_table, claims_as_markdown
 from lusee_bayes.paper.claims import Cases, cross
 from lusee_bayes.paper.figures import FIGURES
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
+from lusee_bayes.runs.origins import origin_of
 
 CASES, UNFINISHED = "cases", "unfinished-cases"
 RESUME = "the same command goes on from the cases that are done"
@@ -54,6 +55,7 @@ def run_paper(
     folder: str | Path,
     overrides: Sequence[str] = (),
     skies: Sequence[str | Path] = (),
+    replace: bool = False,
     stages: Stages | None = None,
 ) -> PaperRun:
     """Compute what is missing of the paper's cases, then draw the figures and judge the claims.
@@ -69,6 +71,8 @@ def run_paper(
         ``key.path=value``, applied to every case.
     skies : sequence of paths
         ULSA HDF5 files whose names tell the frequency; each case scales the nearest one.
+    replace : bool
+        Replace results of another run in the folder.
     stages : Stages, optional
         Told what is being done.
 
@@ -79,7 +83,8 @@ def run_paper(
     """
     stages = stages or Stages()
     scenarios = paper_scenarios(overrides, skies)
-    with run_folder(folder, UNFINISHED, RESUME) as place:
+    origin = origin_of()
+    with run_folder(folder, PAPER, origin, RESUME, replace=replace) as place:
         cases, paths = {}, {}
         with stages.progress("cases", len(scenarios)) as report:
             for number, (name, scenario) in enumerate(scenarios.items()):
@@ -95,7 +100,7 @@ def run_paper(
                         case.to_netcdf(partial, engine="h5netcdf")
                 cases[name] = case
                 report(number + 1, f"{name}: first SNR < 1 at ell {cross(case)}")
-        files = write_run(place, _Computed(cases, paths), PAPER, stages)
+        files = write_run(place, _Computed(cases, paths), PAPER, origin, stages)
         return PaperRun(cases, claim_table(cases), place, files)
 
 

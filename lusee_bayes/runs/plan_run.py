@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 
 from lusee_bayes.core.progress import Stages
@@ -11,6 +12,7 @@ from lusee_bayes.core.tables import write_csv
 from lusee_bayes.report.figures import plan as plan_figures
 from lusee_bayes.results.forecast import Forecast, Variation, forecast_rows, forecasts_of
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
+from lusee_bayes.runs.origins import origin_of
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,11 @@ class PlanRun:
 
 
 def run_plan(
-    variations: Sequence[Variation], folder: str | Path, *, stages: Stages | None = None
+    variations: Sequence[Variation],
+    folder: str | Path,
+    *,
+    replace: bool = False,
+    stages: Stages | None = None,
 ) -> PlanRun:
     """Forecast what every variation would tell, and write table and figure in one transaction.
 
@@ -33,6 +39,8 @@ def run_plan(
         Such as those of :func:`.default_variations`.
     folder : path
         Of the results.
+    replace : bool
+        Replace results of another run in the folder.
     stages : Stages, optional
         Told what is being done.
 
@@ -42,9 +50,12 @@ def run_plan(
         With the variation's name, for whatever is wrong with its scenario.
     """
     stages = stages or Stages()
-    with run_folder(folder) as place:
+    told = {f"{v.source}, {v.family}, {v.name}": v.scenario for v in variations}
+    digests = {name: sha256(s.to_yaml().encode()).hexdigest()[:12] for name, s in told.items()}
+    origin = origin_of(**digests)
+    with run_folder(folder, PLAN, origin, replace=replace) as place:
         forecasts = forecasts_of(variations, stages)
-        return PlanRun(forecasts, place, write_run(place, forecasts, PLAN, stages))
+        return PlanRun(forecasts, place, write_run(place, forecasts, PLAN, origin, stages))
 
 
 # what the folder of a plan holds; a new file is one line here

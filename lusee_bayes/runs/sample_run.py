@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import transaction
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
@@ -19,6 +18,7 @@ from lusee_bayes.report.figures import samples as sample_figures
 from lusee_bayes.results.map_files import write_cube, write_map
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult, sample_result
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
+from lusee_bayes.runs.origins import origin_of
 from lusee_bayes.sampling.datatree import write_datatree
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.programs import Program, load_program
@@ -57,6 +57,7 @@ def run_sample(
     sampler: Sampler | None = None,
     data: Path | None = None,
     resume: bool = False,
+    replace: bool = False,
     stages: Stages | None = None,
 ) -> SampleRun:
     """Sample the posterior of a program, and write the folder in one transaction.
@@ -77,6 +78,8 @@ def run_sample(
         Visibilities to use; without them the scenario's own are simulated.
     resume : bool
         Go on with the unfinished run in the folder, or take over a finished one.
+    replace : bool
+        Replace results of another run in the folder.
     stages : Stages, optional
         Told what is being done.
 
@@ -95,20 +98,22 @@ def run_sample(
     sampler = sampler or Sampler(seed=scenario.seed)
     folder = Path(folder)
     if not scenario.frequencies_mhz:
-        return _run_single(scenario, folder, program, sampler, data, resume, stages)
-    runs = []
-    for channel in scenario.channels():
-        where = folder / f"{channel.frequency_mhz:g}MHz"
-        own = Stages(stages.console, verbose=stages.verbose) if stages else Stages()
-        runs.append(_run_single(channel, where, program, sampler, data, resume, own))
-    results = tuple(result for run in runs for result in run.results)
-    with run_folder(folder) as place, transaction(place, "sampled cubes") as stage:
-        for name in ("mean", "std"):
-            pixels = np.stack([result.maps[name] for result in results])
-            write_cube(stage / f"{name}.fits", name, pixels, scenario)
-        (stage / "scenario.yaml").write_text(scenario.to_yaml())
-    files = [folder / name for name in ("mean.fits", "std.fits", "scenario.yaml")]
-    return SampleRun(results, folder, [*(f for run in runs for f in run.files), *files])
+        return _run_single(scenario, folder, program, sampler, data, resume, replace, stages)
+    stages = stages or Stages()
+    origin = _origin(scenario, data, program)
+    with run_folder(folder, CUBES, origin, RESUME, replace=replace) as place:
+        runs = []
+        for channel in scenario.channels():
+            where = place / f"{channel.frequency_mhz:.15g}MHz"
+            own = Stages(stages.console, verbose=stages.verbose)
+            runs.append(_run_single(channel, where, program, sampler, data, resume, replace, own))
+        results = tuple(result for run in runs for result in run.results)
+        files = write_run(place, (scenario, results), CUBES, origin, stages)
+        return SampleRun(results, place, [*(f for run in runs for f in run.files), *files])
+
+
+def _origin(scenario: Scenario, data: Path | None, program: Program) -> dict[str, str]:
+    return origin_of(scenario, data, program=f"{program.name} ({program.digest[:12]})")
 
 
 def _run_single(
@@ -118,14 +123,24 @@ def _run_single(
     sampler: Sampler,
     data: Path | None,
     resume: bool,
+    replace: bool,
     stages: Stages | None,
 ) -> SampleRun:
     stages = stages or Stages()
-    with run_folder(folder, CHAINS, RESUME) as place:
+    origin = _origin(scenario, data, program)
+    with run_folder(folder, SAMPLE, origin, RESUME, replace=replace) as place:
         measured = None if data is None else read_data(data, scenario)
         experiment = build(scenario, measured, stages)
         result = sample_result(experiment, program, sampler, place, resume=resume, stages=stages)
-        return SampleRun((result,), place, write_run(place, result, SAMPLE, stages))
+        return SampleRun((result,), place, write_run(place, result, SAMPLE, origin, stages))
+
+
+def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Path) -> None:
+    scenario, results = sampled
+    for name in ("mean", "std"):
+        pixels = np.stack([result.maps[name] for result in results])
+        write_cube(folder / f"{name}.fits", name, pixels, scenario)
+    (folder / "scenario.yaml").write_text(scenario.to_yaml())
 
 
 def _write_maps(result: SampleResult, folder: Path) -> None:
@@ -159,3 +174,6 @@ SAMPLE = RunKind(
     },
     unfinished=CHAINS,
 )
+
+# what the folder of several channels holds, besides a folder of each
+CUBES = RunKind("sampled cubes", outputs=(Output(_write_cubes),), figures={})

@@ -14,6 +14,7 @@ from lusee_bayes.report.figures import samples as sample_figures
 from lusee_bayes.results.sample_result import CHAINS, sample_result
 from lusee_bayes.results.validation_result import ValidationResult
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
+from lusee_bayes.runs.origins import origin_of
 from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS
 from lusee_bayes.sampling.calibration import calibrate_sky, require_simulations
 from lusee_bayes.sampling.hmc import Sampler
@@ -39,6 +40,7 @@ def run_validate(
     simulations: int = 500,
     data: Path | None = None,
     resume: bool = False,
+    replace: bool = False,
     stages: Stages | None = None,
 ) -> ValidationRun:
     """Check the analytic posterior of a scenario by HMC and by simulated data sets.
@@ -60,6 +62,8 @@ def run_validate(
         Visibilities to use; without them the scenario's own are simulated.
     resume : bool
         Go on with the unfinished run in the folder, or judge the finished one again.
+    replace : bool
+        Replace results of another run in the folder.
     stages : Stages, optional
         Told what is being done.
 
@@ -73,7 +77,8 @@ def run_validate(
     program = load_program("sky")
     require_simulations(simulations)
     require_draws(sampler.draws)
-    with run_folder(folder, CHAINS, RESUME) as place:
+    origin = origin_of(scenario, data)
+    with run_folder(folder, VALIDATION, origin, RESUME, replace=replace) as place:
         measured = None if data is None else read_data(data, scenario)
         experiment = build(scenario, measured, stages)
         sampled = sample_result(experiment, program, sampler, place, resume=resume, stages=stages)
@@ -88,7 +93,7 @@ def run_validate(
                 model, model, n_simulations=simulations, seed=scenario.seed, report=update
             )
         result = ValidationResult(name, sampled, found, ranks)
-        return ValidationRun(result, place, write_run(place, result, VALIDATION, stages))
+        return ValidationRun(result, place, write_run(place, result, VALIDATION, origin, stages))
 
 
 def _of_sampled(output: Output) -> Output:

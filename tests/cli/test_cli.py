@@ -220,7 +220,7 @@ def test_an_interrupted_write_leaves_the_previous_result_whole(
     monkeypatch.setattr(MapResult, "summary", interrupt)
     monkeypatch.setattr(runs, "map_result", lambda *_, **__: small_map.result)
     monkeypatch.setattr(runs, "MAP", replace(runs.MAP, figures={}))
-    assert run("map", "fiducial", *SMALL, "--set", "seed=2", "-o", out, "-q") == 130
+    assert run("map", "fiducial", *SMALL, "--set", "seed=2", "-o", out, "--force", "-q") == 130
     said = capsys.readouterr().err.strip()
     assert said == f"lusee-bayes: interrupted; the earlier results are as they were in '{out}'"
     assert content(out) == before

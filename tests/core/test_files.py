@@ -152,7 +152,7 @@ def test_a_death_at_any_step_leaves_the_old_or_the_new(tmp_path):
         old = with_folders(OWN | WORK | earlier)
         assert {name: text for name, text in start.items() if name != MANIFEST} == old
         files = NEW | ({"kept.fits": OLD["kept.fits"]} if earlier else {})
-        manifest = {"kind": "test", "files": sorted(files), "discard": ["chains"]}
+        manifest = {"kind": "test", "files": sorted(files), "discard": ["chains"], "origin": {}}
         new = with_folders(OWN | files) | {MANIFEST: json.dumps(manifest, indent=2) + "\n"}
         committed = [COMMITTED in hit or hit.get(MANIFEST) == new[MANIFEST] for hit, _ in found]
         assert committed == sorted(committed)
@@ -189,7 +189,7 @@ def test_a_failing_rename_leaves_the_folder_as_it_was(folder, monkeypatch):
 
 def test_own_files_stay_and_those_of_the_earlier_run_go(folder):
     finished(folder, NEW)
-    manifest = {"kind": "test", "files": sorted(NEW), "discard": []}
+    manifest = {"kind": "test", "files": sorted(NEW), "discard": [], "origin": {}}
     assert read_manifest(folder) == manifest
     assert content(folder) == OWN | NEW | {MANIFEST: json.dumps(manifest, indent=2) + "\n"}
     assert not (folder / "gone").exists()
@@ -285,6 +285,11 @@ def test_a_thread_commits_too(folder):
     [
         "{", "[]", "3", '{"kind": "map"}', '{"kind": "map", "files": 3, "discard": []}',
         '{"kind": "map", "files": [1], "discard": []}', "\0",
+        # nothing outside the folder is to be moved or removed
+        '{"kind": "map", "files": ["../own.txt"], "discard": []}',
+        '{"kind": "map", "files": [], "discard": ["/tmp"]}',
+        '{"kind": "map", "files": [], "discard": ["."]}',
+        '{"kind": "map", "files": [], "discard": [], "origin": 3}',
     ],
 )  # fmt: skip
 def test_a_damaged_manifest_is_one_sentence_before_anything_is_written(text, folder):

@@ -291,9 +291,9 @@ def test_draws_stay_where_they_are_until_the_results_are_written(short, killed, 
     with monkeypatch.context() as patch:
         patch.setattr(sample_run, "write_map", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            write_run(killed, short, SAMPLE, Stages())
+            write_run(killed, short, SAMPLE, {}, Stages())
     assert content(killed) == before
-    write_run(killed, short, SAMPLE, Stages())
+    write_run(killed, short, SAMPLE, {}, Stages())
     assert not (killed / "chains").exists()
     written = read_datatree(killed / "samples.nc")["posterior"]["sky"]
     np.testing.assert_array_equal(written, tree["posterior"]["sky"].values[:, :60])
@@ -302,7 +302,7 @@ def test_draws_stay_where_they_are_until_the_results_are_written(short, killed, 
 def test_results_can_be_written_twice(short, killed, tmp_path):
     numbers = replace(SAMPLE, figures={}, name="without a page")
     for folder in (killed, killed, tmp_path / "elsewhere"):
-        write_run(folder, short, numbers, Stages())
+        write_run(folder, short, numbers, {}, Stages())
     assert (tmp_path / "elsewhere" / "samples.nc").exists()
 
 
@@ -326,12 +326,12 @@ def test_a_kill_while_the_draws_are_removed_is_no_harm(
         patch.setattr(os, "unlink", unlink)
         patch.setattr(os, "remove", unlink)
         with pytest.raises(KeyboardInterrupt):
-            write_run(killed, short, numbers, Stages())
+            write_run(killed, short, numbers, {}, Stages())
     assert (killed / "samples.nc").exists()
     # the marker of the run is a file, too
     assert len(list((killed / "chains").iterdir())) == n_chunks + 1 - deleted
     sampler = replace(SAMPLER, draws=60)
-    with run_folder(killed) as folder:
+    with run_folder(killed, numbers, {}) as folder:
         again = sample_result(experiment, load_program("sky"), sampler, folder, resume=True)
     assert not (killed / "chains").exists()
     np.testing.assert_array_equal(again.skies, tree["posterior"]["sky"].values[:, :60])

@@ -17,7 +17,7 @@ from lusee_bayes.experiment.schema.noise import (
 from lusee_bayes.experiment.schema.observation import ObservationSection, RunSection
 from lusee_bayes.experiment.schema.output import OutputSection
 from lusee_bayes.experiment.schema.prior import IsotropicPriorSection, PriorSection
-from lusee_bayes.experiment.schema.section import Frequency, Section
+from lusee_bayes.experiment.schema.section import Frequency, Section, Seed
 from lusee_bayes.experiment.schema.sky import (
     SKY_SECTIONS,
     FileSkySection,
@@ -47,6 +47,7 @@ __all__ = [
     "RunSection",
     "ScalarBeamSection",
     "Section",
+    "Seed",
     "SkySection",
     "SourceSection",
     "SourcesSection",

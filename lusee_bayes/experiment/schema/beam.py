@@ -13,7 +13,13 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
-from lusee_bayes.experiment.schema.section import Positive, Section, without_other_kinds
+from lusee_bayes.experiment.schema.section import (
+    Angle,
+    Positive,
+    Section,
+    Temperature,
+    without_other_kinds,
+)
 from lusee_bayes.instrument.beams import (
     BeamSource,
     EmbeddedBeams,
@@ -50,7 +56,7 @@ class MonopoleBeamSection(Section):
     surface_permittivity: Annotated[float, Field(ge=1)] = 3.7
     deep_permittivity: Annotated[float, Field(ge=1)] = 6.1
     loss_tangent: Annotated[float, Field(ge=0)] = 0.01
-    turntable_offset_deg: float = 0.0
+    turntable_offset_deg: Angle = 0.0
 
     @property
     def label(self) -> str:
@@ -83,9 +89,9 @@ class _FileSection(Section):
     is_file: ClassVar[bool] = True
 
     file: str
-    turntable_offset_deg: float = 0.0
+    turntable_offset_deg: Angle = 0.0
     quadrature: Literal["exact", "luseepy"] = "exact"
-    moon_temperature_k: Annotated[float, Field(ge=0)] = 0.0
+    moon_temperature_k: Temperature = 0.0
 
     @property
     def label(self) -> str:
@@ -113,7 +119,7 @@ class ScalarBeamSection(_FileSection):
 
     model: Literal["luseepy"] = "luseepy"
     taper: bool = True
-    rotations_deg: Annotated[tuple[float, ...], Field(min_length=1)] = (0.0, 90.0, 180.0, 270.0)
+    rotations_deg: Annotated[tuple[Angle, ...], Field(min_length=1)] = (0.0, 90.0, 180.0, 270.0)
 
     @property
     def n_ports(self) -> int:
@@ -147,7 +153,7 @@ class ResponseSection(_FileSection):
 
     model: Literal["response"] = "response"
     receiver: Literal["jfet", "open"] = "jfet"
-    antenna_temperature_k: Annotated[float, Field(ge=0)] = 0.0
+    antenna_temperature_k: Temperature = 0.0
 
     @property
     def n_ports(self) -> int:

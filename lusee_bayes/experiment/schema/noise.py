@@ -62,7 +62,7 @@ class BeamErrorSection(Section):
     with the seed.
     """
 
-    shift_mhz: float | None = None
+    shift_mhz: Annotated[float, Field(ge=-49, le=49)] | None = None
     file: str | None = None
     parameters: dict[str, Positive] = Field(default_factory=dict)
     treatment: Treatment = "marginalised"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from datetime import date
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
-from lusee_bayes.experiment.schema.section import Positive, Section
+from lusee_bayes.experiment.schema.section import Angle, Positive, Section
 from lusee_bayes.instrument.observation import Observation, Run
 
 
@@ -16,7 +15,7 @@ class RunSection(Section):
     """One stretch of data at one turntable angle."""
 
     cycles: Positive = 1.0
-    turntable_deg: float = 0.0
+    turntable_deg: Angle = 0.0
     night_only: bool = False
 
 
@@ -27,18 +26,12 @@ class ObservationSection(Section):
     have it; for data that they have made.
     """
 
-    lon_deg: float = 182.258
+    lon_deg: Annotated[float, Field(ge=-360, le=360)] = 182.258
     lat_deg: Annotated[float, Field(ge=-90, le=90)] = -23.814
     start: str = "2027-01-15T00:00:00"
     step_s: Positive = 7200.0
     runs: Annotated[tuple[RunSection, ...], Field(min_length=1)] = (RunSection(),)
     fixed_axis: bool = False
-
-    @field_validator("start", mode="before")
-    @classmethod
-    def _as_text(cls, value: Any) -> Any:
-        """YAML reads an unquoted date as a date."""
-        return value.isoformat() if isinstance(value, date) else value
 
     def observation(self) -> Observation:
         """Site, times and turntable angles."""

@@ -5,9 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-Positive = Annotated[float, Field(gt=0)]
+
+def _not_tiny(value: float) -> float:
+    if value < SMALLEST:
+        raise ValueError(f"input should be at least {SMALLEST:g}")
+    return value
+
+
+# what is smaller or larger has no meaning here, and its powers no room in 64 bits
+SMALLEST, LARGEST = 1e-30, 1e30
+Positive = Annotated[float, Field(gt=0, le=LARGEST), AfterValidator(_not_tiny)]
+Temperature = Annotated[float, Field(ge=0, le=1e6)]
+Angle = Annotated[float, Field(ge=-3600, le=3600)]
+# of random numbers; channels have one each, so that some room is left below 64 bits
+Seed = Annotated[int, Field(ge=0, lt=2**62)]
 # of LuSEE-Night's band, in MHz
 Frequency = Annotated[float, Field(ge=1, le=50)]
 # what is done about something that is not known
@@ -15,9 +28,20 @@ Treatment = Literal["marginalised", "sampled", "ignored"]
 
 
 class Section(BaseModel):
-    """Part of a scenario: no key that is not declared, no NaN, nothing changed once made."""
+    """Part of a scenario: no key that is not declared, no NaN, nothing changed once made.
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    Types are strict: no text for numbers, no ``true`` for 1, no 12.0 for 12.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists_are_tuples(cls, tree: Any) -> Any:
+        """YAML has lists where sections have tuples."""
+        if not isinstance(tree, Mapping):
+            return tree
+        return {key: tuple(v) if isinstance(v, list) else v for key, v in tree.items()}
 
 
 def known_keys(kinds: Mapping[str, type[Section]]) -> set[str]:

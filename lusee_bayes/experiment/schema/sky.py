@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
-from lusee_bayes.experiment.schema.section import Positive, Section, without_other_kinds
+from lusee_bayes.experiment.schema.section import Positive, Section, Seed, without_other_kinds
 from lusee_bayes.sky import BRIGHT_SOURCES, FileSource, GalaxySource, SkySource
 
 
@@ -29,7 +29,7 @@ class GalaxySection(Section):
     has_sources: ClassVar[bool] = True
 
     model: Literal["galaxy"] = "galaxy"
-    seed: Annotated[int, Field(ge=0)] = 1
+    seed: Seed = 1
     sources: bool = True
 
     def source(self) -> SkySource:
@@ -55,7 +55,7 @@ class FileSkySection(Section):
     file: str
     dataset: str | None = None
     file_frequency_mhz: Positive | None = None
-    spectral_index: float = -2.5
+    spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
 
     @property
     def sources(self) -> bool:

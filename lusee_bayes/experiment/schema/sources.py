@@ -21,7 +21,7 @@ class SourceSection(Section):
     name: str
     flux_jy: Positive | None = None
     relative_std: Positive = 0.5
-    ra_deg: float | None = None
+    ra_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
     dec_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
     stokes_v: Annotated[float, Field(ge=-1, le=1)] = 0.0
     block_h: Positive | None = None

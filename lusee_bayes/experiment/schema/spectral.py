@@ -26,7 +26,7 @@ class SpectralSection(Section):
     components: Annotated[
         tuple[Literal["power_law", "curvature", "turnover"], ...], Field(min_length=1)
     ] = ("power_law", "curvature", "turnover")
-    index: float = -2.5
+    index: Annotated[float, Field(ge=-20, le=20)] = -2.5
     reference_mhz: Positive = 20.0
     turnover_mhz: Positive = 5.0
     length: Positive = 1.0

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-import yaml
 from jaxtyping import Bool, Float, Shaped
 
+from lusee_bayes.core.yaml_files import parse_yaml
 from lusee_bayes.linear.metrics import ell_cross
 
 Cases = Mapping[str, xr.Dataset]
@@ -123,7 +123,7 @@ def span(values: list[float] | list[int], form: str = "d") -> str:
 
 def entry(case: xr.Dataset, path: str) -> float:
     """An entry of the case's scenario, by its path with dots."""
-    node = yaml.safe_load(case.attrs["scenario"])
+    node = parse_yaml(case.attrs["scenario"], "the scenario of a case")
     for key in path.split("."):
         node = node[int(key)] if isinstance(node, list) else node[key]
     return float(node)
