@@ -25,11 +25,11 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling.chains import Chains
 from lusee_bayes.sampling.checkpoints import Checkpoints
-from lusee_bayes.sampling.datatree import DATA, read_datatree, to_datatree
+from lusee_bayes.sampling.datatree import read_datatree, to_datatree
 from lusee_bayes.sampling.hmc import Sampler, sample
 from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.program_sites import site_names
-from lusee_bayes.sampling.programs import Program, is_collapsed
+from lusee_bayes.sampling.program_checks import require_sampleable
+from lusee_bayes.sampling.programs import Program
 from lusee_bayes.sampling.uncertainty import (
     INTERVAL,
     pixel_interval_of_draws,
@@ -187,7 +187,8 @@ def sample_result(
     if resume and (finished := _finished(folder, identity, sampler)) is not None:
         return SampleResult(experiment, inference, finished, stages.seconds, None)
     arguments = program.arguments(inference.model, program_pieces(experiment))
-    latent = _require_sampleable(program, arguments, data)
+    n_modes = inference.posterior.mean.shape[0]
+    latent = require_sampleable(program, arguments, data.data, n_modes)
     with stages("coordinates"):
         whitening = coordinates(program, arguments, data, inference.posterior, latent)
     checkpoints = Checkpoints(folder / CHAINS, identity, resume=resume)
@@ -257,22 +258,6 @@ def _chart(arguments: dict, latent: list[str]) -> Chart | None:
                 if chart is not None and set(chart.names) <= set(latent):
                     return chart
     return None
-
-
-def _require_sampleable(program: Program, arguments: dict, data: Visibilities) -> list[str]:
-    """The program's latent sites. InputError if it would not end with draws of the sky."""
-    latent, observed = site_names(program.model, {**arguments, "data": data.data})
-    who = f"the program '{program.path or program.name}'"
-    if DATA not in observed:
-        raise InputError(f"{who} has no observed site 'data'; sample('data', ..., obs=data)")
-    if not latent:
-        raise InputError(f"{who} samples nothing: it has no site that is not observed")
-    if SKY not in latent and not is_collapsed(program, arguments, data.data):
-        raise InputError(
-            f"{who} has no site 'sky', and returns no LinearGaussian to draw the sky from; do one "
-            "or the other"
-        )
-    return latent
 
 
 def _finished(folder: Path, identity: dict, sampler: Sampler) -> xr.DataTree | None:

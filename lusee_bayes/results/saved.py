@@ -124,7 +124,7 @@ SUMMARY_TABLE = Layout(
         "quantity": Variable(("quantity",), "text"),
         "mean": Variable(("quantity",), finite=False),
         "sd": Variable(("quantity",), finite=False),
-        "r_hat": Variable(("quantity",), finite=False),
+        "r_hat": Variable(("quantity",), missing=True),
     },
 )
 SAMPLING = Layout(

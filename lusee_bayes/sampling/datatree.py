@@ -112,7 +112,9 @@ def to_datatree(
     }
     if data.truth is not None:
         constants["truth"] = np.asarray(data.truth)
-    dims = {SKY: ["mode"], "data": ["datum"], "gains": ["antenna", "sample"]}
+    dims = {SKY: ["mode"], "data": ["datum"]}
+    if sites.get("gains", np.empty(0)).ndim == 4:
+        dims["gains"] = ["antenna", "sample"]
     dims |= {name: ["mode"] for name in constants}
     for name, value in (truth or {}).items():
         if name in sites:

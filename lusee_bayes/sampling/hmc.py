@@ -155,6 +155,7 @@ def sample(
     previous = None if checkpoints is None else checkpoints.last()
     with numpyro_promotion():
         state = run.start()
+        _require_finite(state)
         if previous is not None:
             done, state = previous.iteration, run.restore(state, previous.state)
         total = sampler.warmup + sampler.draws
@@ -232,6 +233,15 @@ def draw_within(
 
     _, z = jax.lax.scan(step, iterate(sampler.warmup, state), None, length=sampler.draws)
     return _without_auxiliary(jax.vmap(kernel.postprocess_fn(inputs, {}))(z))
+
+
+def _require_finite(state: HMCState) -> None:
+    """InputError if the density is NaN or infinite where the chains begin."""
+    if not bool(jnp.isfinite(state.potential_energy).all()):
+        raise InputError(
+            "the program's density is NaN or infinite where its chains begin; look for logarithms "
+            "and roots of negative numbers, for scales of zero, and for data outside a support"
+        )
 
 
 def _without_auxiliary(sites: dict[str, Array]) -> dict[str, Array]:

@@ -122,7 +122,7 @@ def load_program(source: str | Path) -> Program:
     sys.modules[module.__name__] = module
     try:
         exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
-    except Exception as error:  # whatever a user's file may raise: it is not our failure
+    except (Exception, SystemExit) as error:  # whatever a user's file may raise: not our failure
         del sys.modules[module.__name__]
         kind = type(error).__name__
         raise InputError(f"the program '{path}' does not run: {kind}: {error}") from error
@@ -132,6 +132,12 @@ def load_program(source: str | Path) -> Program:
             f"'{path}' has no function 'model'; a program is def model(..., data=None)"
         )
     asked = inspect.signature(model).parameters
+    for name, argument in asked.items():
+        if argument.kind not in (argument.POSITIONAL_OR_KEYWORD, argument.KEYWORD_ONLY):
+            raise InputError(
+                f"model in '{path}' takes '{name}' by position, or as many as come; every argument "
+                "is given by its name: def model(coupling, prior, noise, data=None)"
+            )
     if "data" not in asked:
         raise InputError(f"model in '{path}' has no argument 'data'; the data could not enter it")
     if asked["data"].default is not None:

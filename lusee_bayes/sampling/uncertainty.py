@@ -208,4 +208,5 @@ def summary(quantities: Mapping[str, Float[np.ndarray, "chains draws"]]) -> pd.D
         Draws by name.
     """
     tree = arviz_base.from_dict({"posterior": dict(quantities)}, check_conventions=False)
-    return arviz_stats.summary(tree, ci_prob=INTERVAL, ci_kind="eti", round_to="none")
+    with np.errstate(all="ignore"):  # of chains that have not moved; NaN then says so
+        return arviz_stats.summary(tree, ci_prob=INTERVAL, ci_kind="eti", round_to="none")

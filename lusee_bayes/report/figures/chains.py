@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import arviz_base
 import arviz_plots
 import numpy as np
@@ -10,11 +12,14 @@ from jaxtyping import Float
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 
-from lusee_bayes.report.figures.drawing import BLUE, GREY
+from lusee_bayes.report.figures.drawing import BLUE, GREY, note
 from lusee_bayes.systematics.base import SKY
 
 # quantities in the figures, the first of a run's list
 N_RANKS, N_PAIRS = 8, 5
+# draws of a chain from which ranks and densities can be estimated
+FEWEST = 4
+TOO_FEW = f"not drawn: a chain has fewer than {FEWEST} draws, or has not moved"
 SIZE = {"layout": "constrained"}
 
 Quantities = dict[str, Float[np.ndarray, "chains draws"]]
@@ -25,28 +30,39 @@ def ranks(quantities: Quantities) -> Figure:
 
     The grey band holds 99 % of the curves of chains that agree.
     """
+    title = "Ranks among the draws of all chains, one curve for each chain"
     chosen = dict(list(quantities.items())[:N_RANKS])
+    if not _vary(chosen.values()):
+        return note(title, TOO_FEW)
     rows = (len(chosen) + 3) // 4
     collection = arviz_plots.plot_rank(
         arviz_base.from_dict({"posterior": chosen}),
         backend="matplotlib",
         figure_kwargs={**SIZE, "figsize": (12, 2.6 * rows + 0.4)},
     )
-    return _figure(collection, "Ranks among the draws of all chains, one curve for each chain")
+    return _figure(collection, title)
 
 
 def energy(statistics: xr.Dataset) -> Figure:
     """Energies of the draws about their mean, their changes from draw to draw, and BFMI."""
-    tree = arviz_base.from_dict({"sample_stats": {"energy": statistics["energy"].values}})
+    title, energies = (
+        "Energies; BFMI below 0.3 tells of chains that move slowly",
+        statistics["energy"],
+    )
+    if not _vary([energies.values]):
+        return note(title, TOO_FEW)
+    tree = arviz_base.from_dict({"sample_stats": {"energy": energies.values}})
     collection = arviz_plots.plot_energy(
         tree, backend="matplotlib", figure_kwargs={**SIZE, "figsize": (11, 3.6)}
     )
-    return _figure(collection, "Energies; BFMI below 0.3 tells of chains that move slowly")
+    return _figure(collection, title)
 
 
 def pairs(quantities: Quantities) -> Figure:
     """Draws of the first quantities against each other."""
     chosen = dict(list(quantities.items())[:N_PAIRS])
+    if not _vary(chosen.values()):
+        return note("Pairs of quantities", TOO_FEW)
     side = 2.2 * len(chosen) + 0.6
     collection = arviz_plots.plot_pair(
         arviz_base.from_dict({"posterior": chosen}),
@@ -73,6 +89,13 @@ def against_analytic(tree: xr.DataTree) -> Figure:
     right.set(xlabel="mode", ylabel="draws / analytic", title="Standard deviations")
     figure.suptitle("Draws against the analytic posterior, mode by mode")
     return figure
+
+
+def _vary(quantities: Iterable[Float[np.ndarray, "chains draws"]]) -> bool:
+    """Whether there are draws enough for ArviZ's estimates, and not all the same."""
+    return all(
+        draws.shape[1] >= FEWEST and bool((np.ptp(draws, axis=1) > 0).all()) for draws in quantities
+    )
 
 
 def _figure(collection: arviz_plots.PlotCollection, title: str) -> Figure:

@@ -74,3 +74,11 @@ def colour_bar(
         bar.set_ticks([], minor=True)
         bar.long_axis.set_major_formatter(lambda value, _: f"{value:,.0f}")
     return bar
+
+
+def note(title: str, text: str) -> Figure:
+    """Make a figure that says why there is none."""
+    figure = Figure(figsize=(8, 1.6), layout="constrained")
+    figure.suptitle(title)
+    figure.text(0.5, 0.35, text, ha="center")
+    return figure

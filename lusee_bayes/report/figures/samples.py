@@ -16,6 +16,7 @@ from lusee_bayes.report.figures.drawing import (
     ORANGE,
     SEQUENTIAL,
     colour_bar,
+    note,
 )
 from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.sample_result import SampleResult
@@ -29,11 +30,16 @@ CHAIN_COLOURS = (BLUE, ORANGE, "#009E73", "#000000")
 def uncertainty(run: SampleResult) -> Figure:
     """Mean, standard deviation and 90 % interval of the drawn maps, and how skewed it is."""
     maps = run.maps
+    chains, draws = run.skies.shape[:2]
+    if chains * draws < 2:
+        return note("Uncertainty of the drawn maps", "not drawn: a single draw has no spread")
     positive = np.percentile(maps["mean"][maps["mean"] > 0], [0.5, 99.8])
     level = maps["mean"].mean()
     width = maps["upper"] - maps["lower"]
     spread, interval = 100.0 * maps["std"] / level, 100.0 * width / level
-    skewness = (maps["upper"] + maps["lower"] - 2.0 * maps["mean"]) / width
+    excess = maps["upper"] + maps["lower"] - 2.0 * maps["mean"]
+    # draws that are all the same have no width, and no asymmetry
+    skewness = np.divide(excess, width, out=np.zeros_like(width), where=width > 0)
     limit = np.percentile(np.abs(skewness), 99.0)
     percent = "% of the mean sky"
     panels = [
@@ -56,7 +62,6 @@ def uncertainty(run: SampleResult) -> Figure:
         image = mollweide(axes, pixels, norm=norm, cmap=cmap, highest_altitude=altitude)
         colour_bar(figure, image, axes, label=unit, shrink=0.85, extend="both")
         axes.set_title(title)
-    chains, draws = run.skies.shape[:2]
     figure.suptitle(
         f"{chains} x {draws} draws of {run.tree.attrs['program']} at "
         f"{run.experiment.scenario.frequency_mhz:g} MHz, Galactic coordinates; dashed: never above "
@@ -75,7 +80,9 @@ def traces(run: SampleResult) -> Figure:
     figure = Figure(figsize=(11, 1.7 * len(columns) + 0.8), layout="constrained")
     grid = figure.subplots(len(columns), 2, width_ratios=(3, 1), squeeze=False)
     for (left, right), (name, draws) in zip(grid, columns, strict=True):
-        bins = np.histogram_bin_edges(draws, 40)
+        # a range of a few rounding errors cannot be cut into bins
+        moved = np.ptp(draws) > 1e-12 * np.abs(draws).max()
+        bins = np.histogram_bin_edges(draws, 40 if moved else 1)
         for number, chain in enumerate(draws):
             colour = CHAIN_COLOURS[number % len(CHAIN_COLOURS)]
             left.plot(chain, color=colour, lw=0.5, alpha=0.8)
