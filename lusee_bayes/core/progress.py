@@ -81,6 +81,11 @@ class Stages:
                 yield lambda done, remark="": bar.update(task, completed=done, remark=remark)
         self._finish(name, start)
 
+    def say(self, text: str) -> None:
+        """Print a line."""
+        if self.console is not None:
+            self.console.print(text, highlight=False, markup=False)
+
     def _finish(self, name: str, start: float) -> None:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
         if self.console is not None:

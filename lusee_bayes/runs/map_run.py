@@ -18,6 +18,7 @@ from lusee_bayes.report.figures import channel as channel_figures
 from lusee_bayes.report.figures import cube as cube_figures
 from lusee_bayes.report.figures import diagnostics as diagnostic_figures
 from lusee_bayes.results.channel_files import CHANNELS
+from lusee_bayes.results.cost import posterior_cost, require_fits, require_resources
 from lusee_bayes.results.cube import CubeResult
 from lusee_bayes.results.cube_channels import cube_result
 from lusee_bayes.results.diagnostics_file import write_diagnostics
@@ -108,7 +109,10 @@ def run_map(
     require_single_frequency("--onto", onto is not None)
     resume = "the same command goes on from the channels that are done"
     origin = origin_of(scenario, data, truth=truth or None)
+    cost = posterior_cost(scenario)
+    require_fits(cost, scenario)
     with run_folder(folder, CUBE, origin, resume, replace=replace, alone=group.is_first) as place:
+        stages.say(cost.line())
         cube = cube_result(scenario, place, data=data, truth=truth, group=group, stages=stages)
         files = write_run(place, cube, CUBE, origin, stages) if group.is_first else []
         return MapRun(cube, place, files)
@@ -126,6 +130,7 @@ def _run_single(
     origin = origin_of(scenario, data, truth=truth or None, onto=onto)
     with run_folder(folder, MAP, origin, replace=replace) as place:
         measured = None if data is None else read_data(data, scenario)
+        require_resources(scenario, measured, stages)
         experiment = build(scenario, measured, stages)
         if truth:
             experiment = with_truth(experiment)

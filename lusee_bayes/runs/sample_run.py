@@ -15,6 +15,7 @@ from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.report.figures import chains as chain_figures
 from lusee_bayes.report.figures import samples as sample_figures
+from lusee_bayes.results.cost import require_resources
 from lusee_bayes.results.map_files import write_cube, write_map
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult, sample_result
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
@@ -130,6 +131,7 @@ def _run_single(
     origin = _origin(scenario, data, program)
     with run_folder(folder, SAMPLE, origin, RESUME, replace=replace) as place:
         measured = None if data is None else read_data(data, scenario)
+        require_resources(scenario, measured, stages, sampler.chains * sampler.draws)
         experiment = build(scenario, measured, stages)
         result = sample_result(experiment, program, sampler, place, resume=resume, stages=stages)
         return SampleRun((result,), place, write_run(place, result, SAMPLE, origin, stages))

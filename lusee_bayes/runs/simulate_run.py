@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from lusee_bayes.core.destinations import require_target
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import write_waterfall
+from lusee_bayes.results.cost import require_fits, simulation_cost
 
 
 def run_simulate(
@@ -47,6 +49,8 @@ def run_simulate(
     """
     path, channels = Path(path), (scenario,)
     stages = stages or Stages()
+    require_target(path)
+    require_fits(simulation_cost(scenario, max(1, len(frequencies_mhz))), scenario)
     if frequencies_mhz:
         if path.suffix != ".fits":
             raise InputError(

@@ -11,6 +11,7 @@ from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.report.figures import samples as sample_figures
+from lusee_bayes.results.cost import require_resources
 from lusee_bayes.results.sample_result import CHAINS, sample_result
 from lusee_bayes.results.validation_result import ValidationResult
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
@@ -80,6 +81,7 @@ def run_validate(
     origin = origin_of(scenario, data)
     with run_folder(folder, VALIDATION, origin, RESUME, replace=replace) as place:
         measured = None if data is None else read_data(data, scenario)
+        require_resources(scenario, measured, stages, sampler.chains * sampler.draws)
         experiment = build(scenario, measured, stages)
         sampled = sample_result(experiment, program, sampler, place, resume=resume, stages=stages)
         posterior, model = sampled.inference.posterior, sampled.inference.model
