@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.experiment.plausibility import require_plausible
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.simulate import simulate
@@ -21,10 +25,13 @@ class Experiment:
         A, S, the model sky and what N is made of.
     data : Visibilities
         d, measured or simulated.
+    doubts : tuple of str
+        What is doubtful about measured data, a sentence each.
     """
 
     setup: Setup
     data: Visibilities
+    doubts: tuple[str, ...] = ()
 
     @property
     def scenario(self) -> Scenario:
@@ -49,14 +56,19 @@ def build(
     Raises
     ------
     InputError
-        If the data are of another frequency, another site or other ports.
+        If the data are of another frequency, another site or other ports, and for data that no
+        sky gives (:func:`.require_plausible`).
     """
     stages = stages or Stages()
     setup = set_up(scenario, data, stages)
     if data is None:
         with stages("noise"):
-            data = simulate(setup)
-    return Experiment(setup, data)
+            return Experiment(setup, simulate(setup))
+    std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    doubts = require_plausible(data, setup.signal, std)
+    for doubt in doubts:
+        stages.say(f"  doubtful: {doubt}")
+    return Experiment(setup, data, doubts)
 
 
 def with_truth(experiment: Experiment) -> Experiment:

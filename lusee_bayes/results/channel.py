@@ -6,6 +6,7 @@ here and nowhere else: of a posterior with its model, or of an information with 
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 
 import jax
@@ -17,6 +18,7 @@ from lusee_bayes.core.arrays import Array, on_host
 from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, per_mode, power_spectrum
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference
+from lusee_bayes.experiment.plausibility import about_information
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.metrics import (
@@ -77,6 +79,8 @@ class ChannelResult:
         Last correction of the mean, in standard deviations.
     n_data, n_missing, rounds : int
         Data, samples left out, and how often the gain term was built.
+    doubts : tuple of str
+        What is doubtful about measured data, a sentence each.
     """
 
     frequency_mhz: float
@@ -97,6 +101,7 @@ class ChannelResult:
     n_data: int
     n_missing: int
     rounds: int
+    doubts: tuple[str, ...] = ()
 
     @property
     def nside(self) -> int:
@@ -167,7 +172,7 @@ class ChannelResult:
         variables["pixel_std"] = (("pixel",), self.pixel_std)
         variables["highest_altitude"] = (("pixel",), self.highest_altitude)
         numbers = {name: getattr(self, name) for name in ("frequency_mhz", *NUMBERS)}
-        return xr.Dataset(variables, attrs=numbers)
+        return xr.Dataset(variables, attrs={**numbers, "doubts": json.dumps(self.doubts)})
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset) -> ChannelResult:
@@ -180,6 +185,7 @@ class ChannelResult:
             frequency_mhz=float(dataset.attrs["frequency_mhz"]),
             truth=arrays.pop("truth", None),
             independent=independent,
+            doubts=tuple(json.loads(dataset.attrs["doubts"])),
             **arrays,
             **numbers,
             **counts,
@@ -238,6 +244,7 @@ def channel_of_posterior(
         n_data=inference.model.n_data,
         n_missing=data.n_missing,
         rounds=inference.rounds,
+        doubts=(*experiment.doubts, *about_information(float(posterior.information_bits()))),
     )
 
 
@@ -253,6 +260,7 @@ class Observed:
     truth : (modes,) array or None
     highest_altitude : (pixels,) array
     n_missing, rounds : int
+    doubts : tuple of str
     """
 
     frequency_mhz: float
@@ -261,6 +269,7 @@ class Observed:
     highest_altitude: Float[np.ndarray, " pixels"]
     n_missing: int
     rounds: int
+    doubts: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, experiment: Experiment, rounds: int) -> Observed:
@@ -273,6 +282,7 @@ class Observed:
             highest_altitude(data.observation, nside),
             data.n_missing,
             rounds,
+            experiment.doubts,
         )
 
 
@@ -332,6 +342,7 @@ def channel_of_information(
         n_data=int(information.n_data),
         n_missing=observed.n_missing,
         rounds=observed.rounds,
+        doubts=(*observed.doubts, *about_information(information_bits)),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,7 +61,7 @@ class ChannelInformation:
             variables["perturbations"] = (("draw", "mode"), perturbations)
         numbers = {name: float(getattr(information, name)) for name in OF_INFORMATION}
         numbers |= {name: getattr(observed, name) for name in OF_CHANNEL}
-        return xr.Dataset(variables, attrs=numbers)
+        return xr.Dataset(variables, attrs={**numbers, "doubts": json.dumps(observed.doubts)})
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset) -> ChannelInformation:
@@ -79,5 +80,6 @@ class ChannelInformation:
             arrays["highest_altitude"],
             int(dataset.attrs["n_missing"]),
             int(dataset.attrs["rounds"]),
+            tuple(json.loads(dataset.attrs["doubts"])),
         )
         return cls(information, observed, arrays["sky"])

@@ -126,7 +126,8 @@ class CubeResult:
 
     def lines(self) -> list[str]:
         """What a terminal shows."""
-        return [self.headline(), self.verdict()]
+        doubts = [f"{c.frequency_mhz:g} MHz: {d}" for c in self.channels for d in c.doubts]
+        return [self.headline(), self.verdict(), *doubts]
 
     @property
     def log_evidence(self) -> float | None:
@@ -164,6 +165,7 @@ class CubeResult:
                 "information_bits": channel.information_bits,
             }
             known = {name: value for name, value in numbers.items() if not np.isnan(value)}
+            known |= {"doubts": list(channel.doubts)} if channel.doubts else {}
             channels.append(
                 {"frequency_mhz": channel.frequency_mhz, "ell_cross": channel.ell_cross, **known}
             )

@@ -84,6 +84,7 @@ class MapResult:
             "beam_rms_difference": beam_rms_difference(self.experiment.setup),
             "mean_refinement_sigma": channel.refinement,
             "never_observed_fraction": channel.never_observed,
+            "doubts": list(channel.doubts),
             "seconds": {name: round(s, 3) for name, s in self.seconds.items()},
             "peak_memory_gb": round(peak_memory_gb(), 3),
             "versions": versions(),
@@ -113,7 +114,7 @@ class MapResult:
     def lines(self) -> list[str]:
         """What a terminal shows: headline, fluxes, verdict."""
         fluxes = [] if self.fluxes is None else flux_lines(self.fluxes)
-        return [self.headline(), *fluxes, self.verdict()]
+        return [self.headline(), *fluxes, self.verdict(), *self.channel.doubts]
 
 
 def map_result(

@@ -1,0 +1,149 @@
+"""Whether data can be what the scenario says: correlations of its instrument under such a sky."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.instrument.products import all_products, auto_indices
+from lusee_bayes.instrument.visibilities import Visibilities
+
+# what noise alone does to one of 1e8 samples
+SIGNIFICANT = 6.0
+# no sky and no gain is that far from the model: the unit is another, or the file is damaged
+IMPOSSIBLE = 1e3
+# skies of this band are known to some ten per cent, and beams to a factor
+DOUBTFUL = 3.0
+# a map that knows less than that is no measurement
+LEAST_BITS = 1.0
+
+
+def require_plausible(
+    data: Visibilities,
+    signal: Float[Array, "products times"],
+    std: Float[Array, " data"],
+) -> tuple[str, ...]:
+    """Check measured data against what every correlator and every sky obeys.
+
+    Auto-correlations are powers, so that they are positive; |V_ij|^2 <= V_ii V_jj (Cauchy and
+    Schwarz); both within the noise.
+
+    Parameters
+    ----------
+    data : Visibilities
+    signal : (products, times) array
+        Visibilities of the modelled sky, in K.
+    std : (data,) array
+        Standard deviations of the radiometer noise, in K.
+
+    Returns
+    -------
+    tuple of str
+        What is doubtful, a sentence each, for the report.
+
+    Raises
+    ------
+    InputError
+        For values that no sky gives, and for auto-correlations that are negative beyond noise.
+    """
+    values, layout = np.asarray(data.grid()), data.layout
+    sigma = np.asarray(layout.scatter(np.asarray(std)))
+    modelled = np.asarray(signal)
+    autos = auto_indices(round(np.sqrt(layout.n_products)))
+    typical = float(np.median(modelled[autos]))
+    _refuse(
+        data,
+        np.abs(values) > IMPOSSIBLE * max(typical, float(np.abs(modelled).max())),
+        f"more than {IMPOSSIBLE:g} times what the modelled sky gives ({typical:.3g} K); look at "
+        "the unit of the data, or leave the sample out (NaN)",
+    )
+    _refuse(
+        data,
+        _only(autos, values < -SIGNIFICANT * sigma),
+        "an auto-correlation that is negative beyond its noise; look at signs and order of the "
+        "products, or leave the sample out (NaN)",
+    )
+    return (*_about_range(values[autos], modelled[autos]), *_about_crosses(data, values, sigma))
+
+
+def about_information(bits: float) -> tuple[str, ...]:
+    """Say that data tell nothing, if so; NaN where the information is not known."""
+    if not bits < LEAST_BITS:
+        return ()
+    return (
+        f"The data tell {bits:.2g} bits of the sky: the map is the prior's, whatever the sky is.",
+    )
+
+
+def _only(
+    rows: np.ndarray, found: Bool[np.ndarray, "products times"]
+) -> Bool[np.ndarray, "products times"]:
+    kept = np.zeros_like(found)
+    kept[rows] = found[rows]
+    return kept
+
+
+def _refuse(data: Visibilities, bad: Bool[np.ndarray, "products times"], why: str) -> None:
+    """InputError for the first of the samples that are bad."""
+    if not bad.any():
+        return
+    product, time = (int(index[0]) for index in np.nonzero(bad))
+    value = float(np.asarray(data.grid())[product, time])
+    raise InputError(
+        f"product {data.labels[product]} at {data.observation.times[time].isot[:19]} is "
+        f"{value:.4g} K ({int(bad.sum())} samples in all): {why}"
+    )
+
+
+def _about_range(
+    autos: Float[np.ndarray, "antennas times"], modelled: Float[np.ndarray, "antennas times"]
+) -> tuple[str, ...]:
+    present = ~np.isnan(autos)
+    if not present.any():
+        return ()
+    ratio = float(np.median(autos[present] / modelled[present]))
+    if 1.0 / IMPOSSIBLE < ratio < IMPOSSIBLE and not 1.0 / DOUBTFUL < ratio < DOUBTFUL:
+        return (
+            f"The auto-correlations are {ratio:.2g} times those of the modelled sky: are unit, "
+            "frequency and beams those of the data?",
+        )
+    if not 1.0 / IMPOSSIBLE < ratio < IMPOSSIBLE:
+        raise InputError(
+            f"the auto-correlations are {ratio:.2g} times those of the modelled sky; look at the "
+            "unit of the data, their frequency and the beams"
+        )
+    return ()
+
+
+def _about_crosses(
+    data: Visibilities,
+    values: Float[np.ndarray, "products times"],
+    sigma: Float[np.ndarray, "products times"],
+) -> tuple[str, ...]:
+    """Pairs of antennas whose crosses are larger than their autos allow."""
+    n = round(np.sqrt(data.layout.n_products))
+    position = {tuple(product): k for k, product in enumerate(all_products(n))}
+    doubts = []
+    for i in range(n):
+        for j in range(i + 1, n):
+            ii, jj = position[i, i, "R"], position[j, j, "R"]
+            re, im = position[i, j, "R"], position[i, j, "I"]
+            vi, vj = values[ii], values[jj]
+            cross = np.hypot(values[re], values[im])
+            # autos within noise of zero bound nothing
+            usable = (vi > 0) & (vj > 0) & ~np.isnan(cross)
+            vi, vj = np.where(usable, vi, 1.0), np.where(usable, vj, 1.0)
+            bound = np.sqrt(vi * vj)
+            spread = np.hypot(sigma[re], sigma[im])
+            of_bound = 0.5 * bound * np.hypot(sigma[ii] / vi, sigma[jj] / vj)
+            excess = usable & (cross - bound > SIGNIFICANT * np.hypot(spread, of_bound))
+            if excess.any():
+                first = data.observation.times[int(np.nonzero(excess)[0][0])].isot[:19]
+                doubts.append(
+                    f"|V_{i}{j}| is larger than sqrt(V_{i}{i} V_{j}{j}), which no sky gives, in "
+                    f"{int(excess.sum())} of {int(usable.sum())} samples (first {first}): one of "
+                    f"the products {i}{i}, {j}{j} and {i}{j} is wrong there."
+                )
+    return tuple(doubts)
