@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -46,6 +46,20 @@ def read_dataset(path: str | Path, format_: str, layout: Layout, hint: str = "")
     with _opened(path, format_, layout, hint) as dataset:
         _checked(path, dataset, layout)
         return dataset.load()
+
+
+def says(path: Path, attributes: Mapping[str, str]) -> bool:
+    """Tell whether a netCDF file of unfinished work is whole, and says so of itself.
+
+    What is damaged is made anew, as what is not there.
+    """
+    if not path.is_file():
+        return False
+    try:
+        with reading(path, "unfinished work"), xr.open_dataset(path, engine="h5netcdf") as file:
+            return all(file.attrs.get(name) == value for name, value in attributes.items())
+    except InputError:
+        return False
 
 
 @contextmanager

@@ -197,7 +197,12 @@ def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
     InputError
         If the file cannot be read, or is not as declared.
     """
-    with reading(path, layout.what, hint) as file, np.load(file, allow_pickle=False) as arrays:
+    # opened here: where NumPy fails to read a file that it has opened itself, it leaves it open
+    with (
+        reading(path, layout.what, hint) as whole,
+        whole.open("rb") as file,
+        np.load(file, allow_pickle=False) as arrays,
+    ):
         if not isinstance(arrays, np.lib.npyio.NpzFile):
             raise InputError(f"{path} holds a single array; expected {layout.what}")
         there = {name: _Member(arrays, name) for name in arrays.files}

@@ -7,13 +7,13 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import h5py
 import numpy as np
 import xarray as xr
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.netcdf_files import says
 from lusee_bayes.core.version import __version__, versions
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.inference import infer
@@ -99,11 +99,8 @@ def with_sky(scenario: Scenario, files: Mapping[float, Path]) -> Scenario:
 
 def read_case(path: Path, scenario: Scenario) -> xr.Dataset | None:
     """A case computed before with the same scenario and version of the package, or None."""
-    if not h5py.is_hdf5(path):
-        return None
-    case = xr.load_dataset(path, engine="h5netcdf")
     wanted = {"format": formats.PAPER_CASE, "scenario": scenario.to_yaml(), "version": __version__}
-    return case if all(case.attrs.get(key) == value for key, value in wanted.items()) else None
+    return xr.load_dataset(path, engine="h5netcdf") if says(path, wanted) else None
 
 
 def compute_case(scenario: Scenario) -> xr.Dataset:

@@ -15,6 +15,7 @@ import xarray as xr
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
+from lusee_bayes.core.netcdf_files import says
 from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.scenario import Scenario
 
@@ -38,15 +39,11 @@ class ChannelFiles:
 
     def path(self, scenario: Scenario, kind: str) -> Path:
         """Of the ``information`` or the ``result`` of a channel."""
-        return self.folder / f"{scenario.frequency_mhz:g}.{kind}.nc"
+        return self.folder / f"{scenario.frequency_mhz:.15g}.{kind}.nc"
 
     def has(self, scenario: Scenario, kind: str) -> bool:
         """Whether it is there, whole and of this run."""
-        path = self.path(scenario, kind)
-        if not path.is_file():
-            return False
-        with xr.open_dataset(path, engine="h5netcdf") as file:
-            return file.attrs.get("identity") == self.identity
+        return says(self.path(scenario, kind), {"identity": self.identity})
 
     def write(self, scenario: Scenario, kind: str, dataset: xr.Dataset) -> None:
         """Write it whole or not at all."""

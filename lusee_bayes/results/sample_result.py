@@ -16,6 +16,7 @@ from numpyro.infer.hmc import HMCState
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages, peak_memory_gb
+from lusee_bayes.core.reading import reading
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference, infer
@@ -121,7 +122,7 @@ class SampleResult:
 
     def lines(self) -> list[str]:
         """What a terminal shows."""
-        return [self.headline()]
+        return [self.headline(), *self.experiment.doubts]
 
     def figures(self) -> dict[str, object]:
         """What sampling.json tells: sizes, speeds, times, memory, versions."""
@@ -133,6 +134,7 @@ class SampleResult:
             "draws": draws,
             "divergences": int(stats["diverging"].sum()),
             "mean_acceptance": float(stats["acceptance_rate"].mean()),
+            "doubts": list(self.experiment.doubts),
             "step_size": [float(x) for x in stats["step_size"].values[:, -1]],
             "mean_steps": float(stats["n_steps"].mean()),
             "gradients_per_second": self.gradients_per_second,
@@ -265,7 +267,8 @@ def _finished(folder: Path, identity: dict, sampler: Sampler) -> xr.DataTree | N
     if (folder / CHAINS).exists() or not (folder / SAMPLES).exists():
         return None
     tree = read_datatree(folder / SAMPLES)
-    same = json.loads(tree.attrs["identity"]) == json.loads(json.dumps(identity))
+    with reading(folder / SAMPLES, "samples"):
+        same = json.loads(tree.attrs["identity"]) == json.loads(json.dumps(identity))
     if not same or tree["posterior"].sizes["draw"] != sampler.draws:
         raise InputError(
             f"'{folder}' holds a finished run with other settings; leave out --resume to replace "

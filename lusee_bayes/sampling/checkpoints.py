@@ -11,13 +11,15 @@ import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.layouts import Layout
+from lusee_bayes.core.reading import read_json, reading
 
+IDENTITY_LAYOUT = Layout("the description of an unfinished run")
 IDENTITY = "run.json"
 CHUNK_GLOB = "chunk-*.npz"
 
@@ -59,18 +61,15 @@ class Chunk:
     @classmethod
     def read(cls, path: Path) -> Chunk:
         """Read a chunk's file. InputError if it cannot be read."""
+        kinds: dict[str, dict[str, np.ndarray]] = {"start": {}, "state": {}, "draws": {}}
         try:
-            with path.open("rb") as file, np.load(file) as arrays:
-                kinds = {"start": {}, "state": {}, "draws": {}}
+            with reading(path, "a checkpoint"), path.open("rb") as file, np.load(file) as arrays:
                 for key in arrays.files:
                     kind, name = key.split(":", 1)
                     kinds[kind][name] = arrays[key]
-            start = int(kinds["start"][""])
-        except (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile) as error:
-            raise InputError(
-                f"the checkpoint '{path}' cannot be read ({error}); delete it to go on from the "
-                "one before"
-            ) from error
+                start = int(kinds["start"][""])
+        except InputError as error:
+            raise InputError(f"{error}; delete it to go on from the one before") from error
         state = [kinds["state"][name] for name in sorted(kinds["state"])]
         return cls(_iteration(path), state, kinds["draws"], start)
 
@@ -190,12 +189,9 @@ def _iteration(path: Path) -> int:
 
 def _read_marker(marker: Path) -> dict[str, object]:
     try:
-        found = json.loads(marker.read_text())
-    except ValueError as error:
-        raise InputError(f"'{marker}' cannot be read ({error}); delete its folder") from error
-    if not isinstance(found, dict):
-        raise InputError(f"'{marker}' does not describe a run; delete its folder")
-    return found
+        return read_json(marker, IDENTITY_LAYOUT)
+    except InputError as error:
+        raise InputError(f"{error}; delete its folder") from error
 
 
 def _short(value: object) -> str:

@@ -1,0 +1,197 @@
+"""Damage to files, drawn by hypothesis: bytes of any file, and items of HDF5, FITS and JSON."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from astropy.io import fits
+from hypothesis import strategies as st
+
+FRACTION = st.floats(0.0, 1.0)
+VALUES = st.sampled_from(
+    [
+        *("", "text", "\uff11\uff12", "2027-13-45", "nan", 0, 1, -1, 3, 10**12, 2**63, True, False),
+        *(1e300, 1e-300, -2.5, float("nan"), float("inf"), float("-inf")),
+    ]
+)
+FILLS = st.sampled_from([np.nan, np.inf, -1.0, 0.0, 1e30, 1e300, -1e300])
+
+
+@st.composite
+def byte_changes(draw: st.DrawFn) -> tuple[Any, ...]:
+    """An operation on the bytes of a file."""
+    kind = draw(st.sampled_from(["cut", "flip", "zero", "remove", "insert", "double"]))
+    return kind, draw(FRACTION), draw(st.integers(1, 4000)), draw(st.binary(min_size=1, max_size=8))
+
+
+def change_bytes(path: Path, change: tuple[Any, ...]) -> None:
+    """Apply :func:`byte_changes`."""
+    kind, fraction, length, data = change
+    content = bytearray(path.read_bytes())
+    at = int(fraction * max(0, len(content) - 1))
+    if kind == "cut":
+        del content[at:]
+    elif kind == "flip":
+        content[at : at + len(data)] = data
+    elif kind == "zero":
+        content[at : at + length] = bytes(len(content[at : at + length]))
+    elif kind == "remove":
+        del content[at : at + length]
+    elif kind == "insert":
+        content[at:at] = data
+    else:
+        content += content[:at]
+    path.write_bytes(bytes(content))
+
+
+@st.composite
+def item_changes(draw: st.DrawFn) -> tuple[Any, ...]:
+    """An operation on one item of a file."""
+    kind = draw(
+        st.sampled_from(
+            ["delete", "rename", "value", "attribute", "drop attribute", "dtype", "shape", "fill"]
+        )
+    )
+    return kind, draw(FRACTION), draw(VALUES), draw(FILLS), draw(st.integers(0, 5))
+
+
+def _changed(array: np.ndarray, change: tuple[Any, ...]) -> np.ndarray:
+    """Another array in an array's place."""
+    kind, _, value, fill, number = change
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if kind == "fill" and array.dtype.kind in "fiuc" and array.size:
+            changed = np.array(array, dtype=float if array.dtype.kind in "iu" else array.dtype)
+            flat = changed.reshape(-1)
+            flat[: max(1, flat.size >> number)] = fill
+            return changed
+        if kind == "shape":
+            options = [array.T, array[..., None], array.reshape(-1), array[:0], array[..., :1]]
+            options += [np.concatenate([array, array])] if array.ndim else [array.reshape(1, 1)]
+            return options[number % len(options)] if array.ndim else np.asarray([value])
+        if kind == "dtype" and array.dtype.kind in "fiuc":
+            types = ["S4", "f4", "i4", "i1", "c16", "?"]
+            real = array.real if array.dtype.kind == "c" else array
+            return real.astype(types[number])
+    return np.asarray(value)
+
+
+def change_hdf5(path: Path, change: tuple[Any, ...]) -> None:
+    """Apply :func:`item_changes` to an HDF5 file, netCDF among them."""
+    kind, fraction, value, _, number = change
+    with h5py.File(path, "r+") as file:
+        found: list[Any] = []
+        file.visititems(lambda _, item: found.append(item))
+        if kind in ("attribute", "drop attribute"):
+            owners = [file, *found]
+            owner = owners[0] if number < 3 else owners[int(fraction * (len(owners) - 1))]
+            names = sorted(owner.attrs)
+            if not names:
+                return
+            name = names[int(fraction * (len(names) - 1))]
+            del owner.attrs[name]
+            if kind == "attribute" and value != 2**63:  # NumPy has no integer for it
+                owner.attrs[name] = value
+            return
+        items = [item for item in found if isinstance(item, h5py.Dataset)]
+        if not items:
+            return
+        item = items[int(fraction * (len(items) - 1))]
+        name = item.name
+        if kind == "delete":
+            del file[name]
+        elif kind == "rename":
+            file.move(name, f"{name}_other")
+        else:
+            array = _changed(np.asarray(item[()]), change)
+            if array.dtype.kind == "U":
+                array = array.astype("S")
+            attributes = {k: v for k, v in item.attrs.items() if not k.isupper()}
+            del file[name]
+            if array.dtype.kind != "O":
+                file[name] = array
+                for key, kept in attributes.items():
+                    if not key.startswith("_Netcdf"):
+                        file[name].attrs[key] = kept
+
+
+def change_fits(path: Path, change: tuple[Any, ...]) -> None:
+    """Apply :func:`item_changes` to a FITS file."""
+    kind, fraction, value, _, number = change
+    with warnings.catch_warnings(), fits.open(path) as opened:
+        warnings.simplefilter("ignore")
+        hdus = fits.HDUList([hdu.copy() for hdu in opened])
+        place = int(fraction * (len(hdus) - 1))
+        hdu = hdus[place]
+        if kind == "delete" and len(hdus) > 1:
+            del hdus[max(1, place)]
+        elif kind == "rename":
+            hdu.name = "OTHER"
+        elif kind in ("attribute", "drop attribute", "value"):
+            own = [k for k in hdus[0].header if not k.startswith(("SIMPLE", "BITPIX", "NAXIS"))]
+            own += [k for k in hdu.header if k.startswith(("TTYPE", "TUNIT", "EXTNAME", "ORDER"))]
+            if own:
+                key = own[int(fraction * 997) % len(own)]
+                owner = hdus[0] if key in hdus[0].header else hdu
+                del owner.header[key]
+                finite = not isinstance(value, float) or np.isfinite(value)
+                if kind != "drop attribute" and finite and str(value).isascii():
+                    owner.header[key if len(key) <= 8 else f"HIERARCH {key}"] = value
+        elif isinstance(hdu, fits.BinTableHDU):
+            names = hdu.columns.names
+            if kind == "shape":
+                hdus[place] = fits.BinTableHDU(hdu.data[: len(hdu.data) >> 1], hdu.header)
+            elif names:
+                column = hdu.data[names[number % len(names)]]
+                if column.dtype.kind == "f":
+                    column[...] = change[3]
+        elif hdu.data is not None:
+            array = _changed(np.asarray(hdu.data), change)
+            if array.dtype.kind in "fiu" and array.ndim:
+                if array.dtype.byteorder not in ("=", "|"):
+                    array = array.astype(array.dtype.newbyteorder("="))
+                hdu.data = np.ascontiguousarray(array)
+        scratch = path.with_suffix(".scratch")
+        hdus.writeto(scratch, overwrite=True, output_verify="ignore")
+    shutil.move(scratch, path)
+
+
+def change_json(path: Path, change: tuple[Any, ...]) -> None:
+    """Apply :func:`item_changes` to a JSON file."""
+    kind, fraction, value, _, number = change
+    tree = json.loads(path.read_text())
+    node: Any = tree
+    for _ in range(number % 3):
+        children = list(node.values()) if isinstance(node, dict) else list(node)
+        inner = [child for child in children if isinstance(child, dict | list) and child]
+        if not inner:
+            break
+        node = inner[int(fraction * (len(inner) - 1))]
+    keys = list(node) if isinstance(node, dict) else list(range(len(node)))
+    if not keys:
+        return
+    key = keys[int(fraction * (len(keys) - 1))]
+    if kind == "delete":
+        del node[key]
+    elif kind == "shape":
+        node[key] = [node[key]]
+    else:
+        node[key] = value
+    path.write_text(json.dumps(tree))
+
+
+CHANGE = {
+    ".nc": change_hdf5, ".hdf5": change_hdf5, ".h5": change_hdf5, ".fits": change_fits,
+    ".json": change_json,
+}  # fmt: skip
+
+
+def change_items(path: Path, change: tuple[Any, ...]) -> None:
+    """Apply :func:`item_changes`, to whatever the file is."""
+    CHANGE[path.suffix](path, change)

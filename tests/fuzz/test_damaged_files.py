@@ -1,0 +1,138 @@
+"""Every file, damaged in every way, is read or refused in a sentence: no traceback, no hang."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from astropy.io import fits
+from changes import byte_changes, change_bytes, change_items, item_changes
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from outcomes import require_answer
+
+import lusee_bayes as lb
+from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.instrument.beams import read_beam
+from lusee_bayes.instrument.visibilities import read_visibilities
+from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
+from lusee_bayes.linear.compact import read_compact
+from lusee_bayes.report.describe import describe
+from lusee_bayes.sky import write_alms
+from lusee_bayes.testing import small_scenario
+
+FEW, MANY = 12, 1500
+
+
+def read_sky(path: Path) -> object:
+    overrides = ["lmax=2", f"sky={{model: file, file: '{path}'}}"]
+    return load_scenario("fiducial", overrides).sky.source().at(25.0, 2)
+
+
+def read_any_data(path: Path) -> object:
+    return read_data(path, small_scenario(lmax=2))
+
+
+READERS = {
+    "visibilities.nc": (describe, read_visibilities),
+    "waterfall.fits": (describe, read_waterfall, read_any_data),
+    "four_port.fits": (describe, read_waterfall),
+    "scalar_beam.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
+    "response.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
+    "posterior.nc": (describe,),
+    "updatable.nc": (describe,),
+    "cube.nc": (describe,),
+    "diagnostics.nc": (describe,),
+    "compact.npz": (describe, read_compact),
+    "map.fits": (describe, read_sky),
+    "cube.fits": (describe, read_sky),
+    "alm.fits": (describe, read_sky),
+    "alms.npz": (describe, read_sky),
+    "sky.hdf5": (describe, read_sky),
+}
+
+LUSEEPYS = {
+    "scalar_beam.fits": "synthetic_monopole_beam.fits",
+    "response.fits": "synthetic_response_v3.fits",
+    "four_port.fits": "four_port_covariance.fits",
+}
+
+
+@pytest.fixture(scope="session")
+def files(tmp_path_factory, small_map, small_cube) -> Path:
+    """A file of every kind."""
+    folder = tmp_path_factory.mktemp("files")
+    experiment = build(small_scenario(lmax=2))
+    experiment.data.write(folder / "visibilities.nc")
+    channels = [replace(experiment.data, frequency_mhz=f) for f in (20.0, 25.0)]
+    write_waterfall(folder / "waterfall.fits", channels, np.array([1 + 1j, 1 + 2j]), "")
+    updatable = ["output={updatable: true, compact: true}"]
+    run = lb.run_map(small_scenario(*updatable, lmax=2), folder / "run")
+    shutil.copy(run.folder / "posterior.nc", folder / "updatable.nc")
+    shutil.copy(run.folder / "posterior_compact.npz", folder / "compact.npz")
+    for name in ("posterior.nc", "diagnostics.nc"):
+        shutil.copy(small_map.folder / name, folder / name)
+    shutil.copy(small_map.folder / "mean.fits", folder / "map.fits")
+    shutil.copy(small_cube.folder / "posterior.nc", folder / "cube.nc")
+    shutil.copy(small_cube.folder / "mean.fits", folder / "cube.fits")
+    write_alms(folder / "alm.fits", np.arange(1.0, 10.0), {"FREQ": 25.0})
+    alm = np.ones((2, 6), dtype=complex)
+    np.savez(folder / "alms.npz", freq=np.array([20.0, 25.0]), alm=alm)
+    with h5py.File(folder / "sky.hdf5", "w") as file:
+        file["smooth_absorb"] = np.linspace(1.0, 2.0, 192)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def luseepys(tmp_path_factory, test_data) -> Path:
+    """luseepy's own files, fewer channels of them."""
+    folder = tmp_path_factory.mktemp("luseepys")
+    for name, source in LUSEEPYS.items():
+        with fits.open(test_data / "luseepy" / source) as opened:
+            hdus = fits.HDUList([hdu.copy() for hdu in opened])
+            for hdu in hdus:
+                if source == "synthetic_monopole_beam.fits" and hdu.shape[:1] == (50,):
+                    hdu.data = hdu.data[8:12]
+            if source == "synthetic_monopole_beam.fits":
+                hdus[0].header.update({"FREQ_MIN": 9.0, "FREQ_MAX": 12.0, "FREQ_N": 4})
+            hdus.writeto(folder / name)
+    return folder
+
+
+@pytest.mark.parametrize("n", [FEW, pytest.param(MANY, marks=pytest.mark.long)])
+@pytest.mark.parametrize("name", READERS)
+def test_damaged_files(name, n, tmp_path, request):
+    folder = request.getfixturevalue("luseepys" if name in LUSEEPYS else "files")
+    source, target = folder / name, tmp_path / name
+
+    for reader in READERS[name]:
+        reader(source)  # as it is, it is read
+
+    def read(change, apply):
+        shutil.copy(source, target)
+        for one in change:
+            apply(target, one)
+        before = sorted(tmp_path.iterdir())
+        for reader in READERS[name]:
+            require_answer(f"damaged {name}", lambda reader=reader: reader(target))
+        assert sorted(tmp_path.iterdir()) == before
+
+    @settings(max_examples=n)
+    @given(st.lists(byte_changes(), min_size=1, max_size=3))
+    def damaged_bytes(change):
+        read(change, change_bytes)
+
+    @settings(max_examples=n)
+    @given(st.lists(item_changes(), min_size=1, max_size=2))
+    def damaged_items(change):
+        read(change, change_items)
+
+    damaged_bytes()
+    if source.suffix != ".npz":
+        damaged_items()
