@@ -7,6 +7,8 @@ sentence on standard error), 130 interrupted.
 from __future__ import annotations
 
 import gc
+import os
+import sys
 
 from cyclopts import App, CycloptsError
 from rich.console import Console
@@ -55,6 +57,16 @@ def main(arguments: list[str] | None = None) -> int:
     except CycloptsError as error:
         errors.print(f"lusee-bayes: {' '.join(str(error).split())}", markup=False)
         return 2
+    except BrokenPipeError:
+        # whoever was to read the output has gone: head has its lines
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        if error.errno is None:
+            raise
+        at = f" ('{error.filename}')" if error.filename else ""
+        errors.print(f"lusee-bayes: {error.strerror}{at}; results are whole or as they were")
+        return 1
     except ProcessLost as error:
         errors.print(f"lusee-bayes: {error}", markup=False)
         return 1

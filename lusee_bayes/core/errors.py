@@ -5,9 +5,23 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+# characters of a message, which quotes what was given
+LONGEST = 1000
+
 
 class InputError(ValueError):
-    """Input that cannot be used. The message says what is wrong, where, and what to do."""
+    """Input that cannot be used. The message says what is wrong, where, and what to do.
+
+    It is one line, whatever it quotes: characters that cannot be printed are shown by their
+    escapes, and the middle of a long one is left out.
+    """
+
+    def __init__(self, message: object):
+        words = " ".join(str(message).split())
+        text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in words)
+        if len(text) > LONGEST:
+            text = f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
+        super().__init__(text)
 
 
 class ProcessLost(RuntimeError):

@@ -179,6 +179,8 @@ def read_manifest(folder: Path) -> dict | None:
     try:
         manifest = json.loads(path.read_text())
         found = {name: manifest[name] for name in ("kind", "files", "discard")}
+        if not isinstance(found["kind"], str):
+            raise TypeError("the kind of the run is no text")
         if not all(map(_is_inside, (*found["files"], *found["discard"]))):
             raise TypeError("names of files in the folder are expected")
         origin = manifest.get("origin", {})

@@ -24,6 +24,6 @@ def memory_limit() -> int:
     return min(limits)
 
 
-def gigabytes(n: float) -> str:
+def gigabytes(n: float | int) -> str:
     """Format a number of bytes: 1.2 GB."""
     return f"{n / 1e9:.2g} GB" if n < 1e11 else f"{n / 1e9:,.0f} GB"

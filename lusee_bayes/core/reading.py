@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import stat
 import warnings
 from collections.abc import Iterator
@@ -51,6 +52,8 @@ def require_file(path: str | Path, what: str, hint: str = "") -> Path:
     if not stat.S_ISREG(mode):
         kind = "a folder" if stat.S_ISDIR(mode) else "neither a file nor a folder"
         raise InputError(f"'{path}' is {kind}; give a file: {what}")
+    if not os.access(path, os.R_OK):
+        raise InputError(f"'{path}' may not be read by this user; change its permissions")
     return path
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import is_fits
+from lusee_bayes.core.reading import require_file
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities
 from lusee_bayes.instrument.waterfalls import Waterfall, read_waterfall
@@ -30,7 +31,8 @@ def read_data(path: Path, scenario: Scenario) -> Visibilities:
     InputError
         If the file cannot be used, or a waterfall does not fit the scenario's beams.
     """
-    if not (path.is_file() and is_fits(path)):
+    require_file(path, "data", "make some with: lusee-bayes simulate SCENARIO")
+    if not is_fits(path):
         return read_visibilities(path)
     waterfall = read_waterfall(path)
     data = waterfall.at(scenario.frequency_mhz, scenario.beam.n_ports)

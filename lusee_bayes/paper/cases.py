@@ -14,6 +14,7 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.netcdf_files import says
+from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.version import __version__, versions
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.inference import infer
@@ -79,8 +80,7 @@ def sky_frequency_mhz(path: str | Path) -> float:
 
     InputError if the file is missing or its name does not tell.
     """
-    if not Path(path).is_file():
-        raise InputError(f"no sky map at '{path}'")
+    path = require_file(path, "sky map")
     found = re.search(r"exp(\d+(?:\.\d+)?)MHz", Path(path).name)
     if found is None or float(found[1]) == 0.0:
         raise InputError(

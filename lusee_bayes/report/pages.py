@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -32,6 +33,8 @@ def write_report(folder: str | Path) -> Path:
         If the folder does not hold the results of ``map``, ``sample`` or ``validate``.
     """
     folder = Path(folder)
+    if not os.path.isdir(folder):
+        raise InputError(f"'{folder}' is no folder; give the folder of a finished run")
     recover(folder)
     kind = _kind(folder)
     if kind not in PAGES:

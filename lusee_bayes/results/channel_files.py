@@ -13,9 +13,9 @@ from pathlib import Path
 
 import xarray as xr
 
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.netcdf_files import says
+from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.scenario import Scenario
 
@@ -66,7 +66,6 @@ def identity_of(scenario: Scenario, data: Path | None, truth: bool, n_draws: int
     """
     parts = [scenario.to_yaml(), str(truth), str(n_draws), __version__]
     if data is not None:
-        if not data.is_file():
-            raise InputError(f"no data at '{data}'; make some with: lusee-bayes simulate SCENARIO")
+        require_file(data, "data", "make some with: lusee-bayes simulate SCENARIO")
         parts.append(hashlib.sha256(data.read_bytes()).hexdigest())
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()

@@ -20,6 +20,7 @@ from numpyro import handlers
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.reading import read_text, require_file
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.sampling.promotion import numpyro_promotion
 
@@ -114,7 +115,7 @@ def load_program(source: str | Path) -> Program:
         If there is none, if it cannot be run, or if it asks for something unknown.
     """
     path = _find(source)
-    text = path.read_bytes()
+    text = read_text(path, "a program in Python").encode()
     module = ModuleType(f"lusee_bayes_program_{path.stem}")
     module.__file__ = str(path)
     # compiled from the text that is hashed, never from a cache of an earlier one; dataclasses look
@@ -158,8 +159,9 @@ def _find(source: str | Path) -> Path:
     if str(source) in program_names():
         return next(f / f"{source}.py" for f in FOLDERS if (f / f"{source}.py").exists())
     path = Path(source)
-    if path.suffix == ".py" and path.is_file():
-        return path
+    if path.suffix == ".py":
+        own = f"the package has {', '.join(program_names())}"
+        return require_file(path, "program", own)
     raise InputError(
         f"no program '{source}': give the path of a Python file, or one of "
         f"{', '.join(program_names())}"

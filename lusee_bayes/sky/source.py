@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import map_to_modes
+from lusee_bayes.core.reading import require_file
 from lusee_bayes.sky.alms import SkyAlms
 from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES, PointSource
 from lusee_bayes.sky.cubes import SkyCube
@@ -120,9 +121,7 @@ def read_sky_file(path: str | Path, dataset: str | None = None) -> SkyFile:
     InputError
         If there is no such file, if no reader recognises it, or if it cannot be used.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"no sky map at '{path}'; check sky.file")
+    path = require_file(path, "sky map", "check sky.file")
     for reader in SKY_READERS:
         if reader.recognises(path):
             return reader.read(path, dataset)

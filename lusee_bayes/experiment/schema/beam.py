@@ -189,7 +189,7 @@ def _one_kind(value: Any) -> Any:
     tree["model"] = tree.get("model") or default
     file = tree.get("file")
     if tree["model"] == default and file is not None:
-        tree["model"] = "response" if is_response(file) else "luseepy"
+        tree["model"] = "response" if isinstance(file, str) and is_response(file) else "luseepy"
     temperatures = ("moon_temperature_k", "antenna_temperature_k")
     if tree["model"] == default and any(tree.get(name) for name in temperatures):
         raise ValueError(

@@ -76,7 +76,7 @@ def without_other_kinds(
     ValueError
         For such a key, where ``strict``.
     """
-    own = kinds.get(tree["model"])
+    own = kinds.get(tree["model"]) if isinstance(tree["model"], str) else None
     if own is None:
         return tree
     kept = {}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import image_names, is_fits
+from lusee_bayes.core.reading import require_file
 from lusee_bayes.instrument.beams.response_file import PortResponse, read_response
 from lusee_bayes.instrument.beams.scalar_file import ScalarBeam, read_scalar_beam
 
@@ -26,14 +27,15 @@ def read_beam(path: str | Path) -> ScalarBeam | PortResponse:
     InputError
         If there is no file, or as :func:`read_scalar_beam` and :func:`read_response`.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"no beam file at '{path}'; check beam.file")
+    path = require_file(path, "beam file", "check beam.file")
     names = set(image_names(path))
     return read_response(path) if "h_theta_real" in names else read_scalar_beam(path)
 
 
 def is_response(path: str | Path) -> bool:
     """Whether there is a four-port response of luseepy at a path."""
-    path = Path(path)
-    return path.is_file() and is_fits(path) and "h_theta_real" in image_names(path)
+    try:
+        path = require_file(path, "beam file")
+    except InputError:
+        return False
+    return is_fits(path) and "h_theta_real" in image_names(path)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import image_names
+from lusee_bayes.core.reading import require_file
 from lusee_bayes.instrument.waterfalls.four_port import read_four_port
 from lusee_bayes.instrument.waterfalls.scalar import read_scalar
 from lusee_bayes.instrument.waterfalls.waterfall import Waterfall
@@ -27,8 +27,6 @@ def read_waterfall(path: str | Path) -> Waterfall:
     InputError
         If there is no file, or as :func:`read_scalar` and :func:`read_four_port`.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"no data at '{path}'")
+    path = require_file(path, "data")
     names = set(image_names(path))
     return read_four_port(path) if "blackbody_normalization_real" in names else read_scalar(path)

@@ -1,0 +1,131 @@
+"""Scenarios of any content are taken or refused in a sentence, and come back as they were."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, get_args
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from outcomes import require_answer
+from pydantic import BaseModel
+
+from lusee_bayes.cli.options import parse_frequencies
+from lusee_bayes.cli.plan_variations import own_variations
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
+from lusee_bayes.results.cost import posterior_cost, require_fits
+
+FEW, MANY = 150, 20_000
+
+NUMBERS = st.one_of(
+    st.integers(), st.floats(), st.integers(-3, 60), st.floats(0.0, 50.0),
+    st.sampled_from([10**400, -(10**400), 2**63, 2**62, 1e308, 5e-324, -0.0]),
+)  # fmt: skip
+WORDS = st.sampled_from([
+    "", "galaxy", "file", "monopole", "response", "marginalised", "sampled", "exact", "isotropic",
+    "2027-13-01", "2027-02-30", "2027-01-15", "0001-01-01", "9999-12-31T23:59:60", "/dev/null",
+    "\uff11\uff12", "\u0661\u0662", "1e5", "0x10", "1:30", "null", "~", "a" * 300, "../x", "x\0y",
+    "\u00e9", "!!python/x",
+])  # fmt: skip
+LEAVES = st.one_of(NUMBERS, WORDS, st.booleans(), st.none(), st.text(max_size=8))
+VALUES = st.recursive(
+    LEAVES,
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=6), inner, max_size=3)
+    ),
+    max_leaves=6,
+)
+
+
+def paths(model: type[BaseModel], parents: str = "") -> list[str]:
+    """Every key that a scenario may have."""
+    found = []
+    for name, field in model.model_fields.items():
+        found.append(f"{parents}{name}")
+        for section in sections(field.annotation):
+            found += paths(section, f"{parents}{name}.")
+    return sorted(set(found))
+
+
+def sections(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [found for part in get_args(annotation) for found in sections(part)]
+
+
+PATHS = paths(Scenario)
+
+
+def load(overrides: list[str]) -> None:
+    scenario = load_scenario("fiducial", overrides)
+    # what is taken can be written and read again, and is small enough or refused
+    assert load_scenario_text(scenario.to_yaml()) == scenario
+    require_fits(posterior_cost(scenario), scenario)
+
+
+def load_scenario_text(text: str) -> Scenario:
+    from lusee_bayes.core.yaml_files import parse_yaml
+
+    return Scenario.model_validate(parse_yaml(text, "the resolved scenario"))
+
+
+@pytest.mark.parametrize("n", [FEW, pytest.param(MANY, marks=pytest.mark.long)])
+def test_every_entry_with_any_value(n):
+    @settings(max_examples=n)
+    @given(st.lists(st.tuples(st.sampled_from(PATHS), VALUES), min_size=1, max_size=3))
+    def check(entries):
+        # YAML takes JSON, and what JSON does not have (NaN, Infinity) as text
+        overrides = [f"{path}={json.dumps(value)}" for path, value in entries]
+        require_answer("scenario entries", lambda: load(overrides))
+
+    check()
+
+
+@pytest.mark.parametrize("n", [FEW, pytest.param(MANY, marks=pytest.mark.long)])
+def test_any_text_as_an_override(n):
+    @settings(max_examples=n)
+    @given(st.one_of(st.text(), st.builds("{}={}".format, st.sampled_from(PATHS), st.text())))
+    def check(override):
+        require_answer("overrides", lambda: load([override]))
+        require_answer("variations", lambda: own_variations("fiducial", [override], []))
+
+    check()
+
+
+@pytest.mark.parametrize("n", [FEW, pytest.param(MANY, marks=pytest.mark.long)])
+def test_any_file_as_a_scenario(n, tmp_path):
+    path = tmp_path / "scenario.yaml"
+    whole = load_scenario("gain_1e-2").to_yaml().encode()
+
+    @settings(max_examples=n)
+    @given(
+        st.one_of(
+            st.binary(max_size=60),
+            st.text(alphabet="{}[]:,-&*!|>'\"#%@ \n\tab01~", max_size=60).map(str.encode),
+            st.tuples(st.integers(0, len(whole)), st.binary(max_size=4)).map(
+                lambda cut: whole[: cut[0]] + cut[1] + whole[cut[0] :]
+            ),
+            st.integers(1, 3000).map(lambda depth: b"[" * depth),
+        )
+    )
+    def check(content):
+        path.write_bytes(content)
+        require_answer("scenario files", lambda: load_scenario(path))
+
+    check()
+
+
+@pytest.mark.parametrize("n", [FEW, pytest.param(MANY, marks=pytest.mark.long)])
+def test_any_frequencies(n):
+    parts = st.one_of(
+        st.floats().map(str), st.text(max_size=4), st.sampled_from(["1e-9", "50", "1"])
+    )
+
+    @settings(max_examples=n)
+    @given(st.tuples(st.lists(parts, min_size=1, max_size=4), st.sampled_from(",:")))
+    def check(drawn):
+        text = drawn[1].join(drawn[0])
+        require_answer("frequencies", lambda: parse_frequencies(text))
+
+    check()
