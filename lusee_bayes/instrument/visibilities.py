@@ -19,6 +19,7 @@ from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.netcdf_files import read_netcdf
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
+from lusee_bayes.instrument.beams.receiver import MeasuredReceiver
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation, utc_of
 from lusee_bayes.instrument.products import labels
@@ -60,6 +61,8 @@ class Visibilities:
     frequency_mhz : float
     truth : (modes,) array or None
         The sky of simulated data in K, Galactic; None for real data.
+    receiver : MeasuredReceiver or None
+        The loads through which they were taken, for data of luseepy's four ports.
 
     Raises
     ------
@@ -72,6 +75,7 @@ class Visibilities:
     observation: Observation
     frequency_mhz: float
     truth: Float[Array, " modes"] | None = None
+    receiver: MeasuredReceiver | None = None
 
     def __post_init__(self):
         require_float64("the data", self.data)
