@@ -1,7 +1,7 @@
 """Waterfalls of luseepy's scalar simulator: visibilities in K.
 
 FITS: image ``data`` (time, product, frequency), ``freq`` in MHz, ``combinations`` (pairs of ports;
-an auto has one column, a cross two, Re and Im). Header: LUNAR_DAY (start and end, UTC), DELTAT_SEC,
+an auto has one column, a cross two, Re and Im). Header: LUNAR_DAY (:mod:`.time_range`), DELTAT_SEC,
 LUN_LAT_DEG, LUN_LONG_DEG; times are start + k DELTAT_SEC. Impedances of the ports in Ohm, ZRe_i and
 ZIm_i, are there for luseepy's conversion to V^2/Hz.
 """
@@ -28,10 +28,10 @@ from lusee_bayes.instrument.observation import (
     Observation,
     require_ephemeris,
     unannounced_leap_seconds,
-    utc_from_text,
 )
 from lusee_bayes.instrument.products import N_ANTENNAS, Product, all_products
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.instrument.waterfalls.time_range import start_of
 from lusee_bayes.instrument.waterfalls.waterfall import SITE_AND_STEP, Waterfall
 
 LAYOUT = Layout(
@@ -42,7 +42,7 @@ LAYOUT = Layout(
         "data": Variable(("time", "product", "freq"), missing=True),
         "combinations": Variable(("pair", 2), "integer", low=0.0, high=N_ANTENNAS - 1.0),
     },
-    {"LUNAR_DAY": Attribute("text"), **SITE_AND_STEP},
+    {"LUNAR_DAY": Attribute("word"), **SITE_AND_STEP},
 )
 
 
@@ -93,9 +93,8 @@ def _columns(path: Path, combinations: Int[np.ndarray, "pairs 2"]) -> list[tuple
 
 
 def _observation(path: Path, said: dict[str, Any], n_times: int) -> Observation:
-    start = said["LUNAR_DAY"].split(" to ")[0]
     with naming(path):
-        first = utc_from_text("LUNAR_DAY", start)
+        first = start_of(said["LUNAR_DAY"])
         require_ephemeris(first.jd + np.array([(n_times - 1) * said["DELTAT_SEC"] / 86400.0]))
         with unannounced_leap_seconds():
             times = first + said["DELTAT_SEC"] * np.arange(n_times) * u.s
