@@ -47,8 +47,8 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     """InputError unless data in V^2/Hz are those of these antennas, receivers and temperatures."""
     section, frequency = scenario.beam, scenario.frequency_mhz
     source = section.source().behind(waterfall.receiver)
-    ours = source.per_kelvin(frequency)
-    if ours is None:
+    circuit = source.circuit(frequency)
+    if circuit is None:
         raise InputError(
             f"{waterfall.path} is in V^2/Hz, at the receivers' inputs of a four-port instrument; "
             "give its response as beam.file"
@@ -66,6 +66,7 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
             f"'{said}' of it, and beam.interpolation is {rule}; {what_to_do}"
         )
     theirs = waterfall.per_kelvin[waterfall.channel(frequency)]
+    ours = circuit.per_kelvin.diagonal().real
     port = int(np.argmax(np.abs(theirs / ours - 1.0)))
     if abs(theirs[port] / ours[port] - 1.0) > SAME_SCALE:
         own_loads = waterfall.receiver is not None

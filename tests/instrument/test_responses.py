@@ -28,7 +28,7 @@ from lusee_bayes.instrument.beams import (
     read_beam,
     read_receiver,
 )
-from lusee_bayes.instrument.beams.receiver import loading_matrix
+from lusee_bayes.instrument.beams.circuit import loading_matrix
 from lusee_bayes.instrument.products import labels, to_matrix
 from lusee_bayes.instrument.waterfalls import read_waterfall
 from lusee_bayes.testing import small_scenario
@@ -62,7 +62,7 @@ def test_loads_and_scales_are_luseepys(luseepy, channel):
     response, _, images = luseepy
     f = FREQUENCIES[channel]
     np.testing.assert_allclose(JFETReceiver().load(f), matrix(images, "zl", channel), rtol=1e-13)
-    loading = response.loading(f)
+    loading = response.circuit(f).loading
     np.testing.assert_allclose(loading, matrix(images, "m", channel), rtol=0, atol=1e-14)
     enclosure = matrix(images, "blackbody_normalization", channel).diagonal().real
     np.testing.assert_allclose(response.per_kelvin(f), enclosure, rtol=1e-13)
@@ -203,7 +203,7 @@ def test_volts_of_short_dipoles(tmp_path):
     open_ = Boltzmann * VACUUM / wavelength**2 * 1.09 * 4 * np.pi / 3 * arms.T @ arms
     za, zl = response.impedance[1], JFETReceiver().load(f)
     m = zl @ np.linalg.inv(za + zl)
-    np.testing.assert_allclose(response.loading(f), m, rtol=1e-12)
+    np.testing.assert_allclose(response.circuit(f).loading, m, rtol=1e-12)
     expected = m @ open_ @ m.conj().T
     beams = response.beams(f, 2, unit="V2/Hz")
     got = np.asarray(to_matrix(beams.modes))[..., 0] * np.sqrt(4 * np.pi)
@@ -300,7 +300,7 @@ def test_receivers(tmp_path):
         measured.load(31.0)
     response = replace(read_beam(write(tmp_path / "response.fits")), receiver=measured)
     za = 0.95 * response.impedance[1] + 0.05 * response.impedance[2]
-    np.testing.assert_allclose(response.loading(21.0), zl @ np.linalg.inv(za + zl), rtol=1e-12)
+    np.testing.assert_allclose(response.circuit(21.0).loading, zl @ np.linalg.inv(za + zl), rtol=1e-12)
 
 
 def test_losses_emit_at_the_antennas_temperature(tmp_path):
@@ -310,7 +310,7 @@ def test_losses_emit_at_the_antennas_temperature(tmp_path):
             images["ZA"] = images["ZA"] + images["Rloss"]
 
     response = read_beam(write(tmp_path / "response.fits", change=lossy))
-    m = response.loading(20.0)
+    m = response.circuit(20.0).loading
     expected = 4 * Boltzmann * 300.0 * 0.5 * m @ m.conj().T
     got = np.asarray(to_matrix(response.background(20.0, 0.0, 300.0, unit="V2/Hz")[:, None]))
     np.testing.assert_allclose(got[..., 0], expected, rtol=0, atol=1e-9 * np.abs(expected).max())

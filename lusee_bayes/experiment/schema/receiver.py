@@ -40,7 +40,7 @@ class JFETSection(Section):
     parallel_ohm: _ports(Positive) = _JFET.parallel_ohm
     series_ohm: _ports(NotNegative) = _JFET.series_ohm
     skin_ohm: _ports(NotNegative) = _JFET.skin_ohm
-    skin_power: _ports(float) = _JFET.skin_power
+    skin_power: _ports(Annotated[float, Field(ge=-10, le=10)]) = _JFET.skin_power
 
     def receiver(self) -> Receiver | None:
         """The receiver, or None for open ports."""
