@@ -11,13 +11,12 @@ from lusee_bayes.core.fits_files import is_fits
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities
 from lusee_bayes.instrument.waterfalls import Waterfall, read_waterfall
+from lusee_bayes.instrument.waterfalls.four_port import INTERPOLATIONS
 
 # beams and data hold the impedances with 24 bits
 SAME_SCALE = 1e-5
 # relative; a header holds 15 digits of a temperature
 SAME_TEMPERATURE = 1e-12
-# FREQINT of a waterfall, and what it is called here
-RULES = {"linear-native-alm": "linear", "cubic-spline": "spline"}
 
 
 def read_data(path: Path, scenario: Scenario) -> Visibilities:
@@ -54,16 +53,16 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
             "give its response as beam.file"
         )
     rule, said = source.interpolated(frequency), waterfall.interpolation
-    if rule is not None and said is not None and RULES.get(said) != rule:
-        known = RULES.get(said)
+    if rule is not None and said is not None and said != INTERPOLATIONS[rule]:
+        known = [name for name, word in INTERPOLATIONS.items() if word == said]
         what_to_do = (
-            f"use --set beam.interpolation={known}"
+            f"use --set beam.interpolation={known[0]}"
             if known
-            else f"expected one of {', '.join(RULES)}, or a response with that frequency"
+            else f"expected one of {', '.join(INTERPOLATIONS.values())}, or a response that has it"
         )
         raise InputError(
-            f"{section.file} has no frequency {frequency:.15g} MHz, {waterfall.path} says FREQINT = "
-            f"'{said}' of it, and beam.interpolation is {rule}; {what_to_do}"
+            f"{section.file} does not have the frequency {frequency:.15g} MHz; {waterfall.path} "
+            f"has it by FREQINT = '{said}', the scenario by beam.interpolation={rule}; {what_to_do}"
         )
     theirs = waterfall.per_kelvin[waterfall.channel(frequency)]
     ours = circuit.per_kelvin.diagonal().real
@@ -81,8 +80,8 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     ):
         if not np.isclose(theirs_k, ours_k, rtol=SAME_TEMPERATURE, atol=0.0):
             raise InputError(
-                f"{waterfall.path} holds the emission of {theirs_k:.15g} K, the scenario's {name} is "
-                f"{ours_k:.15g}; use --set beam.{name}={theirs_k:.15g}"
+                f"{waterfall.path} holds the emission of {theirs_k:.15g} K, the scenario's {name} "
+                f"is {ours_k:.15g}; use --set beam.{name}={theirs_k:.15g}"
             )
 
 

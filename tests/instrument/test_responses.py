@@ -300,7 +300,9 @@ def test_receivers(tmp_path):
         measured.load(31.0)
     response = replace(read_beam(write(tmp_path / "response.fits")), receiver=measured)
     za = 0.95 * response.impedance[1] + 0.05 * response.impedance[2]
-    np.testing.assert_allclose(response.circuit(21.0).loading, zl @ np.linalg.inv(za + zl), rtol=1e-12)
+    np.testing.assert_allclose(
+        response.circuit(21.0).loading, zl @ np.linalg.inv(za + zl), rtol=1e-12
+    )
 
 
 def test_losses_emit_at_the_antennas_temperature(tmp_path):

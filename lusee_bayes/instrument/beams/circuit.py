@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Complex
 from scipy.constants import Boltzmann
 
+from lusee_bayes.instrument.beams.receiver import Receiver
+
 
 @dataclass(frozen=True)
 class Circuit:
@@ -19,18 +21,25 @@ class Circuit:
 
     Attributes
     ----------
+    frequency_mhz : float
     antenna_ohm : (ports, ports) complex array
         ZA.
     moon_ohm, loss_ohm : (ports, ports) complex array
         Resistive parts of ZA: radiation into the Moon, losses in the antennas.
-    load_ohm : (ports, ports) complex array or None
-        ZL; None for open ports.
+    receiver : Receiver or None
+        None for open ports.
     """
 
+    frequency_mhz: float
     antenna_ohm: Complex[np.ndarray, "ports ports"]
     moon_ohm: Complex[np.ndarray, "ports ports"]
     loss_ohm: Complex[np.ndarray, "ports ports"]
-    load_ohm: Complex[np.ndarray, "ports ports"] | None
+    receiver: Receiver | None
+
+    @property
+    def load_ohm(self) -> Complex[np.ndarray, "ports ports"] | None:
+        """ZL; None for open ports."""
+        return None if self.receiver is None else self.receiver.load(self.frequency_mhz)
 
     @property
     def resistance_ohm(self) -> Complex[np.ndarray, "ports ports"]:
@@ -62,4 +71,3 @@ def loading_matrix(
     if load_ohm is None:
         return np.eye(len(antenna_ohm), dtype=complex)
     return np.linalg.solve((antenna_ohm + load_ohm).T, load_ohm.T).T
-

@@ -113,8 +113,7 @@ class PortResponse:
     def circuit(self, frequency_mhz: float) -> Circuit:
         """Return antennas and receivers. InputError outside the frequencies of the file."""
         parts = (self.impedance, self.moon_resistance, self.loss_resistance)
-        load = None if self.receiver is None else self.receiver.load(frequency_mhz)
-        return Circuit(*self._at(frequency_mhz, *parts), load)
+        return Circuit(frequency_mhz, *self._at(frequency_mhz, *parts), self.receiver)
 
     def per_kelvin(self, frequency_mhz: float) -> Float[np.ndarray, " ports"]:
         """Return U_aa, the V^2/Hz that an enclosure of 1 K makes at each receiver's input."""

@@ -4,7 +4,8 @@ FITS version 3: image ``data`` (time, product, frequency); ``freq`` in MHz; ``ti
 the scale TIMESYS; table ``products`` with a column ``label``; U (frequency, port, port), the
 covariance that an enclosure of 1 K makes, as ``blackbody_normalization``; the receivers' loads ZL
 (frequency, port, port) in Ohm. Header: LUN_LAT_DEG, LUN_LONG_DEG, DELTAT_SEC, TMOON_K, TANT_K and
-FREQINT, the interpolation of the response between its frequencies. Divided by sqrt(U_aa U_bb), visibilities are in K.
+FREQINT, the interpolation of the response between its frequencies. Divided by sqrt(U_aa U_bb),
+visibilities are in K.
 """
 
 from __future__ import annotations
@@ -21,12 +22,15 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import read_fits
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming
+from lusee_bayes.instrument.beams.gridded import Interpolation
 from lusee_bayes.instrument.beams.receiver import LOADS, MeasuredReceiver
 from lusee_bayes.instrument.observation import Observation, utc_of
 from lusee_bayes.instrument.products import N_ANTENNAS, all_products, labels
 from lusee_bayes.instrument.waterfalls.waterfall import SITE_AND_STEP, Waterfall
 
 UNIT = "V^2/Hz"
+# what FREQINT calls the interpolation of responses between their frequencies
+INTERPOLATIONS: dict[Interpolation, str] = {"linear": "linear-native-alm", "spline": "cubic-spline"}
 LAYOUT = Layout(
     "a waterfall of luseepy's four-port simulator",
     {

@@ -23,6 +23,7 @@ SITE_AND_STEP = {
     "DELTAT_SEC": Attribute(low=1e-6, high=1e9),
 }
 
+
 @dataclass(frozen=True)
 class Waterfall:
     """Visibilities of several frequencies.
