@@ -69,7 +69,7 @@ class Waterfall:
         if abs(known[nearest] - frequency_mhz) > SAME_FREQUENCY_MHZ:
             raise InputError(
                 f"{self.path} has no channel at {frequency_mhz:.15g} MHz (it has "
-                f"{', '.join(f'{f:.7g}' for f in known)}); use --set frequency_mhz="
+                f"{', '.join(f'{f:.9g}' for f in known)}); use --set frequency_mhz="
                 f"{known[nearest]:.15g}"
             )
         return nearest
