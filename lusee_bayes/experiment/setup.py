@@ -177,8 +177,8 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
     """InputError unless data are of the scenario's frequency and site."""
     if abs(data.frequency_mhz - scenario.frequency_mhz) > SAME_FREQUENCY_MHZ:
         raise InputError(
-            f"the data are at {data.frequency_mhz:.15g} MHz, the scenario at "
-            f"{scenario.frequency_mhz:.15g}; use --set frequency_mhz={data.frequency_mhz:.15g}"
+            f"the data are at {data.frequency_mhz} MHz, the scenario at "
+            f"{scenario.frequency_mhz}; use --set frequency_mhz={data.frequency_mhz}"
         )
     here, there = data.observation, scenario.observation
     east = (here.lon_deg - there.lon_deg + 180.0) % 360.0 - 180.0

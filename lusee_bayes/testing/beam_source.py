@@ -80,6 +80,7 @@ def check_beam_source(
 
     impedance = source.impedance(frequency_mhz)
     assert impedance is None or np.isfinite(impedance)
+    assert source.interpolated(frequency_mhz) in (None, "linear", "spline")
     circuit = source.circuit(frequency_mhz)
     assert circuit is None or (np.linalg.eigvalsh(circuit.per_kelvin) > 0.0).all()
 
