@@ -15,6 +15,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.instrument.beams import CapacitorReceiver, read_beam
+from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_four_port
 
 
@@ -138,6 +139,10 @@ def test_simulated_and_mapped_between_the_responses_frequencies(luseepy, tmp_pat
     sure = lb.load_scenario("fiducial", [*beam, f"frequency_mhz={f!r}", warm,
                                          f"beam.receiver={capacitor}"])  # fmt: skip
     np.testing.assert_allclose(data.grid(), build(sure).data.grid(), rtol=1e-14)
+    # and through the package's own files
+    own = read_visibilities(data.write(tmp_path / "own.nc"))
+    np.testing.assert_array_equal(own.receiver.load(f), data.receiver.load(f))
+    np.testing.assert_array_equal(build(scenario, own).setup.beams.modes, setup.beams.modes)
 
     # what hints say is accepted
     given = [*beam, "frequency_mhz=6.83333", "beam.moon_temperature_k=251.235"]
