@@ -22,6 +22,7 @@ from .instrument.pointing import Pointing as Pointing
 from .instrument.visibilities import Visibilities as Visibilities
 from .instrument.visibilities import read_visibilities as read_visibilities
 from .instrument.waterfalls import read_waterfall as read_waterfall
+from .instrument.waterfalls import write_four_port as write_four_port
 from .instrument.waterfalls import write_waterfall as write_waterfall
 from .linear.compact import CompactPosterior as CompactPosterior
 from .linear.compact import read_compact as read_compact

@@ -17,7 +17,7 @@ import numpy as np
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.memory import gigabytes, memory_limit
 
-Kind = Literal["real", "complex", "integer", "boolean", "text"]
+Kind = Literal["real", "complex", "integer", "boolean", "text", "word"]
 # numpy's kinds of dtypes that each takes, and what it becomes
 KINDS: dict[str, tuple[str, type]] = {
     "real": ("fiu", np.float64),
@@ -25,6 +25,7 @@ KINDS: dict[str, tuple[str, type]] = {
     "integer": ("iu", np.int64),
     "boolean": ("biu", np.bool_),
     "text": ("UST", np.str_),
+    "word": ("UST", np.str_),
 }
 NAMES = {
     "real": "real numbers",
@@ -32,6 +33,7 @@ NAMES = {
     "integer": "whole numbers",
     "boolean": "true or false",
     "text": "text",
+    "word": "text or a whole number",
 }
 
 
@@ -84,7 +86,8 @@ class Attribute:
 
     Attributes
     ----------
-    kind : {"real", "integer", "boolean", "text"}
+    kind : {"real", "integer", "boolean", "text", "word"}
+        A word is text, or a whole number that is read as text.
     low, high : float
         Its range, ends included.
     choices : sequence of str
@@ -258,7 +261,9 @@ def _require_none(where: str, values: np.ndarray, bad: np.ndarray, what: str) ->
 def _checked_value(where: str, value: Any, declared: Attribute) -> Any:
     if isinstance(value, np.ndarray | np.generic) and value.size == 1:
         value = value.reshape(()).item()
-    if declared.kind == "text":
+    if declared.kind == "word" and isinstance(value, int) and not isinstance(value, bool):
+        value = str(value)
+    if declared.kind in ("text", "word"):
         text = _text(where, value)
         _require_choice(where, text, declared.choices)
         return text

@@ -12,9 +12,12 @@ from lusee_bayes.core.reading import require_file
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities
 from lusee_bayes.instrument.waterfalls import Waterfall, read_waterfall
+from lusee_bayes.instrument.waterfalls.four_port import INTERPOLATIONS
 
 # beams and data hold the impedances with 24 bits
 SAME_SCALE = 1e-5
+# relative; a header holds 15 digits of a temperature
+SAME_TEMPERATURE = 1e-12
 
 
 def read_data(path: Path, scenario: Scenario) -> Visibilities:
@@ -43,27 +46,51 @@ def read_data(path: Path, scenario: Scenario) -> Visibilities:
 
 def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     """InputError unless data in V^2/Hz are those of these antennas, receivers and temperatures."""
-    section = scenario.beam
-    ours = section.source().per_kelvin(scenario.frequency_mhz)
-    if ours is None:
+    section, frequency = scenario.beam, scenario.frequency_mhz
+    source = section.source().behind(waterfall.receiver)
+    circuit = source.circuit(frequency)
+    if circuit is None:
         raise InputError(
             f"{waterfall.path} is in V^2/Hz, at the receivers' inputs of a four-port instrument; "
             "give its response as beam.file"
         )
-    theirs = waterfall.per_kelvin[waterfall.channel(scenario.frequency_mhz)]
+    rule, said = source.interpolated(frequency), waterfall.interpolation
+    if rule is not None and said is not None and said != INTERPOLATIONS[rule]:
+        known = [name for name, word in INTERPOLATIONS.items() if word == said]
+        what_to_do = (
+            f"use --set beam.interpolation={known[0]}"
+            if known
+            else f"expected one of {', '.join(INTERPOLATIONS.values())}, or a response that has it"
+        )
+        raise InputError(
+            f"{section.file} does not have the frequency {frequency:.15g} MHz; {waterfall.path} "
+            f"has it by FREQINT = '{said}', the scenario by beam.interpolation={rule}; {what_to_do}"
+        )
+    theirs = waterfall.per_kelvin[waterfall.channel(frequency)]
+    ours = circuit.per_kelvin.diagonal().real
     port = int(np.argmax(np.abs(theirs / ours - 1.0)))
     if abs(theirs[port] / ours[port] - 1.0) > SAME_SCALE:
+        own_loads = waterfall.receiver is not None
         raise InputError(
             f"in {waterfall.path} 1 K is {theirs[port]:.6g} V^2/Hz at port {port}, with "
-            f"{section.file} and beam.receiver={section.receiver} it is {ours[port]:.6g}; "
-            "give the response and the receiver that the data were taken with"
+            f"{section.file} it is {ours[port]:.6g}; "
+            + _what_differs(own_loads, section.receiver is not None)
         )
     for name, theirs_k, ours_k in (
         ("moon_temperature_k", waterfall.moon_k, section.moon_temperature_k),
         ("antenna_temperature_k", waterfall.antenna_k, section.antenna_temperature_k),
     ):
-        if theirs_k != ours_k:
+        if not np.isclose(theirs_k, ours_k, rtol=SAME_TEMPERATURE, atol=0.0):
             raise InputError(
-                f"{waterfall.path} holds the emission of {theirs_k:g} K, the scenario's {name} is "
-                f"{ours_k:g}; use --set beam.{name}={theirs_k:g}"
+                f"{waterfall.path} holds the emission of {theirs_k:.15g} K, the scenario's {name} "
+                f"is {ours_k:.15g}; use --set beam.{name}={theirs_k:.15g}"
             )
+
+
+def _what_differs(own_loads: bool, said: bool) -> str:
+    """What may be wrong, and what to do: the data may hold the loads, the scenario may say them."""
+    if not own_loads:
+        return "give the response and the beam.receiver that the data were taken with"
+    if said:
+        return "leave out beam.receiver, so that the loads ZL in the data are used"
+    return "both are with the loads ZL in the data: give the response that they were taken with"

@@ -13,7 +13,8 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import SourceSection
-from lusee_bayes.instrument.beams import BeamSource, Monopoles, ProductBeams
+from lusee_bayes.instrument.beams import BeamSource, Monopoles, ProductBeams, Receiver
+from lusee_bayes.instrument.beams.gridded import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.ephemeris import BODIES, body_direction
 from lusee_bayes.instrument.instrument import Instrument
@@ -53,6 +54,8 @@ class Setup:
         Visibilities without any sky, in K.
     signal : (products, times) array
         Visibilities of sky, background and sources through the modelled beams, in K.
+    receiver : Receiver or None
+        The receivers that the data say; None for others.
     """
 
     scenario: Scenario
@@ -66,6 +69,7 @@ class Setup:
     responses: tuple[Float[Array, "products times"], ...]
     background: Float[Array, " products"]
     signal: Float[Array, "products times"]
+    receiver: Receiver | None = None
 
     @property
     def pointing(self) -> Pointing:
@@ -123,7 +127,8 @@ def set_up(
             observation = replace(data.observation, fixed_axis=fixed_axis)
         pointing = Pointing.of(observation, scenario.lmax)
     with stages("beams"):
-        source = scenario.beam.source()
+        receiver = None if data is None else data.receiver
+        source = scenario.beam.source().behind(receiver)
         beams = source.beams(scenario.frequency_mhz, scenario.lmax)
         background = source.background(scenario.frequency_mhz)
         # sources need the exact pattern, which only the embedded antennas have
@@ -159,6 +164,7 @@ def set_up(
         responses,
         background,
         signal,
+        receiver,
     )
 
 
@@ -169,7 +175,7 @@ def _antennas(scenario: Scenario, source: BeamSource) -> Monopoles:
 
 def require_fitting(data: Visibilities, scenario: Scenario) -> None:
     """InputError unless data are of the scenario's frequency and site."""
-    if not np.isclose(data.frequency_mhz, scenario.frequency_mhz, 1e-9):
+    if abs(data.frequency_mhz - scenario.frequency_mhz) > SAME_FREQUENCY_MHZ:
         raise InputError(
             f"the data are at {data.frequency_mhz} MHz, the scenario at "
             f"{scenario.frequency_mhz}; use --set frequency_mhz={data.frequency_mhz}"
@@ -180,7 +186,7 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
         raise InputError(
             f"the data were taken at longitude {here.lon_deg:g}, latitude {here.lat_deg:g} "
             f"degrees, the scenario's site is {there.lon_deg:g}, {there.lat_deg:g}; use --set "
-            f"observation.lon_deg={here.lon_deg:g} --set observation.lat_deg={here.lat_deg:g}"
+            f"observation.lon_deg={here.lon_deg:.15g} --set observation.lat_deg={here.lat_deg:.15g}"
         )
 
 

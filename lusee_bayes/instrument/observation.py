@@ -26,7 +26,7 @@ from lusee_bayes.core.checks import require_finite, require_positive
 from lusee_bayes.core.errors import InputError
 
 CYCLE_DAYS = 27.321661
-# period after which the sky repeats itself in luseepy's default engines
+# period after which the sky repeats itself in luseepy's engine croissant
 LUSEEPY_MONTH_HOURS = 655.72
 EPHEMERIS_YEARS = (1900, 2050)
 
@@ -67,8 +67,9 @@ class Observation:
     step_s : float
         Integration time of a sample in seconds.
     fixed_axis : bool
-        Turn the sky once in 655.72 hours about the axis of the first sample, as the default
-        engines of luseepy do. Wrong by several times the radiometer noise, but so are their data.
+        Turn the sky once in 655.72 hours about the axis of the first sample, as
+        luseepy's engine croissant does. Wrong by several times the radiometer noise, but so are
+        its data.
 
     Raises
     ------

@@ -80,8 +80,8 @@ def source_response(
     monopoles : Monopoles, optional
         By default the paper's antennas.
     stokes_v : float
-        V / I. Where it is positive, an observer who looks towards the source sees the electric
-        field turn clockwise (left-handed in the convention of the IAU).
+        V / I with the IAU's sign. Where it is positive, a receiver that looks towards the source
+        sees the electric field turn counter-clockwise (right-handed).
 
     Returns
     -------

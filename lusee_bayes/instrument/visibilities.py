@@ -19,10 +19,12 @@ from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.netcdf_files import read_netcdf
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
+from lusee_bayes.instrument.beams.receiver import MeasuredReceiver
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation, utc_of
 from lusee_bayes.instrument.products import labels
 
+LOADS = ("load_ohm_real", "load_ohm_imag")
 # what a file of visibilities holds
 LAYOUT = Layout(
     "visibilities",
@@ -35,6 +37,9 @@ LAYOUT = Layout(
         "run": Variable(("time",), "integer", low=0.0),
         "turntable_deg": Variable(("run_number",)),
         "truth": Variable(("mode",), optional=True),
+        # the receivers' loads ZL, where they are known
+        "load_frequency_mhz": Variable(("load_frequency",), low=0.0, grows=True, optional=True),
+        **{name: Variable(("load_frequency", "port", "port_2"), optional=True) for name in LOADS},
     },
     {
         "frequency_mhz": Attribute(low=0.0),
@@ -60,6 +65,8 @@ class Visibilities:
     frequency_mhz : float
     truth : (modes,) array or None
         The sky of simulated data in K, Galactic; None for real data.
+    receiver : MeasuredReceiver or None
+        The loads through which they were taken, for data of luseepy's four ports.
 
     Raises
     ------
@@ -72,6 +79,7 @@ class Visibilities:
     observation: Observation
     frequency_mhz: float
     truth: Float[Array, " modes"] | None = None
+    receiver: MeasuredReceiver | None = None
 
     def __post_init__(self):
         require_float64("the data", self.data)
@@ -116,6 +124,10 @@ class Visibilities:
         }
         if self.truth is not None:
             variables["truth"] = (("mode",), np.asarray(self.truth), {"units": "K"})
+        if self.receiver is not None:
+            dims, ohm = ("load_frequency", "port", "port_2"), self.receiver.load_ohm
+            variables["load_frequency_mhz"] = (dims[:1], self.receiver.frequencies_mhz)
+            variables |= {n: (dims, x) for n, x in zip(LOADS, (ohm.real, ohm.imag), strict=True)}
         # two parts keep the times exact; datetime64 is for the reader's eye
         variables["jd1"] = (("time",), observation.times.jd1, {"scale": "utc"})
         variables["jd2"] = (("time",), observation.times.jd2, {"scale": "utc"})
@@ -202,4 +214,13 @@ def read_visibilities(path: str | Path) -> Visibilities:
             observation,
             found.values["frequency_mhz"],
             here.get("truth"),
+            _receiver(path, here),
         )
+
+
+def _receiver(path: str | Path, here: dict[str, np.ndarray]) -> MeasuredReceiver | None:
+    names = ("load_frequency_mhz", *LOADS)
+    if not set(names) <= set(here):
+        return None
+    frequencies, real, imaginary = (here[name] for name in names)
+    return MeasuredReceiver(str(path), frequencies, real + 1j * imaginary)

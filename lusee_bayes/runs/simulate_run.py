@@ -10,10 +10,10 @@ import numpy as np
 from lusee_bayes.core.destinations import require_target
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.instrument.waterfalls import write_waterfall
+from lusee_bayes.instrument.waterfalls import write_four_port, write_waterfall
 from lusee_bayes.results.cost import require_fits, simulation_cost
 
 
@@ -67,11 +67,29 @@ def run_simulate(
     if path.suffix != ".fits":
         data[0].write(path, {"scenario": scenario.to_yaml()})
         return data
+    _write_waterfall(path, experiments, scenario)
+    return data
+
+
+def _write_waterfall(path: Path, experiments: Sequence[Experiment], scenario: Scenario) -> None:
+    """In luseepy's layout of four ports where the beams know volts, else in its scalar one."""
+    data = [experiment.data for experiment in experiments]
+    sources = [(e.setup.beam_source, e.scenario.frequency_mhz) for e in experiments]
+    circuits = [circuit for source, f in sources if (circuit := source.circuit(f)) is not None]
+    if circuits:
+        section = scenario.beam
+        write_four_port(
+            path,
+            data,
+            circuits,
+            moon_k=section.moon_temperature_k,
+            antenna_k=section.antenna_temperature_k,
+            interpolation=section.interpolation,
+            response=section.file,
+            scenario=scenario.to_yaml(),
+        )
+        return
     unknown = complex(np.nan, np.nan)
-    impedance = [
-        experiment.setup.beam_source.impedance(experiment.scenario.frequency_mhz)
-        for experiment in experiments
-    ]
+    impedance = [source.impedance(f) for source, f in sources]
     ohm = np.array([unknown if z is None else z for z in impedance])
     write_waterfall(path, data, ohm, scenario.to_yaml())
-    return data

@@ -80,8 +80,9 @@ def check_beam_source(
 
     impedance = source.impedance(frequency_mhz)
     assert impedance is None or np.isfinite(impedance)
-    per_kelvin = source.per_kelvin(frequency_mhz)
-    assert per_kelvin is None or (per_kelvin.shape == (n,) and (per_kelvin > 0.0).all())
+    assert source.interpolated(frequency_mhz) in (None, "linear", "spline")
+    circuit = source.circuit(frequency_mhz)
+    assert circuit is None or (np.linalg.eigvalsh(circuit.per_kelvin) > 0.0).all()
 
     try:
         antennas = source.monopoles

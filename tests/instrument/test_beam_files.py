@@ -12,6 +12,7 @@ import xarray as xr
 from astropy.io import fits
 from astropy.time import Time
 from fits_files import write_images
+from reference import hemisphere, real_harmonics
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
@@ -173,7 +174,7 @@ def write(path, *, without=(), change=None, header=None):
 
 def test_between_frequencies_and_directions(tmp_path):
     """Cubic splines over steps of 10 MHz and 2 degrees of a pattern known everywhere."""
-    beam = read_beam(write(tmp_path / "beam.fits"))
+    beam = replace(read_beam(write(tmp_path / "beam.fits")), interpolation="spline")
     assert beam.n_phi == 60
     fields = beam.fields(27.0, taper=False, rotations_deg=(0.0, 33.0))
     grid = fields.grid
@@ -193,6 +194,81 @@ def test_between_frequencies_and_directions(tmp_path):
     few = beam.fields(30.0)
     many = beam.fields(30.0, grid=HemisphereGrid(few.grid.theta, few.grid.weights, 120))
     np.testing.assert_allclose(many.e_theta[:, :, ::2], few.e_theta, rtol=0, atol=1e-13)
+
+
+def test_between_frequencies_as_luseepy_does(tmp_path):
+    """Straight lines between the integrals of products, and between gains: summed by hand.
+
+    The exact grid's nodes are between the file's directions, where splines are good to 5e-6.
+    """
+    beam = read_beam(write(tmp_path / "beam.fits"))
+    angles = (0.0, 33.0)
+    theta, phi, solid_angle = hemisphere(40, 90)
+    harmonics = real_harmonics(theta, phi, 4) * solid_angle[:, None]
+    crossed = {}
+    for f in (20.0, 30.0):
+        arms = [
+            np.array([e.ravel() for e in point_pattern(theta, phi - np.radians(a), f)])
+            for a in angles
+        ]
+        products = [
+            (arms[0] * arms[0].conj()).sum(0).real,
+            (arms[0] * arms[1].conj()).sum(0).real,
+            (arms[0] * arms[1].conj()).sum(0).imag,
+            (arms[1] * arms[1].conj()).sum(0).real,
+        ]
+        crossed[f] = np.array(products) @ harmonics
+    gain = 0.3 * 100.0 / 20.0 + 0.7 * 100.0 / 30.0
+    expected = gain / (4 * np.pi) * (0.3 * crossed[20.0] + 0.7 * crossed[30.0])
+    options = {"taper": False, "rotations_deg": angles}
+    got = beam.beams(27.0, 4, **options).modes
+    largest = np.abs(expected).max()
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-5 * largest)
+    splined = replace(beam, interpolation="spline").beams(27.0, 4, **options).modes
+    assert np.abs(splined - expected).max() > 1e-2 * largest
+    # the ground is what the sky leaves
+    emitted = beam.background(27.0, 2.0, **options)
+    left = np.array([1.0, 0.0, 0.0, 1.0]) - np.sqrt(4 * np.pi) * expected[:, 0]
+    np.testing.assert_allclose(emitted, 2.0 * left, rtol=0, atol=1e-4 * np.abs(left).max())
+
+
+@pytest.mark.parametrize("quadrature", ["luseepy", "exact"])
+def test_between_frequencies_of_luseepys_file(luseepy, test_data, quadrature):
+    """10.4 MHz, from the file's own numbers by luseepy's sum; the exact rule differs by less than
+    twice what the rectangle rule costs."""
+    beam, _, _, _ = luseepy
+    with fits.open(test_data / "luseepy" / "synthetic_monopole_beam.fits") as hdus:
+        images = {hdu.name: np.array(hdu.data, dtype=float) for hdu in hdus}
+    low = list(images["freq"]).index(10.0)
+    theta, phi = np.radians(np.arange(91.0)), np.radians(2.0 * np.arange(180))
+    taper = 1.0 - (np.arctan((theta - np.pi / 2) / 0.03) / np.pi + 0.5) ** 2
+    solid_angle = np.sin(theta) * np.radians(1.0) * np.radians(2.0) / (4 * np.pi) * taper**2
+    points = [a.ravel() for a in np.meshgrid(theta, phi, indexing="ij")]
+    harmonics = real_harmonics(*points, 3) * np.repeat(solid_angle, 180)[:, None]
+    expected = 0.0
+    for k, weight in ((low, 0.6), (low + 1, 0.4)):
+        arm = [
+            (images[f"{name}_real"] + 1j * images[f"{name}_imag"])[k, :, :-1]
+            for name in ("Etheta", "EPhi")
+        ]
+        # ports 0 and 1: the second one a quarter turn on
+        cross = sum(e * np.roll(e, 45, axis=1).conj() for e in arm).ravel()
+        expected = expected + weight * np.array([cross.real, cross.imag]) @ harmonics
+    expected = expected * (0.6 * images["gain_conv"][low] + 0.4 * images["gain_conv"][low + 1])
+    grid = beam.luseepy_grid if quadrature == "luseepy" else None
+    got = beam.beams(10.4, 3, grid=grid).modes[1:3]
+    tolerance = 1e-12 if quadrature == "luseepy" else 5e-4
+    assert off(got, expected) < tolerance
+    # a spline through the fields is another thing: 1e-5 of the peak in steps of 1 MHz
+    splined = replace(beam, interpolation="spline").beams(10.4, 3, grid=beam.luseepy_grid)
+    assert off(splined.modes[1:3], expected) > 1e-6
+
+
+def point_pattern(theta, phi, f):
+    """:func:`pattern` in single directions."""
+    e_theta = np.cos(theta) * np.cos(phi - 0.3) + 0.2 * np.sin(2 * theta)
+    phase = np.exp(1j * f / 20 * np.cos(theta))
+    return e_theta * phase, -np.sin(phi - 0.3) * (1 + 0.1j * np.sin(theta))
 
 
 def test_kelvin_in_kelvin_out(tmp_path):

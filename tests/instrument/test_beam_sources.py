@@ -64,7 +64,7 @@ def test_embedded_beams():
     check(source, 1e-12)
     assert not source.emits
     assert source.impedance(FREQUENCY) is None
-    assert source.per_kelvin(FREQUENCY) is None
+    assert source.circuit(FREQUENCY) is None
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_scalar_file_beams(scalar, options, quadrature):
     source = ScalarFileBeams(scalar, **options)
     check(source, quadrature)
     assert source.impedance(FREQUENCY) == scalar.impedance[scalar.frequencies_mhz == FREQUENCY]
-    assert source.per_kelvin(FREQUENCY) is None
+    assert source.circuit(FREQUENCY) is None
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,8 @@ def test_response_beams(response, options, quadrature):
     source = ResponseBeams(lossy, **options)
     check(source, quadrature)
     assert source.impedance(FREQUENCY) is None
-    np.testing.assert_array_equal(source.per_kelvin(FREQUENCY), response.per_kelvin(FREQUENCY))
+    kelvin = source.circuit(FREQUENCY).per_kelvin.diagonal().real
+    np.testing.assert_array_equal(kelvin, response.per_kelvin(FREQUENCY))
 
 
 def test_files_are_placed_and_integrated_as_asked(scalar, response):

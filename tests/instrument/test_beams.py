@@ -133,12 +133,12 @@ def test_a_fully_polarised_wave_gives_the_product_of_the_voltages():
     rng = np.random.default_rng(3)
     for _ in range(5):
         e = rng.standard_normal(2) + 1j * rng.standard_normal(2)
-        coherency = np.outer(e, e.conj())  # [[I + Q, U + i V], [U - i V, I - Q]] / 2
+        coherency = np.outer(e, e.conj())  # [[I + Q, U - i V], [U + i V, I - Q]] / 2
         stokes = {
             "I": np.trace(coherency).real,
             "Q": (coherency[0, 0] - coherency[1, 1]).real,
             "U": 2 * coherency[0, 1].real,
-            "V": 2 * coherency[0, 1].imag,
+            "V": -2 * coherency[0, 1].imag,
         }
         got = sum(np.asarray(stokes_beam(fields, s)) * value for s, value in stokes.items())
         voltage = np.asarray(fields.e_theta) * e[0] + np.asarray(fields.e_phi) * e[1]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from fits_files import write_images
+from reference import hemisphere, real_harmonics
 from scipy.constants import Boltzmann, c, physical_constants
 
 import lusee_bayes as lb
@@ -21,8 +22,13 @@ from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.model import radiometer
-from lusee_bayes.instrument.beams import Receiver, read_beam
-from lusee_bayes.instrument.beams.receiver import loading_matrix
+from lusee_bayes.instrument.beams import (
+    CapacitorReceiver,
+    JFETReceiver,
+    read_beam,
+    read_receiver,
+)
+from lusee_bayes.instrument.beams.circuit import loading_matrix
 from lusee_bayes.instrument.products import labels, to_matrix
 from lusee_bayes.instrument.waterfalls import read_waterfall
 from lusee_bayes.testing import small_scenario
@@ -55,8 +61,8 @@ FREQUENCIES = (5.0, 10.0, 25.0, 50.0)
 def test_loads_and_scales_are_luseepys(luseepy, channel):
     response, _, images = luseepy
     f = FREQUENCIES[channel]
-    np.testing.assert_allclose(Receiver().load(f), matrix(images, "zl", channel), rtol=1e-13)
-    loading = response.loading(f)
+    np.testing.assert_allclose(JFETReceiver().load(f), matrix(images, "zl", channel), rtol=1e-13)
+    loading = response.circuit(f).loading
     np.testing.assert_allclose(loading, matrix(images, "m", channel), rtol=0, atol=1e-14)
     enclosure = matrix(images, "blackbody_normalization", channel).diagonal().real
     np.testing.assert_allclose(response.per_kelvin(f), enclosure, rtol=1e-13)
@@ -195,9 +201,9 @@ def test_volts_of_short_dipoles(tmp_path):
     f, wavelength = 20.0, c / 20e6
     _, _, arms = short_dipoles(np.zeros(1), np.zeros(1), 1.5)
     open_ = Boltzmann * VACUUM / wavelength**2 * 1.09 * 4 * np.pi / 3 * arms.T @ arms
-    za, zl = response.impedance[1], Receiver().load(f)
+    za, zl = response.impedance[1], JFETReceiver().load(f)
     m = zl @ np.linalg.inv(za + zl)
-    np.testing.assert_allclose(response.loading(f), m, rtol=1e-12)
+    np.testing.assert_allclose(response.circuit(f).loading, m, rtol=1e-12)
     expected = m @ open_ @ m.conj().T
     beams = response.beams(f, 2, unit="V2/Hz")
     got = np.asarray(to_matrix(beams.modes))[..., 0] * np.sqrt(4 * np.pi)
@@ -211,6 +217,94 @@ def test_volts_of_short_dipoles(tmp_path):
     )
 
 
+def varied(images):
+    """Effective lengths that are not the same at all frequencies."""
+    if "H_theta" in images:
+        for k, factor in enumerate((1.0, 0.8 + 0.1j, 0.9 - 0.4j)):
+            images["H_theta"][:, k] *= factor
+            images["H_phi"][1, k] *= 1.5
+
+
+def between(values, part):
+    return (1.0 - part) * values[1] + part * values[2]
+
+
+def test_between_frequencies_as_luseepy_does(tmp_path):
+    """ZA, resistances and the integrals of open ports over lambda^2 go straight from 20 to 40 MHz;
+    M is that of the ZA in between."""
+    response = read_beam(write(tmp_path / "response.fits", change=varied))
+    f, part = 27.0, 0.35
+    theta, phi, solid_angle = hemisphere(20, 40)
+    harmonics = real_harmonics(theta, phi, 3) * solid_angle[:, None]
+    open_ = []
+    for k, mhz in enumerate((10.0, 20.0, 40.0)):
+        images = {}
+        for name, h in zip(("H_theta", "H_phi"), short_dipoles(theta, phi, 1.5)[:2], strict=True):
+            diagonal = h[:, np.arange(len(theta)), np.arange(len(theta))]
+            images[name] = np.repeat(diagonal[:, None], 3, 1) * (1 + 0.3j)
+        varied(images)
+        pairs = sum(np.einsum("ip,jp,pm->ijm", h[:, k], h[:, k].conj(), harmonics)
+                    for h in images.values())  # fmt: skip
+        open_.append(Boltzmann * VACUUM * (1e6 * mhz / c) ** 2 * pairs)
+    za = between(response.impedance, part)
+    zl = JFETReceiver().load(f)
+    m = zl @ np.linalg.inv(za + zl)
+    expected = np.einsum("ai,ijm,bj->abm", m, between(open_, part), m.conj())
+    largest = np.abs(expected).max()
+    got = np.asarray(to_matrix(response.beams(f, 3, unit="V2/Hz").modes))
+    # the file's single precision
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-6 * largest)
+    splined = replace(response, interpolation="spline").beams(f, 3, unit="V2/Hz")
+    assert np.abs(np.asarray(to_matrix(splined.modes)) - expected).max() > 1e-2 * largest
+    warm = 4 * Boltzmann * 250.0 * m @ between(response.moon_resistance, part) @ m.conj().T
+    got = np.asarray(to_matrix(response.background(f, 250.0, unit="V2/Hz")[:, None]))[..., 0]
+    np.testing.assert_allclose(got, warm, rtol=0, atol=1e-12 * np.abs(warm).max())
+    enclosure = 4 * Boltzmann * m @ ((za + za.conj().T) / 2) @ m.conj().T
+    np.testing.assert_allclose(response.per_kelvin(f), enclosure.diagonal().real, rtol=1e-12)
+    # nothing is interpolated where the file has the frequency, to luseepy's 1e-6 MHz
+    opened = replace(response, receiver=None)
+    exact = opened.beams(20.0, 3, unit="V2/Hz").modes
+    near = opened.beams(20.0 + 9e-7, 3, unit="V2/Hz").modes
+    np.testing.assert_array_equal(near, exact)
+    splined = replace(opened, interpolation="spline").beams(20.0, 3, unit="V2/Hz").modes
+    np.testing.assert_allclose(splined, exact, rtol=0, atol=1e-13 * np.abs(exact).max())
+
+
+def test_receivers(tmp_path):
+    """Loads by hand, and the voltages M of any of them."""
+    w = 2e6 * np.pi * 20.0
+    preamplifiers = {
+        "capacitance_pf": (30.0, 40.0, 35.0, 20.0),
+        "inductance_nh": (0.0, 10.0, 20.0, 30.0),
+        "parallel_ohm": (1e5, 2e5, 3e5, 4e5),
+        "series_ohm": (1.0, 2.0, 0.0, 3.0),
+        "skin_ohm": (0.0, 1e-12, 0.0, 0.0),
+        "skin_power": (1.0, 1.4, 2.0, 2.0),
+    }
+    z = [
+        r + a * w**n + 1j * w * 1e-9 * ind + 1.0 / (1.0 / rp + 1j * w * 1e-12 * cap)
+        for cap, ind, rp, r, a, n in zip(*preamplifiers.values(), strict=True)
+    ]
+    np.testing.assert_allclose(JFETReceiver(**preamplifiers).load(20.0), np.diag(z), rtol=1e-13)
+    z = [1.0 / (1j * w * cap * 1e-12) for cap in (30.0, 40.0, 35.0, 20.0)]
+    capacitors = CapacitorReceiver((30.0, 40.0, 35.0, 20.0))
+    np.testing.assert_allclose(capacitors.load(20.0), np.diag(z), rtol=1e-13)
+    # measured, coupled loads: straight lines between the frequencies, none beyond
+    rng = np.random.default_rng(2)
+    loads = 100.0 * (rng.standard_normal((2, 4, 4)) + 1j * rng.standard_normal((2, 4, 4)))
+    images = {"freq": np.array([10.0, 30.0]), "ZL_real": loads.real, "ZL_imag": loads.imag}
+    measured = read_receiver(write_images(tmp_path / "zl.fits", images, {}))
+    zl = 0.45 * loads[0] + 0.55 * loads[1]
+    np.testing.assert_allclose(measured.load(21.0), zl, rtol=1e-13)
+    with pytest.raises(InputError, match=r"zl.fits has values from 10 to 30 MHz, not at 31"):
+        measured.load(31.0)
+    response = replace(read_beam(write(tmp_path / "response.fits")), receiver=measured)
+    za = 0.95 * response.impedance[1] + 0.05 * response.impedance[2]
+    np.testing.assert_allclose(
+        response.circuit(21.0).loading, zl @ np.linalg.inv(za + zl), rtol=1e-12
+    )
+
+
 def test_losses_emit_at_the_antennas_temperature(tmp_path):
     def lossy(images):
         if "Rloss" in images:
@@ -218,7 +312,7 @@ def test_losses_emit_at_the_antennas_temperature(tmp_path):
             images["ZA"] = images["ZA"] + images["Rloss"]
 
     response = read_beam(write(tmp_path / "response.fits", change=lossy))
-    m = response.loading(20.0)
+    m = response.circuit(20.0).loading
     expected = 4 * Boltzmann * 300.0 * 0.5 * m @ m.conj().T
     got = np.asarray(to_matrix(response.background(20.0, 0.0, 300.0, unit="V2/Hz")[:, None]))
     np.testing.assert_allclose(got[..., 0], expected, rtol=0, atol=1e-9 * np.abs(expected).max())
@@ -300,7 +394,7 @@ def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
         ([], "give its response as beam.file"),
         (["beam.file={response}"], "use --set beam.moon_temperature_k=250"),
         (["beam.file={response}", "beam.moon_temperature_k=250", "beam.receiver=open"],
-         "give the response and the receiver"),
+         "leave out beam.receiver, so that the loads ZL in the data are used"),
         (["frequency_mhz=11"], "no channel at 11 MHz"),
     ],
 )  # fmt: skip

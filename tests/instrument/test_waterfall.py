@@ -62,6 +62,45 @@ def test_every_sample_is_in_its_place(tmp_path):
     assert observation.step_s == 7200.0 and observation.turntable_deg == (0.0,)
 
 
+@pytest.mark.parametrize(
+    ("lunar_day", "first"),
+    [
+        ("CY2027", "2027-01-01T01:00:00.000"),  # luseepy begins them at one o'clock
+        ("CY27", "2027-01-01T01:00:00.000"),
+        ("FY27", "2026-10-01T00:00:00.000"),
+        ("FY2027", "2026-10-01T00:00:00.000"),
+        ("2027-02-01 13:00:00 to 2027-04-01", "2027-02-01T13:00:00.000"),
+    ],
+)
+def test_ranges_of_time(tmp_path, lunar_day, first):
+    path = write(tmp_path / "w.fits", header=HEADER | {"LUNAR_DAY": lunar_day})
+    observation = read_waterfall(path).observation
+    assert observation.times[0].isot == first
+    np.testing.assert_allclose(observation.hours, 2.0 * np.arange(12), rtol=0, atol=1e-6)
+
+
+def test_lunar_days_begin_at_noon_on_the_far_side(tmp_path):
+    """Days of 29.27 to 29.83 days, about new moon: a noon of the mean Sun is within 14 hours of it
+    (6.3 degrees of libration at 12.2 degrees a day, and the Sun's own equation)."""
+    # new moons of 2025, from almanacs; UTC
+    new_moons = ["01-29T12:36", "02-28T00:45", "03-29T10:58", "04-27T19:31", "05-27T03:02"]
+    found = []
+    for number, new_moon in zip((2500, "2501", 2502, 2503, 2504), new_moons, strict=True):
+        path = tmp_path / f"{number}.fits"
+        found.append(read_waterfall(write(path, header=HEADER | {"LUNAR_DAY": number})).observation)
+        off = (found[-1].times[0] - Time(f"2025-{new_moon}", scale="utc")).to_value(u.hour)
+        assert abs(off) < 14.0
+    days = np.diff([o.times[0].jd for o in found])
+    assert ((days > 29.2) & (days < 29.9)).all()
+    # the Sun is highest there and then, by the package's other way to its altitude
+    noon = found[2].times[0]
+    around = noon + np.arange(-120.0, 121.0, 4.0) * u.s
+    middle = Observation(180.0, 0.0, around, np.zeros(61, int), (0.0,), 4.0)
+    highest = np.argmax(middle.sun_altitude_deg())
+    # light needs 8 minutes, in which the Earth and the Moon move on by 20 arcseconds: 40 s
+    assert abs(around[highest] - noon) < 50.0 * u.s
+
+
 def test_any_subset_and_order_of_products(tmp_path):
     """Columns follow the pairs; a pair the other way round is conjugated."""
     data = read_waterfall(write(tmp_path / "w.fits", pairs=[[2, 2], [3, 1], [0, 0]])).at(10.0)
@@ -89,6 +128,10 @@ def test_gaps_are_missing_samples_and_counted(tmp_path):
         ({"without": ("combinations",)}, "has no combinations"),
         ({"header": {k: v for k, v in HEADER.items() if k != "DELTAT_SEC"}}, "no DELTAT_SEC"),
         ({"header": HEADER | {"LUNAR_DAY": "tomorrow"}}, "LUNAR_DAY 'tomorrow' is not a date"),
+        ({"header": HEADER | {"LUNAR_DAY": "CY202"}}, "LUNAR_DAY 'CY202' is not a date to a date"),
+        ({"header": HEADER | {"LUNAR_DAY": 2714}}, "expected a number from 2700, the first"),
+        ({"header": HEADER | {"LUNAR_DAY": 9900}}, "outside the ephemeris"),
+        ({"header": HEADER | {"LUNAR_DAY": 1.5}}, "is 1.5, expected text"),
         ({"pairs": [[0, 0], [0, 4]]}, "combinations holds a value outside 0 to 3: 4"),
         ({"pairs": [[0, 1], [1, 0]]}, "the same pair of ports twice"),
         ({"data": np.zeros((12, 15, 2))}, r"data has 15 products, expected 16"),

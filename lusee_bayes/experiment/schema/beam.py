@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
+from lusee_bayes.experiment.schema.receiver import ReceiverSection
 from lusee_bayes.experiment.schema.section import (
     Angle,
     Positive,
@@ -29,6 +30,7 @@ from lusee_bayes.instrument.beams import (
     ScalarFileBeams,
 )
 from lusee_bayes.instrument.beams.files import is_response
+from lusee_bayes.instrument.beams.gridded import Interpolation
 from lusee_bayes.instrument.beams.response_file import read_response
 from lusee_bayes.instrument.beams.scalar_file import read_scalar_beam
 from lusee_bayes.instrument.products import N_ANTENNAS
@@ -84,13 +86,14 @@ class MonopoleBeamSection(Section):
 
 
 class _FileSection(Section):
-    """What the beams of all files have in common."""
+    """What the beams of luseepy's files have in common."""
 
     is_file: ClassVar[bool] = True
 
     file: str
     turntable_offset_deg: Angle = 0.0
     quadrature: Literal["exact", "luseepy"] = "exact"
+    interpolation: Interpolation = "linear"
     moon_temperature_k: Temperature = 0.0
 
     @property
@@ -113,6 +116,9 @@ class ScalarBeamSection(_FileSection):
         Fade out towards the horizon as luseepy does.
     quadrature : {"exact", "luseepy"}
         ``luseepy`` is luseepy's own rule, for data that luseepy has made.
+    interpolation : {"linear", "spline"}
+        Between the file's frequencies: products of fields linearly as in luseepy, or fields by
+        cubic splines.
     moon_temperature_k : float
         Temperature of the ground, which adds its own radiation.
     """
@@ -129,7 +135,7 @@ class ScalarBeamSection(_FileSection):
     def source(self) -> BeamSource:
         """The pattern of the file, put up at every angle."""
         return ScalarFileBeams(
-            read_scalar_beam(self.file),
+            replace(read_scalar_beam(self.file), interpolation=self.interpolation),
             turntable_offset_deg=self.turntable_offset_deg,
             taper=self.taper,
             rotations_deg=self.rotations_deg,
@@ -145,14 +151,18 @@ class ResponseSection(_FileSection):
     ----------
     file : str
         FITS version 3.
-    receiver : {"jfet", "open"}
-        What is connected to the ports: luseepy's preamplifiers, or nothing.
+    interpolation : {"linear", "spline"}
+        Between the file's frequencies: impedances and products of fields linearly as in luseepy, or
+        impedances and fields by cubic splines.
+    receiver : {"jfet", "capacitor", "file", "open"} or mapping, optional
+        What is connected to the ports, with its parameters (``experiment/schema/receiver.py``). If
+        it is left out, that of the data where their file holds it, else luseepy's preamplifiers.
     moon_temperature_k, antenna_temperature_k : float
         Temperatures of the ground and of the antennas' losses, which add their own radiation.
     """
 
     model: Literal["response"] = "response"
-    receiver: Literal["jfet", "open"] = "jfet"
+    receiver: ReceiverSection | None = None
     antenna_temperature_k: Temperature = 0.0
 
     @property
@@ -162,11 +172,12 @@ class ResponseSection(_FileSection):
 
     def source(self) -> BeamSource:
         """The response of the file, with its receivers."""
-        response = read_response(self.file)
-        if self.receiver == "open":
-            response = replace(response, receiver=None)
+        response = replace(read_response(self.file), interpolation=self.interpolation)
+        if self.receiver is not None:
+            response = replace(response, receiver=self.receiver.receiver())
         return ResponseBeams(
             response,
+            receiver_said=self.receiver is not None,
             turntable_offset_deg=self.turntable_offset_deg,
             luseepy_quadrature=self.quadrature == "luseepy",
             moon_k=self.moon_temperature_k,
@@ -190,6 +201,8 @@ def _one_kind(value: Any) -> Any:
     file = tree.get("file")
     if tree["model"] == default and file is not None:
         tree["model"] = "response" if isinstance(file, str) and is_response(file) else "luseepy"
+    if tree["model"] != "response" and tree.get("receiver") == "jfet":
+        del tree["receiver"]  # scenarios of 0.1 held all keys of all kinds
     temperatures = ("moon_temperature_k", "antenna_temperature_k")
     if tree["model"] == default and any(tree.get(name) for name in temperatures):
         raise ValueError(

@@ -22,8 +22,8 @@ class RunSection(Section):
 class ObservationSection(Section):
     """Where and when; ``runs`` follow one another from ``start`` (UTC).
 
-    ``fixed_axis``: the Moon turns about the axis of the first sample, as luseepy's default engines
-    have it; for data that they have made.
+    ``fixed_axis``: the Moon turns about the axis of the first sample, as luseepy's engine
+    ``croissant`` has it; for data that it has made.
     """
 
     lon_deg: Annotated[float, Field(ge=-360, le=360)] = 182.258

@@ -14,8 +14,8 @@ class SourceSection(Section):
 
     ``flux_jy`` is the mean of its prior (the catalogue's, if left out), ``relative_std`` its
     standard deviation in units of the mean. Own sources give ``ra_deg`` and ``dec_deg`` (ICRS).
-    ``stokes_v``: circularly polarised part V / I. ``block_h``: an amplitude for each block of so
-    many hours, independently; without it one for all times.
+    ``stokes_v``: circularly polarised part V / I, positive if right-handed (IAU). ``block_h``: an
+    amplitude for each block of so many hours, independently; without it one for all times.
     """
 
     name: str

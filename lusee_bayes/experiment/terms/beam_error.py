@@ -74,7 +74,8 @@ def true_instrument(setup: Setup) -> TrueInstrument:
     if error.shift_mhz is not None:
         return TrueInstrument(source, frequency + error.shift_mhz)
     if error.file is not None:
-        return TrueInstrument(section_of_file(error.file, scenario.beam).source(), frequency)
+        other = section_of_file(error.file, scenario.beam).source().behind(setup.receiver)
+        return TrueInstrument(other, frequency)
     truth = BeamErrorTerm().truth(setup, jax.random.key(scenario.seed))
     return TrueInstrument(EmbeddedBeams(placed(source.monopoles, truth)), frequency)
 

@@ -7,7 +7,13 @@ from lusee_bayes.instrument.beams.grid import HemisphereGrid
 from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams
 from lusee_bayes.instrument.beams.parameters import PARAMETERS, parameter, placed
 from lusee_bayes.instrument.beams.product_beams import ProductBeams, product_beams, stokes_beam
-from lusee_bayes.instrument.beams.receiver import Receiver
+from lusee_bayes.instrument.beams.receiver import (
+    CapacitorReceiver,
+    JFETReceiver,
+    MeasuredReceiver,
+    Receiver,
+    read_receiver,
+)
 from lusee_bayes.instrument.beams.regolith import Regolith
 from lusee_bayes.instrument.beams.response_file import PortResponse
 from lusee_bayes.instrument.beams.scalar_file import ScalarBeam
@@ -22,8 +28,11 @@ __all__ = [
     "PARAMETERS",
     "AntennaFields",
     "BeamSource",
+    "CapacitorReceiver",
     "EmbeddedBeams",
     "HemisphereGrid",
+    "JFETReceiver",
+    "MeasuredReceiver",
     "Monopoles",
     "PortResponse",
     "ProductBeams",
@@ -39,5 +48,6 @@ __all__ = [
     "placed",
     "product_beams",
     "read_beam",
+    "read_receiver",
     "stokes_beam",
 ]

@@ -1,6 +1,8 @@
-"""Interpolation of fields between the directions and the frequencies of a file."""
+"""Interpolation between the directions and the frequencies of a file."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import numpy as np
 import scipy
@@ -9,14 +11,58 @@ from jaxtyping import Complex, Float
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
 
+# between the frequencies of a file: luseepy's rule, straight lines between products of fields and
+# between impedances, or cubic splines through fields and impedances
+Interpolation = Literal["linear", "spline"]
+# frequencies that differ by less are one, as in luseepy; a header holds 15 digits of them
+SAME_FREQUENCY_MHZ = 1e-6
+
+
+def neighbours(
+    path: str, known_mhz: Float[np.ndarray, " frequencies"], frequency_mhz: float
+) -> list[tuple[int, float]]:
+    """Return the frequencies of a file that linear interpolation takes, and their weights.
+
+    Parameters
+    ----------
+    path : str
+        File that the frequencies come from, for the error message.
+    known_mhz : (frequencies,) array
+        Growing.
+    frequency_mhz : float
+
+    Returns
+    -------
+    list of (int, float)
+        Place and weight: one of them where the file has the frequency, else two.
+
+    Raises
+    ------
+    InputError
+        Outside the known frequencies.
+    """
+    nearest = int(np.argmin(np.abs(known_mhz - frequency_mhz)))
+    if abs(known_mhz[nearest] - frequency_mhz) <= SAME_FREQUENCY_MHZ:
+        return [(nearest, 1.0)]
+    if not known_mhz[0] < frequency_mhz < known_mhz[-1]:
+        raise InputError(
+            f"{path} has values from {known_mhz[0]:g} to {known_mhz[-1]:g} MHz, not at "
+            f"{frequency_mhz:.12g}; change frequency_mhz, or give a file that reaches there"
+        )
+    above = int(np.searchsorted(known_mhz, frequency_mhz))
+    low, high = known_mhz[above - 1], known_mhz[above]
+    part = float((frequency_mhz - low) / (high - low))
+    return [(above - 1, 1.0 - part), (above, part)]
+
 
 def at_frequency(
     path: str,
     known_mhz: Float[np.ndarray, " frequencies"],
     frequency_mhz: float,
     *parts: np.ndarray,
+    interpolation: Interpolation = "linear",
 ) -> list[np.ndarray]:
-    """Interpolate arrays in frequency by cubic splines.
+    """Interpolate arrays in frequency.
 
     Parameters
     ----------
@@ -26,6 +72,7 @@ def at_frequency(
         Growing.
     frequency_mhz : float
     *parts : (frequencies, ...) array
+    interpolation : {"linear", "spline"}
 
     Returns
     -------
@@ -38,14 +85,11 @@ def at_frequency(
     InputError
         Outside the known frequencies.
     """
-    if not known_mhz[0] <= frequency_mhz <= known_mhz[-1]:
-        raise InputError(
-            f"{path} has beams from {known_mhz[0]:g} to {known_mhz[-1]:g} MHz, not at "
-            f"{frequency_mhz:g}; change frequency_mhz, or give a file that reaches there"
-        )
-    exact = np.flatnonzero(known_mhz == frequency_mhz)
-    if len(exact):
-        return [np.asarray(part[exact[0]]) for part in parts]
+    places = neighbours(path, known_mhz, frequency_mhz)
+    if len(places) == 1:
+        return [np.asarray(part[places[0][0]]) for part in parts]
+    if interpolation == "linear":
+        return [np.asarray(sum(weight * part[k] for k, weight in places)) for part in parts]
     degree = min(3, len(known_mhz) - 1)
     splines = [scipy.interpolate.make_interp_spline(known_mhz, part, k=degree) for part in parts]
     return [np.asarray(spline(frequency_mhz)) for spline in splines]

@@ -33,10 +33,12 @@ def stokes_pairs(
     With E = E_i, F = E_j::
 
         I: (Et Ft* + Ep Fp*) / 2      Q: (Et Ft* - Ep Fp*) / 2
-        U: (Et Fp* + Ep Ft*) / 2      V: i (Et Fp* - Ep Ft*) / 2
+        U: (Et Fp* + Ep Ft*) / 2      V: i (Ep Ft* - Et Fp*) / 2
 
-    from <e_a conj(e_b)> = [[I + Q, U + i V], [U - i V, I - Q]] / 2. The paper's U and V lack the
-    factor 1/2; with it a fully polarised wave gives ``|E.e|^2`` (tests/instrument/test_beams.py).
+    from <e_a conj(e_b)> = [[I + Q, U - i V], [U + i V, I - Q]] / 2 in the basis (theta, phi), with
+    exp(+i w t). V is the IAU's, right-handed minus left-handed: where it is positive, a receiver
+    that looks towards the source sees the electric field turn counter-clockwise. The paper's U and
+    V lack the factor 1/2; with it a fully polarised wave gives ``|E.e|^2``.
 
     Parameters
     ----------
@@ -52,6 +54,10 @@ def stokes_pairs(
     ------
     InputError
         If the Stokes parameter is unknown.
+
+    References
+    ----------
+    Hamaker and Bregman 1996, A&AS 117, 161 (the IAU's convention for V).
     """
     if stokes not in STOKES:
         raise InputError(f"unknown Stokes parameter '{stokes}'; {nearest(stokes, STOKES)}")
@@ -63,7 +69,7 @@ def stokes_pairs(
         return (et * ft - ep * fp) / 2.0
     if stokes == "U":
         return (et * fp + ep * ft) / 2.0
-    return 1j * (et * fp - ep * ft) / 2.0
+    return 1j * (ep * ft - et * fp) / 2.0
 
 
 class ProductBeams(eqx.Module):

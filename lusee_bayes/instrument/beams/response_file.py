@@ -8,7 +8,9 @@ in MHz, theta and phi in degrees. At the receivers' inputs, one-sided, ::
     V_ab = k eta0 / lambda^2 int (M Ht)_a conj((M Ht)_b) + (M Hp)_a conj((M Hp)_b) T dOmega
            + 4 k (M (T_moon Rmoon + T_antenna Rloss) M^H)_ab    in V^2/Hz.
 
-An enclosure of 1 K makes U = 4 k M (ZA + ZA^H) / 2 M^H; V_ab / sqrt(U_aa U_bb) is in K.
+An enclosure of 1 K makes U = 4 k M (ZA + ZA^H) / 2 M^H; V_ab / sqrt(U_aa U_bb) is in K. Between the
+frequencies of the file luseepy interpolates impedances and the integrals of open ports (M left out)
+linearly, and takes M of the interpolated ZA.
 """
 
 from __future__ import annotations
@@ -25,13 +27,19 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.fits_files import read_fits
 from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.instrument.beams.circuit import Circuit
 from lusee_bayes.instrument.beams.fields import SPEED_OF_LIGHT, AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
-from lusee_bayes.instrument.beams.gridded import at_frequency, on_grid
+from lusee_bayes.instrument.beams.gridded import (
+    Interpolation,
+    at_frequency,
+    neighbours,
+    on_grid,
+)
 from lusee_bayes.instrument.beams.luseepy_rules import BandLimitedGrid
-from lusee_bayes.instrument.beams.product_beams import ProductBeams, product_beams
-from lusee_bayes.instrument.beams.receiver import Receiver, loading_matrix
-from lusee_bayes.instrument.products import N_ANTENNAS, to_real
+from lusee_bayes.instrument.beams.product_beams import ProductBeams, product_modes
+from lusee_bayes.instrument.beams.receiver import JFETReceiver, Receiver
+from lusee_bayes.instrument.products import N_ANTENNAS, to_matrix, to_real
 
 VACUUM_OHM = physical_constants["characteristic impedance of vacuum"][0]
 LENGTHS = ("H_theta", "H_phi")
@@ -76,6 +84,9 @@ class PortResponse:
         Rmoon and Rloss in Ohm.
     receiver : Receiver or None
         What is connected to the ports; None leaves them open.
+    interpolation : {"linear", "spline"}
+        Between the frequencies: luseepy's rule, impedances and products of fields linearly, or
+        cubic splines through impedances and fields.
     """
 
     path: str
@@ -86,7 +97,8 @@ class PortResponse:
     impedance: Complex[np.ndarray, "frequencies ports ports"]
     moon_resistance: Complex[np.ndarray, "frequencies ports ports"]
     loss_resistance: Complex[np.ndarray, "frequencies ports ports"]
-    receiver: Receiver | None = Receiver()
+    receiver: Receiver | None = JFETReceiver()
+    interpolation: Interpolation = "linear"
 
     @property
     def n_phi(self) -> int:
@@ -98,17 +110,14 @@ class PortResponse:
         """The directions of the file with the rule of luseepy's four-port engine."""
         return BandLimitedGrid.of(self.theta, self.n_phi)
 
-    def loading(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
-        """Return M = ZL (ZA + ZL)^-1. InputError outside the frequencies of the file."""
-        impedance = self._impedance(frequency_mhz)
-        load = None if self.receiver is None else self.receiver.load(frequency_mhz)
-        return loading_matrix(impedance, load)
+    def circuit(self, frequency_mhz: float) -> Circuit:
+        """Return antennas and receivers. InputError outside the frequencies of the file."""
+        parts = (self.impedance, self.moon_resistance, self.loss_resistance)
+        return Circuit(frequency_mhz, *self._at(frequency_mhz, *parts), self.receiver)
 
     def per_kelvin(self, frequency_mhz: float) -> Float[np.ndarray, " ports"]:
         """Return U_aa, the V^2/Hz that an enclosure of 1 K makes at each receiver's input."""
-        loading, impedance = self.loading(frequency_mhz), self._impedance(frequency_mhz)
-        resistance = (impedance + impedance.conj().T) / 2.0
-        return 4.0 * Boltzmann * (loading @ resistance @ loading.conj().T).diagonal().real
+        return self.circuit(frequency_mhz).per_kelvin.diagonal().real
 
     def fields(
         self,
@@ -120,10 +129,12 @@ class PortResponse:
     ) -> AntennaFields:
         """Return the fields of the ports; their products are beams in ``unit`` per K and sr.
 
+        Between the frequencies of the file this is so with splines only. With linear interpolation
+        the fields themselves are interpolated here, for pictures; use :meth:`beams` for products.
+
         Parameters
         ----------
         frequency_mhz : float
-            Cubic splines interpolate between those of the file.
         grid : HemisphereGrid, optional
             By default nodes that integrate across the horizon exactly; ``luseepy_grid`` is the
             rule of luseepy.
@@ -141,24 +152,10 @@ class PortResponse:
         InputError
             Outside the frequencies of the file, or for an unknown unit.
         """
-        if unit not in UNITS:
-            raise InputError(f"unknown unit '{unit}'; {nearest(unit, UNITS)}")
-        parts = at_frequency(
-            self.path, self.frequencies_mhz, frequency_mhz, self.h_theta, self.h_phi
-        )
-        if grid is None:
-            grid = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
-        wavelength = SPEED_OF_LIGHT / (1e6 * frequency_mhz)
-        # product beams are halves of the sums over polarisations
-        scale = np.full(N_ANTENNAS, np.sqrt(2.0 * Boltzmann * VACUUM_OHM) / wavelength)
-        if unit == "K":
-            scale = scale / np.sqrt(self.per_kelvin(frequency_mhz))
-        mixing = scale[:, None] * self.loading(frequency_mhz)
-        turned = (
-            np.tensordot(mixing, [on_grid(h, self.theta, grid, turn_deg) for h in part], axes=1)
-            for part in parts
-        )
-        return AntennaFields(*turned, grid)
+        opened = self._open(self._at(frequency_mhz, self.h_theta, self.h_phi), grid, turn_deg)
+        mixing = self._mixing(frequency_mhz, unit) / (SPEED_OF_LIGHT / (1e6 * frequency_mhz))
+        parts = (np.tensordot(mixing, part, axes=1) for part in (opened.e_theta, opened.e_phi))
+        return AntennaFields(*parts, opened.grid)
 
     def beams(
         self,
@@ -170,8 +167,18 @@ class PortResponse:
         unit: Unit = "K",
     ) -> ProductBeams:
         """Return the beams of all products, in ``unit`` per K; arguments as of :meth:`fields`."""
-        fields = self.fields(frequency_mhz, grid=grid, turn_deg=turn_deg, unit=unit)
-        return product_beams(fields, frequency_mhz, lmax, normalise=False)
+        if self.interpolation == "spline":
+            fields = self.fields(frequency_mhz, grid=grid, turn_deg=turn_deg, unit=unit)
+            modes = product_modes(fields, lmax, normalise=False)
+            return ProductBeams(modes, float(frequency_mhz))
+        opened = np.zeros((N_ANTENNAS**2, (lmax + 1) ** 2))
+        for k, weight in neighbours(self.path, self.frequencies_mhz, frequency_mhz):
+            fields = self._open([self.h_theta[k], self.h_phi[k]], grid, turn_deg)
+            wavelength = SPEED_OF_LIGHT / (1e6 * self.frequencies_mhz[k])
+            opened += weight / wavelength**2 * product_modes(fields, lmax, normalise=False)
+        mixing = self._mixing(frequency_mhz, unit)
+        seen = np.einsum("ai,ijm,bj->abm", mixing, to_matrix(opened), mixing.conj(), optimize=True)
+        return ProductBeams(to_real(seen), float(frequency_mhz))
 
     def background(
         self,
@@ -199,24 +206,40 @@ class PortResponse:
         InputError
             Outside the frequencies of the file.
         """
-        moon, loss = at_frequency(
-            self.path,
-            self.frequencies_mhz,
-            frequency_mhz,
-            self.moon_resistance,
-            self.loss_resistance,
-        )
-        loading = self.loading(frequency_mhz)
-        emitted = moon_k * moon + antenna_k * loss
-        seen = 4.0 * Boltzmann * loading @ emitted @ loading.conj().T
+        circuit = self.circuit(frequency_mhz)
+        seen = circuit.emitted(moon_k * circuit.moon_ohm + antenna_k * circuit.loss_ohm)
         if unit == "K":
             root = np.sqrt(self.per_kelvin(frequency_mhz))
             seen = seen / (root[:, None] * root[None])
         return to_real(seen)
 
-    def _impedance(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
-        (impedance,) = at_frequency(self.path, self.frequencies_mhz, frequency_mhz, self.impedance)
-        return impedance
+    def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
+        return at_frequency(
+            self.path,
+            self.frequencies_mhz,
+            frequency_mhz,
+            *parts,
+            interpolation=self.interpolation,
+        )
+
+    def _mixing(self, frequency_mhz: float, unit: str) -> Complex[np.ndarray, "ports ports"]:
+        """M, scaled such that products of open ports' fields / wavelength become beams."""
+        if unit not in UNITS:
+            raise InputError(f"unknown unit '{unit}'; {nearest(unit, UNITS)}")
+        # product beams are halves of the sums over polarisations
+        scale = np.full(N_ANTENNAS, np.sqrt(2.0 * Boltzmann * VACUUM_OHM))
+        if unit == "K":
+            scale = scale / np.sqrt(self.per_kelvin(frequency_mhz))
+        return scale[:, None] * self.circuit(frequency_mhz).loading
+
+    def _open(
+        self, parts: list[np.ndarray], grid: HemisphereGrid | None, turn_deg: float
+    ) -> AntennaFields:
+        """The effective lengths of one frequency on a grid, of ports that are open."""
+        if grid is None:
+            grid = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
+        turned = (np.stack([on_grid(h, self.theta, grid, turn_deg) for h in p]) for p in parts)
+        return AntennaFields(*turned, grid)
 
 
 def read_response(path: str | Path) -> PortResponse:

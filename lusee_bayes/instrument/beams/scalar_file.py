@@ -6,7 +6,8 @@ exp(+i w t); gain_conv g(frequency), freq in MHz, Z_real and Z_imag in Ohm. Visi
 
     T_ij = sqrt(g_i g_j) / (4 pi) int (Et_i conj(Et_j) + Ep_i conj(Ep_j)) I dOmega,
 
-so that fields times sqrt(2 g / 4 pi) give product beams without any other normalisation.
+so that fields times sqrt(2 g / 4 pi) give product beams without any other normalisation. Between
+the frequencies of the file luseepy interpolates g and the integrals linearly, not the fields.
 """
 
 from __future__ import annotations
@@ -23,9 +24,14 @@ from lusee_bayes.core.fits_files import read_fits
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
-from lusee_bayes.instrument.beams.gridded import at_frequency, on_grid
+from lusee_bayes.instrument.beams.gridded import (
+    Interpolation,
+    at_frequency,
+    neighbours,
+    on_grid,
+)
 from lusee_bayes.instrument.beams.luseepy_rules import rectangle_rule
-from lusee_bayes.instrument.beams.product_beams import ProductBeams, product_beams, stokes_beam
+from lusee_bayes.instrument.beams.product_beams import ProductBeams, product_modes
 from lusee_bayes.instrument.products import to_real
 
 FIELDS = ("Etheta_real", "Etheta_imag", "EPhi_real", "EPhi_imag")
@@ -68,6 +74,9 @@ class ScalarBeam:
         gain_conv of the file.
     impedance : (frequencies,) complex array or None
         Of the arm in Ohm; None where the file has none.
+    interpolation : {"linear", "spline"}
+        Between the frequencies: luseepy's rule, products of fields and gain linearly, or cubic
+        splines through the fields and the gain.
     """
 
     path: str
@@ -77,6 +86,7 @@ class ScalarBeam:
     e_phi: Complex[np.ndarray, "frequencies theta phi"]
     gain: Float[np.ndarray, " frequencies"]
     impedance: Complex[np.ndarray, " frequencies"] | None = None
+    interpolation: Interpolation = "linear"
 
     @property
     def n_phi(self) -> int:
@@ -98,10 +108,12 @@ class ScalarBeam:
     ) -> AntennaFields:
         """Return the fields of the arms; their products are beams in K per K.
 
+        Between the frequencies of the file this is so with splines only. With linear interpolation
+        the fields themselves are interpolated here, for pictures; use :meth:`beams` for products.
+
         Parameters
         ----------
         frequency_mhz : float
-            Cubic splines interpolate between those of the file.
         grid : HemisphereGrid, optional
             By default nodes that integrate across the horizon exactly; ``luseepy_grid`` is the
             rule of luseepy.
@@ -120,20 +132,8 @@ class ScalarBeam:
         InputError
             Outside the frequencies of the file.
         """
-        *parts, gain = at_frequency(
-            self.path, self.frequencies_mhz, frequency_mhz, self.e_theta, self.e_phi, self.gain
-        )
-        if grid is None:
-            grid = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
-        scale = np.full(len(grid.theta), np.sqrt(2.0 * float(gain) / (4.0 * np.pi)))
-        if taper:
-            below = np.arctan((grid.theta - np.pi / 2.0) / TAPER_WIDTH) / np.pi + 0.5
-            scale = scale * (1.0 - below**2)
-        turned = (
-            np.stack([on_grid(part, self.theta, grid, a) for a in rotations_deg]) * scale[:, None]
-            for part in parts
-        )
-        return AntennaFields(*(x.astype(np.complex128) for x in turned), grid)
+        *parts, gain = self._at(frequency_mhz, self.e_theta, self.e_phi, self.gain)
+        return self._put_up(parts, float(gain), grid, taper, rotations_deg)
 
     def beams(
         self,
@@ -145,8 +145,24 @@ class ScalarBeam:
         rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
     ) -> ProductBeams:
         """Return the beams of all products, in K per K; arguments as of :meth:`fields`."""
-        fields = self.fields(frequency_mhz, grid=grid, taper=taper, rotations_deg=rotations_deg)
-        return product_beams(fields, frequency_mhz, lmax, normalise=False)
+        if self.interpolation == "spline":
+            fields = self.fields(frequency_mhz, grid=grid, taper=taper, rotations_deg=rotations_deg)
+            modes = product_modes(fields, lmax, normalise=False)
+        else:
+            (gain,) = self._at(frequency_mhz, self.gain)
+            modes = np.zeros((len(rotations_deg) ** 2, (lmax + 1) ** 2))
+            for k, weight in neighbours(self.path, self.frequencies_mhz, frequency_mhz):
+                parts = [self.e_theta[k], self.e_phi[k]]
+                fields = self._put_up(parts, float(gain), grid, taper, rotations_deg)
+                modes += weight * product_modes(fields, lmax, normalise=False)
+        return ProductBeams(modes, float(frequency_mhz))
+
+    def impedance_at(self, frequency_mhz: float) -> complex | None:
+        """Return the arm's impedance in Ohm, or None. InputError outside the file's frequencies."""
+        if self.impedance is None:
+            return None
+        (ohm,) = self._at(frequency_mhz, self.impedance)
+        return complex(ohm)
 
     def background(
         self,
@@ -181,9 +197,39 @@ class ScalarBeam:
         InputError
             Outside the frequencies of the file.
         """
-        fields = self.fields(frequency_mhz, grid=grid, taper=taper, rotations_deg=rotations_deg)
-        sky = fields.grid.integrate(to_real(stokes_beam(fields)))
+        beams = self.beams(frequency_mhz, 0, grid=grid, taper=taper, rotations_deg=rotations_deg)
+        sky = np.sqrt(4.0 * np.pi) * beams.modes[:, 0]
         return moon_k * (to_real(np.eye(len(rotations_deg), dtype=np.complex128)) - sky)
+
+    def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
+        return at_frequency(
+            self.path,
+            self.frequencies_mhz,
+            frequency_mhz,
+            *parts,
+            interpolation=self.interpolation,
+        )
+
+    def _put_up(
+        self,
+        parts: list[np.ndarray],
+        gain: float,
+        grid: HemisphereGrid | None,
+        taper: bool,
+        rotations_deg: tuple[float, ...],
+    ) -> AntennaFields:
+        """The fields of one arm, one for each port, with the scale that the gain gives them."""
+        if grid is None:
+            grid = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
+        scale = np.full(len(grid.theta), np.sqrt(2.0 * gain / (4.0 * np.pi)))
+        if taper:
+            below = np.arctan((grid.theta - np.pi / 2.0) / TAPER_WIDTH) / np.pi + 0.5
+            scale = scale * (1.0 - below**2)
+        turned = (
+            np.stack([on_grid(part, self.theta, grid, a) for a in rotations_deg]) * scale[:, None]
+            for part in parts
+        )
+        return AntennaFields(*(x.astype(np.complex128) for x in turned), grid)
 
 
 def read_scalar_beam(path: str | Path) -> ScalarBeam:

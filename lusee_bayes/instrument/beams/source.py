@@ -8,7 +8,7 @@ is one class here and one line in the test of the contract,
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,11 +16,13 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.instrument.beams.circuit import Circuit
 from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
-from lusee_bayes.instrument.beams.gridded import at_frequency
+from lusee_bayes.instrument.beams.gridded import Interpolation, neighbours
 from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams
 from lusee_bayes.instrument.beams.product_beams import ProductBeams
+from lusee_bayes.instrument.beams.receiver import Receiver
 from lusee_bayes.instrument.beams.response_file import PortResponse
 from lusee_bayes.instrument.beams.scalar_file import ROTATIONS_DEG, ScalarBeam
 from lusee_bayes.instrument.products import N_ANTENNAS
@@ -112,8 +114,8 @@ class BeamSource(ABC):
         """
         return None
 
-    def per_kelvin(self, frequency_mhz: float) -> Float[np.ndarray, " ports"] | None:
-        """Return the V^2/Hz that 1 K makes at each port; None if the source knows no volts.
+    def circuit(self, frequency_mhz: float) -> Circuit | None:
+        """Return the antennas' impedances and their receivers; None if the source knows no volts.
 
         Raises
         ------
@@ -121,6 +123,20 @@ class BeamSource(ABC):
             If the source knows volts, but not at this frequency.
         """
         return None
+
+    def interpolated(self, frequency_mhz: float) -> Interpolation | None:
+        """Return how beams are interpolated to this frequency; None where they are not.
+
+        Raises
+        ------
+        InputError
+            If the source has no beams at this frequency.
+        """
+        return None
+
+    def behind(self, receiver: Receiver | None) -> BeamSource:
+        """Return the source with the receivers of data, where they and nothing else say them."""
+        return self
 
     @property
     def monopoles(self) -> Monopoles:
@@ -209,11 +225,12 @@ class ScalarFileBeams(BeamSource):
         return self.beam.background(frequency_mhz, self.moon_k, grid=self._grid, **self._placement)
 
     def impedance(self, frequency_mhz: float) -> complex | None:
+        return self.beam.impedance_at(frequency_mhz)
+
+    def interpolated(self, frequency_mhz: float) -> Interpolation | None:
         beam = self.beam
-        if beam.impedance is None:
-            return None
-        (ohm,) = at_frequency(beam.path, beam.frequencies_mhz, frequency_mhz, beam.impedance)
-        return complex(ohm)
+        there = neighbours(beam.path, beam.frequencies_mhz, frequency_mhz)
+        return beam.interpolation if len(there) > 1 else None
 
     @property
     def _grid(self) -> HemisphereGrid | None:
@@ -238,6 +255,8 @@ class ResponseBeams(BeamSource):
         Integrate with luseepy's own rule, for data that luseepy has made.
     moon_k, antenna_k : float
         Temperatures of the ground and of the lossy antennas in K.
+    receiver_said : bool
+        Whether the response's receivers are to be used for all data; else those that data say.
     """
 
     response: PortResponse
@@ -245,6 +264,7 @@ class ResponseBeams(BeamSource):
     luseepy_quadrature: bool = False
     moon_k: float = 0.0
     antenna_k: float = 0.0
+    receiver_said: bool = True
 
     @property
     def n_ports(self) -> int:
@@ -268,5 +288,15 @@ class ResponseBeams(BeamSource):
             return np.zeros(self.n_ports**2)
         return self.response.background(frequency_mhz, self.moon_k, self.antenna_k)
 
-    def per_kelvin(self, frequency_mhz: float) -> Float[np.ndarray, " ports"]:
-        return self.response.per_kelvin(frequency_mhz)
+    def interpolated(self, frequency_mhz: float) -> Interpolation | None:
+        response = self.response
+        there = neighbours(response.path, response.frequencies_mhz, frequency_mhz)
+        return response.interpolation if len(there) > 1 else None
+
+    def behind(self, receiver: Receiver | None) -> BeamSource:
+        if receiver is None or self.receiver_said:
+            return self
+        return replace(self, response=replace(self.response, receiver=receiver))
+
+    def circuit(self, frequency_mhz: float) -> Circuit:
+        return self.response.circuit(frequency_mhz)

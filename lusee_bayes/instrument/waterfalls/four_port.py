@@ -2,8 +2,10 @@
 
 FITS version 3: image ``data`` (time, product, frequency); ``freq`` in MHz; ``time`` (JD1, JD2) in
 the scale TIMESYS; table ``products`` with a column ``label``; U (frequency, port, port), the
-covariance that an enclosure of 1 K makes, as ``blackbody_normalization``. Header: LUN_LAT_DEG,
-LUN_LONG_DEG, DELTAT_SEC, TMOON_K, TANT_K. Divided by sqrt(U_aa U_bb), visibilities are in K.
+covariance that an enclosure of 1 K makes, as ``blackbody_normalization``; the receivers' loads ZL
+(frequency, port, port) in Ohm. Header: LUN_LAT_DEG, LUN_LONG_DEG, DELTAT_SEC, TMOON_K, TANT_K and
+FREQINT, the interpolation of the response between its frequencies. Divided by sqrt(U_aa U_bb),
+visibilities are in K.
 """
 
 from __future__ import annotations
@@ -20,11 +22,15 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import read_fits
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming
+from lusee_bayes.instrument.beams.gridded import Interpolation
+from lusee_bayes.instrument.beams.receiver import LOADS, MeasuredReceiver
 from lusee_bayes.instrument.observation import Observation, utc_of
 from lusee_bayes.instrument.products import N_ANTENNAS, all_products, labels
 from lusee_bayes.instrument.waterfalls.waterfall import SITE_AND_STEP, Waterfall
 
 UNIT = "V^2/Hz"
+# what FREQINT calls the interpolation of responses between their frequencies
+INTERPOLATIONS: dict[Interpolation, str] = {"linear": "linear-native-alm", "spline": "cubic-spline"}
 LAYOUT = Layout(
     "a waterfall of luseepy's four-port simulator",
     {
@@ -34,12 +40,14 @@ LAYOUT = Layout(
         # a sample that is not finite is missing
         "data": Variable(("time", "product", "freq"), missing=True),
         "blackbody_normalization_real": Variable(("freq", N_ANTENNAS, N_ANTENNAS)),
+        **{name: Variable(("freq", N_ANTENNAS, N_ANTENNAS), optional=True) for name in LOADS},
     },
     {
         **SITE_AND_STEP,
         "TMOON_K": Attribute(low=0.0),
         "TANT_K": Attribute(low=0.0, optional=True),
         "TIMESYS": Attribute("text", optional=True),
+        "FREQINT": Attribute("text", optional=True),
         "BUNIT": Attribute("text", choices=(UNIT,)),
     },
 )
@@ -82,7 +90,16 @@ def read_four_port(path: Path) -> Waterfall:
         per_kelvin,
         said["TMOON_K"],
         said.get("TANT_K", 0.0),
+        _receiver(path, images),
+        said.get("FREQINT"),
     )
+
+
+def _receiver(path: Path, images: dict[str, np.ndarray]) -> MeasuredReceiver | None:
+    if not set(LOADS) <= set(images):
+        return None
+    real, imaginary = (images[name] for name in LOADS)
+    return MeasuredReceiver(str(path), images["freq"], real + 1j * imaginary)
 
 
 def _places(path: Path, products: np.ndarray) -> list[int]:

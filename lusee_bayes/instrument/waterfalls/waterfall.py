@@ -9,6 +9,8 @@ from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Attribute
+from lusee_bayes.instrument.beams.gridded import SAME_FREQUENCY_MHZ
+from lusee_bayes.instrument.beams.receiver import MeasuredReceiver
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import N_ANTENNAS, all_products
@@ -20,8 +22,6 @@ SITE_AND_STEP = {
     "LUN_LAT_DEG": Attribute(low=-90.0, high=90.0),
     "DELTAT_SEC": Attribute(low=1e-6, high=1e9),
 }
-# two frequencies that differ by less, relatively, are one
-SAME_FREQUENCY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,10 @@ class Waterfall:
         V^2/Hz that 1 K makes at each port; None unless the file is in V^2/Hz.
     moon_k, antenna_k : float
         Temperatures in K of the Moon and of the antennas, whose emission the visibilities contain.
+    receiver : MeasuredReceiver or None
+        The receivers' loads at the channels; None unless the file holds them.
+    interpolation : str or None
+        How luseepy calls its interpolation of the response between channels; None if not said.
     """
 
     path: str
@@ -49,6 +53,8 @@ class Waterfall:
     per_kelvin: Float[np.ndarray, "frequencies ports"] | None = None
     moon_k: float = 0.0
     antenna_k: float = 0.0
+    receiver: MeasuredReceiver | None = None
+    interpolation: str | None = None
 
     def channel(self, frequency_mhz: float) -> int:
         """Return the number of the channel at a frequency.
@@ -60,11 +66,11 @@ class Waterfall:
         """
         known = self.frequencies_mhz
         nearest = int(np.argmin(np.abs(known - frequency_mhz)))
-        if not np.isclose(known[nearest], frequency_mhz, rtol=SAME_FREQUENCY):
+        if abs(known[nearest] - frequency_mhz) > SAME_FREQUENCY_MHZ:
             raise InputError(
-                f"{self.path} has no channel at {frequency_mhz:g} MHz (it has "
-                f"{', '.join(f'{f:g}' for f in known)}); use --set frequency_mhz="
-                f"{known[nearest]:g}"
+                f"{self.path} has no channel at {frequency_mhz:.15g} MHz (it has "
+                f"{', '.join(f'{f:.9g}' for f in known)}); use --set frequency_mhz="
+                f"{known[nearest]:.15g}"
             )
         return nearest
 
@@ -101,4 +107,10 @@ class Waterfall:
         except InputError as error:
             raise InputError(f"{self.path} at {frequency_mhz:g} MHz: {error}") from error
         data = layout.gather(np.where(present, values, 0.0)[within])
-        return Visibilities(data, layout, self.observation, float(self.frequencies_mhz[channel]))
+        return Visibilities(
+            data,
+            layout,
+            self.observation,
+            float(self.frequencies_mhz[channel]),
+            receiver=self.receiver,
+        )

@@ -45,12 +45,12 @@ def describe_waterfall(path: Path) -> str:
         kelvin = waterfall.per_kelvin
         four_port_lines = [
             f"  in V^2/Hz: 1 K is {kelvin.min():.4g} to {kelvin.max():.4g} of them",
-            f"  with the emission of the Moon at {waterfall.moon_k:g} K",
+            f"  with the emission of the Moon at {waterfall.moon_k:.15g} K",
         ]
     return "\n".join(
         [
             f"{path}: a waterfall of luseepy" + (", four ports" if four_port else ""),
-            f"  channels at {', '.join(f'{f:g}' for f in waterfall.frequencies_mhz)} MHz",
+            f"  channels at {', '.join(f'{f:.9g}' for f in waterfall.frequencies_mhz)} MHz",
             f"  {len(names)} products ({' '.join(names)}), {observation.n_times} times of "
             f"{observation.step_s:g} s, {gaps} samples missing",
             f"  {observation.times[0].isot} to {observation.times[-1].isot} UTC",
