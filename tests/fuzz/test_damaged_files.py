@@ -39,6 +39,16 @@ def read_any_data(path: Path) -> object:
     return read_data(path, small_scenario(lmax=2))
 
 
+def read_onto(path: Path) -> object:
+    folder = path.parent / "onto"
+    folder.mkdir(exist_ok=True)
+    try:
+        shutil.copy(path, folder / "posterior.nc")
+        return read_updatable(folder, small_scenario(lmax=2))
+    finally:
+        shutil.rmtree(folder)
+
+
 READERS = {
     "visibilities.nc": (describe, read_visibilities),
     "waterfall.fits": (describe, read_waterfall, read_any_data),
@@ -46,7 +56,7 @@ READERS = {
     "scalar_beam.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
     "response.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
     "posterior.nc": (describe,),
-    "updatable.nc": (describe,),
+    "updatable.nc": (describe, read_onto),
     "cube.nc": (describe,),
     "diagnostics.nc": (describe,),
     "compact.npz": (describe, read_compact),

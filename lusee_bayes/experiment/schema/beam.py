@@ -55,9 +55,9 @@ class MonopoleBeamSection(Section):
     length_m: Positive = 3.0
     zenith_angle_deg: Annotated[float, Field(gt=0, lt=180)] = 75.0
     height_m: Positive = 2.0
-    surface_permittivity: Annotated[float, Field(ge=1)] = 3.7
-    deep_permittivity: Annotated[float, Field(ge=1)] = 6.1
-    loss_tangent: Annotated[float, Field(ge=0)] = 0.01
+    surface_permittivity: Annotated[float, Field(ge=1, le=1e6)] = 3.7
+    deep_permittivity: Annotated[float, Field(ge=1, le=1e6)] = 6.1
+    loss_tangent: Annotated[float, Field(ge=0, le=1e6)] = 0.01
     turntable_offset_deg: Angle = 0.0
 
     @property

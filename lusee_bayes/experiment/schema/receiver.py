@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from lusee_bayes.experiment.schema.section import Positive, Section
+from lusee_bayes.experiment.schema.section import LARGEST, Positive, Section
 from lusee_bayes.instrument.beams.receiver import (
     CapacitorReceiver,
     JFETReceiver,
@@ -27,7 +27,7 @@ def _ports(entry: Any) -> Any:
     return Annotated[tuple[entry, ...], four, BeforeValidator(_each_port)]
 
 
-NotNegative = Annotated[float, Field(ge=0)]
+NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 _JFET, _CAPACITOR = JFETReceiver(), CapacitorReceiver()
 
 
