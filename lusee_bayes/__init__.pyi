@@ -10,8 +10,12 @@ from .instrument.beams import BeamSource as BeamSource
 from .instrument.beams import Monopoles as Monopoles
 from .instrument.beams import ProductBeams as ProductBeams
 from .instrument.beams import Regolith as Regolith
+from .instrument.beams import SampledBeams as SampledBeams
+from .instrument.beams import from_uvbeam as from_uvbeam
 from .instrument.beams import monopole_beams as monopole_beams
 from .instrument.beams import read_beam as read_beam
+from .instrument.beams import sampled_beams as sampled_beams
+from .instrument.beams import write_sampled_beams as write_sampled_beams
 from .instrument.coupling import Coupling as Coupling
 from .instrument.coupling import CouplingMatrix as CouplingMatrix
 from .instrument.coupling import DenseCoupling as DenseCoupling

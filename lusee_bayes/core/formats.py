@@ -13,6 +13,7 @@ POSTERIOR = "lusee_bayes posterior 1"
 POSTERIOR_CUBE = "lusee_bayes posterior cube 1"
 COMPACT_POSTERIOR = "lusee_bayes compact posterior 1"
 SAMPLES = "lusee_bayes samples 1"
+BEAMS = "lusee_bayes beams 1"
 DIAGNOSTICS = "lusee_bayes diagnostics 1"
 PAPER_CASE = "lusee_bayes paper case 1"
 
@@ -31,4 +32,5 @@ def format_of(path: str | Path) -> str | None:
             return None
         with h5py.File(path) as file:
             kind = file.attrs.get("format")
-    return kind.decode(errors="replace") if isinstance(kind, bytes) else kind
+    kind = kind.decode(errors="replace") if isinstance(kind, bytes) else kind
+    return kind if isinstance(kind, str) else None

@@ -30,4 +30,6 @@ class LazyModule:
 healpy = LazyModule("healpy")
 coordinates = LazyModule("astropy.coordinates")
 numpyro = LazyModule("numpyro")
+# an optional extra
+pyuvdata = LazyModule("pyuvdata")
 dist = LazyModule("numpyro.distributions")

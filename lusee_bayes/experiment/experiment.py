@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.representation import Described
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.plausibility import require_plausible
 from lusee_bayes.experiment.scenario import Scenario
@@ -15,8 +16,8 @@ from lusee_bayes.experiment.simulate import simulate
 from lusee_bayes.instrument.visibilities import Visibilities
 
 
-@dataclass(frozen=True)
-class Experiment:
+@dataclass(frozen=True, repr=False)
+class Experiment(Described):
     """The pieces of d = A m + n, with d. :func:`build` makes one of a scenario.
 
     Attributes
@@ -32,6 +33,13 @@ class Experiment:
     setup: Setup
     data: Visibilities
     doubts: tuple[str, ...] = ()
+
+    def description(self) -> tuple[str, ...]:
+        scenario = self.scenario
+        return (
+            f"{scenario.frequency_mhz:g} MHz, lmax = {scenario.lmax}, beams {scenario.beam.label}",
+            *self.data.description(),
+        )
 
     @property
     def scenario(self) -> Scenario:

@@ -104,6 +104,20 @@ class Scenario(Section):
             )
         return self
 
+    @model_validator(mode="after")
+    def _prior_files_have_a_frequency(self) -> Scenario:
+        prior = self.prior
+        if self.joint and prior.has_files:
+            raise ValueError(
+                "joint takes the spectral prior; leave out prior.spectrum_file and prior.mean_file"
+            )
+        if self.frequencies_mhz and prior.has_files and prior.file_frequency_mhz is None:
+            raise ValueError(
+                "prior.spectrum_file and prior.mean_file are of one frequency; with "
+                "frequencies_mhz, say which in prior.file_frequency_mhz"
+            )
+        return self
+
     def channels(self) -> tuple[Scenario, ...]:
         """The scenario of every channel; draws of each have a seed of their own, one further."""
         alone = {"frequencies_mhz": (), "joint": False}

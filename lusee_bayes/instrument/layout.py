@@ -13,9 +13,10 @@ from jaxtyping import Bool, Float, Int, Shaped
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.representation import Described
 
 
-class DataLayout(eqx.Module):
+class DataLayout(Described, eqx.Module):
     """The product and the time of every entry of d.
 
     Attributes
@@ -30,6 +31,11 @@ class DataLayout(eqx.Module):
     n_products: int = eqx.field(static=True)
     n_times: int = eqx.field(static=True)
     index: Int[Array, " data"] | None = None
+
+    def description(self) -> tuple[str, ...]:
+        grid = self.n_products * self.n_times
+        absent = f", {grid - self.size} absent" if self.index is not None else ""
+        return (f"{self.n_products} products x {self.n_times} times, {self.size} data{absent}",)
 
     @classmethod
     def from_flags(cls, flags: Bool[np.ndarray, "products times"]) -> DataLayout:

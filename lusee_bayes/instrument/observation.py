@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.core.checks import require_finite, require_positive
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.representation import Described, listed
 
 CYCLE_DAYS = 27.321661
 # period after which the sky repeats itself in luseepy's engine croissant
@@ -50,8 +51,8 @@ class Run:
     night_only: bool = False
 
 
-@dataclass(frozen=True)
-class Observation:
+@dataclass(frozen=True, repr=False)
+class Observation(Described):
     """The samples of one or more runs at one site.
 
     Attributes
@@ -115,6 +116,17 @@ class Observation:
                 "each turntable angle) without going back"
             )
         require_ephemeris(self.times.jd)
+
+    def description(self) -> tuple[str, ...]:
+        with unannounced_leap_seconds():
+            first, last = self.times[0].isot[:19], self.times[-1].isot[:19]
+        angles = listed(tuple(f"{angle:g}" for angle in self.turntable_deg))
+        axis = ", with a fixed axis of the Moon" if self.fixed_axis else ""
+        return (
+            f"longitude {self.lon_deg:g}, latitude {self.lat_deg:g} degrees{axis}",
+            f"{first} to {last} UTC, {self.n_times} samples of {self.step_s:g} s",
+            f"{self.n_runs} run{'s' * (self.n_runs > 1)}, turntable at {angles} degrees",
+        )
 
     @classmethod
     def from_runs(
@@ -277,21 +289,6 @@ def unannounced_leap_seconds() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)
         yield
-
-
-def utc_of(
-    jd1: Float[np.ndarray, " times"], jd2: Float[np.ndarray, " times"], scale: str = "utc"
-) -> Time:
-    """Return times of Julian dates in two parts, in UTC.
-
-    Raises
-    ------
-    InputError
-        If one is not finite or outside the ephemeris.
-    """
-    require_ephemeris(jd1 + jd2)
-    with unannounced_leap_seconds():
-        return Time(jd1, jd2, format="jd", scale=scale).utc
 
 
 def utc_from_text(name: str, text: str) -> Time:

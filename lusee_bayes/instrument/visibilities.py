@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,17 +13,25 @@ from jaxtyping import Float
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import require_finite, require_float64, require_shape
+from lusee_bayes.core.checks import require_finite, require_float64, require_positive, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
+from lusee_bayes.core.harmonics import lmax_of
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.netcdf_files import read_netcdf
 from lusee_bayes.core.reading import naming, require_file
+from lusee_bayes.core.representation import Described, extent, listed
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument.beams.receiver import MeasuredReceiver
+from lusee_bayes.instrument.correlations import (
+    real_products,
+    runs_of,
+    site_of,
+)
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, utc_of
-from lusee_bayes.instrument.products import labels
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.products import N_ANTENNAS, labels
+from lusee_bayes.instrument.times import step_of, utc_of, utc_times
 
 LOADS = ("load_ohm_real", "load_ohm_imag")
 # what a file of visibilities holds
@@ -51,8 +60,8 @@ LAYOUT = Layout(
 HINT = "make some with: lusee-bayes simulate SCENARIO"
 
 
-@dataclass(frozen=True)
-class Visibilities:
+@dataclass(frozen=True, repr=False)
+class Visibilities(Described):
     """Measured or simulated data.
 
     Attributes
@@ -90,6 +99,82 @@ class Visibilities:
                 f"the data have {self.layout.n_times} times, the observation "
                 f"{self.observation.n_times}"
             )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        data: Any,
+        times: Any,
+        frequency_mhz: float,
+        *,
+        products: Any = None,
+        site: Any = "LuSEE-Night",
+        flags: Any = None,
+        turntable_deg: Any = 0.0,
+        convention: str = "s_i conj(s_j)",
+        step_s: float | None = None,
+        n_antennas: int = N_ANTENNAS,
+    ) -> Visibilities:
+        """Make a data set of arrays.
+
+        Parameters
+        ----------
+        data : (times, products) array
+            In K. Complex correlations V_ij of pairs of ports, or their real and imaginary parts as
+            real columns; NaN, or masked, where a sample is absent.
+        times : (times,) sequence
+            Middles of the samples, growing: datetimes, ISO dates (UTC) or an astropy Time.
+        frequency_mhz : float
+        products : sequence of str, optional
+            The name of each column, in any order: "01" for complex data, "01R" and "01I" for real
+            data, and "10" for the correlation of port 1 with port 0. By default all products in
+            the order 00, 01, 02, ..., 11, 12, ... Those without a column are absent.
+        site : str or (float, float)
+            Name, or selenographic longitude and latitude in degrees.
+        flags : (times, products) or (times,) array of bool, optional
+            True where a sample is not to be used.
+        turntable_deg : float or (times,) array
+            Turntable angle in degrees, from East towards North.
+        convention : {"s_i conj(s_j)", "conj(s_i) s_j"}
+            What "ij" is the mean of, with voltages that go as exp(+i w t). Software that has
+            exp(-i w t) has the other sign of the imaginary part, too.
+        step_s : float, optional
+            Integration time in seconds; by default the median step from sample to sample.
+        n_antennas : int
+            Number of ports.
+
+        Returns
+        -------
+        Visibilities
+
+        Raises
+        ------
+        InputError
+            If arrays do not fit each other or cannot be what they are said to be.
+        """
+        values, missing = real_products(data, products, flags, convention, n_antennas)
+        utc = utc_times(times)
+        if len(utc) != values.shape[1]:
+            raise InputError(
+                f"there are {len(utc)} times for data of {values.shape[1]} times (their first axis)"
+            )
+        require_positive("frequency_mhz", frequency_mhz)
+        lon_deg, lat_deg = site_of(site)
+        run, angles = runs_of(turntable_deg, len(utc))
+        observation = Observation(lon_deg, lat_deg, utc, run, angles, step_of(utc, step_s))
+        layout = DataLayout.from_flags(missing)
+        return cls(layout.gather(values), layout, observation, float(frequency_mhz))
+
+    def description(self) -> tuple[str, ...]:
+        first, *dates = self.observation.description()
+        missing = f", {self.n_missing} absent" if self.n_missing else ""
+        truth = "" if self.truth is None else f"; simulated, lmax = {lmax_of(len(self.truth))}"
+        return (
+            f"{self.layout.n_products} products x {self.layout.n_times} times at "
+            f"{self.frequency_mhz:g} MHz, {self.layout.size} data{missing}",
+            f"{extent(self.data, 'K')}{truth}; products {listed(self.labels)}",
+            f"{dates[0]}, at {first}",
+        )
 
     @property
     def n_missing(self) -> int:

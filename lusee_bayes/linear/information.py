@@ -22,6 +22,7 @@ from lusee_bayes.core.arrays import Array, compiled, namespace, on_processor, pl
 from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import cholesky, gram_matrix, scaled, solve_lower
+from lusee_bayes.core.representation import Described, number
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
 from lusee_bayes.linear.normal_matrix import has_structure, is_within_times, normal_matrix
 from lusee_bayes.linear.posterior import Posterior
@@ -33,7 +34,7 @@ from lusee_bayes.sky.priors import Prior
 REFINEMENTS = 3
 
 
-class Information(eqx.Module):
+class Information(Described, eqx.Module):
     """ln p(d | m) of some data as a function of the sky m; see the module's equations.
 
     Attributes
@@ -128,7 +129,7 @@ class Information(eqx.Module):
         first = cls(matrix, vector, zero, misfit, xp.asarray(factor.log_det()), n_data)
         root = _diagonal_root(prior, n_modes=matrix.shape[0])
         lower = _precision_root(matrix, root)
-        mean = prior.colour(_condition(first, root, lower, 1)[0])
+        mean = prior.colour(_condition(first, root, lower, prior.white_mean, 1)[0])
         vector, misfit = gradient_and_misfit(coupling, factor, centred, mean)
         perturbations = None
         if n_perturbations:
@@ -140,6 +141,12 @@ class Information(eqx.Module):
             )
         information = cls(matrix, vector, mean, misfit, first.log_det, n_data, perturbations)
         return information, information._posterior(prior, lower, 2)
+
+    def description(self) -> tuple[str, ...]:
+        return (
+            f"ln p(d | m) of {number(self.n_data, '.0f')} data, for {self.n_modes} modes of the "
+            "sky, in K",
+        )
 
     @property
     def n_modes(self) -> int:
@@ -214,7 +221,7 @@ class Information(eqx.Module):
 
     def _posterior(self, prior: Prior, lower: Array, refinements: int) -> Posterior:
         root = _diagonal_root(prior, self.n_modes)
-        u, log_evidence, moved = _condition(self, root, lower, refinements)
+        u, log_evidence, moved = _condition(self, root, lower, prior.white_mean, refinements)
         if not is_traced(moved) and not float(moved) <= CONVERGENCE:
             raise InputError(
                 f"the posterior mean did not converge: its last step was {float(moved):.2g} "
@@ -252,7 +259,11 @@ def _precision_root(matrix: Float[Array, "modes modes"], root: Float[Array, " mo
 
 @compiled
 def _condition(
-    information: Information, root: Array, lower: Array, refinements: int
+    information: Information,
+    root: Array,
+    lower: Array,
+    prior_mean: Array | None,
+    refinements: int,
 ) -> tuple[Array, Array, Array]:
     """Mean of u, ln p(d), and the last step in standard deviations.
 
@@ -261,17 +272,18 @@ def _condition(
     xp = namespace(information)
     start = xp.where(root > 0, information.reference / xp.where(root > 0, root, 1.0), 0.0)
     here = information.recentred(start * root)
+    expected = xp.zeros_like(root) if prior_mean is None else prior_mean
     correction, moved = xp.zeros_like(root), xp.asarray(np.inf)
     for _ in range(refinements):
         pull = here.vector - here.matrix @ (root * correction)
-        gradient = root * pull - (start + correction)
+        gradient = root * pull - (start + correction - expected)
         half = solve_lower(lower, gradient[:, None], transpose=False)
         correction = correction + solve_lower(lower, half, transpose=True)[:, 0]
         moved = xp.asarray(xp.linalg.norm(half))
     u = start + correction
     log_evidence = -0.5 * (
         here.recentred(u * root).misfit
-        + u @ u
+        + (u - expected) @ (u - expected)
         + here.log_det
         + 2.0 * xp.log(xp.diagonal(lower)).sum()
         + here.n_data * np.log(2.0 * np.pi)

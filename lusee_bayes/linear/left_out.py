@@ -1,6 +1,6 @@
 """The protocol of what tells how a group of data differs from its prediction by all others.
 
-With K = A S A^T + N the covariance of data under the model and u = K^-1 (d - offset), a group s
+With K = A S A^T + N the covariance of data under the model and u = K^-1 (d - E[d]), a group s
 differs from its prediction by K_ss^-1 u_s, K_ss being a block of K^-1, and ::
 
     chi^2_s = u_s^T K_ss^-1 u_s.
@@ -20,7 +20,7 @@ class LeftOut(ABC):
     Attributes
     ----------
     u : (products, times) array
-        K^-1 (d - offset), in 1/K; zero where a sample is missing.
+        K^-1 (d - E[d]), in 1/K; zero where a sample is missing.
     inverse_diagonal : (products, times) array
         The diagonal of K^-1, in 1/K^2, of the data that :meth:`stretch` has left out; else NaN.
     """

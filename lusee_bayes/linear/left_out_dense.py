@@ -43,7 +43,7 @@ class DenseLeftOut(LeftOut):
     def __init__(self, model: LinearGaussian, data: Float[Array, " data"], layout: DataLayout):
         solver = model.factorise()
         self._factor, self._half, self._layout = solver.factor, solver.half(), layout
-        white = solver.factor.whiten(data if model.offset is None else data - model.offset)
+        white = solver.surprise(data)
         rest = white - self._half.T @ (self._half @ white)
         self._u = np.asarray(solver.factor.whiten_transpose(rest))
         self.u = layout.scatter(self._u)

@@ -17,6 +17,7 @@ from jaxtyping import Float, PRNGKeyArray
 from lusee_bayes.core.arrays import Array, on_processor
 from lusee_bayes.core.checks import require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.representation import Described
 from lusee_bayes.instrument.coupling import Coupling, as_coupling
 from lusee_bayes.linear.information import Information, gradient_and_misfit
 from lusee_bayes.linear.normal_matrix import has_structure, is_within_times
@@ -26,15 +27,15 @@ from lusee_bayes.noise.covariance import Covariance
 from lusee_bayes.sky.priors import Prior
 
 
-class LinearGaussian(eqx.Module):
-    """d = A m + offset + n, m ~ N(0, S), n ~ N(0, N): a distribution over data vectors.
+class LinearGaussian(Described, eqx.Module):
+    """d = A m + offset + n, m ~ N(mu, S), n ~ N(0, N): a distribution over data vectors.
 
     Parameters
     ----------
     coupling : Coupling or (data, unknowns) array
         A. An array is wrapped in a ``DenseCoupling``.
     prior : Prior
-        S, in K^2.
+        S, in K^2, and mu where it is not zero.
     noise : Covariance
         N, in K^2.
     offset : (data,) array or None
@@ -67,6 +68,15 @@ class LinearGaussian(eqx.Module):
             require_float64("the offset", self.offset)
             require_shape("the offset", self.offset, (n_data,))
             require_finite("the offset", self.offset)
+
+    def description(self) -> tuple[str, ...]:
+        offset = "" if self.offset is None else " + offset"
+        return (
+            f"d = A m{offset} + n, {self.n_data} data, {self.prior.size} unknowns of the sky, in K",
+            f"A {type(self.coupling).__name__}, S {type(self.prior).__name__}, "
+            f"N {type(self.noise).__name__}",
+            "condition(data) gives the posterior",
+        )
 
     @property
     def n_data(self) -> int:

@@ -12,6 +12,7 @@ from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import inverse_from_cholesky, scaled, solve_lower
+from lusee_bayes.core.representation import Described, number
 from lusee_bayes.sky.priors import Prior
 
 # directions whose standard deviations are computed at once
@@ -21,7 +22,7 @@ CHUNK = 2048
 PRECISION = 1e-3
 
 
-class Posterior(eqx.Module):
+class Posterior(Described, eqx.Module):
     """N(mean, C) over the sky's unknowns m = G u, in K.
 
     Attributes
@@ -46,6 +47,15 @@ class Posterior(eqx.Module):
     basis: Float[Array, "white rank"] | None
     log_evidence: Float[Array, ""]
     refinement: Float[Array, ""]
+
+    def description(self) -> tuple[str, ...]:
+        form = "map" if self.basis is None else "data"
+        return (
+            f"{self.prior.size} unknowns of the sky, in K, {form}-space form",
+            f"ln evidence {number(self.log_evidence)}, "
+            f"{number(self.information_bits(), '.1f')} bits of information",
+            "mean, std(), covariance(), sample(key, n), prior_fraction()",
+        )
 
     @property
     def mean(self) -> Float[Array, " unknowns"]:

@@ -184,13 +184,13 @@ def residuals(model: LinearGaussian, posterior: Posterior, data: Visibilities) -
     if left_out is None:
         predicted = model.predict(posterior.mean)
         u = np.asarray(model.noise.solve(data.data - predicted))
-        total = float(np.asarray(_without_offset(model, data)) @ u)
+        total = float(np.asarray(_less_expected(model, data)) @ u)
         return Residuals(np.asarray(predicted), np.full(len(u), np.nan), total, (), (), ())
     u = left_out.u[layout.product, layout.time]
     day = np.floor(observation.hours / HOURS_A_DAY).astype(int)
     angles, angle_of_run = np.unique(observation.turntable_deg, return_inverse=True)
     angle = angle_of_run[observation.run]
-    total = float(np.asarray(_without_offset(model, data)) @ u)
+    total = float(np.asarray(_less_expected(model, data)) @ u)
 
     def group(name: str, n: int, squared: float) -> Group:
         if n == len(u):
@@ -229,7 +229,10 @@ def residuals(model: LinearGaussian, posterior: Posterior, data: Visibilities) -
     return Residuals(predicted, z, total, products, days, of_angles)
 
 
-def _without_offset(model: LinearGaussian, data: Visibilities) -> Float[Array, " data"]:
+def _less_expected(model: LinearGaussian, data: Visibilities) -> Float[Array, " data"]:
+    """Less what the prior's mean sky predicts."""
+    if model.prior.white_mean is not None:
+        return data.data - model.predict(model.prior.colour(model.prior.white_mean))
     return data.data if model.offset is None else data.data - model.offset
 
 

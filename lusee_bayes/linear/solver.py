@@ -5,7 +5,8 @@ With N = L L^T, S = G G^T and the whitened sky u (m = G u), set W = L^-1 A G and
     Lambda = 1 + W^T W,   u | d ~ N(Lambda^-1 W^T w, Lambda^-1),
     log p(d) = -1/2 [ |w - W u|^2 + |u|^2 + ln|N| + ln|Lambda| + N_data ln 2 pi ]    (u the mean),
 
-the equations of the map-space form, preconditioned. With fewer data than modes the same is done in
+the equations of the map-space form, preconditioned. (Where the prior has a mean mu, d is less
+A mu, and u is that of m - mu.) With fewer data than modes the same is done in
 the row space of W: W^T = Q R (Householder), u = Q v + (a part that only the prior knows),
 Lambda_v = 1 + R R^T of the size of the data. It equals S A^T (A S A^T + N)^-1 d without the
 cancellation of S - S A^T (...)^-1 A S, which loses the variance of well measured modes.
@@ -115,6 +116,23 @@ class Solver(eqx.Module):
             As :meth:`condition`.
         """
         return self._solve(data)[1]
+
+    def surprise(self, data: Float[Array, " data"]) -> Float[Array, " data"]:
+        """Compute L^-1 (d - E[d]), where E[d] is what the prior's mean sky predicts.
+
+        Parameters
+        ----------
+        data : (data,) array
+            d, in K.
+
+        Returns
+        -------
+        (data,) array
+            White data, of which the model says N(0, 1 + W W^T).
+        """
+        white = self.factor.whiten(data if self.offset is None else data - self.offset)
+        mean = self.prior.white_mean
+        return white if mean is None else white - self.whitened @ mean
 
     def half(self) -> Float[Array, "rank data"]:
         """Compute H with (A S A^T + N)^-1 = L^-T (1 - H^T H) L^-1.
@@ -247,7 +265,7 @@ def _solve(solver: Solver, data: Float[Array, " data"]) -> tuple[Array, Array, A
     (corrected seminormal equations) restores what they lose. Derivatives do not go through the
     iteration: at its fixed point one more step with live arrays carries them exactly.
     """
-    white = solver.factor.whiten(data if solver.offset is None else data - solver.offset)
+    white = solver.surprise(data)
     live = (solver.whitened, solver.lower, solver.basis, white)
     frozen = jax.lax.stop_gradient(live)
 
@@ -278,4 +296,6 @@ def _solve(solver: Solver, data: Float[Array, " data"]) -> tuple[Array, Array, A
         + log_det
         + white.shape[0] * np.log(2.0 * np.pi)
     )
-    return u, log_evidence, moved
+    # u was that of the sky's deviation from the prior's mean
+    mean = solver.prior.white_mean
+    return u if mean is None else u + mean, log_evidence, moved

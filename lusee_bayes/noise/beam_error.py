@@ -1,4 +1,4 @@
-"""Errors of the beams in A: N_beam = dA S dA^T along known directions dA.
+"""Errors of the beams in A: N_beam = dA (S + mu mu^T) dA^T along known directions dA.
 
 If the true coupling matrix is A + dA, the data hold dA m besides A m; over skies of the prior, that
 is noise of covariance dA S dA^T (paper, section on beam precision). Directions: the
@@ -21,21 +21,24 @@ from lusee_bayes.sky.priors import Prior
 
 
 def beam_error_noise(direction: Coupling, prior: Prior) -> LowRankCovariance:
-    """Return the covariance dA S dA^T of a beam error.
+    """Return the covariance dA (S + mu mu^T) dA^T of a beam error, mu being the prior's mean.
 
     Parameters
     ----------
     direction : Coupling
         dA: the coupling matrix of a difference of beams.
     prior : Prior
-        S.
+        S and mu.
 
     Returns
     -------
     LowRankCovariance
         In K^2.
     """
-    return LowRankCovariance(prior.colour_columns(direction.dense()), "the beam-error covariance")
+    columns = prior.colour_columns(direction.dense())
+    if prior.white_mean is not None:
+        columns = jnp.concatenate([columns, (columns @ prior.white_mean)[:, None]], axis=1)
+    return LowRankCovariance(columns, "the beam-error covariance")
 
 
 def difference(true: ProductBeams, model: ProductBeams) -> ProductBeams:

@@ -24,6 +24,7 @@ from lusee_bayes.core.checks import (
     require_shape,
 )
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.instrument.gaps import without_gaps
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.products import all_products, auto_indices, to_matrix
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, TimeBlockCovariance
@@ -48,7 +49,8 @@ def radiometer_noise(
     Parameters
     ----------
     visibilities : (products, times) array
-        Modelled or measured V_k(t) on the full grid, in K.
+        Modelled or measured V_k(t) on the full grid, in K. Samples that are absent from the
+        layout may be 0 or NaN; :func:`.without_gaps` fills them where noise depends on them.
     layout : DataLayout
     bandwidth_hz : float
     step_s : float
@@ -78,6 +80,7 @@ def radiometer_noise(
         raise InputError(f"the radiometer's duty_cycle must not exceed 1, got {duty_cycle}")
     require_float64("the visibilities", visibilities)
     require_shape("the visibilities", visibilities, (layout.n_products, layout.n_times))
+    visibilities = without_gaps(visibilities, layout)
     require_finite("the visibilities", visibilities)
     autos = visibilities[auto_indices(round(np.sqrt(layout.n_products)))]
     require_positive(

@@ -14,6 +14,7 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.harmonics import mode_numbers, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import peak_memory_gb
+from lusee_bayes.core.representation import Described, extent
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.residuals import SIGNIFICANCE, probability
@@ -30,8 +31,8 @@ from lusee_bayes.sky.landmarks import LANDMARKS
 SIGNIFICANT = 6.0
 
 
-@dataclass(frozen=True)
-class CubeResult:
+@dataclass(frozen=True, repr=False)
+class CubeResult(Described):
     """The posterior of every channel's sky, in K.
 
     Attributes
@@ -49,6 +50,14 @@ class CubeResult:
     channels: tuple[ChannelResult, ...]
     components: Components | None
     seconds: dict[str, float] = field(default_factory=dict)
+
+    def description(self) -> tuple[str, ...]:
+        kind = "independent" if self.components is None else "joint"
+        return (
+            f"{len(self.channels)} {kind} channels, {extent(self.frequencies_mhz, 'MHz')}, "
+            f"lmax = {self.scenario.lmax}",
+            self.verdict(),
+        )
 
     @property
     def frequencies_mhz(self) -> Float[np.ndarray, " channels"]:

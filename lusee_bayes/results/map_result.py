@@ -12,6 +12,7 @@ import xarray as xr
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages, peak_memory_gb
+from lusee_bayes.core.representation import Described
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference, infer
@@ -25,8 +26,8 @@ from lusee_bayes.results.fluxes import flux_lines, flux_table
 from lusee_bayes.results.updatable import Updatable, read_updatable
 
 
-@dataclass(frozen=True)
-class MapResult:
+@dataclass(frozen=True, repr=False)
+class MapResult(Described):
     """A posterior map at one frequency: a cube of one channel, with its model at hand.
 
     Attributes
@@ -55,6 +56,13 @@ class MapResult:
     fluxes: pd.DataFrame | None
     digests: tuple[str, ...]
     seconds: dict[str, float] = field(default_factory=dict)
+
+    def description(self) -> tuple[str, ...]:
+        channel = self.channel
+        return (
+            f"{channel.frequency_mhz:g} MHz, lmax = {self.scenario.lmax}, {channel.n_data} data",
+            *self.lines(),
+        )
 
     @property
     def scenario(self) -> Scenario:

@@ -23,7 +23,7 @@ HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
 
 
 class SkyPrior(dist.Distribution):
-    """m ~ N(0, S) for a prior whose root is diagonal; event (unknowns,).
+    """m ~ N(mu, S) for a prior whose root is diagonal; event (unknowns,).
 
     Parameters
     ----------
@@ -55,13 +55,16 @@ class SkyPrior(dist.Distribution):
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Skies of the prior, ``(*sample_shape, unknowns)``, in K."""
-        u = jax.random.normal(key, (*sample_shape, self.prior.rank), dtype=jnp.float64)
-        return self.prior.colour(u)
+        n = int(np.prod(sample_shape))
+        return self.prior.sample(key, n).reshape(*sample_shape, self.prior.size)
 
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute ln p(m) of one sky, or of every row of an array of skies."""
         scale = self.scale
-        u = value / scale.reshape(*(1,) * (value.ndim - 1), -1)
+        row = (*(1,) * (value.ndim - 1), -1)
+        u = value / scale.reshape(row)
+        if self.prior.white_mean is not None:
+            u = u - self.prior.white_mean.reshape(row)
         return -0.5 * (u**2).sum(-1) - jnp.log(scale).sum() - scale.shape[0] * HALF_LOG_2PI
 
 
@@ -162,8 +165,7 @@ class Marginal(dist.Distribution):
     def leave_one_out(self, value: Float[Array, " data"]) -> Float[Array, " data"]:
         """Compute ln p(d_i | all other data) of every datum; see CorrelatedNormal."""
         solver = self.model.factorise()
-        offset = self.model.offset
-        white = solver.factor.whiten(value if offset is None else value - offset)
+        white = solver.surprise(value)
         root = solver.factor.whiten(jnp.eye(value.shape[0]))
         # (A S A^T + N)^-1 = L^-T (1 - H^T H) L^-1,  H = L_Lambda^-1 W^T
         half = solver.half()

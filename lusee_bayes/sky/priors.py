@@ -1,7 +1,7 @@
-"""The prior on the sky, m ~ N(0, S), through a square root S = G G^T.
+"""The prior on the sky, m ~ N(mu, S), through a square root S = G G^T; mu is zero by default.
 
-Everything downstream works with the whitened sky u = G^-1 m ~ N(0, 1). S itself is never inverted,
-so an ell without power (C_ell = 0) is a mode that is known to be zero, not an error.
+Everything downstream works with the whitened sky u = G^-1 m ~ N(G^-1 mu, 1). S itself is never
+inverted, so an ell without power (C_ell = 0) is a mode that is known to be zero, not an error.
 """
 
 from __future__ import annotations
@@ -15,13 +15,17 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import is_traced, require_finite, require_float64
+from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, per_mode, pixel_matrix
+from lusee_bayes.core.representation import Described, extent
 
 
-class Prior(eqx.Module):
-    """N(0, S) over the sky's unknowns, as m = G u of independent normals u."""
+class Prior(Described, eqx.Module):
+    """N(mu, S) over the sky's unknowns, as m = G u of independent normals u of unit variance."""
+
+    def description(self) -> tuple[str, ...]:
+        return (f"{self.size} unknowns of {self.rank} independent normals",)
 
     @property
     @abstractmethod
@@ -49,6 +53,11 @@ class Prior(eqx.Module):
     def variance(self) -> Float[Array, " unknowns"]:
         """Return the diagonal of S, in K^2."""
 
+    @property
+    def white_mean(self) -> Float[Array, " white"] | None:
+        """Mean of u; None for zero."""
+        return None
+
     def covariance(self) -> Float[Array, "unknowns unknowns"]:
         """Return S as a matrix, in K^2."""
         root = self.colour(jnp.eye(self.rank))
@@ -70,7 +79,10 @@ class Prior(eqx.Module):
             In K.
         """
         shape = (self.rank,) if n is None else (n, self.rank)
-        return self.colour(jax.random.normal(key, shape, dtype=jnp.float64))
+        u = jax.random.normal(key, shape, dtype=jnp.float64)
+        if self.white_mean is not None:
+            u = u + self.white_mean.reshape(*(1,) * (u.ndim - 1), -1)
+        return self.colour(u)
 
 
 def _require_spectrum(spectrum: Float[Array, " ells"]) -> None:
@@ -88,23 +100,54 @@ def _require_spectrum(spectrum: Float[Array, " ells"]) -> None:
 
 
 class HarmonicPrior(Prior):
-    """S = diag(C_ell): an isotropic Gaussian sky in real harmonic coefficients.
+    """S = diag(C_ell): an isotropic Gaussian sky in real harmonic coefficients, about a mean sky.
 
     Attributes
     ----------
     spectrum : (ells,) array
         C_ell in K^2 for ell = 0..lmax; C_0 is the prior variance of the monopole.
+    mean : (modes,) array or None
+        The prior mean, in K, Galactic, real packed; None for zero.
 
     Raises
     ------
     InputError
-        If the spectrum is not float64, not finite, or negative.
+        If the spectrum or the mean is not float64 or not finite, the spectrum is negative, or the
+        mean has another lmax, or power at an ell where the spectrum has none.
     """
 
     spectrum: Float[Array, " ells"]
+    mean: Float[Array, " modes"] | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
         _require_spectrum(self.spectrum)
+        if self.mean is None:
+            return
+        require_float64("the prior mean", self.mean)
+        require_shape("the prior mean", self.mean, (self.size,))
+        require_finite("the prior mean", self.mean)
+        if is_traced(self.spectrum, self.mean):
+            return
+        fixed = np.flatnonzero((np.asarray(self.mean) != 0.0) & ~(np.asarray(self.variance()) > 0))
+        if fixed.size:
+            raise InputError(
+                f"the prior mean has power at ell = {int(np.sqrt(fixed[0]))}, where C_ell is zero; "
+                "give that ell a variance"
+            )
+
+    def description(self) -> tuple[str, ...]:
+        about = "zero" if self.mean is None else "a mean sky"
+        return (
+            f"independent coefficients about {about}, lmax = {self.spectrum.shape[0] - 1}",
+            f"{self.size} real coefficients, Galactic; C_ell {extent(self.spectrum, 'K^2')}",
+        )
+
+    @property
+    def white_mean(self) -> Float[Array, " white"] | None:
+        if self.mean is None:
+            return None
+        xp, root = namespace(self.mean, self.spectrum), self.diagonal_root()
+        return xp.where(root > 0, self.mean / xp.where(root > 0, root, 1.0), 0.0)
 
     @property
     def size(self) -> int:

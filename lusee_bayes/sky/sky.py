@@ -9,9 +9,10 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_finite, require_float64
 from lusee_bayes.core.harmonics import lmax_of, power_spectrum
+from lusee_bayes.core.representation import Described, number
 
 
-class Sky(eqx.Module):
+class Sky(Described, eqx.Module):
     """Brightness temperature of the whole sky at one frequency.
 
     Attributes
@@ -37,6 +38,13 @@ class Sky(eqx.Module):
         require_float64("the sky", self.modes)
         require_finite("the sky", self.modes)
         lmax_of(self.modes.shape[-1])
+
+    def description(self) -> tuple[str, ...]:
+        mean = number(self.modes[0] / np.sqrt(4.0 * np.pi))
+        return (
+            f"{self.name} at {self.frequency_mhz:g} MHz, lmax = {self.lmax}",
+            f"{self.modes.shape[-1]} real coefficients, Galactic, in K; mean {mean} K",
+        )
 
     @property
     def lmax(self) -> int:

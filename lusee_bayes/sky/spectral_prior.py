@@ -20,6 +20,7 @@ from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import require_finite, require_float64, require_positive, require_shape
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import per_mode, power_spectrum
+from lusee_bayes.core.representation import Described, extent, listed
 from lusee_bayes.sky.priors import HarmonicPrior
 
 # spectra over the power law: x is frequency / reference, y frequency / turnover; ionised gas takes
@@ -63,7 +64,7 @@ def check_components(names: tuple[str, ...], n_channels: int, residual: float | 
         )
 
 
-class SpectralPrior(eqx.Module):
+class SpectralPrior(Described, eqx.Module):
     """N(0, S) over the skies of all channels; see the module's equations.
 
     Attributes
@@ -217,6 +218,14 @@ class SpectralPrior(eqx.Module):
             jnp.asarray(values[:, None] * spectrum),
             _residual_spectra(skies, None, residual),
             tuple(f"principal {k}" for k in range(len(values))),
+        )
+
+    def description(self) -> tuple[str, ...]:
+        residual = "no residual" if self.residual is None else "a residual in each"
+        return (
+            f"{self.n_channels} channels, {extent(self.frequencies_mhz, 'MHz')}, "
+            f"lmax = {self.lmax}",
+            f"{self.n_components} component maps ({listed(self.names)}), {residual}; Galactic, K",
         )
 
     @property

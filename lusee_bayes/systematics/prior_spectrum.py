@@ -46,7 +46,7 @@ class PowerSpectrum(Scale):
             tilt = numpyro.sample("tilt", dist.Normal(jnp.zeros(()), self.tilt_std))
             ell = jnp.arange(float(spectrum.shape[0]))
             spectrum = spectrum * ((ell + 1.0) / PIVOT) ** tilt
-        return replace(model, prior=HarmonicPrior(spectrum))
+        return replace(model, prior=HarmonicPrior(spectrum, mean=model.prior.mean))
 
 
 class SpectrumBands(Scale):
@@ -80,4 +80,4 @@ class SpectrumBands(Scale):
         band = np.searchsorted(np.asarray(self.edges), np.arange(lmax + 1), side="right")
         normal = dist.LogNormal(jnp.zeros(len(self.edges) + 1), self.log_std).to_event(1)
         power = numpyro.sample("band_power", normal)
-        return replace(model, prior=HarmonicPrior(spectrum * power[band]))
+        return replace(model, prior=HarmonicPrior(spectrum * power[band], mean=model.prior.mean))

@@ -6,8 +6,8 @@ import numpy as np
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.rotations import turn_about_z
-from lusee_bayes.instrument.beams import BeamSource, HemisphereGrid, Monopoles, product_beams
-from lusee_bayes.instrument.products import auto_indices, labels, to_matrix
+from lusee_bayes.instrument.beams import BeamSource, HemisphereGrid, Monopoles, stokes_beam
+from lusee_bayes.instrument.products import auto_indices, labels, to_matrix, to_real
 from lusee_bayes.testing.refusals import ROUNDING
 
 
@@ -48,13 +48,21 @@ def check_beam_source(
     assert beams.labels == labels(n)
     assert beams.frequency_mhz == frequency_mhz
 
-    # the coefficients are those of the fields, in the beams' own unit, and a smaller lmax is a
-    # slice
+    # the coefficients are those of the patterns, in the beams' own unit, and these are the fields';
+    # a smaller lmax is a slice
     grid = HemisphereGrid.for_lmax(lmax)
-    fields = source.fields(frequency_mhz, grid)
-    assert fields.grid is grid
-    assert fields.n_antennas == n
-    expected = np.asarray(product_beams(fields, frequency_mhz, lmax, normalise=False).modes)
+    patterns = np.asarray(source.patterns(frequency_mhz, grid))
+    assert patterns.shape == (n, n, len(grid.theta), grid.n_phi)
+    expected = np.asarray(grid.modes(to_real(patterns), lmax))
+    try:
+        fields = source.fields(frequency_mhz, grid)
+    except InputError as error:
+        assert "beams of products, not the E fields" in str(error)
+    else:
+        assert fields.grid is grid
+        assert fields.n_antennas == n
+        own = np.asarray(stokes_beam(fields))
+        np.testing.assert_allclose(patterns, own, rtol=0, atol=ROUNDING * np.abs(own).max())
     unit = (modes * expected).sum() / (expected**2).sum()
     assert unit > 0
     np.testing.assert_allclose(modes, unit * expected, rtol=0, atol=quadrature * largest)

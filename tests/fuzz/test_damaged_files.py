@@ -19,7 +19,7 @@ import lusee_bayes as lb
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.instrument.beams import read_beam
+from lusee_bayes.instrument.beams import read_beam, sampled_beams, write_sampled_beams
 from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.linear.compact import read_compact
@@ -55,6 +55,9 @@ READERS = {
     "four_port.fits": (describe, read_waterfall),
     "scalar_beam.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
     "response.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
+    "sampled_fields.nc": (describe, lambda path: read_beam(path).beams(25.0, 2)),
+    "sampled_fields.fits": (describe, lambda path: read_beam(path).beams(25.0, 2)),
+    "sampled_products.nc": (describe, lambda path: read_beam(path).beams(25.0, 2)),
     "posterior.nc": (describe,),
     "updatable.nc": (describe, read_onto),
     "cube.nc": (describe,),
@@ -82,6 +85,13 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
     experiment.data.write(folder / "visibilities.nc")
     channels = [replace(experiment.data, frequency_mhz=f) for f in (20.0, 25.0)]
     write_waterfall(folder / "waterfall.fits", channels, np.array([1 + 1j, 1 + 2j]), "")
+    theta, phi = np.linspace(0.0, 90.0, 7), np.arange(0.0, 360.0, 45.0)
+    fields = np.ones((4, 7, 8), dtype=complex)
+    sampled = sampled_beams(25.0, e_theta=fields, e_phi=fields, theta_deg=theta, phi_deg=phi)
+    write_sampled_beams(folder / "sampled_fields.nc", sampled)
+    write_sampled_beams(folder / "sampled_fields.fits", sampled)
+    products = sampled_beams([20.0, 30.0], products=np.ones((2, 4, 48)))
+    write_sampled_beams(folder / "sampled_products.nc", products)
     updatable = ["output={updatable: true, compact: true}"]
     run = lb.run_map(small_scenario(*updatable, lmax=2), folder / "run")
     shutil.copy(run.folder / "posterior.nc", folder / "updatable.nc")

@@ -208,3 +208,55 @@ def test_bad_visibilities_are_refused():
 def test_slopes_with_respect_to_the_noise_factor_flow(form):
     slope = jax.grad(lambda f: noise(form, factor=f).log_det())(jnp.asarray(2.0))
     assert float(slope) == pytest.approx(N_PRODUCTS * N_TIMES / 2.0, rel=1e-12)
+
+
+# one time without any sample, one product at a time, and port 3 never
+WHOLE_TIME = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
+WHOLE_TIME[:, 1] = True
+ONE_CROSS = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
+ONE_CROSS[4, 2] = True
+LOST_PORT = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
+LOST_PORT[[5, 6, 10, 11, 13, 14, 15]] = True
+
+
+@pytest.mark.parametrize("absent", [0.0, np.nan])
+@pytest.mark.parametrize(
+    ("flags", "form"),
+    [
+        (WHOLE_TIME, "paper"),
+        (WHOLE_TIME, "exact"),
+        (ONE_CROSS, "paper"),
+        (LOST_PORT, "paper"),
+        (LOST_PORT, "exact"),
+    ],
+)
+def test_absent_samples_change_nothing_for_the_others(flags, form, absent):
+    layout = DataLayout.from_flags(flags)
+    seen = np.where(flags, absent, np.asarray(VISIBILITIES))
+    options = {"bandwidth_hz": BANDWIDTH, "step_s": STEP, "form": form}
+    got = radiometer_noise(seen, layout, **options)
+    keep = np.flatnonzero(~flags.ravel())
+    whole = np.asarray(noise(form).dense())[np.ix_(keep, keep)]
+    np.testing.assert_allclose(got.dense(), whole, rtol=1e-13, atol=1e-13 * whole.max())
+
+
+def test_an_absent_auto_is_interpolated_in_time():
+    flags = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
+    flags[0, 1] = True
+    rising = np.asarray(VISIBILITIES).copy()
+    rising[0] = [1e4, 1.2e4, 1.4e4]  # a straight line, so that nothing is lost
+    layout = DataLayout.from_flags(flags)
+    options = {"bandwidth_hz": BANDWIDTH, "step_s": STEP}
+    whole = radiometer_noise(rising, LAYOUT, **options).diagonal()[~flags.ravel()]
+    got = radiometer_noise(np.where(flags, 0.0, rising), layout, **options).diagonal()
+    np.testing.assert_allclose(got, whole, rtol=1e-14)
+    # a model's values of absent samples stay
+    np.testing.assert_array_equal(radiometer_noise(rising, layout, **options).diagonal(), whole)
+
+
+def test_an_auto_that_was_never_measured_is_refused():
+    flags = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
+    flags[7] = True
+    seen = np.where(flags, 0.0, np.asarray(VISIBILITIES))
+    with pytest.raises(InputError, match="the auto 11R is absent at all times"):
+        radiometer_noise(seen, DataLayout.from_flags(flags))

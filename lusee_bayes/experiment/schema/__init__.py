@@ -5,6 +5,7 @@ from lusee_bayes.experiment.schema.beam import (
     BeamSection,
     MonopoleBeamSection,
     ResponseSection,
+    SampledBeamSection,
     ScalarBeamSection,
     section_of_file,
 )
@@ -45,6 +46,7 @@ __all__ = [
     "RadiometerSection",
     "ResponseSection",
     "RunSection",
+    "SampledBeamSection",
     "ScalarBeamSection",
     "Section",
     "Seed",

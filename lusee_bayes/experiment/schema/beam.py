@@ -27,9 +27,10 @@ from lusee_bayes.instrument.beams import (
     Monopoles,
     Regolith,
     ResponseBeams,
+    SampledFileBeams,
     ScalarFileBeams,
 )
-from lusee_bayes.instrument.beams.files import is_response
+from lusee_bayes.instrument.beams.files import kind_of, read_sampled
 from lusee_bayes.instrument.beams.gridded import Interpolation
 from lusee_bayes.instrument.beams.response_file import read_response
 from lusee_bayes.instrument.beams.scalar_file import read_scalar_beam
@@ -185,9 +186,44 @@ class ResponseSection(_FileSection):
         )
 
 
+class SampledBeamSection(Section):
+    """Beams of one's own in directions: fields of antennas or beams of products, or a UVBeam.
+
+    Attributes
+    ----------
+    file : str
+        netCDF or FITS of :func:`lusee_bayes.sampled_beams`, or pyuvdata's beam FITS.
+    turntable_offset_deg : float
+        By how much the turntable is further round than it says, from East towards North.
+    normalise : bool
+        Scale the beams so that autos integrate to one on average; by default as the file says.
+    """
+
+    is_file: ClassVar[bool] = True
+
+    model: Literal["sampled"] = "sampled"
+    file: str
+    turntable_offset_deg: float = 0.0
+    normalise: bool | None = None
+
+    @property
+    def label(self) -> str:
+        """Which antennas, for the header of a file."""
+        return Path(self.file).name
+
+    @property
+    def n_ports(self) -> int:
+        """Number of ports."""
+        return read_sampled(self.file).n_ports
+
+    def source(self) -> BeamSource:
+        """The beams of the file."""
+        return SampledFileBeams(read_sampled(self.file), self.turntable_offset_deg, self.normalise)
+
+
 BEAM_SECTIONS = {
     section.model_fields["model"].default: section
-    for section in (MonopoleBeamSection, ScalarBeamSection, ResponseSection)
+    for section in (MonopoleBeamSection, ScalarBeamSection, ResponseSection, SampledBeamSection)
 }
 
 
@@ -200,7 +236,7 @@ def _one_kind(value: Any) -> Any:
     tree["model"] = tree.get("model") or default
     file = tree.get("file")
     if tree["model"] == default and file is not None:
-        tree["model"] = "response" if isinstance(file, str) and is_response(file) else "luseepy"
+        tree["model"] = kind_of(file) if isinstance(file, str) else "luseepy"
     if tree["model"] != "response" and tree.get("receiver") == "jfet":
         del tree["receiver"]  # scenarios of 0.1 held all keys of all kinds
     temperatures = ("moon_temperature_k", "antenna_temperature_k")
@@ -224,7 +260,7 @@ BeamSection = Annotated[
 
 def section_of_file(file: str, like: Any) -> Any:
     """The section of another beam file, put up as the beams of ``like`` are."""
-    kind = BEAM_SECTIONS["response" if is_response(file) else "luseepy"]
+    kind = BEAM_SECTIONS[kind_of(file)]
     shared = {
         name: value
         for name, value in like.model_dump().items()

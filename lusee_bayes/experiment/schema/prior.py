@@ -8,11 +8,26 @@ from pydantic import Field, model_validator
 
 from lusee_bayes.experiment.schema.section import Positive, Section
 from lusee_bayes.sky import Sky
+from lusee_bayes.sky.prior_files import read_mean, read_spectrum
 from lusee_bayes.sky.priors import HarmonicPrior, Prior
 
 
 class IsotropicPriorSection(Section):
-    """Independent coefficients with C_ell the spectrum of the scenario's sky, times ``scale``.
+    """Independent coefficients: C_ell the spectrum of the scenario's sky, or of a file; mean 0.
+
+    Attributes
+    ----------
+    scale : float
+        Multiplies C_ell.
+    spectrum_file : str
+        Text with lines of ell and C_ell in K^2, in place of the scenario's sky.
+    mean_file : str
+        The prior mean: a HEALPix FITS map in K, Galactic.
+    file_frequency_mhz : float
+        What these files were made for; by default the scenario's frequency.
+    spectral_index : float
+        Scales them from ``file_frequency_mhz`` to the scenario's frequency: the mean once, C_ell
+        twice.
 
     Sampled where they are not known: ln of an amplitude and a tilt, C_ell A ((ell + 1) / 10)^tilt,
     of prior standard deviations ``log_amplitude_std`` and ``tilt_std``; or (``band_edges``: first
@@ -21,6 +36,10 @@ class IsotropicPriorSection(Section):
 
     model: Literal["isotropic"] = "isotropic"
     scale: Positive = 1.0
+    spectrum_file: str | None = None
+    mean_file: str | None = None
+    file_frequency_mhz: Positive | None = None
+    spectral_index: float = -2.5
     log_amplitude_std: Positive | None = None
     tilt_std: Positive | None = None
     band_edges: tuple[Annotated[int, Field(ge=1)], ...] = ()
@@ -43,8 +62,21 @@ class IsotropicPriorSection(Section):
         return self
 
     def prior(self, sky: Sky) -> Prior:
-        """S of a model sky."""
-        return HarmonicPrior(sky.spectrum() * self.scale)
+        """S, and the mean, at the frequency and up to the lmax of a model sky."""
+        read_at = self.file_frequency_mhz or sky.frequency_mhz
+        steepening = (sky.frequency_mhz / read_at) ** self.spectral_index
+        spectrum = sky.spectrum()
+        if self.spectrum_file is not None:
+            spectrum = read_spectrum(self.spectrum_file, sky.lmax) * steepening**2
+        mean = None
+        if self.mean_file is not None:
+            mean = read_mean(self.mean_file, read_at, sky.lmax) * steepening
+        return HarmonicPrior(spectrum * self.scale, mean=mean)
+
+    @property
+    def has_files(self) -> bool:
+        """Whether the prior is read from files, which are of one frequency."""
+        return self.spectrum_file is not None or self.mean_file is not None
 
 
 # a further prior joins here, told apart by ``model``

@@ -11,6 +11,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import numpyro
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms.term import Around, Term, Truth
+from lusee_bayes.instrument.gaps import without_gaps
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.noise import GainDrift, with_gains
 from lusee_bayes.systematics import GainDrifts, Systematic
@@ -76,22 +77,20 @@ def gain_drifts(setup: Setup, around: Around) -> GainDrifts:
 def measured_visibilities(
     data: Visibilities, model: Float[Array, "products times"]
 ) -> Float[Array, "products times"]:
-    """Visibilities that set a noise level: the measured ones where a time has all products.
+    """Visibilities that set a noise level: the measured ones, absent samples interpolated.
 
     A time without any sample takes the model's (it enters nothing).
 
     Raises
     ------
     InputError
-        For a time of which only some products are there.
+        If an auto was never measured, but other products of its port were.
     """
-    present = data.layout.present
-    complete, some = present.all(0), present.any(0)
-    if bool((some & ~complete).any()):
-        first = int((some & ~complete).argmax())
+    some = data.layout.present.any(0)
+    try:
+        measured = without_gaps(data.layout.scatter(data.data), data.layout)
+    except InputError as error:
         raise InputError(
-            f"time {first} lacks some of its products, so the noise cannot be built around what "
-            "was measured there; use noise.radiometer.temperature=model and "
-            "noise.gain.visibilities=model"
-        )
-    return np.where(complete[None], data.layout.scatter(data.data), model)
+            f"{error}, or use noise.radiometer.temperature=model and noise.gain.visibilities=model"
+        ) from error
+    return np.where(some[None], measured, model)

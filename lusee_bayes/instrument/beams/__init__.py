@@ -16,6 +16,9 @@ from lusee_bayes.instrument.beams.receiver import (
 )
 from lusee_bayes.instrument.beams.regolith import Regolith
 from lusee_bayes.instrument.beams.response_file import PortResponse
+from lusee_bayes.instrument.beams.sampled import SampledBeams, sampled_beams
+from lusee_bayes.instrument.beams.sampled_file import write_sampled_beams
+from lusee_bayes.instrument.beams.sampled_source import SampledFileBeams
 from lusee_bayes.instrument.beams.scalar_file import ScalarBeam
 from lusee_bayes.instrument.beams.source import (
     BeamSource,
@@ -23,6 +26,7 @@ from lusee_bayes.instrument.beams.source import (
     ResponseBeams,
     ScalarFileBeams,
 )
+from lusee_bayes.instrument.beams.uvbeam import from_uvbeam
 
 __all__ = [
     "PARAMETERS",
@@ -39,15 +43,20 @@ __all__ = [
     "Receiver",
     "Regolith",
     "ResponseBeams",
+    "SampledBeams",
+    "SampledFileBeams",
     "ScalarBeam",
     "ScalarFileBeams",
     "beams_towards",
     "displaced",
+    "from_uvbeam",
     "monopole_beams",
     "parameter",
     "placed",
     "product_beams",
     "read_beam",
     "read_receiver",
+    "sampled_beams",
     "stokes_beam",
+    "write_sampled_beams",
 ]

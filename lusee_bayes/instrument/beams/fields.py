@@ -9,6 +9,7 @@ from jaxtyping import Complex, Float
 from lusee_bayes.core.arrays import Array, as_complex, namespace
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.representation import Described
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
 
 SPEED_OF_LIGHT = 299792458.0  # m/s
@@ -25,7 +26,7 @@ def phasor(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
     return as_complex(xp.cos(angle), xp.sin(angle))
 
 
-class AntennaFields(eqx.Module):
+class AntennaFields(Described, eqx.Module):
     """Complex response of each antenna to a wave arriving from each direction of a grid.
 
     Frame: topocentric, theta from the zenith, phi from East towards North. The time convention is
@@ -53,6 +54,13 @@ class AntennaFields(eqx.Module):
                     f"{name} must be a complex128 array, got {getattr(self, name).dtype}; "
                     "convert it with numpy.asarray(x, dtype=numpy.complex128)"
                 )
+
+    def description(self) -> tuple[str, ...]:
+        return (
+            f"E_theta and E_phi of {self.n_antennas} antennas, complex",
+            f"{len(self.grid.theta)} angles from zenith to horizon x {self.grid.n_phi} azimuths, "
+            "from East towards North",
+        )
 
     @property
     def n_antennas(self) -> int:

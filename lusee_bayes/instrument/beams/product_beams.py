@@ -10,6 +10,7 @@ from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import require_float64
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import lmax_of
+from lusee_bayes.core.representation import Described, extent, listed
 from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.products import auto_indices, labels, to_real
 
@@ -72,7 +73,7 @@ def stokes_pairs(
     return 1j * (ep * ft - et * fp) / 2.0
 
 
-class ProductBeams(eqx.Module):
+class ProductBeams(Described, eqx.Module):
     """Harmonic coefficients of the beam of every product, in the topocentric frame.
 
     Beams are zero below the horizon.
@@ -101,6 +102,15 @@ class ProductBeams(eqx.Module):
                 f"{self.modes.shape[0]} products do not come from any number of antennas; "
                 "expected 1, 4, 9, 16, ..."
             )
+
+    def description(self) -> tuple[str, ...]:
+        autos = self.modes[auto_indices(round(np.sqrt(self.n_products))), 0]
+        return (
+            f"{self.n_products} products at {self.frequency_mhz:g} MHz, lmax = {self.lmax}",
+            f"{self.modes.shape[1]} real coefficients each, topocentric, K per K: "
+            f"{listed(self.labels)}",
+            f"integrals of the autos over the sky {extent(autos * np.sqrt(4.0 * np.pi), 'sr K/K')}",
+        )
 
     @property
     def lmax(self) -> int:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
@@ -21,7 +21,7 @@ from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
 from lusee_bayes.instrument.beams.gridded import Interpolation, neighbours
 from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams
-from lusee_bayes.instrument.beams.product_beams import ProductBeams
+from lusee_bayes.instrument.beams.product_beams import ProductBeams, stokes_beam
 from lusee_bayes.instrument.beams.receiver import Receiver
 from lusee_bayes.instrument.beams.response_file import PortResponse
 from lusee_bayes.instrument.beams.scalar_file import ROTATIONS_DEG, ScalarBeam
@@ -61,8 +61,20 @@ class BeamSource(ABC):
         Raises
         ------
         InputError
+            If the source has no beams at this frequency, or no fields of antennas.
+        """
+
+    def patterns(
+        self, frequency_mhz: float, grid: HemisphereGrid
+    ) -> Complex[Array, "antennas antennas theta phi"]:
+        """Return the response of every pair to Stokes I on a grid, in the unit of :meth:`fields`.
+
+        Raises
+        ------
+        InputError
             If the source has no beams at this frequency.
         """
+        return stokes_beam(self.fields(frequency_mhz, grid))
 
     @abstractmethod
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:

@@ -14,9 +14,10 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_finite, require_float64, require_shape
+from lusee_bayes.core.representation import Described
 
 
-class Coupling(eqx.Module):
+class Coupling(Described, eqx.Module):
     """A matrix A, of shape (data, unknowns), from a sky in K to data in K.
 
     Attributes
@@ -26,6 +27,10 @@ class Coupling(eqx.Module):
     """
 
     response: Float[Array, " data"] | None = eqx.field(default=None, kw_only=True)
+
+    def description(self) -> tuple[str, ...]:
+        data, unknowns = self.shape
+        return (f"{data} data x {unknowns} unknowns of the sky, K per K",)
 
     @property
     @abstractmethod

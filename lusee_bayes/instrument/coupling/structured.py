@@ -139,6 +139,13 @@ class CouplingMatrix(Coupling):
         """
         return cls.build(beams, Pointing.of(observation, beams.lmax))
 
+    def description(self) -> tuple[str, ...]:
+        return (
+            *super().description(),
+            *self.layout.description(),
+            "never formed: beams, pointing and a turn for each order m",
+        )
+
     @property
     def shape(self) -> tuple[int, int]:
         return self.layout.size, self.body_beams.shape[-1]

@@ -24,8 +24,9 @@ from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming
 from lusee_bayes.instrument.beams.gridded import Interpolation
 from lusee_bayes.instrument.beams.receiver import LOADS, MeasuredReceiver
-from lusee_bayes.instrument.observation import Observation, utc_of
+from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import N_ANTENNAS, all_products, labels
+from lusee_bayes.instrument.times import utc_of
 from lusee_bayes.instrument.waterfalls.waterfall import SITE_AND_STEP, Waterfall
 
 UNIT = "V^2/Hz"

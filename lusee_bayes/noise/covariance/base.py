@@ -21,6 +21,7 @@ from jaxtyping import Float, PRNGKeyArray
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.representation import Described
 from lusee_bayes.instrument.layout import DataLayout
 
 
@@ -52,8 +53,11 @@ class Factor(eqx.Module):
         return self.whiten_transpose(self.whiten(x))
 
 
-class Covariance(eqx.Module):
+class Covariance(Described, eqx.Module):
     """A symmetric positive definite matrix N over the entries of the data vector, in K^2."""
+
+    def description(self) -> tuple[str, ...]:
+        return (f"noise covariance of {self.size} data, in K^2",)
 
     @property
     @abstractmethod

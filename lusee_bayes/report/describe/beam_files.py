@@ -1,10 +1,11 @@
-"""What is in the beam files of luseepy."""
+"""What is in beam files."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from lusee_bayes.instrument.beams import PortResponse, ScalarBeam
+from lusee_bayes.instrument.beams.files import read_sampled
 from lusee_bayes.instrument.beams.response_file import read_response
 from lusee_bayes.instrument.beams.scalar_file import read_scalar_beam
 from lusee_bayes.instrument.products import N_ANTENNAS, auto_indices
@@ -43,6 +44,11 @@ def describe_scalar_beam(path: Path) -> str:
     ground = float(beam.background(middle, 1.0)[0])
     lines.append(f"  {ground:.3f} of the beam ends on the ground at {middle:g} MHz")
     return "\n".join(lines)
+
+
+def describe_sampled_beams(path: Path) -> str:
+    """Fields or beams in directions."""
+    return f"{path}: {read_sampled(path)}"
 
 
 def _grid_lines(beam: ScalarBeam | PortResponse) -> list[str]:

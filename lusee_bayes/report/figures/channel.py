@@ -7,7 +7,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.instrument.beams import HemisphereGrid, stokes_beam
+from lusee_bayes.instrument.beams import HemisphereGrid
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.metrics import ell_cross
 from lusee_bayes.report.figures.drawing import (
@@ -48,12 +48,11 @@ def beams(setup: Setup) -> Figure:
     """An auto and two crosses from above: zenith in the centre, North up, horizon at the rim."""
     frequency = setup.scenario.frequency_mhz
     grid = HemisphereGrid.gauss_legendre(48, 120)
-    fields = setup.beam_source.fields(frequency, grid)
-    patterns = np.asarray(stokes_beam(fields))
+    patterns = np.asarray(setup.beam_source.patterns(frequency, grid))
     names = {0: "auto 00", 2: "|cross 02|", 1: "|cross 01|"}
     if not setup.scenario.beam.is_file:
         names = {0: "auto 00 (North)", 2: "|cross 02| (opposite)", 1: "|cross 01| (perpendicular)"}
-    panels = [(name, patterns[0, k]) for k, name in names.items() if k < fields.n_antennas]
+    panels = [(name, patterns[0, k]) for k, name in names.items() if k < len(patterns)]
     figure = Figure(figsize=(11, 4))
     places = {"left": 0.01, "right": 0.99, "bottom": 0.02, "top": 0.82, "wspace": 0.04}
     grid_of_axes = np.atleast_1d(figure.subplots(1, len(panels), gridspec_kw=places))

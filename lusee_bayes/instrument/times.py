@@ -1,0 +1,86 @@
+"""Times in UTC, of whatever kind files and users give them."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+import astropy.units as u
+import numpy as np
+from astropy.time import Time
+from jaxtyping import Float
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.instrument.observation import (
+    require_ephemeris,
+    unannounced_leap_seconds,
+    utc_from_text,
+)
+
+
+def utc_of(
+    jd1: Float[np.ndarray, " times"], jd2: Float[np.ndarray, " times"], scale: str = "utc"
+) -> Time:
+    """Return times of Julian dates in two parts, in UTC.
+
+    Raises
+    ------
+    InputError
+        If one is not finite or outside the ephemeris.
+    """
+    require_ephemeris(jd1 + jd2)
+    with unannounced_leap_seconds():
+        return Time(jd1, jd2, format="jd", scale=scale).utc
+
+
+def utc_times(times: Any) -> Time:
+    """Return times of any kind in UTC.
+
+    Parameters
+    ----------
+    times : (times,) Time, or sequence of datetime, datetime64 or str
+        A datetime without zone and an ISO date are in UTC.
+
+    Raises
+    ------
+    InputError
+        If they are none, or outside the ephemeris.
+    """
+    if not isinstance(times, Time):
+        given = np.atleast_1d(np.asarray(times)).ravel()
+        # numpy makes whole numbers of nanoseconds
+        listed = (np.datetime_as_string(given) if given.dtype.kind == "M" else given).tolist()
+        return Time([_utc(number, one) for number, one in enumerate(listed)])
+    times = times.reshape(-1)
+    require_ephemeris(np.asarray(times.jd))
+    with unannounced_leap_seconds():
+        return times.utc
+
+
+def _utc(number: int, one: Any) -> Time:
+    if isinstance(one, datetime):
+        one = one.astimezone(UTC).replace(tzinfo=None) if one.tzinfo else one
+        one = one.isoformat()
+    if not isinstance(one, str):
+        raise InputError(
+            f"time {number} is {one!r}, of type {type(one).__name__}; give datetimes, ISO dates in "
+            "UTC, or an astropy Time"
+        )
+    # astropy knows no Z, which ISO has for UTC
+    return utc_from_text(f"time {number}", one.removesuffix("Z"))
+
+
+def step_of(times: Time, step_s: float | None) -> float:
+    """Return the integration time in seconds: the one given, or the median step of the times.
+
+    Raises
+    ------
+    InputError
+        If there is one time only, and no step is given.
+    """
+    if step_s is not None:
+        return float(step_s)
+    if len(times) < 2:
+        raise InputError("the integration time of a single sample is not known; give step_s")
+    with unannounced_leap_seconds():
+        return float(np.median(np.abs((times[1:] - times[:-1]).to_value(u.s))))

@@ -1,0 +1,372 @@
+"""Beams of one's own: sampled from known patterns, they give the known beams and visibilities."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import healpy
+import numpy as np
+import pytest
+import xarray as xr
+from astropy.io import fits
+
+import lusee_bayes as lb
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.instrument.beams import (
+    HemisphereGrid,
+    Monopoles,
+    SampledFileBeams,
+    read_beam,
+    sampled_beams,
+    write_sampled_beams,
+)
+from lusee_bayes.instrument.beams.fields import unit_vectors, wavenumber
+from lusee_bayes.instrument.beams.healpix_rings import from_rings
+from lusee_bayes.instrument.products import labels, to_real
+from lusee_bayes.report.describe import describe
+from lusee_bayes.testing import check_beam_source, small_scenario
+
+FREQUENCY, LMAX, NSIDE = 25.0, 4, 16
+THETA, PHI = healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2))
+UP = np.pi / 2 > THETA
+THETA_DEG, PHI_DEG = np.linspace(0.0, 90.0, 31), np.arange(0.0, 360.0, 6.0)
+# cubic splines over steps h = 1 / NSIDE or 3 degrees err by 5/384 (h l)^4 of a pattern with l = 4
+# (products of metres at 25 MHz, l = 2 k L). In the last step, which is extrapolated and a share h
+# of all, it is 35 times that: (x - x_1) ... (x - x_4) there over its value in the middle of nodes
+BETWEEN = 5 / 384 * (4 / NSIDE) ** 4
+AT_HORIZON = 35 * BETWEEN
+SPLINES = BETWEEN + AT_HORIZON / NSIDE
+
+
+def on_pixels(antennas, frequency_mhz=FREQUENCY) -> dict[str, np.ndarray]:
+    """Zero below the horizon, and on it: whatever a file has there is not used."""
+    fields = np.zeros((2, 4, len(THETA)), dtype=complex)
+    fields[:, :, UP] = antennas.towards(frequency_mhz, THETA[UP], PHI[UP])
+    return {"e_theta": fields[0], "e_phi": fields[1]}
+
+
+def on_grid(antennas, frequency_mhz=FREQUENCY) -> dict[str, np.ndarray]:
+    theta, phi = np.radians(THETA_DEG), np.radians(PHI_DEG)
+    e_theta, e_phi = antennas.towards(frequency_mhz, theta[:, None], phi[None])
+    angles = {"theta_deg": THETA_DEG, "phi_deg": PHI_DEG}
+    return {"e_theta": np.asarray(e_theta), "e_phi": np.asarray(e_phi), **angles}
+
+
+def as_products(given: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Beams of products in place of fields: (Et Ft* + Ep Fp*) / 2 written out."""
+    theta, phi = given["e_theta"], given["e_phi"]
+    pairs = [
+        [(a * b.conj() + c * d.conj()) / 2 for b, d in zip(theta, phi, strict=True)]
+        for a, c in zip(theta, phi, strict=True)
+    ]
+    angles = {name: one for name, one in given.items() if name.endswith("deg")}
+    return {"products": to_real(np.array(pairs)), **angles}
+
+
+KINDS = {
+    "pixels": on_pixels,
+    "grid": on_grid,
+    "products on pixels": lambda *args: as_products(on_pixels(*args)),
+    "products on a grid": lambda *args: as_products(on_grid(*args)),
+}
+
+
+@cache
+def embedded(kind, frequency_mhz=FREQUENCY):
+    return KINDS[kind](Monopoles(), frequency_mhz)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_embedded_beam_sampled_gives_the_same_visibilities(kind):
+    made = sampled_beams(FREQUENCY, **embedded(kind))
+    assert made.n_ports == 4
+    observation = lb.Observation.from_runs([lb.Run(0.05, turntable_deg=20.0)])
+    sky = lb.galaxy_sky(FREQUENCY, LMAX)
+    ours, own = (
+        np.asarray(lb.CouplingMatrix.observe(beams, observation) @ sky.modes)
+        for beams in (made.beams(FREQUENCY, LMAX), lb.monopole_beams(FREQUENCY, LMAX))
+    )
+    assert np.abs(ours - own).max() < SPLINES * np.abs(own).max()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_short_dipoles_have_their_closed_form(kind):
+    """Dipoles u at places r: B_ij = (u.v - (u.n)(v.n)) / 2 exp(i k n.(r_i - r_j)), no angles."""
+    rng = np.random.default_rng(2)
+    arms, places = rng.normal(size=(4, 3)), rng.normal(size=(4, 3))
+    k = wavenumber(FREQUENCY)
+
+    class Dipoles:
+        def towards(self, _, theta, phi):
+            theta, phi = np.broadcast_arrays(theta, phi)
+            axes = (
+                np.stack(
+                    [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]
+                ),
+                np.stack([-np.sin(phi), np.cos(phi), 0.0 * phi]),
+            )
+            n = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+            phase = np.exp(1j * k * np.tensordot(places, n, 1))
+            return tuple(np.tensordot(arms, axis, 1) * phase for axis in axes)
+
+    made = sampled_beams(FREQUENCY, **KINDS[kind](Dipoles()), absolute=True)
+    grid = HemisphereGrid.gauss_legendre(12, 20)
+    n = unit_vectors(grid)
+    along = np.tensordot(arms, n, 1)
+    phase = np.exp(1j * k * np.tensordot(places, n, 1))
+    expected = (arms @ arms.T)[:, :, None, None] - along[:, None] * along[None]
+    expected = expected * phase[:, None] * phase[None].conj() / 2
+    # baselines of 4 m have l = k b + 2 = 4 at most
+    patterns = made.patterns(FREQUENCY, grid)
+    assert np.abs(patterns - expected).max() < AT_HORIZON * np.abs(expected).max()
+    # turned by an angle, the pattern at phi is the old one at phi - angle
+    steps = 3
+    turned = made.patterns(FREQUENCY, grid, turn_deg=steps * 360.0 / grid.n_phi)
+    assert np.abs(turned - np.roll(patterns, steps, axis=-1)).max() < 1e-10 * np.abs(expected).max()
+
+
+def test_rings_go_through_the_zenith():
+    """A plane wave of l = 4, from the zenith to the last ring but some."""
+
+    def wave(theta, phi):
+        return np.exp(4j * (np.sin(theta) * np.cos(phi - 0.3) + 0.5 * np.cos(theta)))
+
+    theta, phi = np.linspace(0.0, 1.4, 60), np.linspace(0.0, 6.0, 17)
+    expected = wave(theta[:, None], phi[None])
+    found = from_rings(np.where(UP, wave(THETA, PHI), np.nan), theta, phi)
+    # orders +-3 in the first ring, at theta = sqrt(2/3) / NSIDE: J_3(x) = (x / 2)^3 / 6 each
+    aliased = 2 * (4 * np.sqrt(2 / 3) / NSIDE / 2) ** 3 / 6
+    assert np.abs(found - expected).max() < BETWEEN + aliased
+    # a real function stays real
+    np.testing.assert_allclose(
+        from_rings(np.where(UP, wave(THETA, PHI).real, 0.0), theta, phi), found.real, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_sampled_beams_keep_the_contract(kind):
+    made = sampled_beams(FREQUENCY, **embedded(kind))
+    source = SampledFileBeams(made, turntable_offset_deg=5.0)
+    check_beam_source(
+        source,
+        replace(source, turntable_offset_deg=35.0),
+        turned_deg=30.0,
+        frequency_mhz=FREQUENCY,
+        lmax=LMAX,
+        quadrature=SPLINES,
+    )
+
+
+def test_the_scale_is_the_autos_or_the_files():
+    given = dict(embedded("grid"))
+    bright = given | {"e_theta": 3.0 * given["e_theta"], "e_phi": 3.0 * given["e_phi"]}
+    scaled = sampled_beams(FREQUENCY, **bright).beams(FREQUENCY, LMAX).modes
+    autos = scaled[[0, 7, 12, 15], 0] * np.sqrt(4 * np.pi)
+    np.testing.assert_allclose(autos.mean(), 1.0, rtol=1e-12)
+    one, nine = (
+        sampled_beams(FREQUENCY, **g, absolute=True).beams(FREQUENCY, LMAX).modes
+        for g in (given, bright)
+    )
+    np.testing.assert_allclose(nine, 9.0 * one, rtol=1e-12, atol=1e-12 * np.abs(nine).max())
+    kept = sampled_beams(FREQUENCY, **bright).beams(FREQUENCY, LMAX, normalise=False).modes
+    np.testing.assert_array_equal(kept, nine)
+
+
+@pytest.mark.parametrize("suffix", ["nc", "fits"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_files_come_back(tmp_path, kind, suffix):
+    one, two = (embedded(kind, f) for f in (20.0, 30.0))
+    arrays = {
+        name: values if name.endswith("deg") else np.stack([values, two[name]])
+        for name, values in one.items()
+    }
+    made = sampled_beams([20.0, 30.0], **arrays, absolute=True)
+    path = write_sampled_beams(tmp_path / f"mine.{suffix}", made)
+    again = read_beam(path)
+    assert again.absolute
+    np.testing.assert_array_equal(again.frequencies_mhz, [20.0, 30.0])
+    # the grid's angles go through degrees and back: one rounding
+    for f in (20.0, 24.0):
+        ours, own = (np.asarray(b.beams(f, LMAX).modes) for b in (again, made))
+        np.testing.assert_allclose(ours, own, rtol=0, atol=1e-13 * np.abs(own).max())
+    with pytest.raises(InputError, match="from 20 to 30 MHz, not at 31"):
+        again.beams(31.0, LMAX)
+    text = describe(path)
+    assert "4 antennas" in text
+    assert "at 20, 30 MHz" in text
+
+
+def test_a_scenario_takes_the_file(tmp_path):
+    path = tmp_path / "mine.nc"
+    write_sampled_beams(path, sampled_beams(FREQUENCY, **embedded("pixels")))
+    scenario = small_scenario(f"beam.file={path}")
+    assert scenario.beam.model == "sampled"
+    assert (scenario.beam.n_ports, scenario.beam.label) == (4, "mine.nc")
+    ours, own = (lb.build(s).setup.signal for s in (scenario, small_scenario()))
+    assert np.abs(ours - own).max() < SPLINES * np.abs(own).max()
+    with pytest.raises(InputError, match="rotations_deg is an entry of model luseepy"):
+        small_scenario(f"beam={{model: sampled, file: {path}, rotations_deg: [0, 10]}}")
+
+
+def test_product_beams_of_a_file_may_be_in_any_order(tmp_path):
+    path = tmp_path / "mine.nc"
+    made = sampled_beams(FREQUENCY, **embedded("products on pixels"))
+    write_sampled_beams(path, made)
+    order = np.random.default_rng(0).permutation(16)
+    with xr.open_dataset(path, engine="h5netcdf") as file:
+        shuffled = file.load().isel(product=order)
+    shuffled.attrs["products"] = ", ".join(labels()[k] for k in order)
+    shuffled.to_netcdf(path, engine="h5netcdf")
+    np.testing.assert_array_equal(read_beam(path).products, made.products)
+    shuffled.attrs["products"] = "00R, 01R"
+    shuffled.to_netcdf(path, engine="h5netcdf")
+    with pytest.raises(InputError, match=r"mine\.nc: products is 00R, 01R, expected the names"):
+        read_beam(path)
+
+
+@pytest.mark.parametrize("kind", ["pixels", "grid"])
+def test_what_is_on_or_below_the_horizon_is_not_used(kind):
+    given = embedded(kind)
+    if kind == "grid":
+        further = {"theta_deg": np.linspace(0.0, 180.0, 61)}
+        for name in ("e_theta", "e_phi"):
+            further[name] = np.full((4, 61, len(PHI_DEG)), np.nan + 0j)
+            further[name][:, :30] = given[name][:, :30]
+    else:
+        further = {n: np.where(UP, given[n], np.nan) for n in ("e_theta", "e_phi")}
+    ours, own = (
+        sampled_beams(FREQUENCY, **one).beams(FREQUENCY, LMAX).modes
+        for one in (given | further, given)
+    )
+    np.testing.assert_array_equal(ours, own)
+
+
+def nan_at_the_zenith():
+    given = dict(embedded("grid"))
+    given["e_theta"] = given["e_theta"].copy()
+    given["e_theta"][0, 0, 0] = np.nan
+    return given
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (lambda: {"e_theta": np.zeros((4, 48))}, "give e_theta and e_phi, or products"),
+        (lambda: embedded("grid") | {"phi_deg": None}, "give both theta_deg and phi_deg"),
+        (lambda: embedded("grid") | {"phi_deg": PHI_DEG + 1.0}, "expected 360 k / n"),
+        (lambda: embedded("grid") | {"theta_deg": THETA_DEG / 2}, "to the horizon"),
+        (lambda: embedded("grid") | {"theta_deg": THETA_DEG[::-1]}, "growing angles"),
+        (lambda: embedded("grid") | {"theta_deg": THETA_DEG[1:]}, "30 theta x 60 phi"),
+        (lambda: embedded("grid") | {"e_phi": np.zeros((3, 31, 60))}, "e_phi has shape"),
+        (lambda: {"products": np.zeros((16, 50))}, "no HEALPix map"),
+        (lambda: {"products": np.zeros((5, 48))}, "5 products do not come from"),
+        (lambda: {"products": np.zeros((16, 48), dtype=complex)}, "products are complex"),
+        (nan_at_the_zenith, "NaN or infinity in 1 of"),
+    ],
+)
+def test_arrays_that_are_no_beams_are_refused(given, words):
+    with pytest.raises(InputError) as caught:
+        sampled_beams(FREQUENCY, **given())
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_cannot_be_computed_is_refused():
+    zero = sampled_beams(FREQUENCY, products=np.zeros((16, 12 * 4**2)))
+    with pytest.raises(InputError, match="autos integrate to 0 sr"):
+        zero.beams(FREQUENCY, 2)
+    with pytest.raises(InputError, match="beams of products, not the E fields"):
+        zero.fields(FREQUENCY, HemisphereGrid.for_lmax(2))
+    with pytest.raises(InputError, match="must be positive and grow"):
+        sampled_beams([20.0, 10.0], products=np.zeros((2, 16, 48)))
+
+
+@pytest.mark.parametrize("change", ["no e_phi", "cut", "no absolute", "text"])
+@pytest.mark.parametrize("suffix", ["nc", "fits"])
+def test_damaged_files_are_refused(tmp_path, change, suffix):
+    path = tmp_path / f"mine.{suffix}"
+    write_sampled_beams(path, sampled_beams(FREQUENCY, **embedded("grid")))
+    if change == "cut":
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    elif suffix == "fits":
+        with fits.open(path, memmap=False) as hdus:
+            if change == "no e_phi":
+                del hdus["E_PHI_IMAG"]
+            elif change == "no absolute":
+                del hdus[0].header["ABSOLUTE"]
+            else:
+                hdus[0].header["ABSOLUTE"] = "yes"
+            hdus.writeto(path, overwrite=True)
+    else:
+        with xr.open_dataset(path, engine="h5netcdf") as file:
+            found = file.load()
+        if change == "no e_phi":
+            found = found.drop_vars("e_phi_imag")
+        elif change == "no absolute":
+            del found.attrs["absolute"]
+        else:
+            found.attrs["absolute"] = "yes"
+        found.to_netcdf(path, engine="h5netcdf")
+    with pytest.raises(InputError, match=str(path)):
+        read_beam(path)
+
+
+# --- pyuvdata -------------------------------------------------------------------------------------
+
+
+def uvbeam(coordinates: str):
+    """The embedded antennas as a UVBeam: feeds are its ports, azimuth from East towards North."""
+    pyuvdata = pytest.importorskip("pyuvdata")
+    options = {
+        "telescope_name": "LuSEE-Night",
+        "data_normalization": "physical",
+        "freq_array": np.array([20e6, 30e6]),
+        "feed_name": "test",
+        "feed_version": "1",
+        "model_name": "monopoles",
+        "model_version": "1",
+        "feed_array": ["x", "y"],
+        "feed_angle": np.array([np.pi / 2, 0.0]),
+        "mount_type": "fixed",
+    }
+    if coordinates == "healpix":
+        options |= {"nside": NSIDE}
+        given = [on_pixels(Monopoles(), f) for f in (20.0, 30.0)]
+    else:
+        options |= {"axis1_array": np.radians(PHI_DEG), "axis2_array": np.radians(THETA_DEG)}
+        given = [on_grid(Monopoles(), f) for f in (20.0, 30.0)]
+    # (vector: along phi, along theta; feed; frequency; directions)
+    options["data_array"] = np.stack(
+        [np.stack([one[name][:2] for one in given], axis=1) for name in ("e_phi", "e_theta")]
+    )
+    return pyuvdata.UVBeam.new(**options)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("coordinates", ["az_za", "healpix"])
+def test_a_uvbeam_is_its_fields(tmp_path, coordinates):
+    beam = uvbeam(coordinates)
+    expected = np.asarray(lb.monopole_beams(20.0, LMAX).modes)[[0, 1, 2, 7]]
+    found = lb.from_uvbeam(beam)
+    assert found.n_ports == 2
+    path = tmp_path / "uv.fits"
+    beam.write_beamfits(str(path))
+    scenario = small_scenario(f"beam.file={path}")
+    for made in (found.beams(20.0, LMAX), scenario.beam.source().beams(20.0, LMAX)):
+        assert np.abs(made.modes - expected).max() < SPLINES * np.abs(expected).max()
+    conjugate = lb.from_uvbeam(beam, conjugate=True).beams(20.0, LMAX).modes
+    np.testing.assert_allclose(conjugate[2], -found.beams(20.0, LMAX).modes[2], atol=1e-15)
+    beam.efield_to_power()
+    with pytest.raises(InputError, match="give one of type efield"):
+        lb.from_uvbeam(beam)
+
+
+def test_without_pyuvdata_its_files_are_refused_with_what_to_install(tmp_path, monkeypatch):
+    path = tmp_path / "uv.fits"
+    hdu = fits.PrimaryHDU(np.zeros((2, 2)))
+    hdu.header["NORMSTD"], hdu.header["FEEDLIST"] = "physical", "[x, y]"
+    hdu.writeto(path)
+    monkeypatch.setattr("lusee_bayes.instrument.beams.uvbeam.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'lusee_bayes\[uvdata\]'"):
+        read_beam(path)
