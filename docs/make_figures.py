@@ -19,6 +19,7 @@ from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.simulate import true_values
 from lusee_bayes.linear.metrics import ell_cross, signal_to_noise
+from lusee_bayes.report.figures.channel import maps
 from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar
 from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.map_result import map_result
@@ -28,6 +29,12 @@ from lusee_bayes.sky import BRIGHT_SOURCES
 from lusee_bayes.sky.galaxy import galaxy_map
 
 HERE = Path(__file__).parent / "figures"
+
+
+def first_map() -> None:
+    """Draw the maps of `lusee-bayes map fiducial`."""
+    channel = map_result(lb.build(lb.load_scenario("fiducial"))).channel
+    maps(channel).savefig(HERE / "maps.png", dpi=110)
 
 
 def fixed_axis() -> None:
@@ -218,6 +225,7 @@ if __name__ == "__main__":
     HERE.mkdir(exist_ok=True)
     if Path("output/regolith").is_dir():
         regolith(Path("output/regolith"))
+    first_map()
     point_sources()
     embedded_sky(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
     fixed_axis()

@@ -80,7 +80,9 @@ def _map(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
             "maps",
             "Galactic maps: posterior mean and its standard deviation, and, where the true sky is "
             "known, truth and difference",
-            "Posterior mean and standard deviation; truth and difference where the sky is known.",
+            "Posterior mean and standard deviation; truth and difference where the sky is known. "
+            "All but the standard deviation are drawn through the Gaussian beam named above the "
+            "maps, so that bright edges have no rings; files and numbers are without it.",
         ),
         _figure(
             folder,
