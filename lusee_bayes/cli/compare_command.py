@@ -21,8 +21,6 @@ def compare_command(
 ) -> None:
     """Set finished map runs side by side: maps, spectra, evidence.
 
-    Example: lusee-bayes compare output/fiducial output/gain_1e-2
-
     Parameters
     ----------
     folders

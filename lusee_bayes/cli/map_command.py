@@ -47,14 +47,6 @@ def map_command(
 ) -> int | None:
     """Make a posterior map of a scenario, or of given data.
 
-    Example: lusee-bayes map fiducial --set frequency_mhz=10 -o output/ten
-
-    Example: lusee-bayes map fiducial --data waterfall.fits --set beam.file=beam.fits
-
-    Example: lusee-bayes map fiducial --frequencies 5:50:1 --joint --draws 20 -o output/cube
-
-    Example: lusee-bayes map fiducial --data second_cycle.nc --onto output/first_cycle
-
     Parameters
     ----------
     scenario

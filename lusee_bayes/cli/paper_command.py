@@ -24,8 +24,6 @@ def paper_command(
     Cases that were computed before with the same scenario and version are kept, so that an
     interrupted run goes on where it stopped.
 
-    Example: lusee-bayes paper -o output/paper --sky exp1.0MHz_sky.hdf5 exp10.0MHz_sky.hdf5
-
     Parameters
     ----------
     output

@@ -25,10 +25,6 @@ def plan_command(
 ) -> None:
     """Say what observations would tell: information, modes with SNR > 1, ell_cross; without data.
 
-    Example: lusee-bayes plan fiducial gain_1e-2 -o output/plan
-
-    Example: lusee-bayes plan fiducial --vary frequency_mhz=10,25,40
-
     Parameters
     ----------
     scenario

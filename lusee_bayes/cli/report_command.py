@@ -12,8 +12,6 @@ from lusee_bayes.cli.options import Quiet
 def report_command(folder: Path, *, quiet: Quiet = False) -> None:
     """Write report.html anew from the results that a run has left in its folder.
 
-    Example: lusee-bayes report output/fiducial
-
     Parameters
     ----------
     folder

@@ -45,10 +45,6 @@ def sample_command(
 
     Draws are written as they come: a run that was stopped goes on with --resume.
 
-    Example: lusee-bayes sample fiducial --set lmax=20 --draws 500 -o output/hmc
-
-    Example: lusee-bayes sample gain_1e-2 --frequencies 10,25,40 --resume -o output/three
-
     Parameters
     ----------
     scenario

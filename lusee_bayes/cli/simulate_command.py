@@ -31,10 +31,6 @@ def simulate_command(
 ) -> None:
     """Simulate the visibilities of a scenario.
 
-    Example: lusee-bayes simulate fiducial --set seed=2 -o data.nc
-
-    Example: lusee-bayes simulate fiducial --frequencies 10:30:5 -o waterfall.fits
-
     Parameters
     ----------
     scenario

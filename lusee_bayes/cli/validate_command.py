@@ -41,8 +41,6 @@ def validate_command(
 
     Ends with exit code 1 if a check fails; the thresholds are in validation.md.
 
-    Example: lusee-bayes validate gain_1e-2 --set lmax=8 -o output/check
-
     Parameters
     ----------
     scenario

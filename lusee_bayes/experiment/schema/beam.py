@@ -41,12 +41,20 @@ class MonopoleBeamSection(Section):
 
     Attributes
     ----------
-    length_m, zenith_angle_deg, height_m : float
-        Length of an arm, its angle from the zenith, height of the feed over the ground.
-    surface_permittivity, deep_permittivity, loss_tangent : float
-        Of the regolith: at the surface, 100 m deep, and everywhere.
+    length_m : float
+        Length of an arm.
+    zenith_angle_deg : float
+        Angle of the arms from the zenith.
+    height_m : float
+        Height of the feed over the ground.
+    surface_permittivity : float
+        Permittivity of the regolith at the surface.
+    deep_permittivity : float
+        Permittivity of the regolith 100 m deep.
+    loss_tangent : float
+        Loss tangent of the regolith.
     turntable_offset_deg : float
-        By how much the turntable is further round than it says, from East towards North.
+        Added to every angle of the turntable, from East towards North.
     """
 
     is_file: ClassVar[bool] = False
@@ -110,10 +118,12 @@ class ScalarBeamSection(_FileSection):
     file : str
         FITS version 2.
     rotations_deg : tuple of float
-        By how much the pattern is turned for each port, from East towards North, on top of
-        ``turntable_offset_deg``.
+        Angle of the pattern for each port, from East towards North; ``turntable_offset_deg`` is
+        added.
     taper : bool
         Fade out towards the horizon as luseepy does.
+    turntable_offset_deg : float
+        Added to every angle of the turntable, from East towards North.
     quadrature : {"exact", "luseepy"}
         ``luseepy`` is luseepy's own rule, for data that luseepy has made.
     interpolation : {"linear", "spline"}
@@ -157,8 +167,14 @@ class ResponseSection(_FileSection):
     receiver : {"jfet", "capacitor", "file", "open"} or mapping, optional
         What is connected to the ports, with its parameters (``experiment/schema/receiver.py``). If
         it is left out, that of the data where their file holds it, else luseepy's preamplifiers.
-    moon_temperature_k, antenna_temperature_k : float
-        Temperatures of the ground and of the antennas' losses, which add their own radiation.
+    turntable_offset_deg : float
+        Added to every angle of the turntable, from East towards North.
+    quadrature : {"exact", "luseepy"}
+        ``luseepy`` is luseepy's own rule, for data that luseepy has made.
+    moon_temperature_k : float
+        Temperature of the ground, which adds its own radiation.
+    antenna_temperature_k : float
+        Temperature of the antennas' losses, which add their own radiation.
     """
 
     model: Literal["response"] = "response"
