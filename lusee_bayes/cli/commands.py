@@ -1,6 +1,6 @@
 """The commands: what each does in one line, and examples of it.
 
-They are here and not in the commands' docstrings, because ``lusee-bayes --help`` imports no command.
+They are not in the docstrings of the commands: ``lusee-bayes --help`` imports none of them.
 """
 
 from __future__ import annotations
