@@ -32,7 +32,7 @@ def compare_command(
     quiet
         Print nothing but errors.
     verbose
-        Tell the memory in use after every stage.
+        Print the memory in use after every stage.
     """
     from lusee_bayes.cli.tables import comparison_table
     from lusee_bayes.results.finished_runs import same_data

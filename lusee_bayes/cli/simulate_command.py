@@ -45,7 +45,7 @@ def simulate_command(
     quiet
         Print nothing but errors.
     verbose
-        Tell the memory in use after every stage.
+        Print the memory in use after every stage.
     """
     from lusee_bayes.runs.simulate_run import run_simulate
 

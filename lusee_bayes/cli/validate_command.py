@@ -66,7 +66,7 @@ def validate_command(
     quiet
         Print nothing but errors.
     verbose
-        Tell the memory in use after every stage.
+        Print the memory in use after every stage.
     """
     from lusee_bayes.cli.tables import checks_table
     from lusee_bayes.report.pages import REPORT

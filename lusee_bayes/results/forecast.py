@@ -1,4 +1,4 @@
-"""What an observation would tell, from the posterior covariance alone: no data are needed.
+"""The information in an observation, from the posterior covariance alone: no data are needed.
 
 C = Lambda^-1 does not depend on d. Three numbers are taken from it:
 
@@ -39,7 +39,7 @@ AS_GIVEN = "as given"
 
 @dataclass(frozen=True)
 class Variation:
-    """A scenario to be weighed against others.
+    """A scenario to be compared with others.
 
     source : what it is a variation of; family, name : what differs; lost : ports that are dead,
     of which every product is flagged
@@ -62,7 +62,7 @@ class Variation:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a variation would tell.
+    """The information in a variation.
 
     days : of observing; n_data : samples of all products; information_bits : about the whole sky;
     modes : how many have SNR > 1; snr_squared : (ells,) expected SNR_ell^2 for ell = 0..lmax;

@@ -129,7 +129,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(
 
     monkeypatch.setattr(runs, "compute_case", interrupted)
     state = "the earlier results are as they were" if earlier else "nothing has been written"
-    with pytest.raises(KeyboardInterrupt, match=f"{state} in '.*'; the same command goes on"):
+    with pytest.raises(KeyboardInterrupt, match=f"{state} in '.*'; the same command continues"):
         run_cases(tmp_path)
     after = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     assert {p.name for p in after.keys() - before.keys()} == {"fiducial.nc", "noise_x10.nc"}

@@ -1,4 +1,4 @@
-"""The beams: one section for each kind, told apart by ``model``.
+"""The beams: one section for each kind, selected by ``model``.
 
 A new kind is a class here, with its :class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
 """
@@ -111,7 +111,7 @@ class _FileSection(Section):
 
 
 class ScalarBeamSection(_FileSection):
-    """A scalar beam of luseepy: the pattern of one arm, put up once for every port.
+    """A scalar beam of luseepy: the pattern of one arm, used once for every port.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class ScalarBeamSection(_FileSection):
         return len(self.rotations_deg)
 
     def source(self) -> BeamSource:
-        """The pattern of the file, put up at every angle."""
+        """The pattern of the file, turned to every angle."""
         return ScalarFileBeams(
             replace(read_scalar_beam(self.file), interpolation=self.interpolation),
             turntable_offset_deg=self.turntable_offset_deg,
@@ -239,7 +239,7 @@ BeamSection = Annotated[
 
 
 def section_of_file(file: str, like: Any) -> Any:
-    """The section of another beam file, put up as the beams of ``like`` are."""
+    """The section of another beam file, turned as the beams of ``like`` are."""
     kind = BEAM_SECTIONS["response" if is_response(file) else "luseepy"]
     shared = {
         name: value

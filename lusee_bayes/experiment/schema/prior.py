@@ -59,5 +59,5 @@ class IsotropicPriorSection(Section):
         return HarmonicPrior(sky.spectrum() * self.scale)
 
 
-# a further prior joins here, told apart by ``model``
+# a further prior joins here, selected by ``model``
 PriorSection = IsotropicPriorSection

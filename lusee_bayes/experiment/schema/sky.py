@@ -1,4 +1,4 @@
-"""The sky: one section for each kind, told apart by ``model``.
+"""The sky: one section for each kind, selected by ``model``.
 
 A new kind is a class here, with its :class:`SkySource`, and its name in ``SKY_SECTIONS``.
 """
