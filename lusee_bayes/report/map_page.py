@@ -136,9 +136,9 @@ def _data(folder: Path, found: xr.Dataset) -> list[str]:
         html.paragraph(
             "Each datum, and each product, day and turntable angle as a whole, is compared with "
             "its prediction from all other data. A bad group disturbs the predictions of others, "
-            "too; the culprit is the group whose removal makes the rest fit (last column). Days may "
-            "also stand out where they see a part of the sky that is brighter than the prior expects "
-            "and that no other day constrains as well."
+            "too; the culprit is the group whose removal makes the rest fit (last column). Days "
+            "may also stand out where they see a part of the sky that is brighter than the prior "
+            "expects and that no other day constrains as well."
         ),
         _figure(
             folder,

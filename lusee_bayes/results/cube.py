@@ -90,8 +90,8 @@ class CubeResult:
             return "Conjugate gradients leave the expected chi^2 unknown: fit not judged."
         if not bad and p is not None and p < SIGNIFICANCE:
             return (
-                "Residuals of all channels are as they should be, but their skies do not follow "
-                f"the spectral prior (p {probability(p)}): error bars may be too small. Compare the "
+                "Residuals of all channels are as expected, but their skies do not follow the "
+                f"spectral prior (p {probability(p)}): error bars may be too small. Compare the "
                 "evidence of other spectral.components and of a larger spectral.residual."
             )
         if not bad:
