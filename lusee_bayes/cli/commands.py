@@ -84,6 +84,10 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
 
 
 def help_of(name: str) -> str:
-    """Return the text of ``lusee-bayes NAME --help`` above its parameters, as Markdown."""
+    """Return the text of ``lusee-bayes NAME --help`` above its parameters.
+
+    What Markdown (the terminal) and reST (the site) both read.
+    """
     summary, more, examples = COMMANDS[name]
-    return "\n".join([summary, "", more, "", "**Examples**", "", "```", *examples, "```"])
+    lines = [f"- ``{example}``" for example in examples]
+    return "\n".join([summary, "", more, "", "**Examples**", "", *lines])

@@ -98,8 +98,3 @@ def peak_memory_gb() -> float:
     """Return the largest resident size of this process so far, in GB (10^9 bytes)."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e9 if sys.platform == "darwin" else peak * 1024 / 1e9
-
-
-def duration(seconds: float) -> str:
-    """Write a time to be waited for, to two digits: ``8 s``, ``45 s``, ``6 min``."""
-    return f"{seconds:.2g} s" if seconds < 99.5 else f"{seconds / 60.0:.0f} min"

@@ -25,7 +25,7 @@ from lusee_bayes.core.arrays import namespace
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import sum_over_m
 from lusee_bayes.core.linalg import solve_lower
-from lusee_bayes.core.progress import Stages, duration
+from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
@@ -33,6 +33,7 @@ from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.linear.metrics import effective_resolution_deg, ell_cross, prior_fraction_per_ell
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.results.cost import duration
 
 AS_GIVEN = "as given"
 
@@ -164,7 +165,7 @@ def forecasts_of(variations: Iterable[Variation], stages: Stages | None = None) 
     variations, stages = list(variations), stages or Stages()
     keys = [(variation.scenario.to_yaml(), variation.lost) for variation in variations]
     different = len(set(keys))
-    stages.say(f"{len(variations)} variations, {different} of them different")
+    stages.say(f"  {len(variations)} variations, {different} of them different")
     known: dict[tuple[str, tuple[int, ...]], Forecast] = {}
     start = time.perf_counter()
     with stages.progress("planning", different) as report:
@@ -175,7 +176,7 @@ def forecasts_of(variations: Iterable[Variation], stages: Stages | None = None) 
             known[key] = forecast(variation)
             if len(known) == 1 and different > 1:
                 longest = (different - 1) * (time.perf_counter() - start)
-                stages.say(f"the other {different - 1} take about {duration(longest)}, or less")
+                stages.say(f"  the other {different - 1} take about {duration(longest)}, or less")
         report(len(known), "")
     return [
         replace(known[key], variation=variation)
