@@ -13,6 +13,7 @@ from astropy.coordinates import SkyCoord
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import map_to_modes
 from lusee_bayes.instrument.beams import HemisphereGrid
 from lusee_bayes.instrument.products import labels
 from lusee_bayes.paper import cases as paper
@@ -244,6 +245,8 @@ def synthetic(name: str, agrees: bool) -> xr.Dataset:
         {
             "rho": ("ell", rho), "snr": ("ell", snr), "cl_mean": ("ell", power),
             "cl_truth": ("ell", np.ones(48)), "mean": ("pixel", mean), "truth": ("pixel", truth),
+            "mean_modes": ("mode", map_to_modes(mean, 8)),
+            "truth_modes": ("mode", map_to_modes(truth, 8)),
             "highest_altitude": ("pixel", altitude), "data": (("product", "time"), data),
             "noise_std": (("product", "time"), noise),
             "beam": (("pattern", "theta", "phi"), np.stack([beam] * 3)),
