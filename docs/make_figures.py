@@ -22,6 +22,7 @@ from lusee_bayes.linear.metrics import ell_cross, signal_to_noise
 from lusee_bayes.report.figures.channel import maps
 from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar
 from lusee_bayes.report.figures.mollweide import mollweide
+from lusee_bayes.report.figures.taper import shown
 from lusee_bayes.results.map_result import map_result
 from lusee_bayes.sampling.datatree import read_datatree
 from lusee_bayes.sampling.uncertainty import summary
@@ -115,7 +116,7 @@ def point_sources() -> None:
         result = map_result(experiment)
         mean, truth = result.channel.mean, result.channel.truth
         lines[treatment] = signal_to_noise(mean, truth)
-        residuals[treatment] = modes_to_map(mean - truth, 64)
+        residuals[treatment] = shown(mean - truth, 64)
         if result.fluxes is not None:
             print(result.fluxes.to_string(float_format="{:.4g}".format))
     # the sky with its sources up to lmax, which the second map should show
@@ -140,7 +141,7 @@ def point_sources() -> None:
             orientation="horizontal",
             shrink=0.7,
             label="posterior mean - diffuse sky [K]",
-            ticks=[-15000, 0, 15000],
+            ticks=np.round([-0.9 * largest, 0, 0.9 * largest], -3),
         )
     axes = bottom.subplots()
     ell = np.arange(1, 48)
