@@ -84,7 +84,7 @@ def sky_frequency_mhz(path: str | Path) -> float:
     found = re.search(r"exp(\d+(?:\.\d+)?)MHz", Path(path).name)
     if found is None or float(found[1]) == 0.0:
         raise InputError(
-            f"'{Path(path).name}' has no frequency in it; name the file exp<F>MHz..., for "
+            f"'{Path(path).name}' has no frequency as exp<F>MHz; name the file exp<F>MHz..., for "
             "example exp10.0MHz_sky_map.hdf5"
         )
     return float(found[1])
