@@ -29,6 +29,9 @@ UNITS = {
     "h": "h",
     "k": "K",
     "jy": "Jy",
+    "pf": "pF",
+    "nh": "nH",
+    "ohm": "Ohm",
 }
 TYPES = {float: "number", int: "integer", str: "text", bool: "true, false"}
 # annotated-types' names of bounds, as they are written
@@ -119,7 +122,8 @@ def _keys_of(section: type[Section], prefix: str, kind: str) -> Iterator[Key]:
         if len(inner) > 1:
             kinds = [str(one.model_fields["model"].default) for one in inner]
             meaning = f"Kind of {name}, on which the keys below depend"
-            yield Key(f"{path}.model", "", "", ", ".join(kinds), kinds[0], meaning)
+            first = "none" if field.default is None else kinds[0]
+            yield Key(f"{path}.model", kind, "", ", ".join(kinds), first, meaning)
         for one in inner:
             several = str(one.model_fields["model"].default) if len(inner) > 1 else ""
             number = ".0" if _is_sequence(field.annotation) else ""
@@ -145,7 +149,7 @@ def _alternatives(annotation: Any) -> tuple[Any, ...]:
     """The parts of a union, None left out."""
     bare = _without_metadata(annotation)[0]
     if get_origin(bare) in (Union, types.UnionType):
-        return tuple(a for a in get_args(bare) if a is not type(None))
+        return tuple(b for a in get_args(bare) if a is not type(None) for b in _alternatives(a))
     return (annotation,)
 
 
