@@ -13,6 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # a posterior map of the embedded sky at 25 MHz, in output/fiducial
 map: $(VENV)/installed
 	$(BIN)/lusee-bayes map fiducial
+	@echo "the command is $(BIN)/lusee-bayes; . $(BIN)/activate puts it on PATH"
 
 # a file's tests stay in one process: they share fixtures and compiled functions. Two processes also
 # keep each below the number of memory maps that compiled programs may take up

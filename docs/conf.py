@@ -1,8 +1,13 @@
 """How the documentation is built: ``make docs``; nothing here uses the network."""
 
+import shutil
+from pathlib import Path
+
 import jax
 
 import lusee_bayes
+
+HERE = Path(__file__).parent
 
 # signatures show Float[Array, "data"], not Float[jaxlib._jax.Array, "data"]
 jax.Array.__name__ = "Array"
@@ -16,7 +21,7 @@ html_show_sphinx = False
 html_copy_source = False
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "numpydoc",
@@ -25,6 +30,10 @@ extensions = [
 exclude_patterns = ["_build"]
 
 myst_heading_anchors = 3
+# Sphinx reads what is below this folder: the notebooks are copied to it, and links follow them.
+# They are shown with the outputs that they hold: the tests run them
+shutil.copytree(HERE.parent / "notebooks", HERE / "notebooks", dirs_exist_ok=True)
+nb_execution_mode = "off"
 highlight_language = "text"
 # --option stays two hyphens
 smartquotes = False
@@ -50,3 +59,21 @@ html_theme_options = {
 }
 pygments_style = "default"
 pygments_dark_style = "github-dark"
+
+
+# links between pages and notebooks as the repository has them, and on the site
+MOVED = {
+    "(../notebooks/": "(notebooks/",
+    "(../docs/": "(../",
+    "(../models)": "(../programs.md)",
+}
+
+
+def _follow_the_notebooks(app, name, source):
+    for old, new in MOVED.items():
+        source[0] = source[0].replace(old, new)
+
+
+def setup(app):
+    """Read pages through this."""
+    app.connect("source-read", _follow_the_notebooks)

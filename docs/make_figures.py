@@ -19,8 +19,10 @@ from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.simulate import true_values
 from lusee_bayes.linear.metrics import ell_cross, signal_to_noise
+from lusee_bayes.report.figures.channel import maps
 from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar
 from lusee_bayes.report.figures.mollweide import mollweide
+from lusee_bayes.report.figures.taper import shown
 from lusee_bayes.results.map_result import map_result
 from lusee_bayes.sampling.datatree import read_datatree
 from lusee_bayes.sampling.uncertainty import summary
@@ -28,6 +30,12 @@ from lusee_bayes.sky import BRIGHT_SOURCES
 from lusee_bayes.sky.galaxy import galaxy_map
 
 HERE = Path(__file__).parent / "figures"
+
+
+def first_map() -> None:
+    """Draw the maps of `lusee-bayes map fiducial`."""
+    channel = map_result(lb.build(lb.load_scenario("fiducial"))).channel
+    maps(channel).savefig(HERE / "maps.png", dpi=110)
 
 
 def fixed_axis() -> None:
@@ -108,7 +116,7 @@ def point_sources() -> None:
         result = map_result(experiment)
         mean, truth = result.channel.mean, result.channel.truth
         lines[treatment] = signal_to_noise(mean, truth)
-        residuals[treatment] = modes_to_map(mean - truth, 64)
+        residuals[treatment] = shown(mean - truth, 64)
         if result.fluxes is not None:
             print(result.fluxes.to_string(float_format="{:.4g}".format))
     # the sky with its sources up to lmax, which the second map should show
@@ -133,7 +141,7 @@ def point_sources() -> None:
             orientation="horizontal",
             shrink=0.7,
             label="posterior mean - diffuse sky [K]",
-            ticks=[-15000, 0, 15000],
+            ticks=np.round([-0.9 * largest, 0, 0.9 * largest], -3),
         )
     axes = bottom.subplots()
     ell = np.arange(1, 48)
@@ -218,6 +226,7 @@ if __name__ == "__main__":
     HERE.mkdir(exist_ok=True)
     if Path("output/regolith").is_dir():
         regolith(Path("output/regolith"))
+    first_map()
     point_sources()
     embedded_sky(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
     fixed_axis()

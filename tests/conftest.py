@@ -93,7 +93,7 @@ def small_map(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def small_cube(tmp_path_factory):
-    """A finished run of three frequencies, each by itself, with draws; to be read only."""
+    """A finished run of three frequencies, each on its own, with draws; to be read only."""
     sizes = ["lmax=4", "observation.runs.0.cycles=0.1", "output.draws=3"]
     scenario = lb.load_scenario("fiducial", [*sizes, "frequencies_mhz=[20, 25, 30]"])
     return lb.run_map(scenario, tmp_path_factory.mktemp("small") / "cube")

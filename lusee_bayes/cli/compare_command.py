@@ -21,8 +21,6 @@ def compare_command(
 ) -> None:
     """Set finished map runs side by side: maps, spectra, evidence.
 
-    Example: lusee-bayes compare output/fiducial output/gain_1e-2
-
     Parameters
     ----------
     folders
@@ -34,7 +32,7 @@ def compare_command(
     quiet
         Print nothing but errors.
     verbose
-        Tell the memory in use after every stage.
+        Print the memory in use after every stage.
     """
     from lusee_bayes.cli.tables import comparison_table
     from lusee_bayes.results.finished_runs import same_data

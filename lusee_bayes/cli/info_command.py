@@ -8,10 +8,7 @@ from rich.console import Console
 
 
 def info_command(file: Path) -> None:
-    """Say what is in a file: visibilities, a posterior, samples, or a sky map.
-
-    Example: lusee-bayes info output/fiducial/posterior.nc
-    """
+    """Say what is in a file: visibilities, a posterior, samples, or a sky map."""
     from lusee_bayes.report.describe import describe
 
     Console(soft_wrap=True).print(describe(file), highlight=False, markup=False)

@@ -13,6 +13,7 @@ import sys
 from cyclopts import App, CycloptsError
 from rich.console import Console
 
+from lusee_bayes.cli.commands import COMMANDS, help_of
 from lusee_bayes.core.errors import InputError, ProcessLost
 from lusee_bayes.core.version import __version__
 
@@ -29,18 +30,8 @@ app = App(
 )
 app.register_install_completion_command()
 # named by path: each is imported when called, so that --help and completion answer at once
-for _name, _help in {
-    "simulate": "Simulate the visibilities of a scenario.",
-    "map": "Make a posterior map of a scenario, or of given data.",
-    "sample": "Sample the posterior of a NumPyro program by Hamiltonian Monte Carlo.",
-    "plan": "Say what observations would tell, without data.",
-    "validate": "Check the analytic posterior by HMC and by simulated data sets.",
-    "paper": "Reproduce the figures of the reference paper and judge its claims.",
-    "report": "Write report.html of a finished run anew.",
-    "compare": "Set finished map runs side by side.",
-    "info": "Say what is in a file.",
-}.items():
-    app.command(f"lusee_bayes.cli.{_name}_command:{_name}_command", name=_name, help=_help)
+for _name in COMMANDS:
+    app.command(f"lusee_bayes.cli.{_name}_command:{_name}_command", name=_name, help=help_of(_name))
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -47,14 +47,6 @@ def map_command(
 ) -> int | None:
     """Make a posterior map of a scenario, or of given data.
 
-    Example: lusee-bayes map fiducial --set frequency_mhz=10 -o output/ten
-
-    Example: lusee-bayes map fiducial --data waterfall.fits --set beam.file=beam.fits
-
-    Example: lusee-bayes map fiducial --frequencies 5:50:1 --joint --draws 20 -o output/cube
-
-    Example: lusee-bayes map fiducial --data second_cycle.nc --onto output/first_cycle
-
     Parameters
     ----------
     scenario
@@ -67,24 +59,24 @@ def map_command(
     output
         Folder for the results; by default output/NAME.
     draws
-        How many posterior draws to keep in posterior.nc (output.draws).
+        Number of posterior draws to keep in posterior.nc (output.draws).
     covariance
         Keep the posterior covariance in posterior.nc (output.covariance).
     compact
-        Write posterior_compact.npz, of which NumPy alone can make draws (output.compact).
+        Write posterior_compact.npz, from which NumPy alone makes draws (output.compact).
     updatable
         Keep in posterior.nc what --onto needs (output.updatable).
     onto
         Folder of an updatable run: the data are added to those behind it.
     frequencies
-        Channels in MHz, as 10,25,30 or as first:last:step: a map of each, by itself. A run that was
-        stopped goes on with the same command.
+        Channels in MHz, as 10,25,30 or as first:last:step: a map of each, on its own. The same
+        command continues an interrupted run.
     joint
         One posterior for the skies of all channels, with the scenario's spectral prior.
     processes
-        Share the channels among so many processes on this machine. Under Slurm, srun says how many.
+        Number of processes on this machine that share the channels. Under Slurm, srun sets it.
     devices
-        Make so many devices of the CPU, and share the channels among them.
+        Number of devices to make of the CPU, which share the channels.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
     force
@@ -92,7 +84,7 @@ def map_command(
     quiet
         Print nothing but errors.
     verbose
-        Tell the memory in use after every stage.
+        Print the memory in use after every stage.
     """
     from lusee_bayes.core.launcher import run_processes
     from lusee_bayes.core.process_group import use_cpu_devices

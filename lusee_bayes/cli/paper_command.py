@@ -22,16 +22,14 @@ def paper_command(
     """Reproduce the figures of the reference paper and judge its claims.
 
     Cases that were computed before with the same scenario and version are kept, so that an
-    interrupted run goes on where it stopped.
-
-    Example: lusee-bayes paper -o output/paper --sky exp1.0MHz_sky.hdf5 exp10.0MHz_sky.hdf5
+    interrupted run continues where it stopped.
 
     Parameters
     ----------
     output
         Folder for the cases, figures and tables.
     sky
-        ULSA HDF5 files whose names tell the frequency, as exp10.0MHz_sky.hdf5; each case scales
+        ULSA HDF5 files with the frequency in their names, as exp10.0MHz_sky.hdf5; each case scales
         the one nearest in log frequency.
         Without them the embedded sky is used.
     force

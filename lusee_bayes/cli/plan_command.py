@@ -1,4 +1,4 @@
-"""lusee-bayes plan: which observation is worth more, before there are data."""
+"""lusee-bayes plan: a forecast of the information in observations, before there are data."""
 
 from __future__ import annotations
 
@@ -23,11 +23,7 @@ def plan_command(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Say what observations would tell: information, modes with SNR > 1, ell_cross; without data.
-
-    Example: lusee-bayes plan fiducial gain_1e-2 -o output/plan
-
-    Example: lusee-bayes plan fiducial --vary frequency_mhz=10,25,40
+    """Forecast information, modes with SNR > 1 and ell_cross of observations, without data.
 
     Parameters
     ----------
@@ -47,7 +43,7 @@ def plan_command(
     quiet
         Print nothing but errors.
     verbose
-        Tell the memory in use after every stage.
+        Print the memory in use after every stage.
     """
     from lusee_bayes.cli.plan_variations import headline, variations_of
     from lusee_bayes.cli.tables import forecast_table

@@ -61,7 +61,7 @@ def possible(variations: list[Variation], console: Console) -> list[Variation]:
 
 
 def headline(forecasts: list[Forecast], source: str) -> str:
-    """What the scenario itself tells, and which of its variations tells most."""
+    """The information in the scenario as given, and its most informative variation."""
     first = baseline(forecasts, source)
     best = max(
         (f for f in forecasts if f.variation.source == source), key=lambda f: f.information_bits
@@ -69,5 +69,5 @@ def headline(forecasts: list[Forecast], source: str) -> str:
     text = f"{source}: {first.information_bits:.0f} bits, {first.modes} modes with SNR > 1"
     if best.information_bits > first.information_bits:
         more = best.information_bits - first.information_bits
-        text += f"; most with {best.variation.family}, {best.variation.name}: +{more:.0f} bits"
+        text += f"; most: {best.variation.family}, {best.variation.name}: +{more:.0f} bits"
     return text

@@ -1,4 +1,4 @@
-"""lusee-bayes report: the page of a finished run, made anew."""
+"""lusee-bayes report: the page of a finished run, made again."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ from lusee_bayes.cli.options import Quiet
 
 
 def report_command(folder: Path, *, quiet: Quiet = False) -> None:
-    """Write report.html anew from the results that a run has left in its folder.
-
-    Example: lusee-bayes report output/fiducial
+    """Write report.html again from the results in the folder of a run.
 
     Parameters
     ----------

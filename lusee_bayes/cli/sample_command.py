@@ -43,11 +43,7 @@ def sample_command(
 ) -> None:
     """Sample the posterior of a NumPyro program by Hamiltonian Monte Carlo.
 
-    Draws are written as they come: a run that was stopped goes on with --resume.
-
-    Example: lusee-bayes sample fiducial --set lmax=20 --draws 500 -o output/hmc
-
-    Example: lusee-bayes sample gain_1e-2 --frequencies 10,25,40 --resume -o output/three
+    Draws are written during the run: after an interruption, --resume continues it.
 
     Parameters
     ----------
@@ -62,7 +58,7 @@ def sample_command(
     output
         Folder for the results; by default output/NAME-MODEL.
     resume
-        Go on with the unfinished run in the folder.
+        Continue the unfinished run in the folder.
     chains
         Chains side by side.
     draws
@@ -81,7 +77,7 @@ def sample_command(
     quiet
         Print nothing but errors.
     verbose
-        Tell the memory in use after every stage.
+        Print the memory in use after every stage.
     """
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.sample_run import default_program, run_sample

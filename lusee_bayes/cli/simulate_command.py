@@ -31,10 +31,6 @@ def simulate_command(
 ) -> None:
     """Simulate the visibilities of a scenario.
 
-    Example: lusee-bayes simulate fiducial --set seed=2 -o data.nc
-
-    Example: lusee-bayes simulate fiducial --frequencies 10:30:5 -o waterfall.fits
-
     Parameters
     ----------
     scenario
@@ -49,7 +45,7 @@ def simulate_command(
     quiet
         Print nothing but errors.
     verbose
-        Tell the memory in use after every stage.
+        Print the memory in use after every stage.
     """
     from lusee_bayes.runs.simulate_run import run_simulate
 

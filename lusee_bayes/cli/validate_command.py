@@ -41,8 +41,6 @@ def validate_command(
 
     Ends with exit code 1 if a check fails; the thresholds are in validation.md.
 
-    Example: lusee-bayes validate gain_1e-2 --set lmax=8 -o output/check
-
     Parameters
     ----------
     scenario
@@ -68,7 +66,7 @@ def validate_command(
     quiet
         Print nothing but errors.
     verbose
-        Tell the memory in use after every stage.
+        Print the memory in use after every stage.
     """
     from lusee_bayes.cli.tables import checks_table
     from lusee_bayes.report.pages import REPORT

@@ -75,7 +75,7 @@ def run_processes(n: int, arguments: list[str], module: str = "lusee_bayes.cli")
         except KeyboardInterrupt:
             _end(children, signal.SIGINT)
             if not children or children[0].returncode != 130:
-                _say("interrupted; the same command goes on from what is finished")
+                _say("interrupted; the same command continues from what is finished")
             return 130
         except _Signalled as signalled:
             number = signalled.args[0]
@@ -147,7 +147,7 @@ def _watch(children: list[subprocess.Popen], notes: list[IO[bytes]]) -> int:
     how = f"ended with exit code {code}" if code > 0 else f"was ended by {_signal_name(-code)}"
     _say(
         f"process {failed} of 0..{len(children) - 1} {how}, and the others were stopped; the same "
-        "command goes on from what is finished"
+        "command continues from what is finished"
     )
     return 1
 

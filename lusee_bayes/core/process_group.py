@@ -121,7 +121,7 @@ class ProcessGroup:
                 flat[start : start + SUM_SIZE] = self._sum(flat[start : start + SUM_SIZE])
         except jax.errors.JaxRuntimeError as error:
             raise ProcessLost(
-                "another process of this run has ended; the same command goes on from what is "
+                "another process of this run has ended; the same command continues from what is "
                 f"finished ({' '.join(str(error).split())[:200]})"
             ) from error
         return result

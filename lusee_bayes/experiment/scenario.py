@@ -43,7 +43,36 @@ FOLDER = resources.files("lusee_bayes.experiment") / "scenarios"
 class Scenario(Section):
     """A complete run: of one frequency, or of all of ``frequencies_mhz``.
 
-    ``joint``: channels share a posterior, with the spectral prior; else each has its own.
+    Attributes
+    ----------
+    frequency_mhz : float
+        Frequency of the map.
+    frequencies_mhz : tuple of float
+        Channels of a run of several frequencies, in growing order.
+    joint : bool
+        The channels share one posterior, with the spectral prior; by default each has its own.
+    lmax : int
+        Highest ell of the map, which has (lmax + 1)^2 modes.
+    nside : int
+        HEALPix NSIDE of written maps; by default the lowest with two pixels for each ell.
+    observation : ObservationSection
+        Where and when.
+    beam : BeamSection
+        The antennas.
+    sky : SkySection
+        The true sky of simulated data, and the model for the noise level.
+    prior : PriorSection
+        S.
+    noise : NoiseSection
+        N.
+    sources : SourcesSection
+        Point sources apart from the map.
+    spectral : SpectralSection
+        Prior of joint channels.
+    output : OutputSection
+        What is written on request.
+    seed : int
+        Seed of simulated data and of draws.
     """
 
     frequency_mhz: Frequency = 25.0

@@ -6,7 +6,7 @@ of data differs from its prediction by all others by K_ss^-1 u_s, K_ss being a b
     chi^2_s = u_s^T K_ss^-1 u_s,    chi^2_all - chi^2_s = chi^2 of the others without s.
 
 Both follow chi^2 distributions exactly if the model holds. A bad group spoils the predictions for
-all others too; it is recognised by the others fitting once it is left out.
+all others too; the culprit is the group whose removal makes the rest fit.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class Residuals:
         return found
 
     def verdict(self) -> str:
-        """Describe in a sentence whether the data fit, and which group is to blame if not.
+        """Describe in a sentence whether the data fit, and which group is the cause if not.
 
         Returns
         -------
@@ -128,12 +128,12 @@ class Residuals:
         text = f"The data do not fit the model (p {probability(self.p)})."
         if not self.products:
             return (
-                text + " Which product, day or turntable angle is to blame for it is not judged: "
+                text + " Which product, day or turntable angle is the cause is not judged: "
                 "that would need the whole of A, since the noise couples different times."
             )
         suspects = self.suspects()
         if not suspects:
-            return text + " No single product, day or turntable angle is to blame for it."
+            return text + " No single product, day or turntable angle is the cause."
         parts = [f"{kind} {g.name} (p {probability(g.others_p)})" for kind, g in suspects]
         return f"{text} They do without {', or without '.join(parts)}."
 

@@ -78,13 +78,13 @@ def paper_scenarios(
 def sky_frequency_mhz(path: str | Path) -> float:
     """Frequency in a file name like ULSA's: exp10.0MHz_sky_map_with_absorption.hdf5.
 
-    InputError if the file is missing or its name does not tell.
+    InputError if the file is missing or its name has no frequency.
     """
     path = require_file(path, "sky map")
     found = re.search(r"exp(\d+(?:\.\d+)?)MHz", Path(path).name)
     if found is None or float(found[1]) == 0.0:
         raise InputError(
-            f"'{Path(path).name}' does not tell its frequency; name the file exp<F>MHz..., for "
+            f"'{Path(path).name}' has no frequency as exp<F>MHz; name the file exp<F>MHz..., for "
             "example exp10.0MHz_sky_map.hdf5"
         )
     return float(found[1])

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+import xarray as xr
 from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
+from lusee_bayes.core.harmonics import lmax_of
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.instrument.beams import HemisphereGrid
 from lusee_bayes.paper.claims import FREQUENCIES, SHOWN_FREQUENCIES, Cases, frequency_case
 from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, orthographic
 from lusee_bayes.report.figures.mollweide import mollweide
+from lusee_bayes.report.figures.taper import shown, taper_fwhm_deg
 
 # the paper's colours by group, of lightness different enough for colour-blind readers; the lines
 # within a group differ in style
@@ -100,7 +104,7 @@ def frequency_maps(cases: Cases) -> Figure:
     columns = len(SHOWN_FREQUENCIES)
     for column, frequency in enumerate(SHOWN_FREQUENCIES):
         case = cases[frequency_case(frequency)]
-        mean, truth = case["mean"].values, case["truth"].values
+        mean, truth = (drawn(case, name) for name in ("mean", "truth"))
         percent = 100.0 * (mean - truth) / truth.mean()
         limit = float(np.percentile(np.abs(percent), 99.0))
         norm = temperature_norm(truth)
@@ -119,8 +123,16 @@ def frequency_maps(cases: Cases) -> Figure:
             axes.set_xticklabels([])
             axes.set_yticklabels([])
             colour_bar(figure, axes, image, "K" if row < 2 else "% of the mean sky")
-    figure.suptitle("Galactic coordinates, longitude grows to the left; dashed: never observed")
+    figure.suptitle(
+        "Galactic coordinates, longitude grows to the left; dashed: never observed; drawn through "
+        f"a beam of {taper_fwhm_deg(lmax_of(case.sizes['mode'])):.1f}° (FWHM)"
+    )
     return figure
+
+
+def drawn(case: xr.Dataset, name: str) -> Float[np.ndarray, " pixels"]:
+    """Map of ``mean`` or ``truth`` as reports draw it, through the beam of the taper."""
+    return shown(case[f"{name}_modes"].values, healpy.npix2nside(case.sizes["pixel"]))
 
 
 def temperature_norm(pixels: Float[np.ndarray, " pixels"]) -> LogNorm:
@@ -223,11 +235,11 @@ def scenario_maps(cases: Cases) -> Figure:
     """Figure 9: the true sky at 25 MHz and the map of every scenario, in the same colours."""
     labels = {name: f"{group}: {label}" for group, (_, members) in GROUPS.items()
               for name, label in members.items()}  # fmt: skip
-    truth = cases["fiducial"]["truth"].values
+    truth = drawn(cases["fiducial"], "truth")
     norm = temperature_norm(truth)
     figure = Figure(figsize=(13, 11), layout="constrained")
     panels = [("truth", truth, None)] + [
-        (labels.get(name, name), cases[name]["mean"].values, cases[name]["highest_altitude"].values)
+        (labels.get(name, name), drawn(cases[name], "mean"), cases[name]["highest_altitude"].values)
         for name in MAP_CASES
     ]
     for position, (title, pixels, altitude) in enumerate(panels, 1):
@@ -237,7 +249,11 @@ def scenario_maps(cases: Cases) -> Figure:
         axes.set_xticklabels([])
         axes.set_yticklabels([])
     colour_bar(figure, figure.axes, image, "K")
-    figure.suptitle("Maps at 25 MHz, Galactic coordinates; dashed: never observed")
+    lmax = lmax_of(cases["fiducial"].sizes["mode"])
+    figure.suptitle(
+        "Maps at 25 MHz, Galactic coordinates; dashed: never observed; drawn through a beam of "
+        f"{taper_fwhm_deg(lmax):.1f}° (FWHM)"
+    )
     return figure
 
 

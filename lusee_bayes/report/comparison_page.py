@@ -26,7 +26,7 @@ def comparison_page(runs: Sequence[FinishedRun], figures: Path) -> str:
     """The page as text; ``figures``: folder with maps.png and curves.png."""
     rows = [[_shown(row[key]) for key in HEADER] for row in comparison_rows(runs)]
     caveat = (
-        "All runs map the same data: differences of ln evidence say which model they prefer."
+        "All runs map the same data: differences of ln evidence show which model they favour."
         if same_data(runs)
         else "The runs map different data: their evidences cannot be compared with each other."
     )

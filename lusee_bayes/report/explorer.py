@@ -34,7 +34,7 @@ never above the horizon. Click, or move with the arrow keys.</p>
 <div><h3>Point-spread function there</h3>
 <canvas id="explorer-psf" width="600" height="300" role="img"
 aria-label="point-spread function of the chosen direction"></canvas>
-<p>How the pixel's mean weighs the sky, over its peak: orange adds, purple takes away.</p></div>
+<p>How the pixel's mean weighs the sky, over its peak: orange: positive, purple: negative.</p></div>
 </div>"""
 
 

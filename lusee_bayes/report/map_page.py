@@ -80,14 +80,16 @@ def _map(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
             "maps",
             "Galactic maps: posterior mean and its standard deviation, and, where the true sky is "
             "known, truth and difference",
-            "Posterior mean and standard deviation; truth and difference where the sky is known.",
+            "Posterior mean and standard deviation; truth and difference where the sky is known. "
+            "All but the standard deviation are drawn through the Gaussian beam named above the "
+            "maps, so that bright edges have no rings; files and numbers are without it.",
         ),
         _figure(
             folder,
             "draws",
             "Galactic maps of four draws of the posterior",
-            "Draws of the posterior: skies that the data and the prior allow. What they share is "
-            "known, what differs is not.",
+            "Draws of the posterior: skies that agree with the data and the prior. Features that "
+            "all draws share are constrained; those that differ are not.",
         ),
     ]
 
@@ -121,7 +123,8 @@ def _scales(folder: Path, run: FinishedRun) -> list[str]:
             folder,
             "spectra",
             "Power spectra of prior, posterior mean, posterior variance and truth",
-            "Power spectra. Where the posterior variance meets the prior, the data say nothing.",
+            "Power spectra. Where the posterior variance reaches the prior, the data add no "
+            "information.",
         ),
     ]
 
@@ -132,10 +135,10 @@ def _data(folder: Path, found: xr.Dataset) -> list[str]:
     parts = [
         html.paragraph(
             "Each datum, and each product, day and turntable angle as a whole, is compared with "
-            "what all other data predict of it. A bad group spoils the predictions of others too; "
-            "what tells it is that the others fit once it is left out (last column). Days may also "
-            "stand out by a sky that is brighter in places than the prior expects and that no "
-            "other day has seen as well."
+            "its prediction from all other data. A bad group disturbs the predictions of others, "
+            "too; the culprit is the group whose removal makes the rest fit (last column). Days "
+            "may also stand out where they see a part of the sky that is brighter than the prior "
+            "expects and that no other day constrains as well."
         ),
         _figure(
             folder,
@@ -165,7 +168,7 @@ def _data(folder: Path, found: xr.Dataset) -> list[str]:
             folder,
             "data_vector",
             "The measured visibilities, product by product",
-            "The data as they were measured.",
+            "The data, product by product.",
         )
     )
     return parts
@@ -212,7 +215,7 @@ def _numbers(folder: Path, summary: dict) -> list[str]:
             folder,
             "beams",
             "Beams of an auto and two crosses seen from above, North up",
-            "Beams that the map was made with.",
+            "Beams used for the map.",
         )
     )
     return parts

@@ -25,7 +25,7 @@ PAGES: dict[str, Callable[[Path, str], str]] = {
 
 
 def write_report(folder: str | Path) -> Path:
-    """Write report.html of the results in a folder anew, whole or not at all.
+    """Write report.html of the results in a folder again, whole or not at all.
 
     Raises
     ------

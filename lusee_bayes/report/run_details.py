@@ -14,7 +14,7 @@ def details(folder: Path, figures: dict) -> list[str]:
     scenario = read_text(folder / "scenario.yaml", "a scenario")
     for name in ("seconds", "versions"):
         if not isinstance(figures.get(name), dict):
-            raise InputError(f"the figures of the run in '{folder}' have no {name}; make it anew")
+            raise InputError(f"the figures of the run in '{folder}' have no {name}; make it again")
     seconds = [(name, f"{value} s") for name, value in figures["seconds"].items()]
     seconds.append(("peak memory", f"{figures['peak_memory_gb']:.2f} GB"))
     return [

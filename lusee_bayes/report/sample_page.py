@@ -16,14 +16,14 @@ from lusee_bayes.results.saved import CHECK, SAMPLING, SUMMARY_TABLE, VALIDATION
 FIGURES = {
     "uncertainty": (
         "Galactic maps of the draws: mean, standard deviation, width and asymmetry of intervals",
-        "What the draws say of the sky.",
+        "Mean, standard deviation and intervals of the draws.",
     ),
     "traces": (
         "Draws of each quantity over time for every chain, with histograms",
-        "Draws over time: chains should look alike, and like noise.",
+        "Draws over time: all chains should look like the same noise.",
     ),
     "ranks": (
-        "Differences of the distribution of ranks from an even one, a curve for each chain",
+        "Difference of the distribution of ranks from a uniform one, a curve for each chain",
         "Ranks of each chain's draws among all: the curves stay within the grey band if the chains "
         "agree.",
     ),

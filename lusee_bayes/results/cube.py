@@ -99,7 +99,7 @@ class CubeResult(Described):
             return "Conjugate gradients leave the expected chi^2 unknown: fit not judged."
         if not bad and p is not None and p < SIGNIFICANCE:
             return (
-                "Residuals of all channels are as they should be, but their skies do not obey the "
+                "Residuals of all channels are as expected, but their skies do not follow the "
                 f"spectral prior (p {probability(p)}): error bars may be too small. Compare the "
                 "evidence of other spectral.components and of a larger spectral.residual."
             )
@@ -119,7 +119,7 @@ class CubeResult(Described):
 
     def headline(self) -> str:
         """The few figures that matter, in one line."""
-        kind = "each by itself" if self.components is None else "one posterior"
+        kind = "each on its own" if self.components is None else "one posterior"
         parts = [f"{len(self.channels)} frequencies, {kind}"]
         crosses = [c.ell_cross for c in self.channels if c.ell_cross is not None]
         if crosses:

@@ -1,4 +1,4 @@
-"""The channels of a cube, each by itself or in one posterior; a stopped run goes on."""
+"""The channels of a cube, each on its own or in one posterior; a stopped run goes on."""
 
 from __future__ import annotations
 

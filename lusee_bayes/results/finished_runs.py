@@ -43,7 +43,7 @@ class FinishedRun:
             raise InputError(
                 f"'{folder}' holds files of different runs: summary.json is of "
                 f"{summary['frequency_mhz']:g} MHz, diagnostics.nc of "
-                f"{diagnostics.attrs['frequency_mhz']:g} MHz; make the map anew"
+                f"{diagnostics.attrs['frequency_mhz']:g} MHz; make the map again"
             )
         maps = {name: SkyMap.read(folder / f"{name}.fits").pixels for name in ("mean", "std")}
         if maps["mean"].size != maps["std"].size:

@@ -1,4 +1,4 @@
-"""What an observation would tell, from the posterior covariance alone: no data are needed.
+"""The information in an observation, from the posterior covariance alone: no data are needed.
 
 C = Lambda^-1 does not depend on d. Three numbers are taken from it:
 
@@ -14,13 +14,14 @@ C = Lambda^-1 does not depend on d. Three numbers are taken from it:
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from lusee_bayes.core.arrays import namespace
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import sum_over_m
 from lusee_bayes.core.linalg import solve_lower
@@ -32,13 +33,14 @@ from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.linear.metrics import effective_resolution_deg, ell_cross, prior_fraction_per_ell
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.results.cost import duration
 
 AS_GIVEN = "as given"
 
 
 @dataclass(frozen=True)
 class Variation:
-    """A scenario to be weighed against others.
+    """A scenario to be compared with others.
 
     source : what it is a variation of; family, name : what differs; lost : ports that are dead,
     of which every product is flagged
@@ -61,7 +63,7 @@ class Variation:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a variation would tell.
+    """The information in a variation.
 
     days : of observing; n_data : samples of all products; information_bits : about the whole sky;
     modes : how many have SNR > 1; snr_squared : (ells,) expected SNR_ell^2 for ell = 0..lmax;
@@ -99,8 +101,9 @@ def informed_modes(posterior: Posterior) -> int:
     Counted on the covariance of the whitened sky, whose eigenvalues lie between 0 and 1: on
     Lambda, whose largest is 1e13, rounding would blur the threshold.
     """
-    lower = jnp.tril(posterior.lower)
-    half = np.asarray(solve_lower(lower, jnp.eye(lower.shape[0]), transpose=False))
+    xp = namespace(posterior.lower)
+    lower = xp.tril(posterior.lower)
+    half = np.asarray(solve_lower(lower, xp.eye(lower.shape[0]), transpose=False))
     return int((np.linalg.eigvalsh(half.T @ half) < 0.5).sum())
 
 
@@ -140,7 +143,7 @@ def forecast(variation: Variation) -> Forecast:
             setup = without_ports(setup, variation.lost)
         model = full_model(setup)
         # the covariance is that of any data; these are the shortest to write
-        posterior = model.condition(jnp.zeros(model.n_data))
+        posterior = model.condition(np.zeros(model.n_data))
         return Forecast(
             variation=variation,
             days=setup.observation.n_times * setup.observation.step_s / 86400.0,
@@ -155,19 +158,30 @@ def forecast(variation: Variation) -> Forecast:
 
 
 def forecasts_of(variations: Iterable[Variation], stages: Stages | None = None) -> list[Forecast]:
-    """A forecast of every variation, in their order; what is there twice is computed once."""
+    """A forecast of every variation, in their order; what is there twice is computed once.
+
+    ``stages`` is told how many there are, and after the first about how long the others take.
+    """
     variations, stages = list(variations), stages or Stages()
+    keys = [(variation.scenario.to_yaml(), variation.lost) for variation in variations]
+    different = len(set(keys))
+    stages.say(f"  {len(variations)} variations, {different} of them different")
     known: dict[tuple[str, tuple[int, ...]], Forecast] = {}
-    forecasts = []
-    with stages.progress("planning", len(variations)) as report:
-        for number, variation in enumerate(variations):
-            report(number, f"{variation.source}, {variation.name}")
-            key = variation.scenario.to_yaml(), variation.lost
-            if key not in known:
-                known[key] = forecast(variation)
-            forecasts.append(replace(known[key], variation=variation))
-            report(number + 1, "")
-    return forecasts
+    start = time.perf_counter()
+    with stages.progress("planning", different) as report:
+        for variation, key in zip(variations, keys, strict=True):
+            if key in known:
+                continue
+            report(len(known), f"{variation.source}, {variation.name}")
+            known[key] = forecast(variation)
+            if len(known) == 1 and different > 1:
+                longest = (different - 1) * (time.perf_counter() - start)
+                stages.say(f"  the other {different - 1} take about {duration(longest)}, or less")
+        report(len(known), "")
+    return [
+        replace(known[key], variation=variation)
+        for variation, key in zip(variations, keys, strict=True)
+    ]
 
 
 def baseline(forecasts: Sequence[Forecast], source: str) -> Forecast:

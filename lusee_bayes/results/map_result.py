@@ -177,8 +177,8 @@ def _updated(
     data = experiment.data
     if data.digest() in earlier.digests:
         raise InputError(
-            "these data are behind the earlier posterior already; a second time they would count "
-            "double"
+            "these data are behind the earlier posterior already; used again, they would count "
+            "twice"
         )
     deviations = deviation_model(earlier.posterior, alone.model)
     deviation = deviations.condition(data.data, form="root")

@@ -39,7 +39,7 @@ def read_updatable(folder: str | Path, scenario: Scenario) -> Updatable:
     here, said = saved.arrays, saved.values
     if "precision_root" not in here:
         raise InputError(
-            f"{path} does not hold what an update needs; make that map anew with --updatable"
+            f"{path} does not hold what an update needs; make that map again with --updatable"
         )
     for name in ("frequency_mhz", "lmax"):
         if said[name] != getattr(scenario, name):

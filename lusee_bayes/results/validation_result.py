@@ -64,11 +64,11 @@ class ValidationResult:
             )
         lines += [
             "",
-            "Means, variances and calibration: a true posterior fails each of them once in a "
-            "thousand runs. Eigenvalues: against simulated exact chains that move as far from draw "
-            "to draw. "
+            "Means, variances and calibration: a correct posterior fails each of them once in "
+            "1000 runs. Eigenvalues: against simulated exact chains with the same autocorrelation "
+            "from draw to draw. "
             "R-hat: 1.01, or what the largest of so many modes reaches by chance. Effective sizes, "
-            "BFMI: as is common.",
+            "BFMI: the usual thresholds.",
             "",
             f"Coverage over {ranks.n_simulations} simulations (regions: distance from the mean; "
             "else central intervals):",

@@ -107,7 +107,7 @@ def run_map(
     require_single_frequency("--compact", output.compact)
     require_single_frequency("--updatable", output.updatable)
     require_single_frequency("--onto", onto is not None)
-    resume = "the same command goes on from the channels that are done"
+    resume = "the same command continues from the finished channels"
     origin = origin_of(scenario, data, truth=truth or None)
     cost = posterior_cost(scenario)
     require_fits(cost, scenario)

@@ -19,7 +19,7 @@ from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
 from lusee_bayes.runs.origins import origin_of
 
 CASES, UNFINISHED = "cases", "unfinished-cases"
-RESUME = "the same command goes on from the cases that are done"
+RESUME = "the same command continues from the finished cases"
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def run_paper(
     overrides : sequence of str
         ``key.path=value``, applied to every case.
     skies : sequence of paths
-        ULSA HDF5 files whose names tell the frequency; each case scales the nearest one.
+        ULSA HDF5 files with the frequency in their names; each case scales the nearest one.
     replace : bool
         Replace results of another run in the folder.
     stages : Stages, optional
@@ -79,7 +79,7 @@ def run_paper(
     Raises
     ------
     InputError
-        For skies whose names do not tell, and for overrides that do not fit.
+        For skies without a frequency in their names, and for overrides that do not fit.
     """
     stages = stages or Stages()
     scenarios = paper_scenarios(overrides, skies)

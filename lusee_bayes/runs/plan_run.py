@@ -1,4 +1,4 @@
-"""A plan: what observations would tell, without data."""
+"""A plan: the information in observations, without data."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run_plan(
     replace: bool = False,
     stages: Stages | None = None,
 ) -> PlanRun:
-    """Forecast what every variation would tell, and write table and figure in one transaction.
+    """Forecast the information in every variation, and write table and figure in one transaction.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""HMC as a witness for the analytic posterior: draws against mean, variances and covariance.
+"""HMC as an independent check of the analytic posterior: mean, variances and covariance.
 
 Every threshold is what exact draws of the analytic posterior would exceed once in ``1 /
 FALSE_ALARM`` runs, given how many draws there are and how they hang together in time:

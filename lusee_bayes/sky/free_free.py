@@ -1,4 +1,4 @@
-"""Free-free absorption by the warm ionised gas of the Galaxy.
+"""Free-free absorption and emission of the warm ionised gas of the Galaxy.
 
 The absorption coefficient at frequency nu is k(nu) <n_e^2>. <n_e^2> follows NE2001 (Cordes &
 Lazio 2002, astro-ph/0207156), reduced to what a degree-scale sky below 50 MHz shows: the thick
@@ -53,6 +53,25 @@ def absorption_per_emission_measure(frequency_mhz: float) -> float:
     nu_ghz = frequency_mhz / 1e3
     gaunt = np.log(4.955e-2 / nu_ghz) + 1.5 * np.log(ELECTRON_TEMPERATURE_K)
     return float(3.014e-2 * ELECTRON_TEMPERATURE_K**-1.5 * nu_ghz**-2 * gaunt)
+
+
+def thermal_emission(depth: np.ndarray) -> np.ndarray:
+    """Compute the brightness temperature of the gas itself, T_e (1 - exp(-tau)), in K.
+
+    The gas has one temperature. So the emission of all its parts, each absorbed by the gas in
+    front of it, int T_e exp(-tau) dtau, depends on the whole optical depth only: what is
+    transparent adds T_e tau, what is opaque is a black body of T_e.
+
+    Parameters
+    ----------
+    depth : array
+        Optical depth of the whole line of sight.
+
+    References
+    ----------
+    Rybicki & Lightman, Radiative Processes in Astrophysics, eq. 1.30 (Rayleigh-Jeans).
+    """
+    return -ELECTRON_TEMPERATURE_K * np.expm1(-depth)
 
 
 def thick_disc(radius_kpc: np.ndarray) -> np.ndarray:

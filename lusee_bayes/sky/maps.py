@@ -121,7 +121,7 @@ def _read_fits(path: Path) -> np.ndarray:
     ordering = str(header.get("ORDERING", "absent")).strip().upper()
     if ordering != "RING":
         raise InputError(
-            f"{path}: ORDERING is {ordering}, expected RING; write it anew with "
+            f"{path}: ORDERING is {ordering}, expected RING; write it again with "
             "healpy.write_map(..., nest=False), after healpy.reorder(m, n2r=True) if it is NESTED"
         )
     frame = str(header.get("COORDSYS", "G")).strip().upper()

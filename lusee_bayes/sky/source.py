@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+
+import numpy as np
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import map_to_modes
@@ -42,6 +45,15 @@ class SkySource(ABC):
         """
 
 
+@lru_cache(maxsize=4)
+def _galaxy_modes(frequency_mhz: float, seed: int, lmax: int) -> np.ndarray:
+    """Compute the diffuse sky's coefficients, read-only: variations of a scenario share one sky."""
+    nside = 64 if lmax <= 95 else 128
+    modes = map_to_modes(galaxy_map(frequency_mhz, nside=nside, seed=seed), lmax)
+    modes.flags.writeable = False
+    return modes
+
+
 @dataclass(frozen=True)
 class GalaxySource(SkySource):
     """The embedded sky: diffuse Galaxy, extragalactic background and bright sources.
@@ -58,8 +70,7 @@ class GalaxySource(SkySource):
     sources: tuple[PointSource, ...] = BRIGHT_SOURCES
 
     def at(self, frequency_mhz: float, lmax: int) -> Sky:
-        nside = 64 if lmax <= 95 else 128
-        modes = map_to_modes(galaxy_map(frequency_mhz, nside=nside, seed=self.seed), lmax)
+        modes = _galaxy_modes(float(frequency_mhz), self.seed, lmax)
         for source in self.sources:
             modes = modes + source.modes(frequency_mhz, lmax)
         return Sky(modes, float(frequency_mhz), "embedded Galaxy")

@@ -259,7 +259,7 @@ def test_a_killed_process_ends_the_run(victim, what, folder):
     said = [line for line in err.splitlines() if not re.match(r"[EF]\d{4} ", line)]
     assert "\n".join(said) == (
         f"lusee-bayes: process {victim} of 0..1 was ended by SIGKILL, and the others were stopped; "
-        "the same command goes on from what is finished"
+        "the same command continues from what is finished"
     )
     assert out == ""
 
@@ -271,7 +271,7 @@ def test_a_process_that_fails_shows_why(folder):
     assert err.count("ZeroDivisionError: of process 1") == 1
     assert err.endswith(
         "lusee-bayes: process 1 of 0..1 ended with exit code 1, and the others were stopped; the "
-        "same command goes on from what is finished\n"
+        "same command continues from what is finished\n"
     )
 
 
@@ -328,7 +328,7 @@ def test_processes_that_do_not_listen_are_killed(folder):
         launcher.send_signal(signal.SIGINT)
         _, err = launcher.communicate(timeout=20)
         assert launcher.returncode == 130
-    assert err == "lusee-bayes: interrupted; the same command goes on from what is finished\n"
+    assert err == "lusee-bayes: interrupted; the same command continues from what is finished\n"
 
 
 @pytest.mark.long

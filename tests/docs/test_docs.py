@@ -12,6 +12,7 @@ from pathlib import Path
 
 import jax
 import pytest
+import yaml
 from matplotlib.figure import Figure
 
 import lusee_bayes as lb
@@ -61,6 +62,39 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch, no_figures):
             else:
                 for line in code.replace("\\\n", " ").strip().splitlines():
                     run_command(line)
+
+
+@pytest.mark.long
+def test_the_commands_of_the_readme_run(tmp_path, monkeypatch, no_figures):
+    monkeypatch.chdir(tmp_path)
+    code = "".join(text for kind, text in FENCES.findall((ROOT / "README.md").read_text())
+                   if kind == "sh")  # fmt: skip
+    lines = code.splitlines()
+    # what only a shell does comes before the first command: the environment is activated
+    assert lines.index(". .venv/bin/activate") < min(
+        k for k, line in enumerate(lines) if line.startswith("lusee-bayes")
+    )
+    for line in lines:
+        if line.startswith("lusee-bayes"):
+            run_command(line)
+
+
+def test_the_citation_names_this_version():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["cff-version"] == "1.2.0"
+    # what the standard asks for
+    assert {"authors", "message", "title"} <= set(citation)
+    assert citation["version"] == lb.__version__
+    assert f"version = {{{lb.__version__}}}" in (DOCS / "citing.md").read_text()
+    readme = (ROOT / "README.md").read_text()
+    assert citation["preferred-citation"]["url"] in readme
+
+
+@pytest.mark.parametrize("words", ["own data", "mask", "flag", "cite"])
+def test_words_that_users_search_for_are_in_the_pages(words):
+    # the site's search is over whole words and their stems
+    pages = [*DOCS.glob("*.md"), *DOCS.glob("howto/*.md")]
+    assert any(re.search(rf"\b{words}s?\b", page.read_text(), re.IGNORECASE) for page in pages)
 
 
 def test_the_scenarios_of_the_pages_are_scenarios(tmp_path):

@@ -13,6 +13,7 @@ from astropy.coordinates import SkyCoord
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import map_to_modes
 from lusee_bayes.instrument.beams import HemisphereGrid
 from lusee_bayes.instrument.products import labels
 from lusee_bayes.paper import cases as paper
@@ -129,7 +130,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(
 
     monkeypatch.setattr(runs, "compute_case", interrupted)
     state = "the earlier results are as they were" if earlier else "nothing has been written"
-    with pytest.raises(KeyboardInterrupt, match=f"{state} in '.*'; the same command goes on"):
+    with pytest.raises(KeyboardInterrupt, match=f"{state} in '.*'; the same command continues"):
         run_cases(tmp_path)
     after = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     assert {p.name for p in after.keys() - before.keys()} == {"fiducial.nc", "noise_x10.nc"}
@@ -190,7 +191,7 @@ def test_the_nearest_sky_in_log_frequency_is_scaled(tmp_path):
 @pytest.mark.parametrize("name", ["sky.hdf5", "exp_10MHz.hdf5", "exp0MHz.hdf5"])
 def test_a_name_without_frequency_is_refused(tmp_path, name):
     (tmp_path / name).touch()
-    with pytest.raises(InputError, match="does not tell its frequency"):
+    with pytest.raises(InputError, match="has no frequency as exp<F>MHz"):
         paper.sky_frequency_mhz(tmp_path / name)
     with pytest.raises(InputError, match="no sky map at"):
         paper.sky_frequency_mhz(tmp_path / "exp5MHz.hdf5")
@@ -244,6 +245,8 @@ def synthetic(name: str, agrees: bool) -> xr.Dataset:
         {
             "rho": ("ell", rho), "snr": ("ell", snr), "cl_mean": ("ell", power),
             "cl_truth": ("ell", np.ones(48)), "mean": ("pixel", mean), "truth": ("pixel", truth),
+            "mean_modes": ("mode", map_to_modes(mean, 8)),
+            "truth_modes": ("mode", map_to_modes(truth, 8)),
             "highest_altitude": ("pixel", altitude), "data": (("product", "time"), data),
             "noise_std": (("product", "time"), noise),
             "beam": (("pattern", "theta", "phi"), np.stack([beam] * 3)),

@@ -192,7 +192,7 @@ def test_an_interrupted_run_goes_on_where_it_was(
         assert run(*command) == 130
     assert capsys.readouterr().err.strip() == (
         f"lusee-bayes: interrupted; nothing has been written in '{tmp_path}'; the same command "
-        "goes on from the channels that are done"
+        "continues from the finished channels"
     )
     assert made == [20, 25] and not (tmp_path / "posterior.nc").exists()
     made.clear()
@@ -318,7 +318,7 @@ def test_a_killed_process_ends_the_run_which_can_be_resumed(joint, tmp_path):
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
     assert "process 1 of 0..1 was ended by SIGKILL" in errors
-    assert "goes on from what is finished" in errors
+    assert "continues from what is finished" in errors
     assert not (tmp_path / "posterior.nc").exists()
     kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("channels/*.nc")}
     assert kept

@@ -58,9 +58,9 @@ COMMANDS = {
     "paper": (["paper"], "unfinished-cases"),
 }
 RESUME = {
-    "cube": "the same command goes on from the channels that are done",
+    "cube": "the same command continues from the finished channels",
     "sample": "go on with --resume",
-    "paper": "the same command goes on from the cases that are done",
+    "paper": "the same command continues from the finished cases",
 }
 
 

@@ -1,4 +1,4 @@
-"""The beams: one section for each kind, told apart by ``model``.
+"""The beams: one section for each kind, selected by ``model``.
 
 A new kind is a class here, with its :class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
 """
@@ -42,12 +42,20 @@ class MonopoleBeamSection(Section):
 
     Attributes
     ----------
-    length_m, zenith_angle_deg, height_m : float
-        Length of an arm, its angle from the zenith, height of the feed over the ground.
-    surface_permittivity, deep_permittivity, loss_tangent : float
-        Of the regolith: at the surface, 100 m deep, and everywhere.
+    length_m : float
+        Length of an arm.
+    zenith_angle_deg : float
+        Angle of the arms from the zenith.
+    height_m : float
+        Height of the feed over the ground.
+    surface_permittivity : float
+        Permittivity of the regolith at the surface.
+    deep_permittivity : float
+        Permittivity of the regolith 100 m deep.
+    loss_tangent : float
+        Loss tangent of the regolith.
     turntable_offset_deg : float
-        By how much the turntable is further round than it says, from East towards North.
+        Added to every angle of the turntable, from East towards North.
     """
 
     is_file: ClassVar[bool] = False
@@ -104,17 +112,19 @@ class _FileSection(Section):
 
 
 class ScalarBeamSection(_FileSection):
-    """A scalar beam of luseepy: the pattern of one arm, put up once for every port.
+    """A scalar beam of luseepy: the pattern of one arm, used once for every port.
 
     Attributes
     ----------
     file : str
         FITS version 2.
     rotations_deg : tuple of float
-        By how much the pattern is turned for each port, from East towards North, on top of
-        ``turntable_offset_deg``.
+        Angle of the pattern for each port, from East towards North; ``turntable_offset_deg`` is
+        added.
     taper : bool
         Fade out towards the horizon as luseepy does.
+    turntable_offset_deg : float
+        Added to every angle of the turntable, from East towards North.
     quadrature : {"exact", "luseepy"}
         ``luseepy`` is luseepy's own rule, for data that luseepy has made.
     interpolation : {"linear", "spline"}
@@ -134,7 +144,7 @@ class ScalarBeamSection(_FileSection):
         return len(self.rotations_deg)
 
     def source(self) -> BeamSource:
-        """The pattern of the file, put up at every angle."""
+        """The pattern of the file, turned to every angle."""
         return ScalarFileBeams(
             replace(read_scalar_beam(self.file), interpolation=self.interpolation),
             turntable_offset_deg=self.turntable_offset_deg,
@@ -158,8 +168,14 @@ class ResponseSection(_FileSection):
     receiver : {"jfet", "capacitor", "file", "open"} or mapping, optional
         What is connected to the ports, with its parameters (``experiment/schema/receiver.py``). If
         it is left out, that of the data where their file holds it, else luseepy's preamplifiers.
-    moon_temperature_k, antenna_temperature_k : float
-        Temperatures of the ground and of the antennas' losses, which add their own radiation.
+    turntable_offset_deg : float
+        Added to every angle of the turntable, from East towards North.
+    quadrature : {"exact", "luseepy"}
+        ``luseepy`` is luseepy's own rule, for data that luseepy has made.
+    moon_temperature_k : float
+        Temperature of the ground, which adds its own radiation.
+    antenna_temperature_k : float
+        Temperature of the antennas' losses, which add their own radiation.
     """
 
     model: Literal["response"] = "response"
@@ -259,7 +275,7 @@ BeamSection = Annotated[
 
 
 def section_of_file(file: str, like: Any) -> Any:
-    """The section of another beam file, put up as the beams of ``like`` are."""
+    """The section of another beam file, turned as the beams of ``like`` are."""
     kind = BEAM_SECTIONS[kind_of(file)]
     shared = {
         name: value

@@ -10,10 +10,23 @@ from lusee_bayes.experiment.schema.section import Positive, Section, Treatment
 
 
 class RadiometerSection(Section):
-    """Radiometer noise; ``temperature`` says whose visibilities set its level.
+    """Radiometer noise.
 
-    ``log_factor_std``: prior standard deviation of ln of a further factor of the variance, where
-    the level is not known; simulated data hold one drawn from it, and it is sampled.
+    Attributes
+    ----------
+    form : {"paper", "exact"}
+        ``paper``: independent products; ``exact``: the covariance of the products at each time.
+    bandwidth_hz : float
+        Width of a channel.
+    duty_cycle : float
+        Share of the time in which the spectrometer integrates.
+    factor : float
+        Factor of the noise variance.
+    log_factor_std : float
+        Prior standard deviation of ln of a further factor of the variance, where the level is not
+        known. Simulated data hold one drawn from it, and it is sampled.
+    temperature : {"model", "measured"}
+        Visibilities that set the level: the modelled sky's, or the data themselves.
     """
 
     form: Literal["paper", "exact"] = "paper"
@@ -27,12 +40,24 @@ class RadiometerSection(Section):
 class GainSection(Section):
     """Gain drifts in the data: their covariance in N, or the drifts themselves ``sampled``.
 
-    ``log_sigma_std`` and ``log_correlation_std``: prior standard deviations of ln of the two where
-    they are not known; simulated data hold drawn ones, and they are sampled with the drifts.
-
-    ``visibilities``: the d that the covariance is built around. ``measured`` data hold the drifts
-    themselves, which moves the map by about a standard deviation; ``posterior`` starts from them
-    and repeats with the map's prediction until the map stops moving, which mends that.
+    Attributes
+    ----------
+    sigma : float
+        Standard deviation of the relative gains.
+    correlation_h : float
+        Correlation time.
+    log_sigma_std : float
+        Prior standard deviation of ln sigma, where it is not known. Simulated data hold one drawn
+        from it, and it is sampled with the drifts.
+    log_correlation_std : float
+        The same for ln of the correlation time.
+    treatment : {"marginalised", "sampled", "ignored"}
+        Their covariance is added to N, they are sampled with the map, or they are left out of the
+        model.
+    visibilities : {"model", "measured", "posterior"}
+        The d that the covariance is built around. ``measured`` data hold the drifts themselves,
+        which moves the map by about a standard deviation; ``posterior`` starts from them and
+        repeats with the map's prediction until the map stops moving, which corrects that.
     """
 
     sigma: Positive = 0.01
@@ -54,12 +79,20 @@ class GainSection(Section):
 
 
 class BeamErrorSection(Section):
-    """Beams that differ from the model's in the data; marginalised in N, sampled or ignored.
+    """Beams that differ from the model's in the data; give one of the first three keys.
 
-    ``shift_mhz``: the data are taken with the beams of frequency + shift, ``file``: with those of
-    another file; sampled is the amplitude of that error. ``parameters``: prior standard deviations
-    of parameters of the embedded antennas about the values in ``beam``; the data's own are drawn
-    with the seed.
+    Attributes
+    ----------
+    shift_mhz : float
+        The data are taken with the beams of frequency + shift.
+    file : str
+        The data are taken with the beams of this file.
+    parameters : dict
+        Prior standard deviations of parameters of the embedded antennas about the values in
+        ``beam``, by name; the data's own are drawn with the seed.
+    treatment : {"marginalised", "sampled", "ignored"}
+        The error's covariance is added to N, its amplitude or parameters are sampled with the
+        map, or it is left out of the model.
     """
 
     shift_mhz: Annotated[float, Field(ge=-49, le=49)] | None = None
@@ -75,7 +108,17 @@ class BeamErrorSection(Section):
 
 
 class NoiseSection(Section):
-    """The terms of N; a term that is left out is neither in the data nor in N."""
+    """The terms of N; a term that is left out is neither in the data nor in N.
+
+    Attributes
+    ----------
+    radiometer : RadiometerSection
+        Radiometer noise.
+    gain : GainSection
+        Gain drifts.
+    beam : BeamErrorSection
+        Beam errors.
+    """
 
     radiometer: RadiometerSection = RadiometerSection()
     gain: GainSection | None = None

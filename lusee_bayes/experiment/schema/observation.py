@@ -12,7 +12,17 @@ from lusee_bayes.instrument.observation import Observation, Run
 
 
 class RunSection(Section):
-    """One stretch of data at one turntable angle."""
+    """One stretch of data at one turntable angle.
+
+    Attributes
+    ----------
+    cycles : float
+        Length in lunar cycles of 27.321661 days.
+    turntable_deg : float
+        Angle of the turntable, from East towards North.
+    night_only : bool
+        Leave out samples with the Sun above the horizon.
+    """
 
     cycles: Positive = 1.0
     turntable_deg: Angle = 0.0
@@ -20,10 +30,23 @@ class RunSection(Section):
 
 
 class ObservationSection(Section):
-    """Where and when; ``runs`` follow one another from ``start`` (UTC).
+    """Where and when; ``runs`` follow one another from ``start``.
 
-    ``fixed_axis``: the Moon turns about the axis of the first sample, as luseepy's engine
-    ``croissant`` has it; for data that it has made.
+    Attributes
+    ----------
+    lon_deg : float
+        Longitude of the site on the Moon (MCMF).
+    lat_deg : float
+        Latitude of the site on the Moon (MCMF).
+    start : str
+        First sample, UTC, as 2027-01-15T00:00:00.
+    step_s : float
+        Time between samples.
+    runs : tuple of RunSection
+        Stretches of data, one after another.
+    fixed_axis : bool
+        The Moon turns about the axis of the first sample, as luseepy's engine ``croissant`` has
+        it; for data that it has made.
     """
 
     lon_deg: Annotated[float, Field(ge=-360, le=360)] = 182.258

@@ -15,11 +15,11 @@ class OutputSection(Section):
     Attributes
     ----------
     draws : int
-        How many posterior draws ``posterior.nc`` keeps.
+        Number of posterior draws ``posterior.nc`` keeps.
     covariance : bool
         Keep the posterior covariance in ``posterior.nc``.
     compact : bool
-        Write ``posterior_compact.npz``, of which NumPy alone makes draws.
+        Write ``posterior_compact.npz``, from which NumPy alone makes draws.
     updatable : bool
         Keep in ``posterior.nc`` what new data need to be added later.
     """

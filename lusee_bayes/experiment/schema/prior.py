@@ -29,9 +29,21 @@ class IsotropicPriorSection(Section):
         Scales them from ``file_frequency_mhz`` to the scenario's frequency: the mean once, C_ell
         twice.
 
-    Sampled where they are not known: ln of an amplitude and a tilt, C_ell A ((ell + 1) / 10)^tilt,
-    of prior standard deviations ``log_amplitude_std`` and ``tilt_std``; or (``band_edges``: first
-    ell of each band but the lowest) ln of one amplitude for every band, of ``log_band_std``.
+    Where C_ell is not known, an amplitude and a tilt are sampled, C_ell A ((ell + 1) / 10)^tilt, or
+    one amplitude for every band of ell.
+
+    Attributes
+    ----------
+    scale : float
+        Factor of C_ell.
+    log_amplitude_std : float
+        Prior standard deviation of ln A; A is sampled if it is given.
+    tilt_std : float
+        Prior standard deviation of the tilt, which is sampled if it is given.
+    band_edges : tuple of int
+        First ell of each band but the lowest; amplitudes of the bands are sampled if it is given.
+    log_band_std : float
+        Prior standard deviation of ln of each band's amplitude.
     """
 
     model: Literal["isotropic"] = "isotropic"
@@ -79,5 +91,5 @@ class IsotropicPriorSection(Section):
         return self.spectrum_file is not None or self.mean_file is not None
 
 
-# a further prior joins here, told apart by ``model``
+# a further prior joins here, selected by ``model``
 PriorSection = IsotropicPriorSection

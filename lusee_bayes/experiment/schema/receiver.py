@@ -32,7 +32,23 @@ _JFET, _CAPACITOR = JFETReceiver(), CapacitorReceiver()
 
 
 class JFETSection(Section):
-    """luseepy's preamplifiers; every entry is one number, or one for each port."""
+    """luseepy's preamplifiers; every entry is one number, or one for each port.
+
+    Attributes
+    ----------
+    capacitance_pf : tuple of float
+        Capacitance.
+    inductance_nh : tuple of float
+        Inductance.
+    parallel_ohm : tuple of float
+        Parallel resistance.
+    series_ohm : tuple of float
+        Series resistance.
+    skin_ohm : tuple of float
+        Resistance of the skin effect.
+    skin_power : tuple of float
+        Power of the frequency in the skin effect.
+    """
 
     model: Literal["jfet"] = "jfet"
     capacitance_pf: _ports(Positive) = _JFET.capacitance_pf
@@ -48,7 +64,13 @@ class JFETSection(Section):
 
 
 class CapacitorSection(Section):
-    """Capacitors: one number, or one for each port."""
+    """Capacitors: one number, or one for each port.
+
+    Attributes
+    ----------
+    capacitance_pf : tuple of float
+        Capacitance.
+    """
 
     model: Literal["capacitor"] = "capacitor"
     capacitance_pf: _ports(Positive) = _CAPACITOR.capacitance_pf
@@ -59,7 +81,13 @@ class CapacitorSection(Section):
 
 
 class ReceiverFileSection(Section):
-    """Loads out of a file: images ``freq``, ``ZL_real`` and ``ZL_imag``."""
+    """Loads from a file: images ``freq``, ``ZL_real`` and ``ZL_imag``.
+
+    Attributes
+    ----------
+    file : str
+        Path of the file.
+    """
 
     model: Literal["file"] = "file"
     file: str

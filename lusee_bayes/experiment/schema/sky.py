@@ -1,4 +1,4 @@
-"""The sky: one section for each kind, told apart by ``model``.
+"""The sky: one section for each kind, selected by ``model``.
 
 A new kind is a class here, with its :class:`SkySource`, and its name in ``SKY_SECTIONS``.
 """
@@ -21,7 +21,7 @@ class GalaxySection(Section):
     Attributes
     ----------
     seed : int
-        Of the random small scales.
+        Seed of the random small scales.
     sources : bool
         Add the brightest point sources.
     """
@@ -42,11 +42,13 @@ class FileSkySection(Section):
 
     Attributes
     ----------
-    file, dataset : str
-        Path, and the dataset of an HDF5 file.
+    file : str
+        Path of the file.
+    dataset : str
+        Data set of an HDF5 file.
     file_frequency_mhz : float
-        What the file was made for; by default the scenario's frequency. Of files with many
-        frequencies, that one is taken.
+        Frequency that the file was made for; by default the scenario's. Of a file with many
+        frequencies, this one is taken.
     spectral_index : float
         Scales the sky from ``file_frequency_mhz`` to the scenario's frequency.
     """

@@ -12,10 +12,22 @@ from lusee_bayes.experiment.schema.section import Positive, Section, Treatment
 class SourceSection(Section):
     """A point source, apart from the map: one of the catalogue, a body of the solar system, or own.
 
-    ``flux_jy`` is the mean of its prior (the catalogue's, if left out), ``relative_std`` its
-    standard deviation in units of the mean. Own sources give ``ra_deg`` and ``dec_deg`` (ICRS).
-    ``stokes_v``: circularly polarised part V / I, positive if right-handed (IAU). ``block_h``: an
-    amplitude for each block of so many hours, independently; without it one for all times.
+    Attributes
+    ----------
+    name : str
+        Of the catalogue (Cas A, ...), of a body (Sun, Jupiter, ...), or any other with a position.
+    flux_jy : float
+        Mean of the prior on its flux density; by default the catalogue's.
+    relative_std : float
+        Standard deviation of that prior over its mean.
+    ra_deg : float
+        Right ascension of an own source (ICRS).
+    dec_deg : float
+        Declination of an own source (ICRS).
+    stokes_v : float
+        Circularly polarised fraction V / I, positive if right-handed (IAU).
+    block_h : float
+        Length of blocks of time that have independent amplitudes; by default one for all times.
     """
 
     name: str
@@ -34,7 +46,16 @@ class SourceSection(Section):
 
 
 class SourcesSection(Section):
-    """Point sources that are not part of the map: in N, sampled, or ignored."""
+    """Point sources that are not part of the map: in N, sampled, or ignored.
+
+    Attributes
+    ----------
+    list : tuple of SourceSection
+        The sources.
+    treatment : {"marginalised", "sampled", "ignored"}
+        Their covariance is added to N, their fluxes are sampled with the map, or they are left out
+        of the model.
+    """
 
     list: tuple[SourceSection, ...] = ()
     treatment: Treatment = "marginalised"

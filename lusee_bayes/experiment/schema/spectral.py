@@ -14,12 +14,32 @@ from lusee_bayes.sky.spectral_prior import SpectralPrior
 class SpectralSection(Section):
     """The prior on skies of several frequencies that are mapped together.
 
-    ``components``: maps with the spectra of a power law of ``index``, its curvature (times ln nu)
-    and its turnover (times 1 - exp(-tau), tau = (``turnover_mhz`` / nu)^2.1). ``kernel``: the power
-    law times a Gaussian process in ln nu of the given ``length``. C_ell follow from the scenario's
-    skies. ``residual``: rms of what each channel has of its own, over that of its sky; by default
-    what the components leave of the skies, 0.01 with the kernel. ``solver``: conjugate gradients
-    where the direct one would not fit.
+    C_ell of the components follow from the scenario's skies.
+
+    Attributes
+    ----------
+    model : {"components", "kernel"}
+        A sum of maps with given spectra, or a power law times a Gaussian process in ln nu.
+    components : tuple of str
+        Spectra of the maps: a power law, its curvature (times ln nu) and its turnover (times
+        1 - exp(-tau), tau = (turnover_mhz / nu)^2.1).
+    index : float
+        Spectral index of the power law.
+    reference_mhz : float
+        Frequency at which the components are given.
+    turnover_mhz : float
+        Frequency of optical depth 1 in the turnover.
+    length : float
+        Correlation length of the Gaussian process in ln nu.
+    residual : float
+        rms of what each channel has of its own, over that of its sky; by default what the
+        components leave of the skies, 0.01 with the kernel.
+    solver : {"auto", "direct", "conjugate_gradients"}
+        ``auto``: conjugate gradients where the direct solution does not fit.
+    tolerance : float
+        Relative residual at which conjugate gradients stop.
+    iterations : int
+        Most iterations of conjugate gradients.
     """
 
     model: Literal["components", "kernel"] = "components"

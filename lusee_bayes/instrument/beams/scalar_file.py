@@ -1,4 +1,4 @@
-"""The field pattern of one arm, put up once for each port, from the scalar files of luseepy.
+"""The field pattern of one arm, used once for each port, from the scalar files of luseepy.
 
 FITS version 2: images Etheta_real, Etheta_imag, EPhi_real, EPhi_imag (frequency, theta, phi), the
 response to a wave arriving from (theta, phi), phi from East towards North, time convention

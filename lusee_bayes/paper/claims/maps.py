@@ -46,7 +46,7 @@ def _overdetermined(cases: Cases) -> Verdict:
 @claim(
     "4",
     "with C_0 of the sky the mean temperature is robustly recovered",
-    "most of the error sits in the cap that is never observed, whose mean the data cannot tell",
+    "most of the error is in the cap that is never observed, whose mean the data do not constrain",
 )
 def _mean_temperature(cases: Cases) -> Verdict:
     off = [100 * abs(float(c["mean"].mean() / c["truth"].mean()) - 1) for c in bands(cases)]
@@ -78,7 +78,7 @@ def _prior_impact(cases: Cases) -> Verdict:
 @claim(
     "4.1",
     "large-scale features are recovered at 5 to 45 MHz",
-    "at some frequency the beams tell less",
+    "at some frequency the beams constrain less",
 )
 def _features(cases: Cases) -> Verdict:
     alike = [likeness(case) for case in bands(cases, SHOWN_FREQUENCIES)]

@@ -77,7 +77,7 @@ def _marginalising(cases: Cases) -> Verdict:
 
 BURIED = (
     "an error of several per cent is hundreds of times the radiometer noise in as many directions "
-    "of data space as there are modes; what is left tells less of the weak multipoles"
+    "of data space as there are modes; what is left constrains the weak multipoles less"
 )
 FRINGES = (
     "the beam of a thin monopole 2 m above layered ground is not HFSS's: its change with "

@@ -39,7 +39,7 @@ def describe_posterior_cube(path: Path) -> str:
     temperature = found.arrays["mean"][:, 0] / np.sqrt(4 * np.pi)
     joint, modes = "component_mean" in found.there, found.sizes["mode"]
     extra = [name for name in ("truth", "draws", "independent_mean") if name in found.there]
-    kind = "one posterior for all" if joint else "each by itself"
+    kind = "one posterior for all" if joint else "each on its own"
     return "\n".join(
         [
             f"{path}: posterior over {modes} modes (lmax {attrs['lmax']}) at {len(frequencies)} "

@@ -1,4 +1,4 @@
-"""Figures that tell whether chains can be trusted: ArviZ's, and the analytic witness."""
+"""Figures that show whether chains can be trusted: ArviZ's, and the analytic posterior."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def ranks(quantities: Quantities) -> Figure:
 def energy(statistics: xr.Dataset) -> Figure:
     """Energies of the draws about their mean, their changes from draw to draw, and BFMI."""
     title, energies = (
-        "Energies; BFMI below 0.3 tells of chains that move slowly",
+        "Energies; BFMI below 0.3: chains that move slowly",
         statistics["energy"],
     )
     if not _vary([energies.values]):

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
+from lusee_bayes.core.harmonics import lmax_of
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.instrument.beams import HemisphereGrid
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -21,6 +22,7 @@ from lusee_bayes.report.figures.drawing import (
     without_minor_ticks,
 )
 from lusee_bayes.report.figures.mollweide import mollweide
+from lusee_bayes.report.figures.taper import shown, taper_fwhm_deg
 from lusee_bayes.results.channel import ChannelResult
 
 
@@ -65,35 +67,41 @@ def beams(setup: Setup) -> Figure:
 
 
 def maps(channel: ChannelResult) -> Figure:
-    """Truth, posterior mean, residual over the mean temperature, and standard deviation."""
-    values = channel.maps()
-    sky = values.get("truth", values["mean"])
-    positive = np.percentile(sky[sky > 0], [0.5, 99.8])
-    level = values["mean"].mean()
-    panels = [("posterior mean", values["mean"], LogNorm(*positive), SEQUENTIAL, "K")]
-    if "truth" in values:
-        percent = 100.0 * values["residual"] / level
+    """Truth, posterior mean, residual over the mean temperature, and standard deviation.
+
+    All but the standard deviation are drawn through the beam of :mod:`.taper`.
+    """
+    sky = mean = shown(channel.mean, channel.nside)
+    level, extra = mean.mean(), {}
+    if channel.truth is not None:
+        sky = shown(channel.truth, channel.nside)
+        percent = 100.0 * (mean - sky) / level
         span = np.percentile(np.abs(percent), 99.0)
-        panels = [
-            ("truth", values["truth"], LogNorm(*positive), SEQUENTIAL, "K"),
-            *panels,
-            ("mean - truth", percent, Normalize(-span, span), DIVERGING, "% of the mean sky"),
-        ]
-    spread = 100.0 * values["std"] / level
+        extra = {"mean - truth": (percent, Normalize(-span, span), DIVERGING, "% of the mean sky")}
+    positive = np.percentile(sky[sky > 0], [0.05, 99.8])
+    temperature = (LogNorm(*positive), SEQUENTIAL, "K")
+    spread = 100.0 * channel.pixel_std / level
     bounds = Normalize(*np.percentile(spread, [0.5, 99.5]))
-    panels.append(("posterior standard deviation", spread, bounds, SEQUENTIAL, "% of the mean sky"))
+    panels = {
+        **({"truth": (sky, *temperature)} if extra else {}),
+        "posterior mean": (mean, *temperature),
+        **extra,
+        "posterior standard deviation": (spread, bounds, SEQUENTIAL, "% of the mean sky"),
+    }
     rows = (len(panels) + 1) // 2
     figure = Figure(figsize=(12, 3.6 * rows))
-    places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.9, "wspace": 0.06}
+    places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.88, "wspace": 0.06}
     grid_of_axes = figure.subplots(rows, 2, gridspec_kw=places | {"hspace": 0.12}).ravel()
-    for axes, (title, pixels, norm, cmap, unit) in zip(grid_of_axes, panels, strict=True):
+    for axes, (title, (pixels, norm, cmap, unit)) in zip(grid_of_axes, panels.items(), strict=True):
         image = mollweide(
             axes, pixels, norm=norm, cmap=cmap, highest_altitude=channel.highest_altitude
         )
         colour_bar(figure, image, axes, label=unit, shrink=0.8, extend="both", pad=0.03)
         axes.set_title(title)
     figure.suptitle(
-        f"{channel.frequency_mhz:g} MHz, Galactic coordinates; dashed: never above the horizon"
+        f"{channel.frequency_mhz:g} MHz, Galactic coordinates; dashed: never above the horizon\n"
+        f"{', '.join(list(panels)[:-1])}: seen through a beam of "
+        f"{taper_fwhm_deg(lmax_of(len(channel.mean))):.1f}° (FWHM)"
     )
     return figure
 

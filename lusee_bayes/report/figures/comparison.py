@@ -12,7 +12,7 @@ from lusee_bayes.report.figures.drawing import GREY, colour_bar
 from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.finished_runs import FinishedRun
 
-# told apart without colour vision (Okabe-Ito), and by their lines
+# distinct without colour vision (Okabe-Ito), and by their lines
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000")
 LINES = ("-", "--", "-.", ":")
 

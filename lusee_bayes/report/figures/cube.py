@@ -78,7 +78,7 @@ def fidelity(cube: CubeResult) -> Figure:
     right.plot(ell[1:], values[:, 1:].mean(0), color=BLUE, label="this run")
     if alone is not None:
         right.plot(
-            ell[1:], alone[:, 1:].mean(0), color=ORANGE, ls="--", label="every channel by itself"
+            ell[1:], alone[:, 1:].mean(0), color=ORANGE, ls="--", label="every channel on its own"
         )
     if known:
         right.set_yscale("log")

@@ -1,4 +1,4 @@
-"""The figure of a plan: what every variation would tell, side by side."""
+"""The figure of a plan: the information in every variation, side by side."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from lusee_bayes.report.figures.drawing import BLUE, GREY, ORANGE
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast
 
-# told apart without colour vision (Okabe-Ito) and by shape; again from the first after four
+# distinct without colour vision (Okabe-Ito) and by shape; again from the first after four
 STYLES = ((BLUE, "o"), (ORANGE, "s"), ("#009E73", "^"), ("#000000", "D"))
 
 
@@ -139,4 +139,4 @@ def title(planned: Sequence[Forecast], sources: Sequence[str]) -> str:
         found += f" at {scenarios[0].frequency_mhz:g} MHz"
     if len({s.lmax for s in scenarios}) == 1:
         found += rf", up to $\ell$ = {scenarios[0].lmax}"
-    return f"What an observation would tell: {found} (dashed: as given)"
+    return f"Information in an observation: {found} (dashed: as given)"

@@ -23,7 +23,7 @@ from lusee_bayes.results.sample_result import SampleResult
 from lusee_bayes.sampling.calibration import LEVELS, N_BINS, Ranks
 from lusee_bayes.sampling.validation import Comparison
 
-# four chains that are told apart without colour vision (Okabe-Ito), again from the first after that
+# four chains that are distinct without colour vision (Okabe-Ito), again from the first after that
 CHAIN_COLOURS = (BLUE, ORANGE, "#009E73", "#000000")
 
 

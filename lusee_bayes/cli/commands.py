@@ -1,0 +1,93 @@
+"""The commands: what each does in one line, and examples of it.
+
+They are not in the docstrings of the commands: ``lusee-bayes --help`` imports none of them.
+"""
+
+from __future__ import annotations
+
+# the summary, what else there is to know, and examples
+COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "simulate": (
+        "Simulate the visibilities of a scenario.",
+        "",
+        (
+            "lusee-bayes simulate fiducial --set seed=2 -o data.nc",
+            "lusee-bayes simulate fiducial --frequencies 10:30:5 -o waterfall.fits",
+        ),
+    ),
+    "map": (
+        "Make a posterior map of a scenario, or of given data.",
+        "",
+        (
+            "lusee-bayes map fiducial --set frequency_mhz=10 -o output/ten",
+            "lusee-bayes map fiducial --data data.nc -o output/measured",
+            "lusee-bayes map fiducial --data waterfall.fits --set beam.file=beam.fits",
+            "lusee-bayes map fiducial --frequencies 5:50:1 --joint --draws 20 -o output/cube",
+            "lusee-bayes map fiducial --data second_cycle.nc --onto output/first_cycle",
+        ),
+    ),
+    "sample": (
+        "Sample the posterior of a NumPyro program by Hamiltonian Monte Carlo.",
+        "Draws are written during the run: after an interruption, --resume continues it.",
+        (
+            "lusee-bayes sample fiducial --set lmax=20 --draws 500 -o output/hmc",
+            "lusee-bayes sample fiducial --model my_model.py --set lmax=12",
+            "lusee-bayes sample gain_1e-2 --frequencies 10,25,40 --resume -o output/three",
+        ),
+    ),
+    "plan": (
+        "Forecast the information in observations, without data.",
+        "",
+        (
+            "lusee-bayes plan fiducial gain_1e-2 -o output/plan",
+            "lusee-bayes plan fiducial --vary frequency_mhz=10,25,40",
+        ),
+    ),
+    "validate": (
+        "Check the analytic posterior by HMC and by simulated data sets.",
+        "Ends with exit code 1 if a check fails; validation.md holds the thresholds.",
+        ("lusee-bayes validate gain_1e-2 --set lmax=8 -o output/check",),
+    ),
+    "paper": (
+        "Reproduce the figures of the reference paper and judge its claims.",
+        "Cases that were computed before with the same scenario and version are kept, so that an "
+        "interrupted run continues where it stopped.",
+        (
+            "lusee-bayes paper",
+            "lusee-bayes paper -o output/ulsa --sky exp1.0MHz_sky.hdf5 exp10.0MHz_sky.hdf5",
+        ),
+    ),
+    "report": (
+        "Write report.html of a finished run again.",
+        "",
+        ("lusee-bayes report output/fiducial",),
+    ),
+    "compare": (
+        "Set finished map runs side by side.",
+        "",
+        ("lusee-bayes compare output/fiducial output/gain_1e-2",),
+    ),
+    "info": (
+        "Describe the contents of a file.",
+        "",
+        (
+            "lusee-bayes info output/fiducial/posterior.nc",
+            "lusee-bayes info beam.fits",
+        ),
+    ),
+    "keys": (
+        "List the keys of a scenario: meaning, unit, choices, default.",
+        "",
+        ("lusee-bayes keys", "lusee-bayes keys noise.gain"),
+    ),
+}
+
+
+def help_of(name: str) -> str:
+    """Return the text of ``lusee-bayes NAME --help`` above its parameters.
+
+    What Markdown (the terminal) and reST (the site) both read.
+    """
+    summary, more, examples = COMMANDS[name]
+    lines = [f"- ``{example}``" for example in examples]
+    return "\n".join([summary, "", more, "", "**Examples**", "", *lines])

@@ -1,0 +1,98 @@
+"""The list of a scenario's keys: complete, in words, and true of what scenarios accept."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.experiment.keys import keys_as_markdown, scenario_keys
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
+
+KEYS = scenario_keys()
+PAGE = Path(__file__).parents[2] / "docs" / "keys.md"
+# how sections and lists that are empty by default come to be there
+WITHIN = {
+    "noise.gain": "noise.gain={}",
+    "noise.beam": "noise.beam={shift_mhz: 4}",
+    "sources.list.0": "sources.list=[{name: Cas A}]",
+}
+
+
+def leaves(tree, prefix=""):
+    for name, value in tree.items():
+        yield prefix + name
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{name}.")
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            yield from leaves(value[0], f"{prefix}{name}.0.")
+
+
+def test_every_key_of_a_written_scenario_is_listed_and_explained():
+    scenario = load_scenario("fiducial", [*WITHIN.values(), "sky.sources=false"])
+    written = set(leaves(yaml.safe_load(scenario.to_yaml())))
+    listed = {key.path for key in KEYS}
+    parents = {path for path in written if any(p.startswith(f"{path}.") for p in listed)}
+    assert written - parents <= listed
+    assert [key.path for key in KEYS if not key.meaning] == []
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A scenario of the schema's defaults alone."""
+    path = tmp_path_factory.mktemp("plain") / "plain.yaml"
+    path.write_text(Scenario(sky={"sources": False}).to_yaml())
+    return str(path)
+
+
+DEFAULTS = [
+    k for k in KEYS
+    if k.default not in ("required", "none") and k.kind in ("", "monopole", "galaxy", "isotropic")
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("key", DEFAULTS, ids=lambda key: key.path)
+def test_a_default_changes_nothing(plain, key):
+    before = [text for name, text in WITHIN.items() if key.path.startswith(f"{name}.")]
+    value = "false" if key.path == "sky.sources" else key.default
+    changed = load_scenario(plain, [*before, f"{key.path}={value}"])
+    assert changed == load_scenario(plain, before)
+
+
+BOUNDED = [(k, re.search(r"number, (\S+) to (\S+)$", k.choices)) for k in KEYS]
+
+
+@pytest.mark.parametrize(
+    "key, bounds", [(k, b) for k, b in BOUNDED if b], ids=lambda key: getattr(key, "path", "")
+)
+def test_bounds_are_those_that_are_enforced(key, bounds):
+    if key.kind not in ("", "monopole", "galaxy") or not key.unit or "list" in key.choices:
+        pytest.skip("needs a file or an entry of a list")
+    before = [text for name, text in WITHIN.items() if key.path.startswith(f"{name}.")]
+    low, high = (float(bound) for bound in bounds.groups())
+    for value in (low - 1.0, high + 1.0):
+        with pytest.raises(InputError):
+            load_scenario("fiducial", [*before, f"{key.path}={value}"])
+
+
+def test_units_are_those_of_the_names():
+    units = {key.path.rsplit("_", 1)[-1]: key.unit for key in KEYS if key.unit}
+    assert units == {
+        "mhz": "MHz", "hz": "Hz", "deg": "degrees", "m": "m", "s": "s", "h": "h", "k": "K",
+        "jy": "Jy", "pf": "pF", "nh": "nH", "ohm": "Ohm",
+    }  # fmt: skip
+
+
+def test_a_section_is_listed_alone_and_a_wrong_one_is_corrected():
+    assert {key.path.split(".")[1] for key in scenario_keys("noise.gain")} == {"gain"}
+    assert [key.path for key in scenario_keys("lmax")] == ["lmax"]
+    with pytest.raises(InputError, match=r"no key 'noise\.gane'; did you mean 'noise\.gain'\?"):
+        scenario_keys("noise.gane")
+
+
+def test_the_page_of_keys_is_up_to_date():
+    # lusee-bayes keys --markdown writes the table
+    assert PAGE.read_text().endswith("\n\n" + keys_as_markdown(KEYS))
