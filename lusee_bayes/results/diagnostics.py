@@ -60,6 +60,7 @@ def diagnostics(
     scenario, data = experiment.scenario, experiment.data
     posterior, nside, lmax = on_host(inference.posterior), channel.nside, experiment.scenario.lmax
     found = residuals(judged.model, judged.posterior, data)
+    fit = found.fit()
     draws = np.asarray(posterior.sample(draw_key(scenario), N_DRAWS))
     centres = pixel_matrix(region_nside(nside), lmax)
     kernels = resolution_rows(posterior, centres) @ pixel_matrix(KERNEL_NSIDE, lmax).T
@@ -101,9 +102,11 @@ def diagnostics(
         coords={"product": list(data.labels), "hours": ("time", data.observation.hours)},
         attrs={
             "format": formats.DIAGNOSTICS,
-            "verdict": found.verdict(),
+            "level": fit.level,
+            "verdict": fit.text,
             "chi2": found.chi2,
-            "p": found.p,
+            "p": fit.p,
+            "extremes": [f"{kind} {group.name}" for kind, group in found.extremes()] or "none",
             "suspects": [f"{kind} {group.name}" for kind, group in found.suspects()] or "none",
             "frequency_mhz": scenario.frequency_mhz,
         },

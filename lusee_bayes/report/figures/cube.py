@@ -89,12 +89,11 @@ def fidelity(cube: CubeResult) -> Figure:
 
 
 def chi2(cube: CubeResult) -> Figure:
-    """chi^2 of every channel's data about the map, over its mean if the model holds."""
+    """chi^2 that judges every channel, over its mean if the model holds."""
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
-    expected = cube.stacked("chi2_expected")
-    ratio = cube.stacked("chi2") / expected
-    width = np.sqrt(2.0 * cube.stacked("n_data")) / expected
+    fits = cube.fits()
+    ratio, width = fits.chi2 / fits.degrees, np.sqrt(2.0 / fits.degrees)
     axes.fill_between(
         cube.frequencies_mhz, 1 - 2 * width, 1 + 2 * width, color=GREY, alpha=0.3, lw=0
     )
