@@ -40,7 +40,7 @@ for _name, _help in {
     "paper": "Reproduce the figures of the reference paper and judge its claims.",
     "report": "Write report.html of a finished run anew.",
     "compare": "Set finished map runs side by side.",
-    "info": "Say what is in a file.",
+    "info": "Say what is in a file, or in the folder of a run.",
 }.items():
     app.command(f"lusee_bayes.cli.{_name}_command:{_name}_command", name=_name, help=_help)
 

@@ -18,10 +18,11 @@ from lusee_bayes.results.validation_result import ValidationResult
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
 from lusee_bayes.runs.origins import origin_of
 from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS
-from lusee_bayes.sampling.calibration import calibrate_sky, require_simulations
+from lusee_bayes.sampling.calibration import calibrate_sky
 from lusee_bayes.sampling.hmc import Sampler
+from lusee_bayes.sampling.least import require_draws, require_simulations
 from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.validation import require_draws, validate_draws
+from lusee_bayes.sampling.validation import validate_draws
 
 
 @dataclass(frozen=True)

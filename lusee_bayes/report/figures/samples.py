@@ -20,7 +20,8 @@ from lusee_bayes.report.figures.drawing import (
 )
 from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.sample_result import SampleResult
-from lusee_bayes.sampling.calibration import LEVELS, N_BINS, Ranks
+from lusee_bayes.sampling.calibration import LEVELS, Ranks
+from lusee_bayes.sampling.least import N_BINS
 from lusee_bayes.sampling.validation import Comparison
 
 # four chains that are told apart without colour vision (Okabe-Ito), again from the first after that
