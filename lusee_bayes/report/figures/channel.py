@@ -18,6 +18,7 @@ from lusee_bayes.report.figures.drawing import (
     SEQUENTIAL,
     colour_bar,
     orthographic,
+    seen_range,
     without_minor_ticks,
 )
 from lusee_bayes.report.figures.mollweide import mollweide
@@ -80,9 +81,8 @@ def maps(channel: ChannelResult) -> Figure:
             *panels,
             ("mean - truth", percent, Normalize(-span, span), DIVERGING, "% of the mean sky"),
         ]
-    spread = 100.0 * values["std"] / level
-    bounds = Normalize(*np.percentile(spread, [0.5, 99.5]))
-    panels.append(("posterior standard deviation", spread, bounds, SEQUENTIAL, "% of the mean sky"))
+    bounds = LogNorm(*seen_range(values["std"], channel.highest_altitude))
+    panels.append(("posterior standard deviation", values["std"], bounds, SEQUENTIAL, "K"))
     rows = (len(panels) + 1) // 2
     figure = Figure(figsize=(12, 3.6 * rows))
     places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.9, "wspace": 0.06}

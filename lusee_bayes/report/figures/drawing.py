@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Complex
+from jaxtyping import Complex, Float
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -32,6 +32,25 @@ def save(figure: Figure, path: Path, dpi: int) -> None:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     imsave(path, canvas.buffer_rgba(), dpi=dpi, pil_kwargs={"compress_level": COMPRESSION})
+
+
+def seen_range(
+    std: Float[np.ndarray, "..."], altitude: Float[np.ndarray, " pixels"]
+) -> tuple[float, float]:
+    """Bounds of a logarithmic scale for standard deviations: of what was seen.
+
+    A cap that never rose has standard deviations that would hide the structure of the rest. What
+    lies about its rim, a few percent, has the brightest colour, too.
+
+    Parameters
+    ----------
+    std : (..., pixels) array
+    altitude : (pixels,) array
+        sin of the highest altitude of each pixel.
+    """
+    seen = std[..., altitude >= 0] if (altitude >= 0).any() else std
+    low, high = np.percentile(seen, [0.5, 97.0])
+    return float(low), float(max(high, 1.01 * low))
 
 
 def without_minor_ticks(axis: Axis) -> None:
