@@ -117,7 +117,7 @@ def sentence(level: Level, what: str = "data") -> str:
     return {
         "consistent": f"Consistent: the {what} fit the model",
         "in tension": f"In tension: the {what} and the model agree poorly",
-        "does not fit": f"Does not fit: the {what} do not fit the model",
+        "does not fit": f"Does not fit: the {what} contradict the model",
     }[level]
 
 

@@ -8,6 +8,7 @@ from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_json
 from lusee_bayes.linear.fit import level_of
 from lusee_bayes.report import head, html
+from lusee_bayes.report.cube_explorer import cube_explorer
 from lusee_bayes.report.run_details import details
 from lusee_bayes.results.saved import (
     CHANNEL_SUMMARY,
@@ -83,6 +84,7 @@ def cube_page(folder: Path, name: str) -> str:
         (joint,) = entries(
             folder / "summary.json", {"joint": [summary["joint"]]}, "joint", JOINT_SUMMARY
         )
+    parts["maps"].insert(0, cube_explorer(folder, frequencies))
     parts["maps"].append(html.paragraph(_how(joint, summary.get("log_evidence"))))
     parts["spectra"] += _pulls(folder, summary)
     parts["chi2"] = [_tests(folder, summary), *parts["chi2"], _table(channels)]

@@ -56,7 +56,8 @@
     ];
     if (truth) {
       rows.push(["truth", number(truth.values[pixel], "K")]);
-      rows.push(["mean - truth", `${number((mean - truth.values[pixel]) / std)} standard deviations`]);
+      const pull = number((mean - truth.values[pixel]) / std);
+      rows.push(["mean - truth", `${pull} standard deviations`]);
     }
     rows.push(
       ["share from the prior (ell ≥ 1)", number(layer("prior_fraction").values[pixel])],
@@ -94,7 +95,8 @@
     state.kernel = spreads.kernel(state.z, state.longitude);
     state.peak = state.kernel.reduce((most, x) => Math.max(most, Math.abs(x)), 0);
     const most = state.peak || 1;
-    below.paint(page.point_spread.nside, state.kernel, { low: -most, high: most }, tables.diverging);
+    const scale = { low: -most, high: most };
+    below.paint(page.point_spread.nside, state.kernel, scale, tables.diverging);
     below.ring(state.z, state.longitude, 6, "#4fc3f7");
   }
   function choose(longitude, b) {
@@ -138,7 +140,7 @@
     draw();
     describe();
   });
-  skyView.controls(map, (name) => element(name), () => skyView.place(state.z, state.longitude), draw);
+  skyView.controls(map, element, () => skyView.place(state.z, state.longitude), draw);
   choose(0, 0);
   // for checks of the page: what is shown of a direction, in degrees
   window.explorer = {

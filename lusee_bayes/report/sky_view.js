@@ -179,9 +179,9 @@ const skyView = (function () {
       for (let k = 0; k < found.length; k += 1) {
         if (found[k] < 0) continue;
         const share = shareOf(scale, values[found[k]]);
-        let c = 3 * Math.round(255 * Math.min(1, Math.max(0, share)));
-        let lift = 0;
-        if (hatched && hatched(found[k]) && ((k % width) + Math.floor(k / width)) % 14 < 2) lift = 90;
+        const c = 3 * Math.round(255 * Math.min(1, Math.max(0, share)));
+        const line = ((k % width) + Math.floor(k / width)) % 14 < 2;
+        const lift = line && hatched && hatched(found[k]) ? 90 : 0;
         for (let i = 0; i < 3; i += 1) image.data[4 * k + i] = Math.abs(table[c + i] - lift);
         image.data[4 * k + 3] = 255;
       }
@@ -300,7 +300,10 @@ const skyView = (function () {
         if (at && !(grip && grip.moved)) choose(at);
         grip = null;
       });
-      this.canvas.addEventListener("dblclick", (event) => { this.scale(2, ...share(event)); draw(); });
+      this.canvas.addEventListener("dblclick", (event) => {
+        this.scale(2, ...share(event));
+        draw();
+      });
       this.canvas.addEventListener("pointerleave", () => tell(null));
       this.canvas.addEventListener("wheel", (event) => {
         if (!event.ctrlKey && !event.metaKey) return;
@@ -331,6 +334,7 @@ const skyView = (function () {
       draw();
     });
   }
-  return { controls, bytes, floats, degrees, radians, pixelOf, direction, place, equatorial, number, ticks,
-    bar, View };
+  return {
+    controls, bytes, floats, degrees, radians, pixelOf, place, equatorial, number, ticks, bar, View,
+  };
 })();

@@ -72,7 +72,9 @@ class CubeResult:
         """chi^2 of every channel, and the tests of all of them together."""
         n_data = self.stacked("n_data").astype(np.float64)
         if self.components is None:
-            return ChannelFits(self.frequencies_mhz, self.stacked("chi2_model"), n_data)
+            about = float(self.stacked("chi2").sum()), float(self.stacked("chi2_expected").sum())
+            chi2 = self.stacked("chi2_model")
+            return ChannelFits(self.frequencies_mhz, chi2, n_data, residuals=about)
         expected = self.stacked("chi2_expected")
         bound = bool(np.isnan(expected).any())
         known = not np.isnan(self.components.chi2)

@@ -30,7 +30,8 @@ from lusee_bayes.linear.fit import (
 )
 
 # channels that are named in a sentence
-NAMED = 6
+NAMED = 4
+ABOUT_MAPS = "residuals about all maps"
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,9 @@ class ChannelFits:
     total : tuple of float and int or None
         chi^2 of all data under a joint model and their number; None where channels are independent,
         whose chi^2 add up, and where it is not known.
+    residuals : tuple of float and float or None
+        Of independent channels: chi^2 of the residuals about all maps, and its mean. They tell
+        whether the noise fits, whatever the prior says of the sky.
     joint : bool
         Whether channels share a posterior.
     bound : bool
@@ -82,6 +86,7 @@ class ChannelFits:
     chi2: Float[np.ndarray, " channels"]
     degrees: Float[np.ndarray, " channels"]
     total: tuple[float, int] | None = None
+    residuals: tuple[float, float] | None = None
     joint: bool = False
     bound: bool = False
 
@@ -123,7 +128,22 @@ class ChannelFits:
         if total is not None:
             text = f"chi^2 {total[0]:.0f}, expected {total[1]} +- {np.sqrt(2.0 * total[1]):.0f}"
             found.insert(0, JointTest("sum over all channels", two_sided(*total), 1, text))
+        if self.residuals is not None:
+            text = f"chi^2 {self.residuals[0]:.0f}, expected {self.residuals[1]:.0f}"
+            found.append(JointTest(ABOUT_MAPS, two_sided(*self.residuals), 1, text))
         return found
+
+    def _cause(self, tests: list[JointTest], level: Level) -> list[str]:
+        """Whether sky or noise is at fault where channels of their own do not fit."""
+        about = [test.level for test in tests if test.name == ABOUT_MAPS]
+        if level == "consistent" or not about:
+            return []
+        if about[0] == "consistent":
+            return [
+                "Residuals about the maps are as the noise should be: what the model does not "
+                "describe is the sky, which its prior takes to be isotropic and Gaussian."
+            ]
+        return ["Residuals about the maps are not as the noise should be: look at noise and beams."]
 
     def fit(self) -> Fit:
         """The verdict of all tests, and the channels that stand out."""
@@ -145,6 +165,7 @@ class ChannelFits:
             more = len(extremes) - NAMED
             names += f", {more} more" if more > 0 else ""
             told.append(f"{len(extremes)} of {len(p)} channels stand out: {names}.")
+        told += self._cause(tests, level)
         if self.bound:
             told.append(
                 "Conjugate gradients leave the expected chi^2 unknown; the number of data, its "

@@ -106,3 +106,12 @@ def test_a_joint_run_is_judged(tmp_path):
     total = run.fits().tests()[0]
     assert total.name == "sum over all channels"
     assert f"chi^2 {run.components.chi2:.0f}" in total.found
+
+
+def test_sky_and_noise_are_told_apart():
+    """chi^2 of the model too large, that of the residuals as expected: it is the sky."""
+    large = np.full(46, 5400.0)
+    sky = fits(large, residuals=(46 * 4700.0 + 100.0, 46 * 4700.0)).fit()
+    assert sky.level == "does not fit" and "what the model does not describe is the sky" in sky.text
+    noise = fits(large, residuals=(46 * 5100.0, 46 * 4700.0)).fit()
+    assert "look at noise and beams" in noise.text
