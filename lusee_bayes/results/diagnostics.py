@@ -23,8 +23,9 @@ from lusee_bayes.core.lazy import healpy
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference
 from lusee_bayes.linear.pixel_variance import independent_pixel_std
-from lusee_bayes.linear.residuals import Group, residuals
+from lusee_bayes.linear.residuals import residuals
 from lusee_bayes.results.channel import ChannelResult, draw_key
+from lusee_bayes.results.diagnostics_file import group_variables
 
 REGION_NSIDE = 8
 N_DRAWS = 4
@@ -93,7 +94,7 @@ def diagnostics(
         "data": (("product", "time"), data.grid(), kelvin),
         "predicted": (("product", "time"), on_grid(found.predicted), kelvin),
         "z": (("product", "time"), on_grid(found.z), {"units": "standard deviations"}),
-        **_groups({"product": found.products, "day": found.days, "angle": found.angles}),
+        **group_variables({"product": found.products, "day": found.days, "angle": found.angles}),
     }
     return xr.Dataset(
         variables,
@@ -170,16 +171,3 @@ def region_rows(nside: int, lmax: int) -> Float[np.ndarray, "regions modes"]:
     rows = polar_functions(heights, lmax)[ring[parts]] * sums[:, m + lmax]
     _, first = np.unique(of[parts], return_index=True)
     return np.add.reduceat(rows, first) / np.bincount(of)[:, None]
-
-
-def _groups(kinds: dict[str, tuple[Group, ...]]) -> dict[str, tuple[str, np.ndarray]]:
-    """One row for every group that was left out."""
-    groups = [(kind, group) for kind, found in kinds.items() for group in found]
-    return {
-        "group_kind": ("group", np.array([kind for kind, _ in groups], dtype=np.str_)),
-        "group_name": ("group", np.array([group.name for _, group in groups], dtype=np.str_)),
-        "group_n": ("group", np.array([group.n for _, group in groups])),
-        "group_chi2": ("group", np.array([group.chi2 for _, group in groups])),
-        "group_p": ("group", np.array([group.p for _, group in groups])),
-        "group_others_p": ("group", np.array([group.others_p for _, group in groups])),
-    }

@@ -4,19 +4,37 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import xarray as xr
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.netcdf_files import read_dataset
+from lusee_bayes.linear.residuals import Group
 from lusee_bayes.results.saved import DIAGNOSTICS
 
 
 def write_diagnostics(dataset: xr.Dataset, path: Path) -> None:
     """Write to netCDF; maps of draws and shares in single precision."""
+    if not dataset.sizes["group"]:  # files hold no empty arrays
+        dataset = dataset.drop_dims("group")
     encoding = {name: {"dtype": "float32"} for name in ("draws", "prior_fraction")}
     dataset.to_netcdf(path, engine="h5netcdf", encoding=encoding)
 
 
 def read_diagnostics(path: str | Path) -> xr.Dataset:
     """What :func:`write_diagnostics` wrote. InputError for anything else."""
-    return read_dataset(path, formats.DIAGNOSTICS, DIAGNOSTICS, "lusee-bayes map writes one")
+    found = read_dataset(path, formats.DIAGNOSTICS, DIAGNOSTICS, "lusee-bayes map writes one")
+    return found if "group" in found.sizes else found.assign(group_variables({}))
+
+
+def group_variables(kinds: dict[str, tuple[Group, ...]]) -> dict[str, tuple[str, np.ndarray]]:
+    """One row for every group that was left out."""
+    groups = [(kind, group) for kind, found in kinds.items() for group in found]
+    return {
+        "group_kind": ("group", np.array([kind for kind, _ in groups], dtype=np.str_)),
+        "group_name": ("group", np.array([group.name for _, group in groups], dtype=np.str_)),
+        "group_n": ("group", np.array([group.n for _, group in groups], dtype=np.int64)),
+        "group_chi2": ("group", np.array([group.chi2 for _, group in groups])),
+        "group_p": ("group", np.array([group.p for _, group in groups])),
+        "group_others_p": ("group", np.array([group.others_p for _, group in groups])),
+    }

@@ -8,6 +8,7 @@ from lusee_bayes.linear.fit import LEVELS
 MODES = Variable(("mode",))
 WIDTHS = Variable(("mode",), low=0.0)
 NUMBER, COUNT, TEXT = Attribute(), Attribute("integer", low=0.0), Attribute("text")
+KINDS = ("product", "day", "angle")
 LEVEL = Attribute("text", choices=LEVELS)
 HINT = "give the folder of a finished run"
 
@@ -61,12 +62,13 @@ DIAGNOSTICS = Layout(
         "data": Variable(("product", "time"), finite=False),
         "predicted": Variable(("product", "time"), finite=False),
         "z": Variable(("product", "time"), finite=False),
-        "group_kind": Variable(("group",), "text", choices=("product", "day", "angle")),
-        "group_name": Variable(("group",), "text"),
-        "group_n": Variable(("group",), "integer", low=0.0),
-        "group_chi2": Variable(("group",)),
-        "group_p": Variable(("group",), low=0.0, high=1.0),
-        "group_others_p": Variable(("group",), low=0.0, high=1.0, finite=False),
+        # none where groups were not judged
+        "group_kind": Variable(("group",), "text", choices=KINDS, optional=True),
+        "group_name": Variable(("group",), "text", optional=True),
+        "group_n": Variable(("group",), "integer", low=0.0, optional=True),
+        "group_chi2": Variable(("group",), optional=True),
+        "group_p": Variable(("group",), low=0.0, high=1.0, optional=True),
+        "group_others_p": Variable(("group",), low=0.0, high=1.0, finite=False, optional=True),
     },
     {
         "frequency_mhz": Attribute(low=0.0),

@@ -86,10 +86,12 @@ def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Complex[np.ndarray, 
 def colour_bar(
     figure: Figure, image: ScalarMappable, axes: Axes | list[Axes], **options: object
 ) -> Colorbar:
-    """A colour bar; on a logarithmic scale with plain numbers at 1, 2 and 5 times powers of ten."""
+    """A colour bar; on a logarithmic scale with plain numbers at 1, 2, 5 (narrow ones: six) times powers of ten."""
     bar = figure.colorbar(image, ax=axes, **options)
     if isinstance(image.norm, LogNorm):
-        bar.set_ticks(LogLocator(subs=(1.0, 2.0, 5.0)), minor=False)
+        narrow = image.norm.vmax < 20.0 * image.norm.vmin
+        subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if narrow else (1.0, 2.0, 5.0)
+        bar.set_ticks(LogLocator(subs=subs), minor=False)
         bar.set_ticks([], minor=True)
         bar.long_axis.set_major_formatter(lambda value, _: f"{value:,.0f}")
     return bar
