@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.netcdf_files import read_dataset
-from lusee_bayes.linear.residuals import Group
 from lusee_bayes.results.saved import DIAGNOSTICS
 
 
@@ -27,8 +28,8 @@ def read_diagnostics(path: str | Path) -> xr.Dataset:
     return found if "group" in found.sizes else found.assign(group_variables({}))
 
 
-def group_variables(kinds: dict[str, tuple[Group, ...]]) -> dict[str, tuple[str, np.ndarray]]:
-    """One row for every group that was left out."""
+def group_variables(kinds: Mapping[str, Sequence[Any]]) -> dict[str, tuple[str, np.ndarray]]:
+    """One row for every group (``linear.residuals.Group``) that was left out, by its kind."""
     groups = [(kind, group) for kind, found in kinds.items() for group in found]
     return {
         "group_kind": ("group", np.array([kind for kind, _ in groups], dtype=np.str_)),

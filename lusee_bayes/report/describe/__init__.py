@@ -10,7 +10,6 @@ from pkgutil import resolve_name
 from lusee_bayes.core import formats
 from lusee_bayes.core.fits_files import image_names, is_fits
 from lusee_bayes.core.reading import reading, require_file
-from lusee_bayes.report.describe.folders import describe_folder
 
 # the package's own netCDF files, by their attribute ``format``. What describes a kind is named by
 # path and imported when there is such a file: each needs libraries that others do not
@@ -54,7 +53,7 @@ def describe(path: str | Path) -> str:
         If the file is missing, or of none of these kinds; for a folder that no run has written.
     """
     if Path(path).is_dir():
-        return describe_folder(Path(path))
+        return str(resolve_name(f"{__name__}.folders:describe_folder")(Path(path)))
     path = require_file(path, "file")
     kind = OWN_FORMATS.get(formats.format_of(path) or "")
     if kind is None:

@@ -86,7 +86,7 @@ def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Complex[np.ndarray, 
 def colour_bar(
     figure: Figure, image: ScalarMappable, axes: Axes | list[Axes], **options: object
 ) -> Colorbar:
-    """A colour bar; on a logarithmic scale with plain numbers at 1, 2, 5 (narrow ones: six) times powers of ten."""
+    """A colour bar; on a logarithmic scale with plain numbers, more of them on a narrow one."""
     bar = figure.colorbar(image, ax=axes, **options)
     if isinstance(image.norm, LogNorm):
         narrow = image.norm.vmax < 20.0 * image.norm.vmin
