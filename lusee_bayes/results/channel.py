@@ -29,6 +29,7 @@ from lusee_bayes.linear.metrics import (
     signal_to_noise,
 )
 from lusee_bayes.linear.pixel_variance import pixel_std
+from lusee_bayes.results.observed import Observed
 
 # what the scenario's seed is folded with for posterior draws and for perturbations of information
 DRAWS, PERTURBATIONS = 1, 7
@@ -253,44 +254,6 @@ def channel_of_posterior(
         rounds=inference.rounds,
         doubts=(*experiment.doubts, *about_information(float(posterior.information_bits()))),
     )
-
-
-@dataclass(frozen=True)
-class Observed:
-    """What is known of a channel besides its posterior: for :func:`channel_of_information`.
-
-    Attributes
-    ----------
-    frequency_mhz : float
-    spectrum : (ells,) array
-        C_ell of the channel's own prior, in K^2.
-    truth : (modes,) array or None
-    highest_altitude : (pixels,) array
-    n_missing, rounds : int
-    doubts : tuple of str
-    """
-
-    frequency_mhz: float
-    spectrum: Float[np.ndarray, " ells"]
-    truth: Float[np.ndarray, " modes"] | None
-    highest_altitude: Float[np.ndarray, " pixels"]
-    n_missing: int
-    rounds: int
-    doubts: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, experiment: Experiment, rounds: int) -> Observed:
-        """Of an experiment."""
-        data, nside = experiment.data, experiment.scenario.map_nside
-        return cls(
-            experiment.scenario.frequency_mhz,
-            power_spectrum(np.sqrt(np.asarray(experiment.setup.prior.variance()))),
-            _array(data.truth),
-            highest_altitude(data.observation, nside),
-            data.n_missing,
-            rounds,
-            experiment.doubts,
-        )
 
 
 def channel_of_information(

@@ -15,7 +15,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from matplotlib.patches import Circle
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from lusee_bayes.instrument.beams import HemisphereGrid
 
@@ -51,6 +51,21 @@ def seen_range(
     seen = std[..., altitude >= 0] if (altitude >= 0).any() else std
     low, high = np.percentile(seen, [0.5, 97.0])
     return float(low), float(max(high, 1.01 * low))
+
+
+def plain_ticks(axes: Axes, n: int = 4) -> None:
+    """At most ``n`` ticks on each axis, each with its whole number: no power beside the axis."""
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(n))
+        axis.set_major_formatter(lambda value, _: number_of_tick(value))
+
+
+def number_of_tick(value: float) -> str:
+    """A number as short as its size allows: 12,500 and 1.5e10."""
+    if value == 0 or 1e-3 <= abs(value) < 1e6:
+        return f"{value:,.6g}"
+    mantissa, power = f"{value:.3e}".split("e")
+    return f"{float(mantissa):g}e{int(power)}"
 
 
 def without_minor_ticks(axis: Axis) -> None:
