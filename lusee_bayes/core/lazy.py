@@ -30,4 +30,5 @@ class LazyModule:
 healpy = LazyModule("healpy")
 coordinates = LazyModule("astropy.coordinates")
 numpyro = LazyModule("numpyro")
+special = LazyModule("scipy.special")
 dist = LazyModule("numpyro.distributions")

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.special import chdtr, chdtrc
+
+from lusee_bayes.core.lazy import special
 
 Level = Literal["consistent", "in tension", "does not fit"]
 LEVELS: tuple[Level, ...] = ("consistent", "in tension", "does not fit")
@@ -65,7 +66,7 @@ def two_sided(chi2: float, n: float | int) -> float:
         From 0 to 1, uniform if the model holds.
     """
     # both tails are one half at the median, up to rounding
-    return float(min(1.0, 2.0 * min(chdtr(n, chi2), chdtrc(n, chi2))))
+    return float(min(1.0, 2.0 * min(special.chdtr(n, chi2), special.chdtrc(n, chi2))))
 
 
 def level_of(p: float, n: int = 1) -> Level:

@@ -85,6 +85,7 @@ const skyView = (function () {
         for (const m of [1, 2, 5]) found.push(m * 10 ** e);
       }
       const inside = found.filter((x) => x >= low && x <= high);
+      if (inside.length < 3) return ticks(low, high, false).filter((x) => x >= low);
       return inside.length > 7 ? inside.filter((x) => /^1/.test(x.toExponential())) : inside;
     }
     const raw = (high - low) / 5;

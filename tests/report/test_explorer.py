@@ -87,7 +87,8 @@ def test_what_a_direction_and_the_pointer_tell(page, tmp_path):
         told.hover = elements["explorer-hover"].textContent;
         told.texts = elements["explorer-map"].texts;
         told.options = elements["explorer-layer"].options.map((one) => one.value);
-        told.ticks = [explorer.ticks(1, 1000, true), explorer.ticks(-4, 4, false)];
+        told.ticks = [explorer.ticks(1, 1000, true), explorer.ticks(-4, 4, false),
+          explorer.ticks(3700, 6300, true)];
         const seen = (id) => elements[id].image.data.filter((x, k) => k % 4 === 3 && x).length;
         told.seen = [seen("explorer-map"), seen("explorer-psf")];
         elements["explorer-in"].listeners.click();
@@ -99,7 +100,11 @@ def test_what_a_direction_and_the_pointer_tell(page, tmp_path):
     assert "266.4" in told["hover"] and "-28.9" in told["hover"]
     assert {"Cas A", "Cyg A", "60°", "-30°"} <= set(told["texts"])
     assert {"mean", "std", "truth", "residual", "pull"} <= set(told["options"])
-    assert told["ticks"] == [[1, 10, 100, 1000], [-4, -2, 0, 2, 4]]
+    assert told["ticks"] == [
+        [1, 10, 100, 1000],
+        [-4, -2, 0, 2, 4],
+        [4000, 5000, 6000],
+    ]
     # the ellipse fills pi/4 of its rectangle, and more of it when zoomed in
     assert told["seen"] == pytest.approx([400 * 200 * np.pi / 4, 120 * 60 * np.pi / 4], rel=0.02)
     assert told["zoomed"] > told["seen"][0]
