@@ -115,8 +115,9 @@ def coverage_table(bands: list[dict]) -> list[str]:
         html.paragraph(
             "Share of pixels whose true temperature is within one and two standard deviations of "
             "the mean; in brackets what is expected, with its scatter. rms of (mean - truth) / "
-            "standard deviation is 1 where error bars are right. In the plane real skies have more "
-            "small structure than an isotropic prior allows, and error bars there can be too small."
+            "standard deviation is 1 where error bars are right. An isotropic prior allows every "
+            "direction the same structure: a real sky has more of it in the plane, where error "
+            "bars can be too small, and less towards the poles, where they are too large."
         ),
         html.table(("Galactic latitude", "sky", "within 1 sigma", "within 2 sigma", "rms"), rows),
     ]

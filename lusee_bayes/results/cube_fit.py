@@ -31,7 +31,6 @@ from lusee_bayes.linear.fit import (
 
 # channels that are named in a sentence
 NAMED = 4
-ABOUT_MAPS = "residuals about all maps"
 
 
 @dataclass(frozen=True)
@@ -74,8 +73,8 @@ class ChannelFits:
         chi^2 of all data under a joint model and their number; None where channels are independent,
         whose chi^2 add up, and where it is not known.
     residuals : tuple of float and float or None
-        Of independent channels: chi^2 of the residuals about all maps, and its mean. They tell
-        whether the noise fits, whatever the prior says of the sky.
+        Of independent channels: chi^2 of the residuals about all maps, and its mean. The rest of
+        ``chi2`` is m^T S^-1 m of the maps; the larger excess tells which of noise and sky is off.
     joint : bool
         Whether channels share a posterior.
     bound : bool
@@ -128,22 +127,25 @@ class ChannelFits:
         if total is not None:
             text = f"chi^2 {total[0]:.0f}, expected {total[1]} +- {np.sqrt(2.0 * total[1]):.0f}"
             found.insert(0, JointTest("sum over all channels", two_sided(*total), 1, text))
-        if self.residuals is not None:
-            text = f"chi^2 {self.residuals[0]:.0f}, expected {self.residuals[1]:.0f}"
-            found.append(JointTest(ABOUT_MAPS, two_sided(*self.residuals), 1, text))
         return found
 
-    def _cause(self, tests: list[JointTest], level: Level) -> list[str]:
-        """Whether sky or noise is at fault where channels of their own do not fit."""
-        about = [test.level for test in tests if test.name == ABOUT_MAPS]
-        if level == "consistent" or not about:
+    def _cause(self, level: Level) -> list[str]:
+        """Whether sky or noise is further from the model, of channels of their own."""
+        if level == "consistent" or self.residuals is None:
             return []
-        if about[0] == "consistent":
+        about, expected = self.residuals
+        noise = about / expected
+        sky = (float(self.chi2.sum()) - about) / (float(self.degrees.sum()) - expected)
+        told = (
+            f"Against their expectations, the residuals about the maps are {noise:.3g} times, and "
+            f"the squared sky in units of its prior is {sky:.3g} times as large: "
+        )
+        if abs(sky - 1.0) > abs(noise - 1.0):
             return [
-                "Residuals about the maps are as the noise should be: what the model does not "
-                "describe is the sky, which its prior takes to be isotropic and Gaussian."
+                told + "it is the sky that the model does not describe, which its prior takes to "
+                "be isotropic and Gaussian, more than the noise."
             ]
-        return ["Residuals about the maps are not as the noise should be: look at noise and beams."]
+        return [told + "look at noise and beams."]
 
     def fit(self) -> Fit:
         """The verdict of all tests, and the channels that stand out."""
@@ -165,7 +167,7 @@ class ChannelFits:
             more = len(extremes) - NAMED
             names += f", {more} more" if more > 0 else ""
             told.append(f"{len(extremes)} of {len(p)} channels stand out: {names}.")
-        told += self._cause(tests, level)
+        told += self._cause(level)
         if self.bound:
             told.append(
                 "Conjugate gradients leave the expected chi^2 unknown; the number of data, its "
