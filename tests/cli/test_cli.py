@@ -153,7 +153,7 @@ def test_info_recognises_its_files(folder, tmp_path, capsys):
         (tmp_path / "data.nc", "visibilities at 25 MHz"),
         (folder / "posterior.nc", "posterior over 81 modes"),
         (folder / "mean.fits", "HEALPix sky map, NSIDE 8"),
-        (folder / "mean.fits", "mean of the posterior at 25 MHz up to ell = 8, beam monopole, site"),
+        (folder / "mean.fits", "mean of the posterior at 25 MHz up to ell = 8"),
         (folder / "diagnostics.nc", "residuals by 16 products, 6 days, 2 angles"),
         (folder / "mean_alm.fits", "coefficients of one sky up to ell = 8"),
     ]:
