@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lusee_bayes.core.reading import read_text
 from lusee_bayes.core.version import __version__
 from lusee_bayes.linear.fit import THRESHOLDS
 from lusee_bayes.report import html
@@ -81,7 +82,7 @@ def citation(folder: Path) -> str:
     found = Provenance.read(folder)
     version = __version__ if found is None else found.version
     made = "" if found is None else f", made {found.made[:10]}"
-    scenario = text_hash((folder / "scenario.yaml").read_text())[:12]
+    scenario = text_hash(read_text(folder / "scenario.yaml", "a scenario"))[:12]
     return "\n".join(
         [
             html.paragraph(
