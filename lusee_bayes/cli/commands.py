@@ -68,9 +68,10 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         ("lusee-bayes compare output/fiducial output/gain_1e-2",),
     ),
     "info": (
-        "Describe the contents of a file.",
+        "Describe the contents of a file, or of a run's folder.",
         "",
         (
+            "lusee-bayes info output/fiducial",
             "lusee-bayes info output/fiducial/posterior.nc",
             "lusee-bayes info beam.fits",
         ),

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes.cli.options import Force, Quiet, Verbose, say
+from lusee_bayes.cli.options import Force, Quiet, Verbose, say, show
 from lusee_bayes.core.progress import Stages
 
 
@@ -35,13 +35,12 @@ def compare_command(
         Print the memory in use after every stage.
     """
     from lusee_bayes.cli.tables import comparison_table
-    from lusee_bayes.results.finished_runs import same_data
+    from lusee_bayes.results.finished_runs import evidence_caveat
     from lusee_bayes.runs.compare_run import run_compare
 
     console = Console(quiet=quiet, soft_wrap=True)
     run = run_compare(folders, output, replace=force, stages=Stages(console, verbose=verbose))
     say(console, *(f"  {path}" for path in run.files))
-    console.print(comparison_table(run.runs))
-    if not same_data(run.runs):
-        console.print("different data: the evidences cannot be compared with each other")
-    console.print(f"look at {output / 'comparison.html'}", highlight=False)
+    show(console, comparison_table(run.runs))
+    caveat = evidence_caveat(run.runs)
+    say(console, *([] if caveat is None else [caveat]), f"look at {output / 'comparison.html'}")

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import gc
 import os
+import shlex
 import sys
 
 from cyclopts import App, CycloptsError
 from rich.console import Console
 
 from lusee_bayes.cli.commands import COMMANDS, help_of
+from lusee_bayes.core.command_line import COMMAND
 from lusee_bayes.core.errors import InputError, ProcessLost
 from lusee_bayes.core.version import __version__
 
@@ -39,6 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
     # imports and figures make objects by the million that stay: to search them for cycles again
     # and again takes a fifth of their time
     gc.set_threshold(100_000, 20, 100)
+    COMMAND.set(shlex.join(["lusee-bayes", *(sys.argv[1:] if arguments is None else arguments)]))
     errors = Console(stderr=True, soft_wrap=True, highlight=False)
     try:
         code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter, Token
 from rich.console import Console
+from rich.table import Table
 
 from lusee_bayes.core.errors import InputError
 
@@ -95,6 +96,11 @@ def say(console: Console, *lines: object) -> None:
     """Print lines as they are."""
     for line in lines:
         console.print(str(line), highlight=False, markup=False)
+
+
+def show(console: Console, table: Table) -> None:
+    """Print a table within the width of the terminal: its cells are wrapped."""
+    console.print(table, soft_wrap=False)
 
 
 def parse_frequencies(text: str) -> list[float]:

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes.cli.options import Force, Overrides, Quiet, Verbose, say
+from lusee_bayes.cli.options import Force, Overrides, Quiet, Verbose, say, show
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 
@@ -57,7 +57,7 @@ def plan_command(
     variations = [v for s in sources for v in variations_of(s, vary, set_ or [], console)]
     run = run_plan(variations, output, replace=force, stages=Stages(console, verbose=verbose))
     for source in sources:
-        console.print(forecast_table([f for f in run.forecasts if f.variation.source == source]))
+        show(console, forecast_table([f for f in run.forecasts if f.variation.source == source]))
     say(console, *(f"  {path}" for path in run.files))
     say(console, *(headline(run.forecasts, source) for source in sources))
     say(console, f"look at {run.folder}/figures/plan.png")

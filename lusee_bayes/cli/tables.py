@@ -51,14 +51,20 @@ def checks_table(checks: list[Check]) -> Table:
 
 def comparison_table(runs: Sequence[FinishedRun]) -> Table:
     """Finished runs side by side."""
-    shown = Table("run", "SNR < 1 from ell", "bits", "ln evidence", "less the best", "p")
-    for row in comparison_rows(runs):
+    shown = Table("run", "MHz", "fit")
+    shown.columns[0].overflow = "fold"
+    for name in ("SNR<1 at ell", "bits", "ln evidence", "- best", "p"):
+        shown.add_column(name, justify="right")
+    for run, row in zip(runs, comparison_rows(runs), strict=True):
+        less = row["log_evidence_less_best"]
         shown.add_row(
-            str(row["run"]),
-            str(row["ell_cross"]),
+            escape(run.name),
+            f"{row['frequency_mhz']:g}",
+            str(row["level"]),
+            run.cross_in_words(),
             f"{row['information_bits']:.0f}",
             f"{row['log_evidence']:.1f}",
-            f"{row['log_evidence_less_best']:.1f}",
+            "-" if less is None else f"{less:.1f}",
             f"{row['p']:.2g}",
         )
     return shown

@@ -18,6 +18,7 @@ from lusee_bayes.cli.options import (
     default_folder,
     load,
     say,
+    show,
 )
 from lusee_bayes.core.progress import Stages
 
@@ -68,6 +69,10 @@ def validate_command(
     verbose
         Print the memory in use after every stage.
     """
+    from lusee_bayes.sampling.least import require_draws, require_simulations
+
+    require_simulations(simulations)
+    require_draws(draws)
     from lusee_bayes.cli.tables import checks_table
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.validate_run import run_validate
@@ -87,6 +92,6 @@ def validate_command(
         stages=Stages(console, verbose=verbose),
     )
     say(console, *(f"  {path}" for path in run.files))
-    console.print(checks_table(run.result.checks))
+    show(console, checks_table(run.result.checks))
     say(console, f"{run.result.headline()}; look at {run.folder / REPORT}")
     return 0 if run.result.passed else 1

@@ -16,11 +16,23 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import chdtrc
 
 from lusee_bayes.core.arrays import Array, on_host
 from lusee_bayes.core.threads import in_threads
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.linear.fit import (
+    LEVELS,
+    MISFIT,
+    TENSION,
+    Fit,
+    Level,
+    level_of,
+    probability,
+    sentence,
+    size_of_residuals,
+    two_sided,
+    worst,
+)
 from lusee_bayes.linear.left_out import LeftOut
 from lusee_bayes.linear.left_out_dense import DenseLeftOut
 from lusee_bayes.linear.left_out_structured import StructuredLeftOut
@@ -30,9 +42,8 @@ from lusee_bayes.noise.covariance import LowRankUpdate
 
 # a larger A is not formed, and its groups of data are not judged: 60,000 data at lmax 47
 DENSE_BYTES = 1.2e9
-# a fit less probable than this is called bad; real skies are not drawn from the prior, and that
-# alone gives probabilities of 1e-3
-SIGNIFICANCE = 1e-6
+# groups that stand out and are named in a sentence
+NAMED = 4
 HOURS_A_DAY = 24.0
 
 
@@ -49,9 +60,9 @@ class Group:
     chi2 : float
         Of these data given all others.
     p : float
-        Probability of a larger ``chi2`` if the model holds.
+        Probability of a ``chi2`` as far out on its side if the model holds.
     others_p : float
-        Probability of a larger chi^2 of the others without these; NaN if there are no others.
+        The same of the others without these; NaN if there are no others.
     """
 
     name: str
@@ -88,70 +99,96 @@ class Residuals:
 
     @property
     def p(self) -> float:
-        """Probability of a larger chi^2 of all data."""
-        return float(chdtrc(len(self.z), self.chi2))
+        """Probability of a chi^2 of all data as far out on its side."""
+        return two_sided(self.chi2, len(self.z))
+
+    def kinds(self) -> tuple[tuple[str, tuple[Group, ...]], ...]:
+        """The groups by kind, each with the kind's name."""
+        return (
+            ("product", self.products),
+            ("day", self.days),
+            ("turntable angle", self.angles),
+        )
+
+    def compared(self) -> list[tuple[str, Group]]:
+        """The groups that others predict, with their kinds."""
+        return [(k, g) for k, groups in self.kinds() for g in groups if np.isfinite(g.others_p)]
+
+    def extremes(self) -> list[tuple[str, Group]]:
+        """Groups that stand out from what all others predict, the least probable first.
+
+        Returns
+        -------
+        list of (str, Group)
+            With the kind. Their p-values times the number of all groups are below ``TENSION``.
+        """
+        groups = self.compared()
+        found = [
+            (kind, group) for kind, group in groups if level_of(group.p, len(groups)) != LEVELS[0]
+        ]
+        return sorted(found, key=lambda one: one[1].p)
+
+    def level(self) -> Level:
+        """The verdict in a word.
+
+        A product or a turntable angle is predicted from others that saw the same sky, so that it
+        counts as all data do. A day is predicted from other days that saw other directions: there
+        the prediction is the prior's, and a bright part of the sky is enough to make it stand out.
+        It makes a fit tense, not bad.
+        """
+        found = [level_of(self.p)]
+        for kind, group in self.extremes():
+            bad = level_of(group.p, len(self.compared()))
+            found.append("in tension" if kind == "day" else bad)
+        return worst(found)
 
     def suspects(self) -> list[tuple[str, Group]]:
-        """Find the groups without which all other data fit.
+        """Find the groups whose removal makes the rest fit.
 
         Returns
         -------
         list of (str, Group)
             For each kind at most one group, with the kind; empty if all data fit.
         """
-        if self.p > SIGNIFICANCE:
+        level = self.level()
+        if level == "consistent":
             return []
+        enough = TENSION if level == "in tension" else MISFIT
+        standing_out = self.extremes()
         found = []
-        for kind, groups in (
-            ("product", self.products),
-            ("day", self.days),
-            ("turntable angle", self.angles),
-        ):
+        for kind, groups in self.kinds():
             known = [group for group in groups if np.isfinite(group.others_p)]
+            if level == "in tension":
+                known = [group for group in known if (kind, group) in standing_out]
             if not known:
                 continue
             best = max(known, key=lambda group: group.others_p)
-            if best.others_p > SIGNIFICANCE:
+            if best.others_p > enough:
                 found.append((kind, best))
         return found
 
-    def verdict(self) -> str:
-        """Describe in a sentence whether the data fit, and which group is the cause if not.
-
-        Returns
-        -------
-        str
-            For people to read.
-        """
-        if self.p > SIGNIFICANCE:
-            return f"The data fit the model (p {probability(self.p)})."
-        text = f"The data do not fit the model (p {probability(self.p)})."
-        if not self.products:
-            return (
-                text + " Which product, day or turntable angle is the cause is not judged: "
-                "that would need the whole of A, since the noise couples different times."
+    def fit(self) -> Fit:
+        """Judge whether the data fit, and which groups stand out or are to blame if not."""
+        level = self.level()
+        parts = [f"{sentence(level)} ({size_of_residuals(self.chi2, len(self.z), self.p)})."]
+        if level != "consistent" and not self.products:
+            parts.append(
+                "Products, days and turntable angles were not judged: the noise couples different "
+                "times, which would need the whole of A."
             )
+        extremes = self.extremes()
+        if extremes:
+            named = [f"{kind} {g.name} (p {probability(g.p)})" for kind, g in extremes[:NAMED]]
+            more = len(extremes) - NAMED
+            named += [f"{more} more"] if more > 0 else []
+            parts.append(f"Of {len(self.compared())} groups these stand out: {', '.join(named)}.")
         suspects = self.suspects()
-        if not suspects:
-            return text + " No single product, day or turntable angle is the cause."
-        parts = [f"{kind} {g.name} (p {probability(g.others_p)})" for kind, g in suspects]
-        return f"{text} They do without {', or without '.join(parts)}."
-
-
-def probability(p: float) -> str:
-    """Format a probability.
-
-    Parameters
-    ----------
-    p : float
-        The probability.
-
-    Returns
-    -------
-    str
-        Such as "= 0.62", or "< 1e-300" where it is too small for a float.
-    """
-    return f"= {p:.2g}" if p > 0 else "< 1e-300"
+        if suspects:
+            without = [f"{kind} {g.name} (p {probability(g.others_p)})" for kind, g in suspects]
+            parts.append(f"The others fit without {', or without '.join(without)}.")
+        elif level == "does not fit" and self.products:
+            parts.append("No single product, day or turntable angle is to blame for it.")
+        return Fit(level, self.p, " ".join(parts))
 
 
 def residuals(model: LinearGaussian, posterior: Posterior, data: Visibilities) -> Residuals:
@@ -194,9 +231,9 @@ def residuals(model: LinearGaussian, posterior: Posterior, data: Visibilities) -
 
     def group(name: str, n: int, squared: float) -> Group:
         if n == len(u):
-            return Group(name, n, total, float(chdtrc(n, total)), np.nan)
-        others = float(chdtrc(len(u) - n, total - squared))
-        return Group(name, n, squared, float(chdtrc(n, squared)), others)
+            return Group(name, n, total, two_sided(total, n), np.nan)
+        others = two_sided(total - squared, len(u) - n)
+        return Group(name, n, squared, two_sided(squared, n), others)
 
     def groups(
         names: Sequence[str], counts: np.ndarray, leave: Callable[[int], float]

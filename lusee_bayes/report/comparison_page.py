@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from lusee_bayes.linear.fit import THRESHOLDS
 from lusee_bayes.report import html
-from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, same_data
+from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
 
 HEADER = {
     "run": "run",
+    "level": "fit",
     "frequency_mhz": "MHz",
     "n_data": "data",
     "ell_cross": "SNR < 1 from ell",
@@ -24,17 +26,18 @@ HEADER = {
 
 def comparison_page(runs: Sequence[FinishedRun], figures: Path) -> str:
     """The page as text; ``figures``: folder with maps.png and curves.png."""
-    rows = [[_shown(row[key]) for key in HEADER] for row in comparison_rows(runs)]
-    caveat = (
-        "All runs map the same data: differences of ln evidence show which model they favour."
-        if same_data(runs)
-        else "The runs map different data: their evidences cannot be compared with each other."
-    )
+    rows = [
+        [_shown((row | {"ell_cross": run.cross_in_words()})[key]) for key in HEADER]
+        for run, row in zip(runs, comparison_rows(runs), strict=True)
+    ]
+    caveat = evidence_caveat(runs)
+    same = "All runs map the same data: differences of ln evidence say which model they prefer."
     names = ", ".join(run.name for run in runs)
     return html.page(
         f"Side by side: {names}",
         [
-            html.paragraph(caveat, "verdict"),
+            html.paragraph(caveat or same, "verdict" if caveat is None else "verdict tense"),
+            html.paragraph(f"{THRESHOLDS}.", "threshold"),
             html.table(list(HEADER.values()), rows),
             html.figure(
                 figures / "curves.png",
@@ -53,5 +56,5 @@ def comparison_page(runs: Sequence[FinishedRun], figures: Path) -> str:
 
 def _shown(value: object) -> str:
     if value is None:
-        return "none"
+        return "-"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

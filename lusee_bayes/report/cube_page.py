@@ -6,9 +6,18 @@ from pathlib import Path
 
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_json
-from lusee_bayes.report import html
+from lusee_bayes.linear.fit import level_of
+from lusee_bayes.report import head, html
+from lusee_bayes.report.cube_explorer import cube_explorer
 from lusee_bayes.report.run_details import details
-from lusee_bayes.results.saved import CHANNEL_SUMMARY, CUBE_SUMMARY, JOINT_SUMMARY
+from lusee_bayes.results.saved import (
+    CHANNEL_SUMMARY,
+    COVERAGE,
+    CUBE_SUMMARY,
+    JOINT_SUMMARY,
+    JOINT_TEST,
+    PULLS,
+)
 
 NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "mean.fits", "std.fits")
 FIGURES = {
@@ -27,8 +36,8 @@ FIGURES = {
     ),
     "chi2": (
         "Chi-squared of every channel over its expectation",
-        "Residuals of every channel about its map; grey: two standard deviations of the widest "
-        "distribution they can have if the model holds.",
+        "chi² of every channel over its expectation, of its data under the model, or, of a joint "
+        "posterior, of the residuals about the map; grey: two standard deviations.",
     ),
 }
 SECTIONS = [
@@ -36,6 +45,7 @@ SECTIONS = [
     ("spectra", "Spectra"),
     ("scales", "Scales"),
     ("data", "Data and prediction"),
+    ("files", "Files and citation"),
     ("run", "The run"),
 ]
 
@@ -63,7 +73,7 @@ def cube_page(folder: Path, name: str) -> str:
         f"{name}: the sky at {len(frequencies)} frequencies, "
         f"{frequencies[0]:g} to {frequencies[-1]:g} MHz"
     )
-    fits = summary["verdict"].startswith("The data of all channels fit")
+    channel_words = f"{len(channels)} channels, {frequencies[0]:g} to {frequencies[-1]:g} MHz"
     anchors = dict(zip(("maps", "spectra", "fidelity", "chi2"), SECTIONS, strict=False))
     parts = {
         name: [html.figure(folder / "figures" / f"{name}.png", *texts)]
@@ -74,14 +84,20 @@ def cube_page(folder: Path, name: str) -> str:
         (joint,) = entries(
             folder / "summary.json", {"joint": [summary["joint"]]}, "joint", JOINT_SUMMARY
         )
+    parts["maps"].insert(0, cube_explorer(folder, frequencies))
     parts["maps"].append(html.paragraph(_how(joint, summary.get("log_evidence"))))
-    parts["chi2"].append(_table(channels))
+    parts["spectra"] += _pulls(folder, summary)
+    parts["chi2"] = [_tests(folder, summary), *parts["chi2"], _table(channels)]
+    if "coverage" in channels[0]:
+        parts["maps"].append(_coverage(folder, channels))
     return html.page(
         title,
         [
             html.contents(SECTIONS),
-            html.paragraph(summary["verdict"], "verdict" if fits else "verdict bad"),
+            head.verdict(summary["level"], summary["verdict"]),
+            head.about(folder, channel_words),
             *(html.section(*anchors[name], *inside) for name, inside in parts.items()),
+            html.section(*SECTIONS[-2], head.downloads(folder), head.citation(folder)),
             html.section(*SECTIONS[-1], *details(folder, summary)),
         ],
     )
@@ -101,17 +117,76 @@ def _how(joint: dict | None, evidence: float | None) -> str:
     )
 
 
+def _tests(folder: Path, summary: dict) -> str:
+    tests = entries(folder / "summary.json", summary, "tests", JOINT_TEST)
+    rows = [
+        (t["test"], t["found"], f"{t['p']:.2g}", "" if t["among"] == 1 else t["among"], t["level"])
+        for t in tests
+    ]
+    bad = [t["level"] != "consistent" for t in tests]
+    note = html.paragraph(
+        "All channels together: a small excess that no channel shows by itself is seen in the sum "
+        "and in the number of channels above the median."
+    )
+    return note + html.table(("joint test", "found", "p", "smallest of", "verdict"), rows, bad)
+
+
+def _pulls(folder: Path, summary: dict) -> list[str]:
+    """How far the spectra are from the truth, and why in the plane."""
+    if not summary.get("pulls"):
+        return []
+    found = entries(folder / "summary.json", summary, "pulls", PULLS)
+    rows = [
+        (p["direction"], f"{p['rms']:.2f}", f"{p['worst']:+.1f} at {p['worst_mhz']:g} MHz")
+        for p in found
+    ]
+    return [
+        html.paragraph(
+            "Difference of mean and truth in standard deviations. A spectrum is that of one "
+            "direction as the map resolves it: the mean is the true sky averaged with the "
+            "point-spread function, and the prior fills in what is smaller. Towards the Galactic "
+            "centre ionised gas absorbs a lane of a few degrees within bright rims, the deeper the "
+            "lower the frequency. A map that is coarser than the lane averages lane and rims, and "
+            "its mean is brighter than the truth in the lane. The standard deviation does not "
+            "tell: the isotropic Gaussian prior does not expect so much structure within a few "
+            "degrees. Away from the plane mean and truth agree within the error bars."
+        ),
+        html.table(("direction", "rms over channels", "furthest"), rows),
+    ]
+
+
+def _coverage(folder: Path, channels: list[dict]) -> str:
+    """Share of pixels within one standard deviation of the truth, a row for each channel."""
+    where = folder / "summary.json"
+    bands = [entries(where, channel, "coverage", COVERAGE) for channel in channels]
+    header = ("MHz", *(band["name"] for band in bands[0]))
+    rows = [
+        (f"{c['frequency_mhz']:g}", *(f"{band['within_1']:.1%}" for band in mine))
+        for c, mine in zip(channels, bands, strict=True)
+    ]
+    chance = ", ".join(f"{100 * band['error_1']:.1f}" for band in bands[0])
+    note = html.paragraph(
+        "Share of pixels whose true temperature is within one standard deviation of the mean; "
+        f"expected: 68.3 %, by chance up to about ± {chance} % in the columns."
+    )
+    return html.folded(
+        "are the error bars right? coverage by latitude", note, html.table(header, rows)
+    )
+
+
 def _table(channels: list[dict]) -> str:
-    header = ("MHz", "data", "missing", "chi²", "expected", "first ell with SNR < 1")
+    header = ("MHz", "data", "missing", "p", "chi² about the map", "expected", "first ell, SNR < 1")
     rows = [
         (
             f"{c['frequency_mhz']:g}",
             c["n_data"],
             c["n_missing"],
+            f"{c['p']:.2g}",
             f"{c['chi2']:.0f}",
             f"{c['chi2_expected']:.0f}" if "chi2_expected" in c else "unknown",
             "" if c.get("ell_cross") is None else c["ell_cross"],
         )
         for c in channels
     ]
-    return html.folded("every channel", html.table(header, rows))
+    bad = [level_of(c["p"], len(channels)) != "consistent" for c in channels]
+    return html.folded("every channel", html.table(header, rows, bad))

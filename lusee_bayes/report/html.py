@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from importlib import resources
 from pathlib import Path
+from urllib.parse import quote
 
 TEMPLATE = """<!DOCTYPE html>
 <html lang="en">
@@ -50,16 +51,43 @@ def section(anchor: str, title: str, *parts: str) -> str:
     return f'<section id="{anchor}">\n{inside}\n</section>'
 
 
+def subsection(title: str) -> str:
+    """A heading within a section."""
+    return f"<h3>{escape(title)}</h3>"
+
+
 def paragraph(text: str, kind: str = "") -> str:
     """Plain text."""
     return f'<p class="{kind}">{escape(text)}</p>' if kind else f"<p>{escape(text)}</p>"
+
+
+class Markup(str):
+    """Text that is HTML already."""
+
+    __slots__ = ()
+
+
+def link(path: str) -> Markup:
+    """A link to a file beside the page."""
+    return Markup(f'<a href="{escape(quote(path))}" download>{escape(path)}</a>')
+
+
+def definitions(rows: Iterable[tuple[str, str]]) -> str:
+    """Names and what they mean, side by side."""
+    inside = "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in rows)
+    return f'<dl class="about">{inside}</dl>'
+
+
+def _cell(value: object) -> str:
+    return value if isinstance(value, Markup) else escape(str(value))
 
 
 def figure(path: Path, alternative: str, caption: str) -> str:
     """A picture, inside the page, with a text for those who do not see it."""
     data = base64.b64encode(path.read_bytes()).decode()
     return (
-        f'<figure><img src="data:image/png;base64,{data}" alt="{escape(alternative)}">'
+        f'<figure><div class="scroll"><img src="data:image/png;base64,{data}" '
+        f'alt="{escape(alternative)}"></div><p class="cue">Swipe the figure sideways.</p>'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
 
@@ -73,7 +101,7 @@ def table(
     head = "".join(f'<th scope="col">{escape(str(cell))}</th>' for cell in header)
     lines = [
         f"<tr{' class=bad' if mark else ''}>"
-        + "".join(f"<td>{escape(str(cell))}</td>" for cell in row)
+        + "".join(f"<td>{_cell(cell)}</td>" for cell in row)
         + "</tr>"
         for row, mark in zip(rows, marks, strict=True)
     ]

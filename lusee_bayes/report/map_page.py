@@ -8,13 +8,13 @@ import numpy as np
 import xarray as xr
 
 from lusee_bayes.core.files import require_files
-from lusee_bayes.core.reading import read_table
-from lusee_bayes.linear.residuals import SIGNIFICANCE, probability
-from lusee_bayes.report import html
+from lusee_bayes.core.reading import entries, read_table
+from lusee_bayes.linear.fit import probability
+from lusee_bayes.report import head, html
 from lusee_bayes.report.explorer import explorer
 from lusee_bayes.report.run_details import details
 from lusee_bayes.results.finished_runs import FinishedRun
-from lusee_bayes.results.saved import SOURCES
+from lusee_bayes.results.saved import COVERAGE, SOURCES
 
 NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "diagnostics.nc", "mean.fits", "std.fits")
 FIGURES = ("maps", "draws", "fidelity", "spectra", "data_vector", "residuals", "beams")
@@ -23,6 +23,7 @@ SECTIONS = [
     ("scales", "Scales"),
     ("data", "Data and prediction"),
     ("numbers", "Numbers"),
+    ("files", "Files and citation"),
     ("run", "The run"),
 ]
 # days in the table, the worst first
@@ -48,17 +49,18 @@ def map_page(folder: Path, name: str) -> str:
     run = FinishedRun.read(folder)
     summary, found = run.summary, run.diagnostics
     title = f"{name}: the sky at {summary['frequency_mhz']:g} MHz"
-    bad = found.attrs["p"] < SIGNIFICANCE
     return html.page(
         title,
         [
             html.contents(SECTIONS),
-            html.paragraph(found.attrs["verdict"], "verdict bad" if bad else "verdict"),
-            html.section("map", SECTIONS[0][1], *_map(folder, summary, found)),
-            html.section("scales", SECTIONS[1][1], *_scales(folder, run)),
-            html.section("data", SECTIONS[2][1], *_data(folder, found)),
-            html.section("numbers", SECTIONS[3][1], *_numbers(folder, summary)),
-            html.section("run", SECTIONS[4][1], *details(folder, summary)),
+            head.verdict(found.attrs["level"], found.attrs["verdict"]),
+            head.about(folder, f"{summary['frequency_mhz']:g} MHz"),
+            html.section(*SECTIONS[0], *_map(folder, summary, found)),
+            html.section(*SECTIONS[1], *_scales(folder, run)),
+            html.section(*SECTIONS[2], *_data(folder, found)),
+            html.section(*SECTIONS[3], *_numbers(folder, summary)),
+            html.section(*SECTIONS[4], head.downloads(folder), head.citation(folder)),
+            html.section(*SECTIONS[5], *details(folder, summary)),
         ],
     )
 
@@ -69,6 +71,9 @@ def _figure(folder: Path, name: str, alternative: str, caption: str) -> str:
 
 def _map(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
     hidden = summary["never_observed_fraction"]
+    bands = None
+    if summary.get("coverage") is not None:
+        bands = entries(folder / "summary.json", summary, "coverage", COVERAGE)
     return [
         html.paragraph(
             f"{hidden:.1%} of the sky never rose above the horizon: there the map is the prior's. "
@@ -91,6 +96,32 @@ def _map(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
             "Draws of the posterior: skies that agree with the data and the prior. Features that "
             "all draws share are constrained; those that differ are not.",
         ),
+        *([] if bands is None else coverage_table(bands)),
+    ]
+
+
+def coverage_table(bands: list[dict]) -> list[str]:
+    """How often error bars hold the truth, by band of latitude, as summary.json tells it."""
+    rows = [
+        (
+            band["name"],
+            f"{band['sky']:.0%}",
+            f"{band['within_1']:.1%} (68.3 ± {100 * band['error_1']:.1f})",
+            f"{band['within_2']:.1%} (95.4 ± {100 * band['error_2']:.1f})",
+            f"{band['rms']:.2f}",
+        )
+        for band in bands
+    ]
+    return [
+        html.subsection("Are the error bars right?"),
+        html.paragraph(
+            "Share of pixels whose true temperature is within one and two standard deviations of "
+            "the mean; in brackets what is expected, with its scatter. rms of (mean - truth) / "
+            "standard deviation is 1 where error bars are right. An isotropic prior allows every "
+            "direction the same structure: a real sky has more of it in the plane, where error "
+            "bars can be too small, and less towards the poles, where they are too large."
+        ),
+        html.table(("Galactic latitude", "sky", "within 1 sigma", "within 2 sigma", "rms"), rows),
     ]
 
 
@@ -126,7 +157,28 @@ def _scales(folder: Path, run: FinishedRun) -> list[str]:
             "Power spectra. Where the posterior variance reaches the prior, the data add no "
             "information.",
         ),
+        _by_ell(run),
     ]
+
+
+def _by_ell(run: FinishedRun) -> str:
+    """The columns of spectra.csv, a row for each multipole."""
+    names = {
+        "ell": "ell",
+        "rho": "correlation",
+        "snr": "SNR",
+        "prior_fraction": "share of the prior",
+        "cl_prior": "C prior [K²]",
+        "cl_mean": "C mean [K²]",
+        "cl_truth": "C truth [K²]",
+        "cl_posterior_variance": "C variance [K²]",
+    }
+    here = [name for name in names if name in run.spectra]
+    rows = [
+        ["" if np.isnan(run.spectra[name][k]) else f"{run.spectra[name][k]:.4g}" for name in here]
+        for k in range(len(run.spectra["ell"]))
+    ]
+    return html.folded("every multipole", html.table([names[name] for name in here], rows))
 
 
 def _data(folder: Path, found: xr.Dataset) -> list[str]:
@@ -135,10 +187,11 @@ def _data(folder: Path, found: xr.Dataset) -> list[str]:
     parts = [
         html.paragraph(
             "Each datum, and each product, day and turntable angle as a whole, is compared with "
-            "its prediction from all other data. A bad group disturbs the predictions of others, "
-            "too; the culprit is the group whose removal makes the rest fit (last column). Days "
-            "may also stand out where they see a part of the sky that is brighter than the prior "
-            "expects and that no other day constrains as well."
+            "what all other data predict of it. A group stands out if its p times the number of "
+            "groups is below 0.01. A bad group spoils the predictions of others too; the culprit "
+            "is the group whose removal makes the rest fit (last column). Days may also stand out "
+            "because the sky is brighter in places than the prior expects and no other day has "
+            "seen them as well."
         ),
         _figure(
             folder,
@@ -147,7 +200,9 @@ def _data(folder: Path, found: xr.Dataset) -> list[str]:
             "Every datum against the prediction of all others, in standard deviations.",
         ),
     ]
-    suspects = list(np.atleast_1d(found.attrs["suspects"]))
+    marked = [
+        str(x) for key in ("suspects", "extremes") for x in np.atleast_1d(found.attrs.get(key, ()))
+    ]
     for kind, title, name in (
         ("product", "By product", "product"),
         ("day", "By day", "day"),
@@ -161,7 +216,7 @@ def _data(folder: Path, found: xr.Dataset) -> list[str]:
             note = f" (the {WORST_DAYS} least probable of {len(rows)})"
             rows = rows[order[:WORST_DAYS]]
         cells = [_group_row(found, int(row)) for row in rows]
-        bad = [f"{name} {cell[0]}" in suspects for cell in cells]
+        bad = [f"{name} {cell[0]}" in marked for cell in cells]
         parts += [html.paragraph(f"{title}{note}"), html.table(header, cells, bad)]
     parts.append(
         _figure(

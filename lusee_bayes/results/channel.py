@@ -29,6 +29,7 @@ from lusee_bayes.linear.metrics import (
     signal_to_noise,
 )
 from lusee_bayes.linear.pixel_variance import pixel_std
+from lusee_bayes.results.observed import Observed
 
 # what the scenario's seed is folded with for posterior draws and for perturbations of information
 DRAWS, PERTURBATIONS = 1, 7
@@ -38,6 +39,7 @@ NUMBERS = (
     "information_bits",
     "chi2",
     "chi2_expected",
+    "chi2_model",
     "refinement",
     "n_data",
     "n_missing",
@@ -75,6 +77,9 @@ class ChannelResult:
         NaN for a channel of a joint posterior, where only those of all channels are known.
     chi2, chi2_expected : float
         Of the residuals about the mean, and its mean if the model holds (NaN if not known).
+    chi2_model : float
+        Of the data under the model, sky included: a chi^2 distribution of ``n_data`` degrees of
+        freedom. NaN for a channel of a joint posterior, which has no model of its own.
     refinement : float
         Last correction of the mean, in standard deviations.
     n_data, n_missing, rounds : int
@@ -97,6 +102,7 @@ class ChannelResult:
     information_bits: float
     chi2: float
     chi2_expected: float
+    chi2_model: float
     refinement: float
     n_data: int
     n_missing: int
@@ -240,50 +246,14 @@ def channel_of_posterior(
         information_bits=float(posterior.information_bits()),
         chi2=float(inference.model.chi2(posterior.mean, data.data)),
         chi2_expected=expected,
+        chi2_model=float(judged.model.chi2(judged.posterior.mean, data.data))
+        + float(np.vdot(judged.posterior.white_mean, judged.posterior.white_mean)),
         refinement=float(posterior.refinement),
         n_data=inference.model.n_data,
         n_missing=data.n_missing,
         rounds=inference.rounds,
         doubts=(*experiment.doubts, *about_information(float(posterior.information_bits()))),
     )
-
-
-@dataclass(frozen=True)
-class Observed:
-    """What is known of a channel besides its posterior: for :func:`channel_of_information`.
-
-    Attributes
-    ----------
-    frequency_mhz : float
-    spectrum : (ells,) array
-        C_ell of the channel's own prior, in K^2.
-    truth : (modes,) array or None
-    highest_altitude : (pixels,) array
-    n_missing, rounds : int
-    doubts : tuple of str
-    """
-
-    frequency_mhz: float
-    spectrum: Float[np.ndarray, " ells"]
-    truth: Float[np.ndarray, " modes"] | None
-    highest_altitude: Float[np.ndarray, " pixels"]
-    n_missing: int
-    rounds: int
-    doubts: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, experiment: Experiment, rounds: int) -> Observed:
-        """Of an experiment."""
-        data, nside = experiment.data, experiment.scenario.map_nside
-        return cls(
-            experiment.scenario.frequency_mhz,
-            power_spectrum(np.sqrt(np.asarray(experiment.setup.prior.variance()))),
-            _array(data.truth),
-            highest_altitude(data.observation, nside),
-            data.n_missing,
-            rounds,
-            experiment.doubts,
-        )
 
 
 def channel_of_information(
@@ -296,6 +266,7 @@ def channel_of_information(
     independent: Float[Array, " modes"] | None = None,
     log_evidence: float = np.nan,
     information_bits: float = np.nan,
+    chi2_model: float = np.nan,
     refinement: float = np.nan,
 ) -> ChannelResult:
     """The channel of a mean and a covariance; where that is not known, of draws.
@@ -311,7 +282,7 @@ def channel_of_information(
         In K^2; None if only the draws tell.
     draws : (n, modes) array
         In K.
-    independent, log_evidence, information_bits, refinement
+    independent, log_evidence, information_bits, chi2_model, refinement
         See :class:`ChannelResult`.
     """
     expected = np.nan
@@ -338,6 +309,7 @@ def channel_of_information(
         information_bits=information_bits,
         chi2=float(information.chi2(mean)),
         chi2_expected=expected,
+        chi2_model=chi2_model,
         refinement=refinement,
         n_data=int(information.n_data),
         n_missing=observed.n_missing,

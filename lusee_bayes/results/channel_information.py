@@ -12,7 +12,7 @@ from jaxtyping import Float
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference
 from lusee_bayes.linear.information import Information
-from lusee_bayes.results.channel import Observed
+from lusee_bayes.results.observed import Observed
 
 # numbers that a file keeps as attributes
 OF_INFORMATION = ("misfit", "log_det", "n_data")

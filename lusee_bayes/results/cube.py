@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
-from scipy.special import chdtrc
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.harmonics import mode_numbers, synthesis_matrix
@@ -17,18 +17,12 @@ from lusee_bayes.core.progress import peak_memory_gb
 from lusee_bayes.core.representation import Described, extent
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.linear.residuals import SIGNIFICANCE, probability
-from lusee_bayes.results.channel import (
-    ChannelResult,
-)
-from lusee_bayes.results.joint_components import (
-    Components,
-)
+from lusee_bayes.linear.fit import THRESHOLDS, Fit, two_sided
+from lusee_bayes.results.channel import ChannelResult
+from lusee_bayes.results.coverage import coverage_rows
+from lusee_bayes.results.cube_fit import ChannelFits
+from lusee_bayes.results.joint_components import Components
 from lusee_bayes.sky.landmarks import LANDMARKS
-
-# chi^2 of a channel that is further from its mean, in standard deviations of the widest
-# distribution it can have, is called bad
-SIGNIFICANT = 6.0
 
 
 @dataclass(frozen=True, repr=False)
@@ -75,47 +69,41 @@ class CubeResult(Described):
             return None
         return np.stack([c.snr(c.independent if independent else None) for c in self.channels])
 
-    def deviation(self, channel: int) -> float:
-        """How far chi^2 is from its mean under the model, over sqrt(2 N_data); NaN if unknown."""
-        it = self.channels[channel]
-        return (it.chi2 - it.chi2_expected) / np.sqrt(2.0 * it.n_data)
-
-    def bad_channels(self) -> list[int]:
-        """Channels whose data do not fit."""
-        return [k for k in range(len(self.channels)) if abs(self.deviation(k)) > SIGNIFICANT]
-
     @property
     def p(self) -> float | None:
-        """Probability of a larger chi^2 of all data under the joint model; None if unknown."""
+        """Probability of chi^2 of all data under the joint model; None if unknown."""
         if self.components is None or np.isnan(self.components.chi2):
             return None
         n_data = sum(channel.n_data for channel in self.channels)
-        return float(chdtrc(n_data, self.components.chi2))
+        return two_sided(self.components.chi2, n_data)
+
+    def fits(self) -> ChannelFits:
+        """chi^2 of every channel, and the tests of all of them together."""
+        n_data = self.stacked("n_data").astype(np.float64)
+        if self.components is None:
+            about = float(self.stacked("chi2").sum()), float(self.stacked("chi2_expected").sum())
+            chi2 = self.stacked("chi2_model")
+            return ChannelFits(self.frequencies_mhz, chi2, n_data, residuals=about)
+        expected = self.stacked("chi2_expected")
+        bound = bool(np.isnan(expected).any())
+        known = not np.isnan(self.components.chi2)
+        return ChannelFits(
+            self.frequencies_mhz,
+            self.stacked("chi2"),
+            n_data if bound else expected,
+            (self.components.chi2, int(n_data.sum())) if known else None,
+            joint=True,
+            bound=bound,
+        )
+
+    @cached_property
+    def fit(self) -> Fit:
+        """Whether the data of all channels fit."""
+        return self.fits().fit()
 
     def verdict(self) -> str:
-        """What the residuals say, in a sentence."""
-        bad, p = self.bad_channels(), self.p
-        if np.isnan(self.deviation(0)):
-            return "Conjugate gradients leave the expected chi^2 unknown: fit not judged."
-        if not bad and p is not None and p < SIGNIFICANCE:
-            return (
-                "Residuals of all channels are as expected, but their skies do not follow the "
-                f"spectral prior (p {probability(p)}): error bars may be too small. Compare the "
-                "evidence of other spectral.components and of a larger spectral.residual."
-            )
-        if not bad:
-            return "The data of all channels fit the model."
-        names = ", ".join(f"{self.frequencies_mhz[k]:g}" for k in bad)
-        worst = max(bad, key=lambda k: abs(self.deviation(k)))
-        channel = self.channels[worst]
-        hint = ""
-        if self.components is not None:
-            hint = " Skies may not obey the spectral prior: see spectral.residual."
-        return (
-            f"The data of {len(bad)} of {len(self.channels)} channels do not fit the model: "
-            f"{names} MHz (worst {channel.frequency_mhz:g} MHz: chi2 {channel.chi2:.0f}, expected "
-            f"{channel.chi2_expected:.0f}).{hint}"
-        )
+        """What the residuals say, in sentences."""
+        return self.fit.text
 
     def headline(self) -> str:
         """The few figures that matter, in one line."""
@@ -136,7 +124,7 @@ class CubeResult(Described):
     def lines(self) -> list[str]:
         """What a terminal shows."""
         doubts = [f"{c.frequency_mhz:g} MHz: {d}" for c in self.channels for d in c.doubts]
-        return [self.headline(), self.verdict(), *doubts]
+        return [self.headline(), self.verdict(), THRESHOLDS, *doubts]
 
     @property
     def log_evidence(self) -> float | None:
@@ -160,11 +148,31 @@ class CubeResult(Described):
                 found[name]["truth"] = truth @ y
         return found
 
+    def pulls(self) -> list[dict[str, object]]:
+        """How far the means of some directions are from the truth, in standard deviations."""
+        found = []
+        for name, values in self.landmarks().items():
+            if "truth" not in values:
+                return []
+            pull = (values["mean"] - values["truth"]) / values["std"]
+            worst = int(np.argmax(np.abs(pull)))
+            found.append(
+                {
+                    "direction": name,
+                    "rms": float(np.sqrt((pull**2).mean())),
+                    "worst": float(pull[worst]),
+                    "worst_mhz": float(self.frequencies_mhz[worst]),
+                }
+            )
+        return found
+
     def summary(self) -> dict[str, object]:
         """Figures of summary.json."""
         channels = []
-        for channel in self.channels:
+        for channel, p in zip(self.channels, self.fits().p().tolist(), strict=True):
             numbers = {
+                "p": p,
+                "chi2_model": channel.chi2_model,
                 "chi2": channel.chi2,
                 "chi2_expected": channel.chi2_expected,
                 "n_data": channel.n_data,
@@ -175,6 +183,8 @@ class CubeResult(Described):
             }
             known = {name: value for name, value in numbers.items() if not np.isnan(value)}
             known |= {"doubts": list(channel.doubts)} if channel.doubts else {}
+            if channel.truth is not None:
+                known["coverage"] = coverage_rows(channel.maps(), self.scenario.lmax)
             channels.append(
                 {"frequency_mhz": channel.frequency_mhz, "ell_cross": channel.ell_cross, **known}
             )
@@ -184,7 +194,13 @@ class CubeResult(Described):
             "log_evidence": self.log_evidence,
             "n_data": sum(channel.n_data for channel in self.channels),
             "n_modes": len(self.channels[0].mean),
-            "verdict": self.verdict(),
+            "level": self.fit.level,
+            "verdict": self.fit.text,
+            "tests": [
+                {"test": t.name, "found": t.found, "p": t.p, "among": t.n, "level": t.level}
+                for t in self.fits().tests()
+            ],
+            "pulls": self.pulls(),
             "channels": channels,
             "seconds": {name: round(s, 3) for name, s in self.seconds.items()},
             "peak_memory_gb": round(peak_memory_gb(), 3),

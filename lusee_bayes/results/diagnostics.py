@@ -8,28 +8,29 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
+from jaxtyping import Float, Int8
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.harmonics import (
     azimuth_functions,
+    lmax_of,
     mode_numbers,
     modes_to_map,
-    pixel_matrix,
     polar_functions,
 )
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference
 from lusee_bayes.linear.pixel_variance import independent_pixel_std
-from lusee_bayes.linear.residuals import Group, residuals
-from lusee_bayes.linear.resolution import resolution_rows
+from lusee_bayes.linear.residuals import residuals
 from lusee_bayes.results.channel import ChannelResult, draw_key
+from lusee_bayes.results.diagnostics_file import group_variables
 
-# regions and the directions of point-spread functions, and the maps these are drawn on
-REGION_NSIDE, KERNEL_NSIDE = 8, 16
+REGION_NSIDE = 8
 N_DRAWS = 4
+# of a byte with its sign
+LARGEST_STEP = 127
 
 
 def diagnostics(
@@ -60,11 +61,9 @@ def diagnostics(
     scenario, data = experiment.scenario, experiment.data
     posterior, nside, lmax = on_host(inference.posterior), channel.nside, experiment.scenario.lmax
     found = residuals(judged.model, judged.posterior, data)
+    fit = found.fit()
     draws = np.asarray(posterior.sample(draw_key(scenario), N_DRAWS))
-    centres = pixel_matrix(region_nside(nside), lmax)
-    kernels = resolution_rows(posterior, centres) @ pixel_matrix(KERNEL_NSIDE, lmax).T
-    peaks = np.abs(kernels).max(axis=1)
-    safe = np.where(peaks > 0, peaks, 1.0)
+    known, steps = packed_resolution(covariance, channel.prior_std)
     # the prior leaves the monopole wide open, which any data settle; with it the prior's share
     # would be close to zero everywhere
     rest_prior = np.where(np.arange(len(covariance)) > 0, channel.prior_std**2, 0.0)
@@ -89,25 +88,60 @@ def diagnostics(
         "region_mean": ("region", rows @ channel.mean, kelvin),
         "region_std": ("region", np.sqrt(region_variance), kelvin),
         "region_prior_fraction": ("region", region_share),
-        "psf": (("region", "kernel_pixel"), kernels / safe[:, None]),
-        "psf_peak": ("region", peaks, {"units": "1/sr"}),
+        "resolution": (("mode", "mode_2"), known),
+        "resolution_step": (("ell", "ell_2"), steps),
+        "prior_std": ("mode", channel.prior_std, kelvin),
         "data": (("product", "time"), data.grid(), kelvin),
         "predicted": (("product", "time"), on_grid(found.predicted), kelvin),
         "z": (("product", "time"), on_grid(found.z), {"units": "standard deviations"}),
-        **_groups({"product": found.products, "day": found.days, "angle": found.angles}),
+        **group_variables({"product": found.products, "day": found.days, "angle": found.angles}),
     }
     return xr.Dataset(
         variables,
         coords={"product": list(data.labels), "hours": ("time", data.observation.hours)},
         attrs={
             "format": formats.DIAGNOSTICS,
-            "verdict": found.verdict(),
+            "level": fit.level,
+            "verdict": fit.text,
             "chi2": found.chi2,
-            "p": found.p,
+            "p": fit.p,
+            "extremes": [f"{kind} {group.name}" for kind, group in found.extremes()] or "none",
             "suspects": [f"{kind} {group.name}" for kind, group in found.suspects()] or "none",
             "frequency_mhz": scenario.frequency_mhz,
         },
     )
+
+
+def packed_resolution(
+    covariance: Float[np.ndarray, "modes modes"], prior_std: Float[np.ndarray, " modes"]
+) -> tuple[Int8[np.ndarray, "modes modes"], Float[np.ndarray, "ells ells"]]:
+    """Pack what the data know of the modes, for point-spread functions of any direction.
+
+    The resolution matrix is R = 1 - C S^-1 = D (1 - D^-1 C D^-1) D^-1, with S = D^2. The symmetric
+    matrix in the middle is kept with a byte for each entry, in steps of its pair of multipoles.
+
+    Parameters
+    ----------
+    covariance : (modes, modes) array
+        Of the posterior, in K^2.
+    prior_std : (modes,) array
+        D, in K.
+
+    Returns
+    -------
+    (modes, modes) array of int8
+        In steps; zero for modes without prior variance.
+    (ells, ells) array
+        The steps.
+    """
+    widths = np.where(prior_std > 0, prior_std, np.inf)
+    white = np.diag((prior_std > 0).astype(np.float64)) - covariance / np.outer(widths, widths)
+    ell, _ = mode_numbers(lmax_of(len(prior_std)))
+    starts = np.flatnonzero(np.diff(ell, prepend=-1))
+    largest = np.maximum.reduceat(np.abs(white), starts, axis=0)
+    largest = np.maximum.reduceat(largest, starts, axis=1)
+    steps = np.where(largest > 0, largest, 1.0) / LARGEST_STEP
+    return np.rint(white / steps[np.ix_(ell, ell)]).astype(np.int8), steps
 
 
 def region_nside(nside: int) -> int:
@@ -137,16 +171,3 @@ def region_rows(nside: int, lmax: int) -> Float[np.ndarray, "regions modes"]:
     rows = polar_functions(heights, lmax)[ring[parts]] * sums[:, m + lmax]
     _, first = np.unique(of[parts], return_index=True)
     return np.add.reduceat(rows, first) / np.bincount(of)[:, None]
-
-
-def _groups(kinds: dict[str, tuple[Group, ...]]) -> dict[str, tuple[str, np.ndarray]]:
-    """One row for every group that was left out."""
-    groups = [(kind, group) for kind, found in kinds.items() for group in found]
-    return {
-        "group_kind": ("group", np.array([kind for kind, _ in groups], dtype=np.str_)),
-        "group_name": ("group", np.array([group.name for _, group in groups], dtype=np.str_)),
-        "group_n": ("group", np.array([group.n for _, group in groups])),
-        "group_chi2": ("group", np.array([group.chi2 for _, group in groups])),
-        "group_p": ("group", np.array([group.p for _, group in groups])),
-        "group_others_p": ("group", np.array([group.others_p for _, group in groups])),
-    }

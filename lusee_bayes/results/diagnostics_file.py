@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.netcdf_files import read_dataset
 from lusee_bayes.results.saved import DIAGNOSTICS
 
-# point-spread functions are kept in units of this part of their peak
-KERNEL_STEP = 1.0 / 127.0
-
 
 def write_diagnostics(dataset: xr.Dataset, path: Path) -> None:
-    """Write to netCDF; point-spread functions with a byte for each value, of their peak."""
-    byte = {"dtype": "int8", "scale_factor": KERNEL_STEP, "_FillValue": -128, "zlib": True}
-    single = {name: {"dtype": "float32"} for name in ("draws", "prior_fraction")}
-    dataset.to_netcdf(path, engine="h5netcdf", encoding={"psf": byte, **single})
+    """Write to netCDF; maps of draws and shares in single precision."""
+    if not dataset.sizes["group"]:  # files hold no empty arrays
+        dataset = dataset.drop_dims("group")
+    encoding = {name: {"dtype": "float32"} for name in ("draws", "prior_fraction")}
+    dataset.to_netcdf(path, engine="h5netcdf", encoding=encoding)
 
 
 def read_diagnostics(path: str | Path) -> xr.Dataset:
     """What :func:`write_diagnostics` wrote. InputError for anything else."""
-    return read_dataset(path, formats.DIAGNOSTICS, DIAGNOSTICS, "lusee-bayes map writes one")
+    found = read_dataset(path, formats.DIAGNOSTICS, DIAGNOSTICS, "lusee-bayes map writes one")
+    return found if "group" in found.sizes else found.assign(group_variables({}))
+
+
+def group_variables(kinds: Mapping[str, Sequence[Any]]) -> dict[str, tuple[str, np.ndarray]]:
+    """One row for every group (``linear.residuals.Group``) that was left out, by its kind."""
+    groups = [(kind, group) for kind, found in kinds.items() for group in found]
+    return {
+        "group_kind": ("group", np.array([kind for kind, _ in groups], dtype=np.str_)),
+        "group_name": ("group", np.array([group.name for _, group in groups], dtype=np.str_)),
+        "group_n": ("group", np.array([group.n for _, group in groups], dtype=np.int64)),
+        "group_chi2": ("group", np.array([group.chi2 for _, group in groups])),
+        "group_p": ("group", np.array([group.p for _, group in groups])),
+        "group_others_p": ("group", np.array([group.others_p for _, group in groups])),
+    }

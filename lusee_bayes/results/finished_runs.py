@@ -31,6 +31,13 @@ class FinishedRun:
     std: Float[np.ndarray, " pixels"]
     diagnostics: xr.Dataset
 
+    def cross_in_words(self) -> str:
+        """First ell with SNR < 1: above the last one, or unknown without a truth."""
+        cross = self.summary["ell_cross"]
+        if cross is not None:
+            return str(cross)
+        return f"> {self.spectra['ell'][-1]:.0f}" if "snr" in self.spectra else "no truth"
+
     @classmethod
     def read(cls, folder: str | Path) -> FinishedRun:
         """InputError if the folder is not one of a finished map run."""
@@ -70,18 +77,55 @@ def read_runs(folders: Sequence[str | Path]) -> list[FinishedRun]:
     return runs
 
 
-def same_data(runs: Sequence[FinishedRun]) -> bool:
-    """Whether all runs map the very same data, so that their evidences may be compared."""
-    first = runs[0].diagnostics["data"].values
-    return all(
-        run.diagnostics["data"].shape == first.shape
-        and np.array_equal(run.diagnostics["data"].values, first, equal_nan=True)
-        for run in runs[1:]
+def evidence_caveat(runs: Sequence[FinishedRun]) -> str | None:
+    """Say why the evidences of runs must not be compared: their data differ.
+
+    Returns
+    -------
+    str or None
+        None if all runs map the very same data.
+    """
+    first, reasons = runs[0], []
+    for run in runs[1:]:
+        reason = _difference(first, run)
+        if reason is not None:
+            reasons.append(f"{run.name} {reason}")
+    if not reasons:
+        return None
+    return (
+        f"Do not compare the evidences: they are of different data. Against {first.name}, "
+        f"{'; '.join(reasons)}."
     )
 
 
+def _difference(first: FinishedRun, run: FinishedRun) -> str | None:
+    """How the data of a run differ from those of the first, in words; None if they do not."""
+    here, there = (one.diagnostics["data"].values for one in (first, run))
+    frequencies = [one.summary["frequency_mhz"] for one in (first, run)]
+    if frequencies[0] != frequencies[1]:
+        return f"is at {frequencies[1]:g} MHz instead of {frequencies[0]:g}"
+    if here.shape != there.shape:
+        sizes = [f"{a.shape[0]} products at {a.shape[1]} times" for a in (here, there)]
+        return f"has {sizes[1]} instead of {sizes[0]}"
+    if (np.isnan(here) != np.isnan(there)).any():
+        counts = [int(np.isfinite(a).sum()) for a in (here, there)]
+        return f"uses {counts[1]} samples instead of {counts[0]}, or others"
+    known = np.isfinite(here)
+    if np.array_equal(here[known], there[known]):
+        return None
+    scale = float(np.vdot(here[known], there[known]) / np.vdot(here[known], here[known]))
+    if np.allclose(there[known], scale * here[known], rtol=1e-6, atol=0.0):
+        return f"has the same data in another unit (times {scale:.6g})"
+    if not np.array_equal(first.diagnostics["hours"].values, run.diagnostics["hours"].values):
+        return "was observed at other times"
+    return "has other values at the same times (another file, noise, sky or seed)"
+
+
 def comparison_rows(runs: Sequence[FinishedRun]) -> list[dict[str, object]]:
-    """One row for each run: the figures that say which map is better."""
+    """One row for each run: the figures that say which map is better.
+
+    The difference of ln evidence is None where data differ.
+    """
     keys = (
         "frequency_mhz",
         "n_data",
@@ -93,11 +137,13 @@ def comparison_rows(runs: Sequence[FinishedRun]) -> list[dict[str, object]]:
         "chi2_expected",
     )
     best = max(run.summary["log_evidence"] for run in runs)
+    comparable = evidence_caveat(runs) is None
     return [
         {
             "run": run.name,
+            "level": run.diagnostics.attrs["level"],
             **{key: run.summary[key] for key in keys},
-            "log_evidence_less_best": run.summary["log_evidence"] - best,
+            "log_evidence_less_best": run.summary["log_evidence"] - best if comparable else None,
             "p": float(run.diagnostics.attrs["p"]),
             "mean_std_k": float(run.std.mean()),
         }

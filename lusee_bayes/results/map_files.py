@@ -49,7 +49,12 @@ def cards(name: str, scenario: Scenario) -> dict[str, object]:
 
 def scenario_hash(scenario: Scenario) -> str:
     """SHA-256 of the resolved scenario, as ``scenario.yaml`` holds it."""
-    return hashlib.sha256(scenario.to_yaml().encode()).hexdigest()
+    return text_hash(scenario.to_yaml())
+
+
+def text_hash(text: str) -> str:
+    """SHA-256 of a resolved scenario in YAML."""
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def write_map(

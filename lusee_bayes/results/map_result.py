@@ -18,9 +18,11 @@ from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference, infer
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.terms import beam_rms_difference
+from lusee_bayes.linear.fit import THRESHOLDS
 from lusee_bayes.linear.metrics import effective_resolution_deg
 from lusee_bayes.linear.updating import composed, deviation_model
 from lusee_bayes.results.channel import ChannelResult, channel_of_posterior
+from lusee_bayes.results.coverage import coverage_rows
 from lusee_bayes.results.diagnostics import diagnostics
 from lusee_bayes.results.fluxes import flux_lines, flux_table
 from lusee_bayes.results.updatable import Updatable, read_updatable
@@ -85,6 +87,10 @@ class MapResult(Described):
             "information_bits": channel.information_bits,
             "chi2": channel.chi2,
             "chi2_expected": channel.chi2_expected,
+            "level": self.diagnostics.attrs["level"],
+            "verdict": self.verdict(),
+            "p": self.diagnostics.attrs["p"],
+            "coverage": coverage_rows(channel.maps(), self.scenario.lmax),
             "n_data": channel.n_data,
             "n_missing": channel.n_missing,
             "n_modes": len(channel.mean),
@@ -99,7 +105,7 @@ class MapResult(Described):
         }
 
     def verdict(self) -> str:
-        """What the residuals say, in a sentence."""
+        """What the residuals say, in sentences."""
         return str(self.diagnostics.attrs["verdict"])
 
     def headline(self) -> str:
@@ -120,9 +126,9 @@ class MapResult(Described):
         return ", ".join(parts)
 
     def lines(self) -> list[str]:
-        """What a terminal shows: headline, fluxes, verdict."""
+        """What a terminal shows: headline, fluxes, verdict with its thresholds."""
         fluxes = [] if self.fluxes is None else flux_lines(self.fluxes)
-        return [self.headline(), *fluxes, self.verdict(), *self.channel.doubts]
+        return [self.headline(), *fluxes, self.verdict(), THRESHOLDS, *self.channel.doubts]
 
 
 def map_result(

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
+from lusee_bayes.linear.fit import LEVELS
 
 MODES = Variable(("mode",))
 WIDTHS = Variable(("mode",), low=0.0)
 NUMBER, COUNT, TEXT = Attribute(), Attribute("integer", low=0.0), Attribute("text")
+KINDS = ("product", "day", "angle")
+LEVEL = Attribute("text", choices=LEVELS)
 HINT = "give the folder of a finished run"
 
 POSTERIOR = Layout(
@@ -51,22 +54,25 @@ DIAGNOSTICS = Layout(
         "region_mean": Variable(("region",)),
         "region_std": Variable(("region",), low=0.0),
         "region_prior_fraction": Variable(("region",)),
-        "psf": Variable(("region", "kernel_pixel")),
-        "psf_peak": Variable(("region",)),
+        "resolution": Variable(("mode", "mode_2"), "integer", low=-127.0, high=127.0),
+        "resolution_step": Variable(("ell", "ell_2"), low=0.0),
+        "prior_std": WIDTHS,
         "product": Variable(("product",), "text"),
         "hours": Variable(("time",)),
         "data": Variable(("product", "time"), finite=False),
         "predicted": Variable(("product", "time"), finite=False),
         "z": Variable(("product", "time"), finite=False),
-        "group_kind": Variable(("group",), "text", choices=("product", "day", "angle")),
-        "group_name": Variable(("group",), "text"),
-        "group_n": Variable(("group",), "integer", low=0.0),
-        "group_chi2": Variable(("group",)),
-        "group_p": Variable(("group",), low=0.0, high=1.0),
-        "group_others_p": Variable(("group",), low=0.0, high=1.0, finite=False),
+        # none where groups were not judged
+        "group_kind": Variable(("group",), "text", choices=KINDS, optional=True),
+        "group_name": Variable(("group",), "text", optional=True),
+        "group_n": Variable(("group",), "integer", low=0.0, optional=True),
+        "group_chi2": Variable(("group",), optional=True),
+        "group_p": Variable(("group",), low=0.0, high=1.0, optional=True),
+        "group_others_p": Variable(("group",), low=0.0, high=1.0, finite=False, optional=True),
     },
     {
         "frequency_mhz": Attribute(low=0.0),
+        "level": LEVEL,
         "verdict": TEXT,
         "p": Attribute(low=0.0, high=1.0),
         "chi2": NUMBER,
@@ -89,7 +95,13 @@ MAP_SUMMARY = Layout(
 )
 CUBE_SUMMARY = Layout(
     "the figures of a run of several frequencies",
-    attributes={"verdict": TEXT, "n_data": COUNT, "n_modes": COUNT, "peak_memory_gb": NUMBER},
+    attributes={
+        "level": LEVEL,
+        "verdict": TEXT,
+        "n_data": COUNT,
+        "n_modes": COUNT,
+        "peak_memory_gb": NUMBER,
+    },
 )
 CHANNEL_SUMMARY = Layout(
     "the figures of a channel",
@@ -97,6 +109,7 @@ CHANNEL_SUMMARY = Layout(
         "frequency_mhz": Attribute(low=0.0),
         "n_data": COUNT,
         "n_missing": COUNT,
+        "p": Attribute(low=0.0, high=1.0),
         "chi2": NUMBER,
         "chi2_expected": Attribute(optional=True),
         "ell_cross": Attribute("integer", optional=True),
@@ -105,6 +118,36 @@ CHANNEL_SUMMARY = Layout(
 JOINT_SUMMARY = Layout(
     "the figures of a joint posterior",
     attributes={"solver": TEXT, "iterations": COUNT, "refinement_sigma": NUMBER},
+)
+COVERAGE = Layout(
+    "the coverage of a band of latitude",
+    attributes={
+        "name": TEXT,
+        **dict.fromkeys(("sky", "within_1", "within_2", "error_1", "error_2", "rms"), NUMBER),
+    },
+)
+JOINT_TEST = Layout(
+    "a joint test of all channels",
+    attributes={
+        "test": TEXT,
+        "found": TEXT,
+        "p": Attribute(low=0.0, high=1.0),
+        "among": COUNT,
+        "level": LEVEL,
+    },
+)
+PULLS = Layout(
+    "pulls in a direction",
+    attributes={"direction": TEXT, "rms": NUMBER, "worst": NUMBER, "worst_mhz": NUMBER},
+)
+PROVENANCE = Layout(
+    "the provenance of a run's results",
+    attributes={
+        **dict.fromkeys(("file", "first", "last", "command", "version", "made"), TEXT),
+        "known_sky": Attribute("boolean"),
+        **dict.fromkeys(("seed", "n_times", "lmax"), Attribute("integer")),
+        **dict.fromkeys(("step_s", "lon_deg", "lat_deg"), NUMBER),
+    },
 )
 VALIDATION = Layout("the checks of a validation", attributes={"passed": Attribute("boolean")})
 CHECK = Layout(

@@ -17,6 +17,7 @@ from lusee_bayes.core.files import MANIFEST, recover, transaction
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.report.figures.drawing import save
 from lusee_bayes.report.pages import PAGES, REPORT
+from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.runs.origins import Origin, require_own
 
 FIGURES = "figures"
@@ -155,7 +156,12 @@ def _state(folder: Path, before: int | None, unfinished: str, resume: str) -> st
 
 
 def write_run(
-    folder: Path, result: Any, kind: RunKind, origin: Origin, stages: Stages
+    folder: Path,
+    result: Any,
+    kind: RunKind,
+    origin: Origin,
+    stages: Stages,
+    provenance: Provenance | None = None,
 ) -> list[Path]:
     """Draw all figures and write all files of a run, in one transaction.
 
@@ -169,6 +175,8 @@ def write_run(
         What the results are made of (:func:`.origin_of`).
     stages : Stages
         Told what is being done.
+    provenance : Provenance, optional
+        Where the data come from, for the head of the page.
 
     Returns
     -------
@@ -186,6 +194,8 @@ def write_run(
             for output in kind.outputs:
                 if output.wanted(result):
                     output.write(result, stage)
+            if provenance is not None:
+                provenance.write(stage)
             if kind.name in PAGES:
                 page = PAGES[kind.name](stage, folder.resolve().name)
                 (stage / REPORT).write_text(page)

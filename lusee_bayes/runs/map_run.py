@@ -25,6 +25,7 @@ from lusee_bayes.results.diagnostics_file import write_diagnostics
 from lusee_bayes.results.map_files import cards, write_cube, write_map
 from lusee_bayes.results.map_result import MapResult, map_result
 from lusee_bayes.results.posterior_file import about, write_posterior
+from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.runs.folder import (
     Output,
     RunKind,
@@ -114,8 +115,10 @@ def run_map(
     with run_folder(folder, CUBE, origin, resume, replace=replace, alone=group.is_first) as place:
         stages.say(cost.line())
         cube = cube_result(scenario, place, data=data, truth=truth, group=group, stages=stages)
-        files = write_run(place, cube, CUBE, origin, stages) if group.is_first else []
-        return MapRun(cube, place, files)
+        if not group.is_first:
+            return MapRun(cube, place, [])
+        provenance = _provenance_of_channels(scenario, data, cube)
+        return MapRun(cube, place, write_run(place, cube, CUBE, origin, stages, provenance))
 
 
 def _run_single(
@@ -135,7 +138,18 @@ def _run_single(
         if truth:
             experiment = with_truth(experiment)
         result = map_result(experiment, onto=onto, stages=stages)
-        return MapRun(result, place, write_run(place, result, MAP, origin, stages))
+        provenance = Provenance.of_experiment(experiment, data)
+        return MapRun(result, place, write_run(place, result, MAP, origin, stages, provenance))
+
+
+def _provenance_of_channels(scenario: Scenario, file: Path | None, cube: CubeResult) -> Provenance:
+    """Of the data of the first channel; all have the same times."""
+    if file is None:
+        observation = scenario.observation.observation()
+    else:
+        observation = read_data(file, scenario.channels()[0]).observation
+    known = cube.stacked("truth") is not None
+    return Provenance.of(scenario, observation, file, known_sky=known)
 
 
 def _write_maps(result: MapResult, folder: Path) -> None:

@@ -17,6 +17,7 @@ from lusee_bayes.report.figures import chains as chain_figures
 from lusee_bayes.report.figures import samples as sample_figures
 from lusee_bayes.results.cost import require_resources
 from lusee_bayes.results.map_files import write_cube, write_map
+from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult, sample_result
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
 from lusee_bayes.runs.origins import origin_of
@@ -134,7 +135,9 @@ def _run_single(
         require_resources(scenario, measured, stages, sampler.chains * sampler.draws)
         experiment = build(scenario, measured, stages)
         result = sample_result(experiment, program, sampler, place, resume=resume, stages=stages)
-        return SampleRun((result,), place, write_run(place, result, SAMPLE, origin, stages))
+        provenance = Provenance.of_experiment(experiment, data)
+        files = write_run(place, result, SAMPLE, origin, stages, provenance)
+        return SampleRun((result,), place, files)
 
 
 def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Path) -> None:

@@ -12,15 +12,17 @@ from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.report.figures import samples as sample_figures
 from lusee_bayes.results.cost import require_resources
+from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.results.sample_result import CHAINS, sample_result
 from lusee_bayes.results.validation_result import ValidationResult
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
 from lusee_bayes.runs.origins import origin_of
 from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS
-from lusee_bayes.sampling.calibration import calibrate_sky, require_simulations
+from lusee_bayes.sampling.calibration import calibrate_sky
 from lusee_bayes.sampling.hmc import Sampler
+from lusee_bayes.sampling.least import require_draws, require_simulations
 from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.validation import require_draws, validate_draws
+from lusee_bayes.sampling.validation import validate_draws
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,9 @@ def run_validate(
                 model, model, n_simulations=simulations, seed=scenario.seed, report=update
             )
         result = ValidationResult(name, sampled, found, ranks)
-        return ValidationRun(result, place, write_run(place, result, VALIDATION, origin, stages))
+        provenance = Provenance.of_experiment(experiment, data)
+        files = write_run(place, result, VALIDATION, origin, stages, provenance)
+        return ValidationRun(result, place, files)
 
 
 def _of_sampled(output: Output) -> Output:

@@ -20,14 +20,13 @@ from jaxtyping import Float, Int, Key, PRNGKeyArray
 from scipy import stats
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.solver import Solver
+from lusee_bayes.sampling.least import N_BINS, require_simulations
 
 # ranks among 99 draws take 100 values, so that the levels below are met exactly
 N_DRAWS = 99
 LEVELS = (0.50, 0.68, 0.90, 0.95)
-N_BINS = 20
 
 # chance that a true posterior fails the verdict over all quantities
 FALSE_ALARM = 1e-3
@@ -106,12 +105,6 @@ class Ranks:
     def passed(self) -> bool:
         """Whether no quantity's ranks are too uneven."""
         return bool(self.p_values().min() > self.threshold)
-
-
-def require_simulations(n: int) -> None:
-    """Raise InputError for too few data sets: each bin of the histogram should expect five."""
-    if n < 5 * N_BINS:
-        raise InputError(f"calibration needs at least {5 * N_BINS} simulations, got {n}")
 
 
 def calibrate(

@@ -26,6 +26,7 @@ from scipy import stats
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.sampling.least import require_draws
 
 # chance that a true posterior fails one of the three comparisons
 FALSE_ALARM = 1e-3
@@ -102,12 +103,6 @@ class Comparison:
     def passed(self) -> bool:
         """Whether every check passed."""
         return all(check.passed for check in self.checks)
-
-
-def require_draws(n: int) -> None:
-    """Raise InputError for fewer draws of a chain than a comparison needs."""
-    if n < 100:
-        raise InputError(f"a comparison needs 100 draws of each chain, got {n}")
 
 
 def validate_draws(

@@ -112,12 +112,12 @@ class SkyAlms(SkyFile):
 
     def summary(self) -> tuple[str, ...]:
         known, means = self.frequencies_mhz, self.modes[:, 0] / np.sqrt(4.0 * np.pi)
-        frequencies = "frequency not said"
-        if known is not None:
-            frequencies = f"{', '.join(f'{f:g}' for f in known)} MHz"
+        skies = "one sky" if len(means) == 1 else f"{len(means)} skies"
+        frequencies = "" if known is None else f", {', '.join(f'{f:g}' for f in known)} MHz"
+        levels = f"{means[0]:.6g}" if len(means) == 1 else f"{means[0]:.6g} to {means[-1]:.6g}"
         return (
-            f"coefficients of {len(means)} skies up to ell = {self.lmax}, {frequencies}",
-            f"means {means[0]:.6g} to {means[-1]:.6g} K",
+            f"coefficients of {skies} up to ell = {self.lmax}{frequencies}",
+            f"mean temperature {levels} K",
         )
 
 

@@ -45,7 +45,7 @@ def test_map_writes_what_it_promises(folder):
     assert {p.name for p in folder.iterdir()} == {
         "posterior.nc", "mean.fits", "mean_alm.fits", "std.fits", "truth.fits", "residual.fits",
         "spectra.csv", "summary.json", "scenario.yaml", "diagnostics.nc", "report.html", "figures",
-        "manifest.json",
+        "manifest.json", "provenance.json",
     }  # fmt: skip
     for figure in ("maps", "data_vector", "beams", "fidelity", "spectra", "draws", "residuals"):
         image = matplotlib.image.imread(folder / "figures" / f"{figure}.png")
@@ -153,9 +153,9 @@ def test_info_recognises_its_files(folder, tmp_path, capsys):
         (tmp_path / "data.nc", "visibilities at 25 MHz"),
         (folder / "posterior.nc", "posterior over 81 modes"),
         (folder / "mean.fits", "HEALPix sky map, NSIDE 8"),
-        (folder / "mean.fits", "mean at 25 MHz up to ell = 8, beam monopole, site 182.258"),
+        (folder / "mean.fits", "mean of the posterior at 25 MHz up to ell = 8"),
         (folder / "diagnostics.nc", "residuals by 16 products, 6 days, 2 angles"),
-        (folder / "mean_alm.fits", "coefficients of 1 skies up to ell = 8"),
+        (folder / "mean_alm.fits", "coefficients of one sky up to ell = 8"),
     ]:
         assert run("info", path) == 0
         assert words in capsys.readouterr().out

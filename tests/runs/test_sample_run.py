@@ -390,6 +390,7 @@ def test_sample_writes_what_it_promises(runs):
     assert {p.name for p in whole.iterdir()} == {
         "samples.nc", "summary.csv", "mean.fits", "std.fits", "lower.fits", "upper.fits",
         "scenario.yaml", "sampling.json", "report.html", "figures", "manifest.json",
+        "provenance.json",
     }  # fmt: skip
     assert {p.stem for p in (whole / "figures").iterdir()} == {
         "uncertainty", "traces", "ranks", "energy", "pairs", "against_analytic",

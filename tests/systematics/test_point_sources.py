@@ -32,6 +32,7 @@ from lusee_bayes.experiment.setup import Setup, source_responses
 from lusee_bayes.experiment.simulate import simulate, true_values
 from lusee_bayes.experiment.terms import point_sources
 from lusee_bayes.instrument.source_response import altitude_deg
+from lusee_bayes.linear.fit import THRESHOLDS
 from lusee_bayes.linear.templates import template_amplitudes
 from lusee_bayes.results.fluxes import flux_lines, flux_table
 from lusee_bayes.results.map_result import map_result
@@ -248,7 +249,11 @@ def test_a_source_below_the_horizon_is_known_from_its_prior_only():
 
 def test_ignored_sources_have_no_fluxes():
     result = map_result(experiment("ignored"))
-    assert result.fluxes is None and result.lines() == [result.headline(), result.verdict()]
+    assert result.fluxes is None and result.lines() == [
+        result.headline(),
+        result.verdict(),
+        THRESHOLDS,
+    ]
 
 
 # --- sampled --------------------------------------------------------------------------------------

@@ -49,13 +49,15 @@ KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
 
 
 def describe(path: str | Path) -> str:
-    """A few lines on a file: visibilities, a posterior, samples, beams, or a sky.
+    """A few lines on a file (visibilities, a posterior, samples, beams, a sky), or a run's folder.
 
     Raises
     ------
     InputError
-        If the file is missing, or of none of these kinds.
+        If the file is missing, or of none of these kinds; for a folder that no run has written.
     """
+    if Path(path).is_dir():
+        return str(resolve_name(f"{__name__}.folders:describe_folder")(Path(path)))
     path = require_file(path, "file")
     kind = OWN_FORMATS.get(formats.format_of(path) or "")
     if kind is None:

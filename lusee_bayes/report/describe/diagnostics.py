@@ -17,6 +17,6 @@ def describe_diagnostics(path: Path) -> str:
             f"{path}: diagnostics of a map at {found.attrs['frequency_mhz']:g} MHz",
             f"  {found.attrs['verdict']}",
             f"  residuals by {', '.join(counts)}; {found.sizes['draw']} draws, "
-            f"{found.sizes['region']} point-spread functions",
+            f"resolution of {found.sizes['mode']} modes",
         ]
     )

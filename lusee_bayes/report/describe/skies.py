@@ -18,11 +18,13 @@ def describe_sky(path: Path) -> str:
 def _describe_cards(path: Path) -> list[str]:
     """What a FITS file of the package says of itself."""
     with opened(path) as hdus:
-        header = hdus[1].header if len(hdus) > 1 else {}
-        if "SCENHASH" not in header:
+        headers = [hdu.header for hdu in hdus if "SCENHASH" in hdu.header]
+        if not headers:
             return []
+        (header, *_) = headers
+        at = f" at {header['FREQ']:g} MHz" if "FREQ" in header else ""
         return [
-            f"  {header['CONTENT']} at {header['FREQ']:g} MHz up to ell = {header['LMAX']}, beam "
+            f"  {header['CONTENT']} of the posterior{at} up to ell = {header['LMAX']}, beam "
             f"{header['BEAM']}, site {header['SITELON']:g}, {header['SITELAT']:g} degrees",
             f"  {header['CREATOR']}, scenario {header['SCENHASH'][:12]}",
         ]

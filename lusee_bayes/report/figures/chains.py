@@ -12,7 +12,7 @@ from jaxtyping import Float
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 
-from lusee_bayes.report.figures.drawing import BLUE, GREY, note
+from lusee_bayes.report.figures.drawing import BLUE, GREY, note, plain_ticks
 from lusee_bayes.systematics.base import SKY
 
 # quantities in the figures, the first of a run's list
@@ -70,7 +70,13 @@ def pairs(quantities: Quantities) -> Figure:
         backend="matplotlib",
         figure_kwargs={**SIZE, "figsize": (side, side)},
     )
-    return _figure(collection, "Pairs of quantities")
+    figure = _figure(collection, "Pairs of quantities")
+    for axes in figure.axes:
+        plain_ticks(axes, 3)
+        axes.tick_params(labelsize=8)
+        for label in (axes.xaxis.label, axes.yaxis.label):
+            label.set(text=label.get_text().replace(" [", "\n["), size=9)
+    return figure
 
 
 def against_analytic(tree: xr.DataTree) -> Figure:

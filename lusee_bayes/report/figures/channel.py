@@ -19,6 +19,7 @@ from lusee_bayes.report.figures.drawing import (
     SEQUENTIAL,
     colour_bar,
     orthographic,
+    seen_range,
     without_minor_ticks,
 )
 from lusee_bayes.report.figures.mollweide import mollweide
@@ -80,13 +81,12 @@ def maps(channel: ChannelResult) -> Figure:
         extra = {"mean - truth": (percent, Normalize(-span, span), DIVERGING, "% of the mean sky")}
     positive = np.percentile(sky[sky > 0], [0.05, 99.8])
     temperature = (LogNorm(*positive), SEQUENTIAL, "K")
-    spread = 100.0 * channel.pixel_std / level
-    bounds = Normalize(*np.percentile(spread, [0.5, 99.5]))
+    bounds = LogNorm(*seen_range(channel.pixel_std, channel.highest_altitude))
     panels = {
         **({"truth": (sky, *temperature)} if extra else {}),
         "posterior mean": (mean, *temperature),
         **extra,
-        "posterior standard deviation": (spread, bounds, SEQUENTIAL, "% of the mean sky"),
+        "posterior standard deviation": (channel.pixel_std, bounds, SEQUENTIAL, "K"),
     }
     rows = (len(panels) + 1) // 2
     figure = Figure(figsize=(12, 3.6 * rows))

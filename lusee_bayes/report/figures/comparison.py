@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from lusee_bayes.report.figures.drawing import GREY, colour_bar
+from lusee_bayes.report.figures.drawing import GREY, colour_bar, seen_range
 from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.finished_runs import FinishedRun
 
@@ -21,7 +21,8 @@ def maps(runs: Sequence[FinishedRun]) -> Figure:
     """Posterior mean and standard deviation of every run, each kind on one scale."""
     means = np.concatenate([run.mean for run in runs])
     positive = LogNorm(*np.percentile(means[means > 0], [0.5, 99.8]))
-    spread = Normalize(*np.percentile(np.concatenate([run.std for run in runs]), [0.5, 99.5]))
+    bounds = [seen_range(run.std, run.diagnostics["highest_altitude"].values) for run in runs]
+    spread = LogNorm(min(low for low, _ in bounds), max(high for _, high in bounds))
     figure = Figure(figsize=(12, 3.4 * len(runs) + 0.4), layout="constrained")
     for row, run in enumerate(runs):
         altitude = run.diagnostics["highest_altitude"].values

@@ -7,7 +7,14 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from lusee_bayes.report.figures.drawing import BLUE, GREY, ORANGE, SEQUENTIAL, colour_bar
+from lusee_bayes.report.figures.drawing import (
+    BLUE,
+    GREY,
+    ORANGE,
+    SEQUENTIAL,
+    colour_bar,
+    seen_range,
+)
 from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.cube import CubeResult
 
@@ -23,16 +30,16 @@ def maps(cube: CubeResult) -> Figure:
     figure = Figure(figsize=(12, 3.4 * len(shown) + 0.4), layout="constrained")
     for row, k in enumerate(shown):
         positive = LogNorm(*np.percentile(mean[k][mean[k] > 0], [0.5, 99.8]))
-        percent = 100.0 * pixel_std[k] / mean[k].mean()
-        spread = Normalize(*np.percentile(percent, [0.5, 99.5]))
+        altitude = cube.channels[k].highest_altitude
+        spread = LogNorm(*seen_range(pixel_std[k], altitude))
         for column, (title, pixels, norm, unit) in enumerate(
             (
                 ("posterior mean", mean[k], positive, "K"),
-                ("standard deviation", percent, spread, "% of the mean sky"),
+                ("standard deviation", pixel_std[k], spread, "K"),
             )
         ):
             axes = figure.add_subplot(len(shown), 2, 2 * row + column + 1)
-            image = mollweide(axes, pixels, norm=norm)
+            image = mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
             colour_bar(figure, image, axes, label=unit, shrink=0.85, extend="both")
             axes.set_title(f"{cube.frequencies_mhz[k]:g} MHz: {title}")
     return figure
@@ -89,12 +96,11 @@ def fidelity(cube: CubeResult) -> Figure:
 
 
 def chi2(cube: CubeResult) -> Figure:
-    """chi^2 of every channel's data about the map, over its mean if the model holds."""
+    """chi^2 that judges every channel, over its mean if the model holds."""
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
-    expected = cube.stacked("chi2_expected")
-    ratio = cube.stacked("chi2") / expected
-    width = np.sqrt(2.0 * cube.stacked("n_data")) / expected
+    fits = cube.fits()
+    ratio, width = fits.chi2 / fits.degrees, np.sqrt(2.0 / fits.degrees)
     axes.fill_between(
         cube.frequencies_mhz, 1 - 2 * width, 1 + 2 * width, color=GREY, alpha=0.3, lw=0
     )

@@ -7,6 +7,7 @@ import xarray as xr
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
+from lusee_bayes.linear.fit import probability
 from lusee_bayes.report.figures.drawing import (
     BLUE,
     DIVERGING,
@@ -78,5 +79,6 @@ def residuals(found: xr.Dataset) -> Figure:
     right.set(xlabel=f"p-value (drawn down to {LEAST_P:g})", xlim=(LEAST_P / 3, 3))
     right.grid(axis="y", lw=0.3)
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, fontsize=8)
-    figure.suptitle(f"Residuals at {found.attrs['frequency_mhz']:g} MHz: {found.attrs['verdict']}")
+    level, p = found.attrs["level"], probability(found.attrs["p"])
+    figure.suptitle(f"Residuals at {found.attrs['frequency_mhz']:g} MHz: {level} (p {p})")
     return figure

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Complex
+from jaxtyping import Complex, Float
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -15,7 +15,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from matplotlib.patches import Circle
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from lusee_bayes.instrument.beams import HemisphereGrid
 
@@ -32,6 +32,40 @@ def save(figure: Figure, path: Path, dpi: int) -> None:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     imsave(path, canvas.buffer_rgba(), dpi=dpi, pil_kwargs={"compress_level": COMPRESSION})
+
+
+def seen_range(
+    std: Float[np.ndarray, "..."], altitude: Float[np.ndarray, " pixels"]
+) -> tuple[float, float]:
+    """Bounds of a logarithmic scale for standard deviations: of what was seen.
+
+    A cap that never rose has standard deviations that would hide the structure of the rest. What
+    lies about its rim, a few percent, has the brightest colour, too.
+
+    Parameters
+    ----------
+    std : (..., pixels) array
+    altitude : (pixels,) array
+        sin of the highest altitude of each pixel.
+    """
+    seen = std[..., altitude >= 0] if (altitude >= 0).any() else std
+    low, high = np.percentile(seen, [0.5, 97.0])
+    return float(low), float(max(high, 1.01 * low))
+
+
+def plain_ticks(axes: Axes, n: int = 4) -> None:
+    """At most ``n`` ticks on each axis, each with its whole number: no power beside the axis."""
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(n))
+        axis.set_major_formatter(lambda value, _: number_of_tick(value))
+
+
+def number_of_tick(value: float) -> str:
+    """A number as short as its size allows: 12,500 and 1.5e10."""
+    if value == 0 or 1e-3 <= abs(value) < 1e6:
+        return f"{value:,.6g}"
+    mantissa, power = f"{value:.3e}".split("e")
+    return f"{float(mantissa):g}e{int(power)}"
 
 
 def without_minor_ticks(axis: Axis) -> None:
@@ -67,10 +101,12 @@ def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Complex[np.ndarray, 
 def colour_bar(
     figure: Figure, image: ScalarMappable, axes: Axes | list[Axes], **options: object
 ) -> Colorbar:
-    """A colour bar; on a logarithmic scale with plain numbers at 1, 2 and 5 times powers of ten."""
+    """A colour bar; on a logarithmic scale with plain numbers, more of them on a narrow one."""
     bar = figure.colorbar(image, ax=axes, **options)
     if isinstance(image.norm, LogNorm):
-        bar.set_ticks(LogLocator(subs=(1.0, 2.0, 5.0)), minor=False)
+        narrow = image.norm.vmax < 20.0 * image.norm.vmin
+        subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if narrow else (1.0, 2.0, 5.0)
+        bar.set_ticks(LogLocator(subs=subs), minor=False)
         bar.set_ticks([], minor=True)
         bar.long_axis.set_major_formatter(lambda value, _: f"{value:,.0f}")
     return bar

@@ -17,10 +17,12 @@ from lusee_bayes.report.figures.drawing import (
     SEQUENTIAL,
     colour_bar,
     note,
+    plain_ticks,
 )
 from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.sample_result import SampleResult
-from lusee_bayes.sampling.calibration import LEVELS, N_BINS, Ranks
+from lusee_bayes.sampling.calibration import LEVELS, Ranks
+from lusee_bayes.sampling.least import N_BINS
 from lusee_bayes.sampling.validation import Comparison
 
 # four chains that are distinct without colour vision (Okabe-Ito), again from the first after that
@@ -89,10 +91,12 @@ def traces(run: SampleResult) -> Figure:
             right.hist(
                 chain, bins, color=colour, histtype="step", density=True, label=f"chain {number}"
             )
-        left.set(ylabel=name, xlim=(0, draws.shape[1]))
+        plain_ticks(left)
+        plain_ticks(right)
+        left.set(ylabel=name.replace(" [", "\n["), xlim=(0, draws.shape[1]))
         left.yaxis.label.set_size(8)
-        right.set(yticks=[], xlabel=name)
-        right.xaxis.label.set_size(8)
+        right.set(yticks=[])
+        right.tick_params(labelsize=8)
     grid[0][1].legend(frameon=False, fontsize=7)
     grid[-1][0].set_xlabel("draw")
     figure.suptitle(f"Draws of {run.tree.attrs['program']}")

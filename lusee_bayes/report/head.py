@@ -1,0 +1,97 @@
+"""What every page begins and ends with: the verdict, where the data come from, files, citation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lusee_bayes.core.reading import read_text
+from lusee_bayes.core.version import __version__
+from lusee_bayes.linear.fit import THRESHOLDS
+from lusee_bayes.report import html
+from lusee_bayes.results.map_files import text_hash
+from lusee_bayes.results.provenance import Provenance
+
+# files of a run that are worth a link, with what is in them
+FILES = {
+    "mean.fits": "posterior mean, HEALPix, K",
+    "std.fits": "standard deviation, HEALPix, K",
+    "lower.fits": "lower end of the 90 % interval, HEALPix, K",
+    "upper.fits": "upper end of the 90 % interval, HEALPix, K",
+    "truth.fits": "the true sky, HEALPix, K",
+    "residual.fits": "mean less truth, HEALPix, K",
+    "mean_alm.fits": "harmonic coefficients of the mean, as healpy.write_alm",
+    "posterior.nc": "posterior over the modes; draws and covariance if asked for",
+    "posterior_compact.npz": "compact posterior, from which NumPy can draw",
+    "diagnostics.nc": "residuals, groups, point-spread functions",
+    "samples.nc": "draws of all chains, ArviZ DataTree",
+    "spectra.csv": "fidelity and power, a row for each multipole",
+    "sources.csv": "fluxes of point sources",
+    "summary.csv": "ArviZ's summary of the draws",
+    "validation.json": "the checks and their thresholds",
+    "summary.json": "the figures of this page",
+    "sampling.json": "the figures of this page",
+    "scenario.yaml": "the resolved scenario: running it again gives the same numbers",
+    "provenance.json": "where the data come from, command, version, date",
+}
+CLASSES = {"consistent": "verdict", "in tension": "verdict tense", "does not fit": "verdict bad"}
+
+
+def verdict(level: str, text: str) -> str:
+    """The verdict on a fit, with the thresholds of its three levels."""
+    return f"{html.paragraph(text, CLASSES[level])}\n{html.paragraph(THRESHOLDS, 'threshold')}"
+
+
+def about(folder: Path, channels: str) -> str:
+    """Where the results come from; ``channels``: the frequencies in words."""
+    found = Provenance.read(folder)
+    if found is None:
+        return html.paragraph(
+            f"{channels}. Data, command and date were not recorded: the folder is of an earlier "
+            "version."
+        )
+    site = f"longitude {found.lon_deg:g}°, latitude {found.lat_deg:g}° (selenographic)"
+    hours = found.step_s / 3600.0
+    return html.definitions(
+        [
+            ("data", found.data_line()),
+            ("site", site),
+            (
+                "dates",
+                f"{found.first} to {found.last} UTC, {found.n_times} times of {hours:g} h",
+            ),
+            ("sky", f"{channels}, multipoles up to ell = {found.lmax}"),
+            ("command", found.command or "a call of the library"),
+            ("made", f"{found.made} UTC by lusee_bayes {found.version}"),
+        ]
+    )
+
+
+def downloads(folder: Path) -> str:
+    """Links to the files that lie beside the page."""
+    there = [(name, text) for name, text in FILES.items() if (folder / name).is_file()]
+    rows = [
+        (html.link(name), text, f"{(folder / name).stat().st_size / 1e6:.2g} MB")
+        for name, text in there
+    ]
+    note = "The links lead to the files beside this page; move them together."
+    return f"{html.paragraph(note)}\n{html.table(('file', 'content', 'size'), rows)}"
+
+
+def citation(folder: Path) -> str:
+    """How to cite a result of this page."""
+    found = Provenance.read(folder)
+    version = __version__ if found is None else found.version
+    made = "" if found is None else f", made {found.made[:10]}"
+    scenario = text_hash(read_text(folder / "scenario.yaml", "a scenario"))[:12]
+    return "\n".join(
+        [
+            html.paragraph(
+                "Cite the software with its version and the hash of the scenario, which names "
+                "every setting; the method is that of the reference paper (arXiv:2508.16773)."
+            ),
+            html.preformatted(
+                f"lusee_bayes, version {version}: Bayesian maps of the low-frequency sky from "
+                f"LuSEE-Night.\nScenario {scenario}{made}."
+            ),
+        ]
+    )

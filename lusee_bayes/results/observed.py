@@ -1,0 +1,50 @@
+"""What is known of a channel besides its posterior."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.harmonics import power_spectrum
+from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.linear.metrics import highest_altitude
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What is known of a channel besides its posterior: for :func:`channel_of_information`.
+
+    Attributes
+    ----------
+    frequency_mhz : float
+    spectrum : (ells,) array
+        C_ell of the channel's own prior, in K^2.
+    truth : (modes,) array or None
+    highest_altitude : (pixels,) array
+    n_missing, rounds : int
+    doubts : tuple of str
+    """
+
+    frequency_mhz: float
+    spectrum: Float[np.ndarray, " ells"]
+    truth: Float[np.ndarray, " modes"] | None
+    highest_altitude: Float[np.ndarray, " pixels"]
+    n_missing: int
+    rounds: int
+    doubts: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, experiment: Experiment, rounds: int) -> Observed:
+        """Of an experiment."""
+        data, nside = experiment.data, experiment.scenario.map_nside
+        return cls(
+            experiment.scenario.frequency_mhz,
+            power_spectrum(np.sqrt(np.asarray(experiment.setup.prior.variance()))),
+            None if data.truth is None else np.asarray(data.truth),
+            highest_altitude(data.observation, nside),
+            data.n_missing,
+            rounds,
+            experiment.doubts,
+        )
