@@ -95,6 +95,7 @@ def cube_page(folder: Path, name: str) -> str:
         [
             html.contents(SECTIONS),
             head.verdict(summary["level"], summary["verdict"]),
+            head.doubts(folder / "summary.json", summary),
             head.about(folder, channel_words),
             *(html.section(*anchors[name], *inside) for name, inside in parts.items()),
             html.section(*SECTIONS[-2], head.downloads(folder), head.citation(folder)),

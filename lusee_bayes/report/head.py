@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import read_text
 from lusee_bayes.core.version import __version__
 from lusee_bayes.linear.fit import THRESHOLDS
@@ -39,6 +42,20 @@ CLASSES = {"consistent": "verdict", "in tension": "verdict tense", "does not fit
 def verdict(level: str, text: str) -> str:
     """The verdict on a fit, with the thresholds of its three levels."""
     return f"{html.paragraph(text, CLASSES[level])}\n{html.paragraph(THRESHOLDS, 'threshold')}"
+
+
+def doubts(path: Path, found: Mapping[str, Any]) -> str:
+    """What is doubtful about the data, as a run's figures tell it; nothing if they do not.
+
+    Raises
+    ------
+    InputError
+        If it is no list of sentences.
+    """
+    told = found.get("doubts", [])
+    if not isinstance(told, list) or not all(isinstance(text, str) for text in told):
+        raise InputError(f"{path}: doubts is no list of texts; make the results anew")
+    return "\n".join(html.paragraph(f"Doubtful: {text}", CLASSES["in tension"]) for text in told)
 
 
 def about(folder: Path, channels: str) -> str:

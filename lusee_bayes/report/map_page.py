@@ -54,6 +54,7 @@ def map_page(folder: Path, name: str) -> str:
         [
             html.contents(SECTIONS),
             head.verdict(found.attrs["level"], found.attrs["verdict"]),
+            head.doubts(folder / "summary.json", summary),
             head.about(folder, f"{summary['frequency_mhz']:g} MHz"),
             html.section(*SECTIONS[0], *_map(folder, summary, found)),
             html.section(*SECTIONS[1], *_scales(folder, run)),

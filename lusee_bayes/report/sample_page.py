@@ -110,6 +110,7 @@ def sample_page(folder: Path, name: str) -> str:
             html.contents(sections),
             html.paragraph(" ".join([verdict, *reasons]), head.CLASSES[kind]),
             html.paragraph(CRITERIA, "threshold"),
+            head.doubts(folder / "sampling.json", sampling),
             head.about(folder, f"draws of the program {sampling['program']}"),
             *parts,
             html.section("pictures", "Pictures", *present),

@@ -123,8 +123,11 @@ class CubeResult(Described):
 
     def lines(self) -> list[str]:
         """What a terminal shows."""
-        doubts = [f"{c.frequency_mhz:g} MHz: {d}" for c in self.channels for d in c.doubts]
-        return [self.headline(), self.verdict(), THRESHOLDS, *doubts]
+        return [self.headline(), self.verdict(), THRESHOLDS, *self.doubts()]
+
+    def doubts(self) -> list[str]:
+        """What is doubtful about the data, with the channel."""
+        return [f"{c.frequency_mhz:g} MHz: {d}" for c in self.channels for d in c.doubts]
 
     @property
     def log_evidence(self) -> float | None:
@@ -182,7 +185,6 @@ class CubeResult(Described):
                 "information_bits": channel.information_bits,
             }
             known = {name: value for name, value in numbers.items() if not np.isnan(value)}
-            known |= {"doubts": list(channel.doubts)} if channel.doubts else {}
             if channel.truth is not None:
                 known["coverage"] = coverage_rows(channel.maps(), self.scenario.lmax)
             channels.append(
@@ -196,6 +198,7 @@ class CubeResult(Described):
             "n_modes": len(self.channels[0].mean),
             "level": self.fit.level,
             "verdict": self.fit.text,
+            "doubts": self.doubts(),
             "tests": [
                 {"test": t.name, "found": t.found, "p": t.p, "among": t.n, "level": t.level}
                 for t in self.fits().tests()
