@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -39,6 +39,20 @@ def image_names(path: str | Path) -> list[str]:
     """
     with opened(path) as hdus:
         return [hdu.name.lower() for hdu in hdus]
+
+
+def has_words(path: str | Path, words: Iterable[str]) -> bool:
+    """Return whether a file is FITS and its primary header has all of these words.
+
+    Raises
+    ------
+    InputError
+        If it is FITS and cannot be read.
+    """
+    if not is_fits(path):
+        return False
+    with opened(path) as hdus:
+        return all(word in hdus[0].header for word in words)
 
 
 def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:

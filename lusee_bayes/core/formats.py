@@ -17,6 +17,9 @@ BEAMS = "lusee_bayes beams 1"
 DIAGNOSTICS = "lusee_bayes diagnostics 1"
 PAPER_CASE = "lusee_bayes paper case 1"
 
+# words of the primary header that tell pyuvdata's beams from other FITS files
+UVBEAM_WORDS = ("NORMSTD", "FEEDLIST")
+
 
 def format_of(path: str | Path) -> str | None:
     """The attribute ``format`` of an HDF5 or netCDF file; None for files of other kinds.

@@ -38,7 +38,9 @@ def one_sentence(error: ValidationError, source: str, model: type[BaseModel]) ->
     expected = expected[0].lower() + expected[1:]
     if first["type"] == "value_error" and isinstance(first["input"], (dict, BaseModel)):
         return f"{source}: {where}: {expected}{more}" if where else f"{source}: {expected}{more}"
-    return f"{source}: {where} is {first['input']!r}, but {expected}{more}"
+    # YAML has lists where sections have tuples
+    got = list(first["input"]) if isinstance(first["input"], tuple) else first["input"]
+    return f"{source}: {where} is {got!r}, but {expected}{more}"
 
 
 def _resolved(

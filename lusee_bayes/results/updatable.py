@@ -37,7 +37,8 @@ def read_updatable(folder: str | Path, scenario: Scenario) -> Updatable:
     path = Path(folder) / "posterior.nc"
     saved = read_netcdf(path, formats.POSTERIOR, UPDATABLE, HINT)
     here, said = saved.arrays, saved.values
-    if "precision_root" not in here:
+    needed = {"precision_root", "white_mean", "log_evidence", "data_digests"}
+    if not needed <= {*here, *said}:
         raise InputError(
             f"{path} does not hold what an update needs; make that map again with --updatable"
         )

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable
 
 from lusee_bayes.core.errors import InputError
 
 TRIED: Counter[str] = Counter()
+# how many times as many inputs the long run tries
+SCALE = int(os.environ.get("LUSEE_BAYES_FUZZ", "1"))
 
 
 def require_answer(what: str, call: Callable[[], object]) -> None:

@@ -9,13 +9,13 @@ from collections import Counter
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from outcomes import TRIED
+from outcomes import SCALE, TRIED
 
 from lusee_bayes.cli import info_command, report_command
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.errors import InputError
 
-FEW, MANY = 120, 10_000
+FEW, MANY = 120, 3_000 * SCALE
 SMALL = ("--set", "lmax=2", "--set", "observation.runs.0.cycles=0.02", "-q")
 
 

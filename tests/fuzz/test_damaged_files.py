@@ -13,7 +13,7 @@ from astropy.io import fits
 from changes import byte_changes, change_bytes, change_items, item_changes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from outcomes import require_answer
+from outcomes import SCALE, require_answer
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.data_files import read_data
@@ -24,10 +24,11 @@ from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.linear.compact import read_compact
 from lusee_bayes.report.describe import describe
+from lusee_bayes.results.updatable import read_updatable
 from lusee_bayes.sky import write_alms
 from lusee_bayes.testing import small_scenario
 
-FEW, MANY = 12, 1500
+FEW, MANY = 10, 150 * SCALE
 
 
 def read_sky(path: Path) -> object:

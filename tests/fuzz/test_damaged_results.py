@@ -9,7 +9,7 @@ import pytest
 from changes import CHANGE, byte_changes, change_bytes, change_items, item_changes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from outcomes import require_answer
+from outcomes import SCALE, require_answer
 
 import lusee_bayes as lb
 from lusee_bayes.report.pages import write_report
@@ -17,7 +17,7 @@ from lusee_bayes.results.finished_runs import read_runs
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.testing import small_scenario
 
-FEW, MANY = 20, 2_000
+FEW, MANY = 5, 60 * SCALE
 
 
 @pytest.fixture(scope="session")
@@ -73,7 +73,8 @@ def test_damaged_results(kind, n, tmp_path, request):
 
     for name in names:
         check(name, None, None)
-        check(name, ("cut", 0.0, 1, b""), change_bytes)
-        check(name, ("insert", 0.0, 1, b"\0\xff\xfe"), change_bytes)
+        if n > FEW:
+            check(name, ("cut", 0.0, 1, b""), change_bytes)
+            check(name, ("insert", 0.0, 1, b"\0\xff\xfe"), change_bytes)
     damaged_bytes()
     damaged_items()

@@ -8,7 +8,7 @@ from typing import Any, get_args
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from outcomes import require_answer
+from outcomes import SCALE, require_answer
 from pydantic import BaseModel
 
 from lusee_bayes.cli.options import parse_frequencies
@@ -16,7 +16,7 @@ from lusee_bayes.cli.plan_variations import own_variations
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.results.cost import posterior_cost, require_fits
 
-FEW, MANY = 150, 20_000
+FEW, MANY = 100, 3_000 * SCALE
 
 NUMBERS = st.one_of(
     st.integers(), st.floats(), st.integers(-3, 60), st.floats(0.0, 50.0),

@@ -105,7 +105,7 @@ def test_coefficients_through_healpy_bit_by_bit(tmp_path, modes):
     alm = healpy.map2alm(modes_to_map(modes, 16), lmax=8, iter=10)
     healpy.write_alm(theirs, alm, out_dtype=np.float64)
     np.testing.assert_array_equal(sky_from_file(theirs, 25.0, 5).modes, from_healpy(alm)[:36])
-    assert "up to ell = 8, frequency not said" in describe(theirs)
+    assert "coefficients of one sky up to ell = 8" in describe(theirs)
 
 
 def test_luseepys_coefficients_of_many_frequencies(test_data):

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.fits_files import is_fits, opened
+from lusee_bayes.core.fits_files import has_words
+from lusee_bayes.core.formats import UVBEAM_WORDS
 from lusee_bayes.core.lazy import pyuvdata
 from lusee_bayes.core.reading import reading
 from lusee_bayes.instrument.beams.sampled import SampledBeams, sampled_beams
@@ -23,10 +24,7 @@ from lusee_bayes.instrument.beams.sampled import SampledBeams, sampled_beams
 def is_uvbeam_file(path: str | Path) -> bool:
     """Whether there is a beam FITS file of pyuvdata at a path."""
     path = Path(path)
-    if not path.is_file() or not is_fits(path):
-        return False
-    with opened(path) as hdus:
-        return "NORMSTD" in hdus[0].header and "FEEDLIST" in hdus[0].header
+    return path.is_file() and has_words(path, UVBEAM_WORDS)
 
 
 def read_uvbeam(path: str | Path) -> SampledBeams:

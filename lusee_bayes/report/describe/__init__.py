@@ -8,9 +8,8 @@ from pathlib import Path
 from pkgutil import resolve_name
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.fits_files import image_names, is_fits
+from lusee_bayes.core.fits_files import has_words, image_names, is_fits
 from lusee_bayes.core.reading import reading, require_file
-from lusee_bayes.instrument.beams.uvbeam import is_uvbeam_file
 
 # the package's own netCDF files, by their attribute ``format``. What describes a kind is named by
 # path and imported when there is such a file: each needs libraries that others do not
@@ -41,7 +40,7 @@ KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
     (_has_image("h_theta_real"), "beam_files:describe_response"),
     (_has_image("etheta_real"), "beam_files:describe_scalar_beam"),
     (_has_image("e_theta_real", "product_beam"), "beam_files:describe_sampled_beams"),
-    (is_uvbeam_file, "beam_files:describe_sampled_beams"),
+    (lambda path: has_words(path, formats.UVBEAM_WORDS), "beam_files:describe_sampled_beams"),
     (_has_image("combinations", "products"), "data_files:describe_waterfall"),
     (_is_compact, "compact:describe_compact"),
     (lambda path: True, "skies:describe_sky"),
