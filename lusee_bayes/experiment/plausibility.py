@@ -27,8 +27,8 @@ def require_plausible(
 ) -> tuple[str, ...]:
     """Check measured data against what every correlator and every sky obeys.
 
-    Auto-correlations are powers, so that they are positive; |V_ij|^2 <= V_ii V_jj (Cauchy and
-    Schwarz); both within the noise.
+    Auto-correlations are powers, so that they are positive; ``|V_ij|^2 <= V_ii V_jj``
+    (Cauchy and Schwarz); both within the noise.
 
     Parameters
     ----------

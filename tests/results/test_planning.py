@@ -334,7 +334,7 @@ def test_brackets_are_values_not_markup(tmp_path, capsys):
         (["nonsense"], "no scenario 'nonsense'"),
         (["fiducial", "fiducial"], "the scenario 'fiducial' is given twice; give each once"),
         (["fiducial", "--vary", "lmax"], "--vary takes key.path=value,value"),
-        (["fiducial", "--vary", "lmax=]"], "--vary takes key.path=value,value"),
+        (["fiducial", "--vary", "lmax=]"], "--vary lmax=] is not valid YAML"),
         (["fiducial", "--vary", "lmx=3,4"], "unknown key 'lmx'; did you mean 'lmax'?"),
         (["fiducial", "--vary", "lmax=3,0"], "greater than or equal to 1"),
         (["fiducial", "--set", "sky.file=a.fits"], "fiducial, as given: no sky map at 'a.fits'"),

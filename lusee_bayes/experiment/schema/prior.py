@@ -15,6 +15,9 @@ from lusee_bayes.sky.priors import HarmonicPrior, Prior
 class IsotropicPriorSection(Section):
     """Independent coefficients: C_ell the spectrum of the scenario's sky, or of a file; mean 0.
 
+    Where C_ell is not known, an amplitude and a tilt are sampled, C_ell A ((ell + 1) / 10)^tilt, or
+    one amplitude for every band of ell.
+
     Attributes
     ----------
     scale : float
@@ -28,14 +31,6 @@ class IsotropicPriorSection(Section):
     spectral_index : float
         Scales them from ``file_frequency_mhz`` to the scenario's frequency: the mean once, C_ell
         twice.
-
-    Where C_ell is not known, an amplitude and a tilt are sampled, C_ell A ((ell + 1) / 10)^tilt, or
-    one amplitude for every band of ell.
-
-    Attributes
-    ----------
-    scale : float
-        Factor of C_ell.
     log_amplitude_std : float
         Prior standard deviation of ln A; A is sampled if it is given.
     tilt_std : float
@@ -51,7 +46,7 @@ class IsotropicPriorSection(Section):
     spectrum_file: str | None = None
     mean_file: str | None = None
     file_frequency_mhz: Positive | None = None
-    spectral_index: float = -2.5
+    spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
     log_amplitude_std: Positive | None = None
     tilt_std: Positive | None = None
     band_edges: tuple[Annotated[int, Field(ge=1)], ...] = ()
