@@ -32,9 +32,7 @@ def _whole(least: int) -> Callable[[object, Sequence[Token]], int]:
         text = token.value
         plain = text.removeprefix("-")
         if not (plain.isascii() and plain.isdigit() and len(plain) < 10) or int(text) < least:
-            raise InputError(
-                f"{token.keyword} {text[:40]}: expected a whole number from {least} to 999999999"
-            )
+            raise InputError(f"expected a whole number from {least} to 999999999, got {text[:40]}")
         return int(text)
 
     return convert

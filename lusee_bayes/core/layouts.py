@@ -36,6 +36,9 @@ NAMES = {
     "word": "text or a whole number",
 }
 
+# no quantity of this field is larger in any unit, and fourth powers have room in 64 bits
+LARGEST = 1e60
+
 
 @runtime_checkable
 class Unread(Protocol):
@@ -233,7 +236,12 @@ def _checked_array(where: str, values: np.ndarray, declared: Variable) -> np.nda
     if declared.kind == "boolean" and not np.isin(values, (0, 1)).all():
         raise InputError(f"{where} holds other numbers than 0 and 1, expected true or false")
     values = np.ascontiguousarray(values, dtype=KINDS[declared.kind][1])
-    if declared.kind == "boolean" or declared.missing:
+    if declared.kind == "boolean":
+        return values
+    parts = (values.real, values.imag) if declared.kind == "complex" else (values,)
+    large = np.logical_or.reduce([np.isfinite(p) & (np.abs(p) > LARGEST) for p in parts])
+    _require_none(where, values, large, f"a number beyond {LARGEST:g}")
+    if declared.missing:
         return values
     bad = np.isinf(values) | (np.isnan(values) if declared.finite else False)
     _require_none(where, values, bad, "NaN or infinity" if declared.finite else "infinity")
@@ -272,7 +280,8 @@ def _checked_value(where: str, value: Any, declared: Attribute) -> Any:
         raise InputError(f"{where} is {value!r}, expected {_one(declared.kind)}")
     if declared.kind == "boolean":
         return bool(number)
-    if not np.isfinite(number) or not declared.low <= number <= declared.high:
+    finite = np.isfinite(number) and abs(number) <= LARGEST
+    if not finite or not declared.low <= number <= declared.high:
         limits = f" from {declared.low:g} to {declared.high:g}"
         limited = np.isfinite([declared.low, declared.high]).any()
         raise InputError(

@@ -58,6 +58,8 @@ class RunKind:
         The folder that holds unfinished work, removed when the results are there.
     dpi : int
         Of the figures.
+    after : sequence of str
+        Kinds of runs whose results in the folder, of the same origin, it takes over.
     """
 
     name: str
@@ -65,6 +67,7 @@ class RunKind:
     figures: Mapping[str, Callable[[Any], Figure]]
     unfinished: str = ""
     dpi: int = 110
+    after: Sequence[str] = ()
 
 
 @contextmanager
@@ -113,7 +116,7 @@ def run_folder(
         with lock:
             recover(folder)
             if not replace:
-                require_own(folder, kind.name, origin)
+                require_own(folder, (kind.name, *kind.after), origin)
             before = _written_at(folder)
             use_compilation_cache()
             try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,14 +59,14 @@ def _entries(tree: Mapping[str, Any], parents: str = "") -> Iterator[tuple[str, 
             yield f"{parents}{key}", value
 
 
-def require_own(folder: Path, kind: str, origin: Origin) -> None:
+def require_own(folder: Path, kinds: Sequence[str], origin: Origin) -> None:
     """Check that a folder holds no results of another run.
 
     Parameters
     ----------
     folder : Path
-    kind : str
-        Of the run that is to write there.
+    kinds : sequence of str
+        Of the run that is to write there, and of those whose results it goes on from.
     origin : mapping
         What it is made of.
 
@@ -79,7 +79,7 @@ def require_own(folder: Path, kind: str, origin: Origin) -> None:
     if manifest is None:
         return
     there, advice = manifest["origin"], "give another folder with -o, or --force to replace them"
-    if manifest["kind"] != kind:
+    if manifest["kind"] not in kinds:
         raise InputError(f"'{folder}' holds results of lusee-bayes {manifest['kind']}; {advice}")
     for name in [*origin, *there]:
         old, new = there.get(name), origin.get(name)

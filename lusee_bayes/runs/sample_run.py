@@ -102,7 +102,7 @@ def run_sample(
     if not scenario.frequencies_mhz:
         return _run_single(scenario, folder, program, sampler, data, resume, replace, stages)
     stages = stages or Stages()
-    origin = _origin(scenario, data, program)
+    origin = sample_origin(scenario, data, program)
     with run_folder(folder, CUBES, origin, RESUME, replace=replace) as place:
         runs = []
         for channel in scenario.channels():
@@ -114,7 +114,8 @@ def run_sample(
         return SampleRun(results, place, [*(f for run in runs for f in run.files), *files])
 
 
-def _origin(scenario: Scenario, data: Path | None, program: Program) -> dict[str, str]:
+def sample_origin(scenario: Scenario, data: Path | None, program: Program) -> dict[str, str]:
+    """What determines the draws of a program (:func:`.origin_of`)."""
     return origin_of(scenario, data, program=f"{program.name} ({program.digest[:12]})")
 
 
@@ -129,7 +130,7 @@ def _run_single(
     stages: Stages | None,
 ) -> SampleRun:
     stages = stages or Stages()
-    origin = _origin(scenario, data, program)
+    origin = sample_origin(scenario, data, program)
     with run_folder(folder, SAMPLE, origin, RESUME, replace=replace) as place:
         measured = None if data is None else read_data(data, scenario)
         require_resources(scenario, measured, stages, sampler.chains * sampler.draws)

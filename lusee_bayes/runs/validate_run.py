@@ -16,8 +16,7 @@ from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.results.sample_result import CHAINS, sample_result
 from lusee_bayes.results.validation_result import ValidationResult
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
-from lusee_bayes.runs.origins import origin_of
-from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS
+from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_origin
 from lusee_bayes.sampling.calibration import calibrate_sky
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.least import require_draws, require_simulations
@@ -80,7 +79,7 @@ def run_validate(
     program = load_program("sky")
     require_simulations(simulations)
     require_draws(sampler.draws)
-    origin = origin_of(scenario, data)
+    origin = sample_origin(scenario, data, program)
     with run_folder(folder, VALIDATION, origin, RESUME, replace=replace) as place:
         measured = None if data is None else read_data(data, scenario)
         require_resources(scenario, measured, stages, sampler.chains * sampler.draws)
@@ -120,4 +119,5 @@ VALIDATION = RunKind(
         "calibration": lambda result: sample_figures.calibration(result.ranks),
     },
     unfinished=CHAINS,
+    after=("sample",),
 )

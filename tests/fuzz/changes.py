@@ -111,7 +111,7 @@ def change_hdf5(path: Path, change: tuple[Any, ...]) -> None:
         else:
             array = _changed(np.asarray(item[()]), change)
             if array.dtype.kind == "U":
-                array = array.astype("S")
+                array = np.char.encode(array, "utf-8")
             attributes = {k: v for k, v in item.attrs.items() if not k.isupper()}
             del file[name]
             if array.dtype.kind != "O":

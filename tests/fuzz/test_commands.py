@@ -54,9 +54,9 @@ EXAMPLES = {
     "folder": (["simulate", "fiducial", *SMALL, "-o", "."], "is a folder"),
     "simulate under a file": (["simulate", "fiducial", *SMALL, "-o", "file/x.nc"], "is a file"),
     # options
-    "negative draws": (["map", "fiducial", *SMALL, "--draws", "-3"], "--draws -3: expected"),
-    "half a draw": (["map", "fiducial", *SMALL, "--draws", "1.5"], "--draws 1.5: expected a whole"),
-    "no chains": (["sample", "fiducial", *SMALL, "--chains", "0"], "--chains 0: expected a whole"),
+    "negative draws": (["map", "fiducial", *SMALL, "--draws", "-3"], "--draws: expected .*got -3"),
+    "half a draw": (["map", "fiducial", *SMALL, "--draws", "1.5"], "--draws: expected .*got 1.5"),
+    "no chains": (["sample", "fiducial", *SMALL, "--chains", "0"], "--chains: expected .*got 0"),
     "many frequencies": (["map", "fiducial", "--frequencies=1:50:1e-9"], "channels; at most 4096"),
     "few simulations": (["validate", "fiducial", *SMALL, "--simulations", "50"], "simulations"),
     "misspelt": (["map", "fiducial", "--draw", "3"], "--draw"),

@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import pytest
 
+from lusee_bayes.core.destinations import LOCK
 from lusee_bayes.core.files import MANIFEST, SCRATCH, recover
 
 pytestmark = pytest.mark.long
@@ -83,7 +84,8 @@ class Command:
 
     def start(self, folder: Path, *more: str) -> subprocess.Popen:
         options = [a for s in self.settings for a in ("--set", s) if self.name != "paper"]
-        arguments = [*self.arguments, *options, *more, "-q", "-o", str(folder)]
+        # the earlier run has another seed
+        arguments = [*self.arguments, *options, *more, "--force", "-q", "-o", str(folder)]
         process = subprocess.Popen(
             [sys.executable, "-c", DRIVER, " ".join(self.settings), *arguments],
             env=os.environ
@@ -113,7 +115,9 @@ class Command:
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    """Of all files but the lock, which nobody holds once its process is killed."""
+    found = (path for path in folder.rglob("*") if path.is_file() and path.name != LOCK)
+    return {str(path.relative_to(folder)): path.read_bytes() for path in found}
 
 
 def numbers(folder: Path) -> dict[str, np.ndarray]:

@@ -26,6 +26,7 @@ from reference_linear import z_of
 
 import lusee_bayes
 from lusee_bayes.cli.main import main
+from lusee_bayes.core.destinations import LOCK
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.core.progress import Stages
@@ -150,7 +151,7 @@ def content(folder):
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in folder.rglob("*")
-        if path.is_file()
+        if path.is_file() and path.name != LOCK
     }
 
 
@@ -180,7 +181,8 @@ def assert_same_trees(found, expected):
 def test_a_killed_run_leaves_its_draws_and_nothing_half_made(runs):
     whole, killed = runs
     assert not (whole / "chains").exists()
-    assert {path.name for path in killed.iterdir()} == {"chains"}
+    # the lock is no longer held, and the next run removes its file
+    assert {path.name for path in killed.iterdir()} == {"chains", LOCK}
     done = chunks(killed)
     assert list(done) == list(range(CHUNK, max(done) + 1, CHUNK))
     assert SAMPLER.warmup + 3 * CHUNK <= max(done) < SAMPLER.warmup + SAMPLER.draws
@@ -544,10 +546,10 @@ def model(coupling, prior, noise, data=None):
     ("arguments", "words"),
     [
         (["--model", "skies"], ["no program 'skies'", "prior_amplitude, sky, sky_marginal"]),
-        (["--model", "gone.py"], ["no program 'gone.py'"]),
-        (["--draws", "0"], ["draws must be at least 1, got 0"]),
+        (["--model", "gone.py"], ["no program at 'gone.py'"]),
+        (["--draws", "0"], ["--draws: expected a whole number from 1", "got 0"]),
         (["--draws", "many"], ["many"]),
-        (["--chains", "0"], ["chains must be at least 1, got 0"]),
+        (["--chains", "0"], ["--chains: expected a whole number from 1", "got 0"]),
         (["--warmup", "3"], ["warmup must be at least 20, got 3"]),
         (["--algorithm", "hcm"], ["hcm", "nuts"]),
         (["--set", "lmaxx=3"], ["unknown key 'lmaxx'"]),
@@ -737,7 +739,7 @@ def test_half_the_covariance_is_found_out_with_exit_code_1(validated, tmp_path, 
 def test_too_few_draws_or_simulations_are_refused_before_sampling(tmp_path, capsys, no_sampling):
     out = tmp_path / "out"
     assert run("validate", *SMALL, *SETTINGS, "--simulations", "99", "-q", "-o", out) == 2
-    assert_one_sentence(capsys, "at least 100 simulations, got 99")
+    assert_one_sentence(capsys, "at least 100 simulations", "got 99")
     assert run("validate", *SMALL, "--draws", "99", "-q", "-o", out) == 2
     assert_one_sentence(capsys, "100 draws of each chain, got 99")
     assert not out.exists()
