@@ -17,8 +17,9 @@ def forecast_table(forecasts: list[Forecast]) -> Table:
     """The forecasts of one scenario as a table for the terminal."""
     source = forecasts[0].variation.source
     text = Table(title=escape(source), title_justify="left", title_style="bold")
+    text.caption = "modes: with SNR > 1; ell: the first with SNR < 1; deg: resolution"
     text.add_column("variation", no_wrap=True)
-    for name in ("days", "data", "bits", "more", "SNR > 1", "ell_cross", "deg"):
+    for name in ("days", "data", "bits", "more", "modes", "ell", "deg"):
         text.add_column(name, justify="right")
     family = ""
     for row, forecast in zip(forecast_rows(forecasts), forecasts, strict=True):
@@ -35,7 +36,7 @@ def forecast_table(forecasts: list[Forecast]) -> Table:
             f"{float(str(row['difference_bits'])):+.0f}",
             str(row["modes_snr_above_1"]),
             str(row["ell_cross"]),
-            str(row["resolution_deg"]),
+            "none" if forecast.resolution_deg is None else f"{forecast.resolution_deg:.1f}",
         )
     return text
 

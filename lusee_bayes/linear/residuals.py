@@ -170,7 +170,10 @@ class Residuals:
     def fit(self) -> Fit:
         """Judge whether the data fit, and which groups stand out or are to blame if not."""
         level = self.level()
-        parts = [f"{sentence(level)} ({size_of_residuals(self.chi2, len(self.z), self.p)})."]
+        words = sentence(level)
+        if level == "in tension" and level_of(self.p) == "consistent":
+            words = "In tension: the data fit the model as a whole, but not everywhere"
+        parts = [f"{words} ({size_of_residuals(self.chi2, len(self.z), self.p)})."]
         if level != "consistent" and not self.products:
             parts.append(
                 "Products, days and turntable angles were not judged: the noise couples different "
