@@ -6,6 +6,7 @@ from pathlib import Path
 
 import h5py
 
+from lusee_bayes.core.hdf5_probe import require_readable_hdf5
 from lusee_bayes.core.reading import reading, require_file
 
 VISIBILITIES = "lusee_bayes visibilities 1"
@@ -33,6 +34,7 @@ def format_of(path: str | Path) -> str | None:
     with reading(path, "HDF5"):
         if not h5py.is_hdf5(path):
             return None
+        require_readable_hdf5(path)
         with h5py.File(path) as file:
             kind = file.attrs.get("format")
     kind = kind.decode(errors="replace") if isinstance(kind, bytes) else kind

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.fits_files import is_fits, opened
+from lusee_bayes.core.hdf5_probe import require_readable_hdf5
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.reading import reading
 from lusee_bayes.sky.files import SkyFile, modes_of_map
@@ -97,6 +98,7 @@ def _layout(name: str) -> Layout:
 
 
 def _read_hdf5(path: Path, dataset: str) -> np.ndarray:
+    require_readable_hdf5(path)
     with reading(path, "a sky map in HDF5"), h5py.File(path) as file:
         names = [name for name, item in file.items() if isinstance(item, h5py.Dataset)]
         if dataset not in names:
