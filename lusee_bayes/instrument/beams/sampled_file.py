@@ -110,7 +110,10 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
             given["products"] = _in_order(arrays[POWER], said["products"])
     else:
         parts = [arrays[name] for name in FIELDS]
-        given["e_theta"], given["e_phi"] = parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]
+        # set part by part: infinity times 1j would be NaN, with a warning
+        given["e_theta"], given["e_phi"] = np.empty((2, *parts[0].shape), dtype=complex)
+        given["e_theta"].real, given["e_theta"].imag = parts[0], parts[1]
+        given["e_phi"].real, given["e_phi"].imag = parts[2], parts[3]
     return sampled_beams(
         arrays["frequency_mhz"],
         **given,
