@@ -585,7 +585,7 @@ def test_a_scenario_is_needed_and_has_to_exist(tmp_path, capsys):
         (GOOD.replace("data=None", "data"), ["data"]),
         (GOOD.replace(", obs=data", ""), ["data"]),
         (GOOD.replace('"data"', '"visibilities"'), ["data"]),
-        (GOOD.replace('"sky"', '"m"'), ["sky"]),
+        (GOOD.replace('"sky"', '"mine"'), ["sky"]),
         (NO_LATENT, ["program"]),
     ],
     ids=[
