@@ -6,6 +6,7 @@ interrupt it.
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import signal
 import sys
@@ -71,6 +72,7 @@ def _read_all(path: str, size: int) -> None:
     """In the child: read, and leave without a word."""
     try:
         # whatever it prints is of no use
+        faulthandler.disable()
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         with h5py.File(path) as file:
             _read(file, size)

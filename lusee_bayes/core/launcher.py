@@ -135,6 +135,8 @@ def _watch(children: list[subprocess.Popen], notes: list[IO[bytes]]) -> int:
         return 0
     if codes[failed] > 0 and list(codes.values()) == [codes[failed]] * len(children):
         return codes[failed]
+    # those that miss a killed process may be seen to end before it
+    failed = next((k for k, code in codes.items() if code < 0), failed)
     _end(children, signal.SIGTERM)
     # a spinner may have hidden the cursor
     Console().show_cursor()
