@@ -22,6 +22,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import read_arrays, reading
+from lusee_bayes.core.representation import Described, extent
 from lusee_bayes.linear.posterior import Posterior
 
 # directions whose variance the data reduce by less than this share are left at the prior's
@@ -39,8 +40,8 @@ LAYOUT = Layout(
 )
 
 
-@dataclass(frozen=True)
-class CompactPosterior:
+@dataclass(frozen=True, repr=False)
+class CompactPosterior(Described):
     """Mean and covariance of real harmonic coefficients.
 
     Attributes
@@ -59,6 +60,13 @@ class CompactPosterior:
     prior_std: Float[np.ndarray, " modes"]
     directions: Float[np.ndarray, "modes rank"]
     variances: Float[np.ndarray, " rank"]
+
+    def description(self) -> tuple[str, ...]:
+        return (
+            f"{len(self.mean)} modes, {len(self.variances)} directions better than the prior",
+            f"monopole {self.mean[0] / np.sqrt(4 * np.pi):.4g} K (mean over the sky)",
+            f"standard deviations of modes {extent(self.std(), 'K')}",
+        )
 
     @classmethod
     def of(cls, posterior: Posterior, tolerance: float = TOLERANCE) -> CompactPosterior:

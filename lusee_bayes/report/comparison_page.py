@@ -8,6 +8,7 @@ from pathlib import Path
 from lusee_bayes.linear.fit import THRESHOLDS
 from lusee_bayes.report import html
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
+from lusee_bayes.results.provenance import Provenance
 
 HEADER = {
     "run": "run",
@@ -39,6 +40,8 @@ def comparison_page(runs: Sequence[FinishedRun], figures: Path) -> str:
             html.paragraph(caveat or same, "verdict" if caveat is None else "verdict tense"),
             html.paragraph(f"{THRESHOLDS}.", "threshold"),
             html.table(list(HEADER.values()), rows),
+            html.subsection("Where they come from"),
+            html.table(("run", "data", "dates, UTC", "command", "made"), origins(runs)),
             html.figure(
                 figures / "curves.png",
                 "Correlation with the truth, signal-to-noise and share of the prior over "
@@ -52,6 +55,19 @@ def comparison_page(runs: Sequence[FinishedRun], figures: Path) -> str:
             ),
         ],
     )
+
+
+def origins(runs: Sequence[FinishedRun]) -> list[tuple[str, ...]]:
+    """Name, data, dates, command, date and version of every run, a row each."""
+    return [_origin(run.name, run.provenance) for run in runs]
+
+
+def _origin(name: str, found: Provenance | None) -> tuple[str, ...]:
+    if found is None:
+        return name, "not recorded", "-", "-", "by an earlier version"
+    dates = f"{found.first} to {found.last}"
+    command = found.command or "a call of the library"
+    return name, found.data_line(), dates, command, f"{found.made} by lusee_bayes {found.version}"
 
 
 def _shown(value: object) -> str:

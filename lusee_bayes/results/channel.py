@@ -16,6 +16,7 @@ from jaxtyping import Float, PRNGKeyArray, Shaped
 
 from lusee_bayes.core.arrays import Array, on_host
 from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, per_mode, power_spectrum
+from lusee_bayes.core.representation import Described, extent
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference
 from lusee_bayes.experiment.plausibility import about_information
@@ -52,8 +53,8 @@ def draw_key(scenario: Scenario) -> PRNGKeyArray:
     return jax.random.fold_in(jax.random.key(scenario.seed), DRAWS)
 
 
-@dataclass(frozen=True)
-class ChannelResult:
+@dataclass(frozen=True, repr=False)
+class ChannelResult(Described):
     """The posterior over the sky at one frequency, and what judges it. Skies in K, Galactic.
 
     Attributes
@@ -108,6 +109,13 @@ class ChannelResult:
     n_missing: int
     rounds: int
     doubts: tuple[str, ...] = ()
+
+    def description(self) -> tuple[str, ...]:
+        return (
+            f"{self.frequency_mhz:g} MHz, {self.n_data} data, NSIDE {self.nside}",
+            f"mean {extent(modes_to_map(self.mean, self.nside), 'K')}",
+            f"standard deviation {extent(self.pixel_std, 'K')}",
+        )
 
     @property
     def nside(self) -> int:

@@ -14,6 +14,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover, require_files
 from lusee_bayes.core.reading import read_json, read_table
 from lusee_bayes.results.diagnostics_file import read_diagnostics
+from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.results.saved import MAP_SUMMARY, SPECTRA
 from lusee_bayes.sky import SkyMap
 
@@ -22,7 +23,10 @@ NEEDED = ("summary.json", "spectra.csv", "diagnostics.nc", "mean.fits", "std.fit
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What a map run has left: name of its folder, figures of summary.json, spectra, maps in K."""
+    """What a map run has left: name of its folder, figures of summary.json, spectra, maps in K.
+
+    ``provenance`` is None for a folder of an earlier version, which did not record it.
+    """
 
     name: str
     summary: dict
@@ -30,6 +34,7 @@ class FinishedRun:
     mean: Float[np.ndarray, " pixels"]
     std: Float[np.ndarray, " pixels"]
     diagnostics: xr.Dataset
+    provenance: Provenance | None
 
     def cross_in_words(self) -> str:
         """First ell with SNR < 1: above the last one, or unknown without a truth."""
@@ -62,6 +67,7 @@ class FinishedRun:
             maps["mean"],
             maps["std"],
             diagnostics,
+            Provenance.read(folder),
         )
 
 
