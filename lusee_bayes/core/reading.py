@@ -45,10 +45,11 @@ def require_file(path: str | Path, what: str, hint: str = "") -> Path:
     try:
         mode = path.stat().st_mode
     except FileNotFoundError as error:
-        raise InputError(f"no {what} at '{path}'" + (f"; {hint}" if hint else "")) from error
+        hint = f"; {hint}" if hint else ""
+        raise InputError(f"no {_kind(what)} at '{path}'{hint}") from error
     except (OSError, ValueError) as error:
         # a name that is too long, holds a NUL, or lies behind a file
-        raise InputError(f"no {what} at '{path}': {_reason(error)}") from error
+        raise InputError(f"no {_kind(what)} at '{path}': {_reason(error)}") from error
     if not stat.S_ISREG(mode):
         kind = "a folder" if stat.S_ISDIR(mode) else "neither a file nor a folder"
         raise InputError(f"'{path}' is {kind}; give a file: {what}")
@@ -103,6 +104,11 @@ def naming(path: str | Path) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def _kind(what: str) -> str:
+    """What it should be, without its article."""
+    return what.removeprefix("a ").removeprefix("an ").removeprefix("the ")
 
 
 def _reason(error: BaseException) -> str:

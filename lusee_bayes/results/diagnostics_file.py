@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.netcdf_files import read_dataset
 from lusee_bayes.results.saved import DIAGNOSTICS
 
@@ -25,7 +26,14 @@ def write_diagnostics(dataset: xr.Dataset, path: Path) -> None:
 def read_diagnostics(path: str | Path) -> xr.Dataset:
     """What :func:`write_diagnostics` wrote. InputError for anything else."""
     found = read_dataset(path, formats.DIAGNOSTICS, DIAGNOSTICS, "lusee-bayes map writes one")
-    return found if "group" in found.sizes else found.assign(group_variables({}))
+    empty = group_variables({})
+    if "group" not in found.sizes:
+        return found.assign(empty)
+    # files hold no empty arrays, so that all are absent, or none
+    missing = sorted(empty.keys() - found.keys())
+    if missing:
+        raise InputError(f"{path} has groups without {missing[0]}; lusee-bayes map writes them")
+    return found
 
 
 def group_variables(kinds: Mapping[str, Sequence[Any]]) -> dict[str, tuple[str, np.ndarray]]:

@@ -106,8 +106,8 @@ def test_from_the_command_line(tmp_path, capsys):
     assert saved.posterior.information_bits() > before.information_bits() + 10
     capsys.readouterr()
     for arguments, message in (
-        (("--data", tmp_path / "b.nc", "--onto", both), "would count double"),
-        (("--onto", tmp_path / "none"), "has no posterior.nc"),
+        (("--data", tmp_path / "b.nc", "--onto", both), "would count twice"),
+        (("--onto", tmp_path / "none"), "no posterior of lusee-bayes map --updatable at"),
         (("--onto", both, "--set", "frequency_mhz=10"), "is of frequency_mhz 25, the scenario"),
     ):
         assert run(*mapped, *arguments, "-o", third) == 2

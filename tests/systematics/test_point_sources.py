@@ -244,7 +244,7 @@ def test_a_source_below_the_horizon_is_known_from_its_prior_only():
     assert said == [False, False, False, False, True]
     assert lines[4].startswith("Polaris: 2e+04 +- 1e+04 Jy")
     assert [line.split(":")[0] for line in lines[1:4]] == ["For A", "For A (1)", "For A (2)"]
-    assert result.lines()[1:-1] == lines
+    assert result.lines()[1:] == [*lines, result.verdict(), THRESHOLDS]
 
 
 def test_ignored_sources_have_no_fluxes():
