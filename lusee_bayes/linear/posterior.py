@@ -191,6 +191,21 @@ class Posterior(Described, eqx.Module):
         xp, prior = namespace(self), self.prior.variance()
         return xp.where(prior > 0, self.std() ** 2 / xp.where(prior > 0, prior, 1.0), 0.0)
 
+    def prior_chi2(self) -> Float[Array, ""]:
+        """Compute the squared distance of the mean from that of the prior.
+
+        With the posterior mean, chi^2 of the data plus this is (d - A mu)^T (A S A^T + N)^-1
+        (d - A mu), a chi^2 distribution of N_data degrees of freedom.
+
+        Returns
+        -------
+        () array
+            In prior standard deviations, squared.
+        """
+        expected = self.prior.white_mean
+        u = self.white_mean if expected is None else self.white_mean - expected
+        return namespace(self).asarray(u @ u)
+
     def rms_shift_from(self, other: Posterior) -> Float[Array, ""]:
         """Compute the distance of two posterior means.
 

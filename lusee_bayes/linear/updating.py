@@ -147,3 +147,10 @@ def _require_same_prior(posterior: Posterior, model: LinearGaussian) -> None:
             f"the earlier posterior has another prior: C_ell = {float(old.spectrum[ell]):.4g} at "
             f"ell = {ell}, now {float(new.spectrum[ell]):.4g}; give both the same sky and prior"
         )
+    widths, zero = np.asarray(new.diagonal_root()), np.zeros(new.size)
+    apart = [np.asarray(zero if prior.mean is None else prior.mean) for prior in (old, new)]
+    if (np.abs(apart[0] - apart[1]) > 1e-9 * widths).any():
+        raise InputError(
+            "the earlier posterior has a prior with another mean; give both the same "
+            "prior.mean_file"
+        )

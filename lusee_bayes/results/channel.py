@@ -255,7 +255,7 @@ def channel_of_posterior(
         chi2=float(inference.model.chi2(posterior.mean, data.data)),
         chi2_expected=expected,
         chi2_model=float(judged.model.chi2(judged.posterior.mean, data.data))
-        + float(np.vdot(judged.posterior.white_mean, judged.posterior.white_mean)),
+        + float(judged.posterior.prior_chi2()),
         refinement=float(posterior.refinement),
         n_data=inference.model.n_data,
         n_missing=data.n_missing,

@@ -97,9 +97,7 @@ def cube_result(
             posterior.sample(draw_key(channel), n_draws),
             log_evidence=float(posterior.log_evidence),
             information_bits=float(posterior.information_bits()),
-            # with the posterior mean, |d - A m|^2 + |u|^2 is d^T K^-1 d
-            chi2_model=float(information.chi2(posterior.mean))
-            + float(posterior.white_mean @ posterior.white_mean),
+            chi2_model=float(information.chi2(posterior.mean) + posterior.prior_chi2()),
             refinement=float(posterior.refinement),
         )
         files.write(channel, wanted, found.to_dataset())

@@ -170,7 +170,7 @@ def _direct(
         ]
         information = jax.tree.unflatten(shape, whole).information()
         posterior = component_posterior(information, prior)
-        chi2 = float(information.chi2(posterior.mean) + (posterior.white_mean**2).sum())
+        chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
         components, modes = prior.n_components, posterior.mean.shape[0] // prior.n_components
         spread = jax.block_until_ready(paired(posterior.covariance(), prior))
         draws = posterior.sample(draw_key(scenario), n_draws)

@@ -39,6 +39,8 @@ def posterior_dataset(result: MapResult) -> xr.Dataset:
         lower = np.tril(np.asarray(posterior.lower))
         variables["precision_root"] = (("mode", "mode_2"), lower)
         variables["white_mean"] = ("mode", np.asarray(posterior.white_mean))
+        if posterior.prior.mean is not None:
+            variables["prior_mean"] = ("mode", np.asarray(posterior.prior.mean), {"units": "K"})
         attrs["log_evidence"] = float(posterior.log_evidence)
         attrs["data_digests"] = json.dumps(result.digests)
     return xr.Dataset(variables, coords={"ell": ("mode", ell), "m": ("mode", m)}, attrs=attrs)

@@ -29,6 +29,7 @@ UPDATABLE = Layout(
         **POSTERIOR.variables,
         "precision_root": Variable(("mode", "mode_2"), optional=True),
         "white_mean": Variable(("mode",), optional=True),
+        "prior_mean": Variable(("mode",), optional=True),
     },
     {
         **POSTERIOR.attributes,

@@ -54,8 +54,9 @@ def read_updatable(folder: str | Path, scenario: Scenario) -> Updatable:
             f"{path} holds {len(here['mean'])} modes, expected {n} for lmax = {scenario.lmax}"
         )
     none = jnp.zeros(())
+    mean = jnp.asarray(here["prior_mean"]) if "prior_mean" in here else None
     posterior = Posterior(
-        HarmonicPrior(jnp.asarray(power_spectrum(here["prior_std"]))),
+        HarmonicPrior(jnp.asarray(power_spectrum(here["prior_std"])), mean=mean),
         jnp.asarray(here["white_mean"]),
         jnp.asarray(here["precision_root"]),
         None,

@@ -58,6 +58,23 @@ def test_every_form_gives_the_textbooks_posterior(form):
     np.testing.assert_allclose(found.log_evidence, answer.log_prob, rtol=CLOSE)
 
 
+def test_chi2_is_of_the_deviation_from_the_prior():
+    """(d - A mu)^T (A S A^T + N)^-1 (d - A mu), with a solver that knows no prior."""
+    found = model().condition(jnp.asarray(DATA))
+    centred = DATA - OFFSET - A @ MEAN
+    direct = centred @ np.linalg.solve(A * PER_MODE @ A.T + np.diag(VARIANCE), centred)
+    told = model().chi2(found.mean, jnp.asarray(DATA)) + found.prior_chi2()
+    np.testing.assert_allclose(told, direct, rtol=CLOSE)
+
+
+def test_a_posterior_is_not_updated_under_another_mean():
+    earlier = model().condition(jnp.asarray(DATA), "root")
+    for mean in (None, jnp.asarray(MEAN + 1e-6)):
+        other = replace(model(), prior=HarmonicPrior(jnp.asarray(SPECTRUM), mean=mean))
+        with pytest.raises(InputError, match="another mean"):
+            updated(earlier, other, jnp.asarray(DATA))
+
+
 def test_updates_information_and_few_data():
     first, rest = slice(0, 18), slice(18, 24)
     earlier = model(first).condition(jnp.asarray(DATA[first]), "root")
