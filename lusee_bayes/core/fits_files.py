@@ -13,6 +13,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyWarning
 
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Content, Layout
 from lusee_bayes.core.reading import reading
 
@@ -120,5 +121,11 @@ def opened(path: str | Path, what: str = "FITS", hint: str = "") -> Iterator[fit
     with reading(path, what, hint) as place, place.open("rb") as file:
         # astropy only warns of a file that is cut short
         warnings.simplefilter("error", AstropyWarning)
-        with fits.open(file, memmap=False) as hdus:
+        try:
+            hdus = fits.open(file, memmap=False)
+        except OSError as error:
+            if "SIMPLE" not in str(error):
+                raise
+            raise InputError(f"{path} cannot be read as {what}: it is no FITS file") from error
+        with hdus:
             yield hdus

@@ -10,7 +10,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import is_fits
 from lusee_bayes.core.reading import require_file
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities
+from lusee_bayes.instrument.visibilities import HINT, Visibilities, read_visibilities
 from lusee_bayes.instrument.waterfalls import Waterfall, read_waterfall
 from lusee_bayes.instrument.waterfalls.four_port import INTERPOLATIONS
 
@@ -34,7 +34,7 @@ def read_data(path: Path, scenario: Scenario) -> Visibilities:
     InputError
         If the file cannot be used, or a waterfall does not fit the scenario's beams.
     """
-    require_file(path, "data", "make some with: lusee-bayes simulate SCENARIO")
+    require_file(path, "data", HINT)
     if not is_fits(path):
         return read_visibilities(path)
     waterfall = read_waterfall(path)

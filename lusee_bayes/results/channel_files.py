@@ -18,6 +18,7 @@ from lusee_bayes.core.netcdf_files import says
 from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.instrument.visibilities import HINT
 
 CHANNELS = "channels"
 
@@ -66,6 +67,6 @@ def identity_of(scenario: Scenario, data: Path | None, truth: bool, n_draws: int
     """
     parts = [scenario.to_yaml(), str(truth), str(n_draws), __version__]
     if data is not None:
-        require_file(data, "data", "make some with: lusee-bayes simulate SCENARIO")
+        require_file(data, "data", HINT)
         parts.append(hashlib.sha256(data.read_bytes()).hexdigest())
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()

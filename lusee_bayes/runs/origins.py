@@ -12,6 +12,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import read_manifest
 from lusee_bayes.core.reading import require_file
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.instrument.visibilities import HINT
 
 Origin = Mapping[str, str]
 
@@ -45,7 +46,7 @@ def origin_of(
         tree = scenario.model_dump(mode="json", exclude={"output"})
         found |= {name: json.dumps(value) for name, value in _entries(tree)}
     if data is not None:
-        with require_file(data, "data").open("rb") as file:
+        with require_file(data, "data", HINT).open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         found["data"] = f"'{Path(data).name}' ({digest[:12]})"
     return found | {name: str(value) for name, value in others.items() if value is not None}

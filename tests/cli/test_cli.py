@@ -180,7 +180,7 @@ def test_data_without_truth(folder, tmp_path):
         (["map", "nonsense"], "no scenario 'nonsense'"),
         (["map", "fiducial", "--set", "sky.file=gone.fits"], "no sky map at 'gone.fits'"),
         (["map", "fiducial", "--set", "sky.fil=x"], "unknown key 'sky.fil'; did you mean 'file'?"),
-        (["map", "fiducial", "--data", "gone.nc"], "no data at 'gone.nc'"),
+        (["map", "fiducial", "--data", "gone.nc"], "no data at 'gone.nc'; make some"),
         (["map", "fiducial", "--set", "observation.start=2051-01-01"], "outside the ephemeris"),
         (["map", "fiducial", "--set", "observation.start=soon"], "'soon' is not a date"),
         (["map", "fiducial", "--set", "noise.radiometer.factor=-1"], "greater than 0"),

@@ -332,7 +332,7 @@ def test_missing_and_truncated_files(tmp_path):
     with pytest.raises(InputError, match="cut short"):
         read_beam(path)
     path.write_text("no FITS at all")
-    with pytest.raises(InputError, match="cannot be read as a scalar beam"):
+    with pytest.raises(InputError, match="cannot be read as a scalar beam .*: it is no FITS file$"):
         read_beam(path)
 
 
