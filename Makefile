@@ -47,6 +47,7 @@ docs: $(VENV)/installed-docs
 bench: $(VENV)/installed
 	$(BIN)/python benchmarks/commands.py
 	$(BIN)/python benchmarks/pipeline.py
+	$(BIN)/python benchmarks/priors.py
 	$(BIN)/python benchmarks/structured_noise.py
 	$(BIN)/python benchmarks/sampling.py
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
@@ -19,6 +20,7 @@ from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.simulate import true_values
 from lusee_bayes.linear.metrics import ell_cross, signal_to_noise
+from lusee_bayes.report.figures import coverage
 from lusee_bayes.report.figures.channel import maps
 from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar
 from lusee_bayes.report.figures.mollweide import mollweide
@@ -102,6 +104,18 @@ def embedded_sky(ulsa: Path | None) -> None:
                 f"| {frequency:g} | {float(ours[0] / theirs[0]):.3f} "
                 f"| {ratio.min():.2f} to {ratio.max():.2f} |"
             )
+
+
+def given_skies(ulsa: Path | None) -> None:
+    """Draw and print how often error bars hold skies that the prior does not draw, at 10 MHz."""
+    files = [] if ulsa is None else [ulsa / "exp10.0MHz_sky_map_with_absorption.hdf5"]
+    skies = ["embedded:1", "embedded:2", "embedded+sources:1", "smooth", "spotty", *files]
+    scenario = lb.load_scenario("fiducial", ["frequency_mhz=10", "lmax=31"])
+    with TemporaryDirectory() as folder:
+        result = lb.run_skies(scenario, folder, skies, name="fiducial").result
+    print(result.as_markdown())
+    coverage.coverage(result).savefig(HERE / "coverage.png", dpi=80)
+    coverage.pulls(result).savefig(HERE / "pulls.png", dpi=70)
 
 
 def point_sources() -> None:
@@ -228,5 +242,7 @@ if __name__ == "__main__":
         regolith(Path("output/regolith"))
     first_map()
     point_sources()
-    embedded_sky(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+    ulsa = Path(sys.argv[1]) if len(sys.argv) > 1 else None
+    embedded_sky(ulsa)
+    given_skies(ulsa)
     fixed_axis()

@@ -49,12 +49,14 @@ from .noise.covariance import TimeBlockCovariance as TimeBlockCovariance
 from .results.channel import ChannelResult as ChannelResult
 from .results.cube import CubeResult as CubeResult
 from .results.map_result import MapResult as MapResult
+from .runs.compare_priors_run import run_compare_priors as run_compare_priors
 from .runs.compare_run import run_compare as run_compare
 from .runs.map_run import run_map as run_map
 from .runs.paper_run import run_paper as run_paper
 from .runs.plan_run import run_plan as run_plan
 from .runs.sample_run import run_sample as run_sample
 from .runs.simulate_run import run_simulate as run_simulate
+from .runs.skies_run import run_skies as run_skies
 from .runs.validate_run import run_validate as run_validate
 from .sampling.calibration import calibrate as calibrate
 from .sampling.calibration import calibrate_sky as calibrate_sky
@@ -73,6 +75,7 @@ from .sky import Sky as Sky
 from .sky import SkySource as SkySource
 from .sky import galaxy_sky as galaxy_sky
 from .sky import sky_from_file as sky_from_file
+from .sky.priors import DensePrior as DensePrior
 from .sky.priors import HarmonicPrior as HarmonicPrior
 from .sky.priors import PixelPrior as PixelPrior
 from .sky.spectral_prior import SpectralPrior as SpectralPrior

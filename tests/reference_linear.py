@@ -57,11 +57,11 @@ def log_prob_slope(a, s, n, d, ds, dn) -> float:
     return 0.5 * float(y @ dk @ y - np.trace(np.linalg.solve(k, dk)))
 
 
-_decimal = np.vectorize(Decimal, otypes=[object])
+exact = np.vectorize(Decimal, otypes=[object])
 _float = np.vectorize(float, otypes=[np.float64])
 
 
-def _solve_positive(k, b):
+def solve_exactly(k, b):
     """K^-1 B and ln|K| by Gaussian elimination; no pivoting is needed for a positive K."""
     k, b = k.copy(), b.copy()
     log_det = Decimal(0)
@@ -78,10 +78,10 @@ def _solve_positive(k, b):
 def exact_posterior(a, prior_variance, n, d, digits: int = 60) -> Answer:
     """As ``posterior`` with S = diag(prior_variance), in decimal arithmetic, rounded at the end."""
     with localcontext(prec=digits):
-        a, s, n, d = (_decimal(np.asarray(x)) for x in (a, prior_variance, n, d))
+        a, s, n, d = (exact(np.asarray(x)) for x in (a, prior_variance, n, d))
         a_s = a * s[None]
         k = a_s @ a.T + n
-        solved, log_det = _solve_positive(k, np.concatenate([a_s, d[:, None]], axis=1))
+        solved, log_det = solve_exactly(k, np.concatenate([a_s, d[:, None]], axis=1))
         mean = a_s.T @ solved[:, -1]
         covariance = -(a_s.T @ solved[:, :-1])
         covariance[np.diag_indices(len(s))] += s

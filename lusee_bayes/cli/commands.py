@@ -44,9 +44,13 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         ),
     ),
     "validate": (
-        "Check the analytic posterior by HMC and by simulated data sets.",
-        "Ends with exit code 1 if a check fails; validation.md holds the thresholds.",
-        ("lusee-bayes validate gain_1e-2 --set lmax=8 -o output/check",),
+        "Check the posterior by HMC and by simulated data sets, or on given skies.",
+        "Ends with exit code 1 if a check fails; validation.md, or coverage.md, holds the "
+        "thresholds.",
+        (
+            "lusee-bayes validate gain_1e-2 --set lmax=8 -o output/check",
+            "lusee-bayes validate fiducial --skies embedded:2 embedded:3 smooth spotty sky.fits",
+        ),
     ),
     "paper": (
         "Reproduce the figures of the reference paper and judge its claims.",
@@ -66,6 +70,14 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "Set finished map runs side by side.",
         "",
         ("lusee-bayes compare output/fiducial output/gain_1e-2",),
+    ),
+    "compare-priors": (
+        "Map one data set under several priors, and say which of them it prefers.",
+        "",
+        (
+            "lusee-bayes compare-priors fiducial --set lmax=31 -o output/priors",
+            "lusee-bayes compare-priors fiducial --data data.nc --priors isotropic,local_scales",
+        ),
     ),
     "info": (
         "Describe the contents of a file, or of a run's folder.",

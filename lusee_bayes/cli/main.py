@@ -33,7 +33,8 @@ app = App(
 app.register_install_completion_command()
 # named by path: each is imported when called, so that --help and completion answer at once
 for _name in COMMANDS:
-    app.command(f"lusee_bayes.cli.{_name}_command:{_name}_command", name=_name, help=help_of(_name))
+    _command = f"{_name.replace('-', '_')}_command"
+    app.command(f"lusee_bayes.cli.{_command}:{_command}", name=_name, help=help_of(_name))
 
 
 def main(arguments: list[str] | None = None) -> int:

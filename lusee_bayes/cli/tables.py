@@ -7,8 +7,11 @@ from collections.abc import Sequence
 from rich.markup import escape
 from rich.table import Table
 
+from lusee_bayes.linear.levels import LEVELS
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, forecast_rows
+from lusee_bayes.results.prior_comparison import PriorComparison
+from lusee_bayes.results.sky_coverage import SkiesResult
 from lusee_bayes.results.validation_result import allowed
 from lusee_bayes.sampling.validation import Check
 
@@ -50,11 +53,41 @@ def checks_table(checks: list[Check]) -> Table:
     return table
 
 
+def coverage_table(result: SkiesResult) -> Table:
+    """Given skies and how often error bars hold them, by Galactic latitude."""
+    table = Table("sky", caption="three numbers: |b| < 10, 10 to 30, > 30 deg", show_lines=False)
+    table.columns[0].overflow = "fold"
+    for name in ("68% hold [%]", "rms pull", "largest", "ln evidence", "holds"):
+        table.add_column(name, justify="right", no_wrap=name != "68% hold [%]")
+    for sky in result.skies:
+        *bands, whole = sky.pixels.coverage()
+        table.add_row(
+            escape(sky.name),
+            " ".join(f"{100 * band.held[LEVELS.index(0.68)]:.0f}" for band in bands),
+            " ".join(f"{band.rms:.2f}" for band in bands),
+            f"{whole.largest:.1f}",
+            f"{sky.channel.log_evidence:.1f}",
+            "yes" if result.held(sky) else "NO",
+        )
+    return table
+
+
+def priors_table(result: PriorComparison) -> Table:
+    """One data set under several priors, a column for each."""
+    header, rows = result.table()
+    shown = Table(header[0])
+    for name in header[1:]:
+        shown.add_column(escape(name), justify="right", overflow="fold")
+    for row in rows:
+        shown.add_row(*map(escape, row))
+    return shown
+
+
 def comparison_table(runs: Sequence[FinishedRun]) -> Table:
     """Finished runs side by side."""
     shown = Table("run", "MHz", "fit")
     shown.columns[0].overflow = "fold"
-    for name in ("SNR<1 at ell", "bits", "ln evidence", "- best", "p"):
+    for name in ("SNR<1 at ell", "bits", "ln evidence", "- best", "p instr.", "p prior"):
         shown.add_column(name, justify="right")
     for run, row in zip(runs, comparison_rows(runs), strict=True):
         less = row["log_evidence_less_best"]
@@ -66,6 +99,7 @@ def comparison_table(runs: Sequence[FinishedRun]) -> Table:
             f"{row['information_bits']:.0f}",
             f"{row['log_evidence']:.1f}",
             "-" if less is None else f"{less:.1f}",
-            f"{row['p']:.2g}",
+            f"{row['instrument_p']:.2g}",
+            f"{row['prior_p']:.2g}",
         )
     return shown

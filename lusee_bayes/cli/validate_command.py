@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
+from cyclopts import Parameter
 from rich.console import Console
 
 from lusee_bayes.cli.options import (
@@ -20,12 +22,14 @@ from lusee_bayes.cli.options import (
     say,
     show,
 )
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 
 
 def validate_command(
     scenario: str,
     *,
+    skies: Annotated[list[str] | None, Parameter(consume_multiple=True, negative="")] = None,
     data: Path | None = None,
     output: Output = None,
     resume: Flag = False,
@@ -38,18 +42,21 @@ def validate_command(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> int:
-    """Check the analytic posterior of a scenario by HMC and by simulated data sets.
+    """Check the posterior of a scenario by HMC and by simulated data sets, or on given skies.
 
-    Ends with exit code 1 if a check fails; the thresholds are in validation.md.
+    Ends with exit code 1 if a check fails; the thresholds are in validation.md or coverage.md.
 
     Parameters
     ----------
     scenario
         A YAML file, or the name of a scenario of the package (fiducial, ...).
+    skies
+        Skies to map with the scenario's prior and to compare with the error bars: files, or
+        embedded, smooth and spotty with a seed, as in embedded:2. Nothing is sampled then.
     data
         Visibilities to use; without them the scenario's own are simulated.
     output
-        Folder for the results; by default output/NAME-validation.
+        Folder for the results; by default output/NAME-validation, or NAME-skies.
     resume
         Go on with the unfinished run in the folder, or judge the finished one again.
     chains
@@ -69,6 +76,8 @@ def validate_command(
     verbose
         Print the memory in use after every stage.
     """
+    if skies is not None:
+        return _on_skies(scenario, skies, data, output, resume, set_, force, quiet, verbose)
     from lusee_bayes.sampling.least import require_draws, require_simulations
 
     require_simulations(simulations)
@@ -93,5 +102,38 @@ def validate_command(
     )
     say(console, *(f"  {path}" for path in run.files))
     show(console, checks_table(run.result.checks))
+    say(console, f"{run.result.headline()}; look at {run.folder / REPORT}")
+    return 0 if run.result.passed else 1
+
+
+def _on_skies(
+    scenario: str,
+    skies: list[str],
+    data: Path | None,
+    output: Path | None,
+    resume: bool,
+    set_: list[str] | None,
+    force: bool,
+    quiet: bool,
+    verbose: bool,
+) -> int:
+    if data is not None or resume:
+        raise InputError("--skies simulates its data, all at once; leave out --data and --resume")
+    from lusee_bayes.cli.tables import coverage_table
+    from lusee_bayes.report.pages import REPORT
+    from lusee_bayes.runs.skies_run import run_skies
+
+    console = Console(quiet=quiet, soft_wrap=True)
+    run = run_skies(
+        load(scenario, set_),
+        output or default_folder(scenario, "-skies"),
+        skies,
+        name=Path(scenario).stem,
+        replace=force,
+        stages=Stages(console, verbose=verbose),
+    )
+    say(console, *(f"  {path}" for path in run.files))
+    show(console, coverage_table(run.result))
+    say(console, run.result.thresholds())
     say(console, f"{run.result.headline()}; look at {run.folder / REPORT}")
     return 0 if run.result.passed else 1

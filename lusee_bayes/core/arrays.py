@@ -86,6 +86,27 @@ def scan(
     return carry, None if found[0] is None else np.stack(found)
 
 
+def repeated(xp: ModuleType, unfinished: Callable[[T], Any], step: Callable[[T], T], state: T) -> T:
+    """Return what jax.lax.while_loop does; with NumPy by a loop.
+
+    Parameters
+    ----------
+    xp : module
+        numpy or jax.numpy, that of all arrays that the steps use.
+    unfinished : callable
+        Whether a state is to be followed by another one.
+    step : callable
+        ``step(state)`` gives the next state.
+    state : tree of arrays
+        The first one.
+    """
+    if xp is not np:
+        return jax.lax.while_loop(unfinished, step, state)
+    while unfinished(state):
+        state = step(state)
+    return state
+
+
 def placed(array: Array, where: Any, values: Array) -> Array:
     """Return the array with values at an index; a NumPy array is changed in place."""
     if namespace(array, values) is not np:

@@ -15,7 +15,7 @@ POSTERIOR_CUBE = "lusee_bayes posterior cube 1"
 COMPACT_POSTERIOR = "lusee_bayes compact posterior 1"
 SAMPLES = "lusee_bayes samples 1"
 BEAMS = "lusee_bayes beams 1"
-DIAGNOSTICS = "lusee_bayes diagnostics 1"
+DIAGNOSTICS = "lusee_bayes diagnostics 2"
 PAPER_CASE = "lusee_bayes paper case 1"
 
 # words of the primary header that tell pyuvdata's beams from other FITS files

@@ -12,15 +12,15 @@ has variance C_ell in every coefficient. Y_lm as in healpy (Condon-Shortley phas
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.special import sph_legendre_p_all
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_finite
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.lazy import healpy, special
 
 SQRT2 = np.sqrt(2.0)
 
@@ -114,7 +114,7 @@ def modes_to_map(modes: Float[Array, " modes"], nside: int) -> Float[np.ndarray,
 def _polar_functions(theta: tuple[float, ...], lmax: int) -> np.ndarray:
     """Y_lm at azimuth zero for every packed mode, which depends on ``|m|`` alone."""
     ell, m = mode_numbers(lmax)
-    table = sph_legendre_p_all(lmax, lmax, np.array(theta))[0]
+    table = special.sph_legendre_p_all(lmax, lmax, np.array(theta))[0]
     return np.ascontiguousarray(table[ell, np.abs(m)].T)
 
 
@@ -162,6 +162,27 @@ def pixel_matrix(nside: int, lmax: int) -> Float[np.ndarray, "pixels modes"]:
     """Return :func:`synthesis_matrix` at the centres of HEALPix RING pixels."""
     theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
     return synthesis_matrix(theta, phi, lmax)
+
+
+def columns_to_maps(
+    modes: Float[np.ndarray, "modes maps"], nside: int
+) -> Float[np.ndarray, "pixels maps"]:
+    """Synthesise many HEALPix RING maps at once, a column each: products of matrices by ring."""
+    lmax = lmax_of(modes.shape[0])
+    theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
+    heights, first = np.unique(theta, return_index=True)
+    _, m = mode_numbers(lmax)
+    by_order = np.argsort(m, kind="stable")
+    starts = np.searchsorted(m[by_order], np.arange(-lmax, lmax + 2))
+    polar, packed = polar_functions(heights, lmax)[:, by_order], modes[by_order]
+    waves = np.empty((len(heights), 2 * lmax + 1, modes.shape[1]))
+    for order, (begin, end) in enumerate(pairwise(starts)):
+        np.matmul(polar[:, begin:end], packed[begin:end], out=waves[:, order])
+    azimuth = azimuth_functions(phi, lmax)
+    maps = np.empty((len(phi), modes.shape[1]))
+    for wave, (begin, end) in zip(waves, pairwise([*first, len(phi)]), strict=True):
+        np.matmul(azimuth[begin:end], wave, out=maps[begin:end])
+    return maps
 
 
 def sum_over_m(values: Float[Array, "*batch modes"]) -> Float[np.ndarray, "*batch ells"]:

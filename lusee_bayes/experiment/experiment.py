@@ -8,12 +8,15 @@ import numpy as np
 
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.representation import Described
+from lusee_bayes.experiment.learned_prior import with_learned_prior
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.plausibility import require_plausible
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.simulate import simulate
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.linear.learning import Learned
+from lusee_bayes.sky import SkySource
 
 
 @dataclass(frozen=True, repr=False)
@@ -28,11 +31,14 @@ class Experiment(Described):
         d, measured or simulated.
     doubts : tuple of str
         What is doubtful about measured data, a sentence each.
+    learned : Learned or None
+        How the setup's prior was learned; None for one that was given.
     """
 
     setup: Setup
     data: Visibilities
     doubts: tuple[str, ...] = ()
+    learned: Learned | None = None
 
     def description(self) -> tuple[str, ...]:
         scenario = self.scenario
@@ -50,7 +56,7 @@ class Experiment(Described):
 def build(
     scenario: Scenario, data: Visibilities | None = None, stages: Stages | None = None
 ) -> Experiment:
-    """Build the experiment of a scenario.
+    """Build the experiment of a scenario, with the prior that its data tell.
 
     Parameters
     ----------
@@ -64,22 +70,85 @@ def build(
     Raises
     ------
     InputError
-        If the data are of another frequency, another site or other ports, and for data that no
-        sky gives (:func:`.require_plausible`).
+        If the data are of another frequency, another site or other ports, for data that no sky
+        gives (:func:`.require_plausible`), and for a prior that does not settle.
     """
     stages = stages or Stages()
-    setup = set_up(scenario, data, stages)
+    return _learned(observed(scenario, data, stages), stages)
+
+
+def observed(
+    scenario: Scenario, data: Visibilities | None = None, stages: Stages | None = None
+) -> Experiment:
+    """Build the experiment of a scenario; what its prior could learn of the data is left out.
+
+    Parameters and errors are those of :func:`build`, but that no prior has to settle.
+    """
+    stages = stages or Stages()
     if data is None:
-        with stages("noise"):
-            return Experiment(setup, simulate(setup))
+        return simulated(scenario, stages)
+    setup = set_up(scenario, data, stages)
     std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
-    doubts = require_plausible(data, setup.signal, std)
-    for doubt in doubts:
+    found = Experiment(setup, data, require_plausible(data, setup.signal, std))
+    for doubt in found.doubts:
         stages.say(f"  doubtful: {doubt}")
-    return Experiment(setup, data, doubts)
+    return found
+
+
+def simulated(scenario: Scenario, stages: Stages | None = None) -> Experiment:
+    """Simulate the data of a scenario; what its prior could learn of them is left out.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of one frequency.
+    stages : Stages, optional
+        Told what is being done.
+    """
+    stages = stages or Stages()
+    setup = set_up(scenario, None, stages)
+    with stages("noise"):
+        return Experiment(setup, simulate(setup))
+
+
+def _learned(experiment: Experiment, stages: Stages) -> Experiment:
+    if experiment.setup.family is None:
+        return experiment
+    with stages("prior"):
+        setup, learned = with_learned_prior(experiment.setup, experiment.data)
+    return replace(experiment, setup=setup, learned=learned)
 
 
 def with_truth(experiment: Experiment) -> Experiment:
     """The same, its data being of the scenario's own sky."""
     data = replace(experiment.data, truth=experiment.setup.sky.modes)
     return replace(experiment, data=data)
+
+
+def under_sky(
+    setup: Setup, source: SkySource, seed: int, stages: Stages | None = None
+) -> Experiment:
+    """Simulate data of a given sky, to be mapped with the prior of the scenario.
+
+    The noise, in the data as in N, is that of the given sky; the prior knows nothing of it.
+
+    Parameters
+    ----------
+    setup : Setup
+        Of the scenario.
+    source : SkySource
+        The sky; what it has above the scenario's lmax is left out.
+    seed : int
+        Of the noise and of the systematics.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        If the source has no sky at this frequency, or not up to the scenario's lmax.
+    """
+    scenario = setup.scenario.model_copy(update={"seed": seed})
+    sky = source.at(scenario.frequency_mhz, scenario.lmax)
+    seen = replace(setup.under(sky), scenario=scenario)
+    return _learned(Experiment(seen, simulate(seen)), stages or Stages())

@@ -23,6 +23,8 @@ from lusee_bayes.experiment.schema import (
     BeamSection,
     Frequency,
     GalaxySection,
+    IsotropicPriorSection,
+    LocalScalesPriorSection,
     MonopoleBeamSection,
     NoiseSection,
     ObservationSection,
@@ -83,7 +85,7 @@ class Scenario(Section):
     observation: ObservationSection = ObservationSection()
     beam: BeamSection = MonopoleBeamSection()
     sky: SkySection = GalaxySection()
-    prior: PriorSection = PriorSection()
+    prior: PriorSection = LocalScalesPriorSection()
     noise: NoiseSection = NoiseSection()
     sources: SourcesSection = SourcesSection()
     spectral: SpectralSection = SpectralSection()
@@ -137,19 +139,19 @@ class Scenario(Section):
     def _prior_files_have_a_frequency(self) -> Scenario:
         prior = self.prior
         if self.joint and prior.has_files:
-            raise ValueError(
-                "joint takes the spectral prior; leave out prior.spectrum_file and prior.mean_file"
-            )
+            raise ValueError("joint takes the spectral prior; leave out the files of the prior")
         if self.frequencies_mhz and prior.has_files and prior.file_frequency_mhz is None:
             raise ValueError(
-                "prior.spectrum_file and prior.mean_file are of one frequency; with "
-                "frequencies_mhz, say which in prior.file_frequency_mhz"
+                "the files of the prior are of one frequency; with frequencies_mhz, say which in "
+                "prior.file_frequency_mhz"
             )
         return self
 
     def channels(self) -> tuple[Scenario, ...]:
         """The scenario of every channel; draws of each have a seed of their own, one further."""
-        alone = {"frequencies_mhz": (), "joint": False}
+        alone: dict[str, Any] = {"frequencies_mhz": (), "joint": False}
+        if self.joint:  # theirs is the spectral prior, of the sky's own C_ell
+            alone["prior"] = IsotropicPriorSection(spectrum="sky")
         return tuple(
             self.model_copy(update={**alone, "frequency_mhz": f, "seed": self.seed + number})
             for number, f in enumerate(self.frequencies_mhz)
@@ -158,13 +160,10 @@ class Scenario(Section):
     @property
     def samples(self) -> bool:
         """Whether something besides the sky is to be sampled."""
-        prior = self.prior
         return (
             "sampled" in _treatments(self)
             or self.noise.radiometer.log_factor_std is not None
-            or prior.log_amplitude_std is not None
-            or prior.tilt_std is not None
-            or bool(prior.band_edges)
+            or self.prior.samples
         )
 
     @property

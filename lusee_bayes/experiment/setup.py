@@ -12,7 +12,7 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.schema import SourceSection
+from lusee_bayes.experiment.schema import PriorSection, SourceSection
 from lusee_bayes.instrument.beams import BeamSource, Monopoles, ProductBeams, Receiver
 from lusee_bayes.instrument.beams.gridded import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.coupling import CouplingMatrix
@@ -24,6 +24,7 @@ from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.source_response import source_response
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.sky import BRIGHT_SOURCES, Sky, galactic_unit_vector, kelvin_steradian
+from lusee_bayes.sky.prior_family import PriorFamily
 from lusee_bayes.sky.priors import Prior
 
 # two sites closer than that are one: 30 m
@@ -47,7 +48,7 @@ class Setup:
     coupling : CouplingMatrix
         A.
     prior : Prior
-        S.
+        S. Where it is to be learned, what is expected before there are data.
     responses : tuple of (products, times) arrays
         Of each point source beside the map, to 1 K sr.
     background : (products,) array
@@ -56,6 +57,8 @@ class Setup:
         Visibilities of sky, background and sources through the modelled beams, in K.
     receiver : Receiver or None
         The receivers that the data say; None for others.
+    family : PriorFamily or None
+        Of which data choose the prior; None for a prior that is given.
     """
 
     scenario: Scenario
@@ -70,6 +73,7 @@ class Setup:
     background: Float[Array, " products"]
     signal: Float[Array, "products times"]
     receiver: Receiver | None = None
+    family: PriorFamily | None = None
 
     @property
     def pointing(self) -> Pointing:
@@ -93,6 +97,30 @@ class Setup:
     def prepared(self) -> Instrument:
         """The instrument, prepared for A to be made of many beams."""
         return self.instrument.prepared()
+
+    def with_prior(self, section: PriorSection) -> Setup:
+        """Return the same with another prior, or family of priors.
+
+        Parameters
+        ----------
+        section : PriorSection
+            The scenario's section, in place of its own.
+        """
+        scenario = self.scenario.model_copy(update={"prior": section})
+        prior, family = prior_and_family(scenario, self.sky)
+        return replace(self, scenario=scenario, prior=prior, family=family)
+
+    def under(self, sky: Sky) -> Setup:
+        """Point the instrument at another sky; the prior stays that of the scenario.
+
+        Parameters
+        ----------
+        sky : Sky
+            Of the same frequency and lmax.
+        """
+        complete = CouplingMatrix.build(self.beams, self.pointing)
+        change = complete.layout.scatter(complete @ (sky.modes - self.sky.modes))
+        return replace(self, sky=sky, signal=self.signal + change)
 
 
 def set_up(
@@ -118,7 +146,7 @@ def set_up(
         require_fitting(data, scenario)
     with stages("sky"):
         sky = scenario.sky.source().at(scenario.frequency_mhz, scenario.lmax)
-        prior = scenario.prior.prior(sky)
+        prior, family = prior_and_family(scenario, sky)
     with stages("orientation"):
         if data is None:
             observation = scenario.observation.observation()
@@ -165,7 +193,14 @@ def set_up(
         background,
         signal,
         receiver,
+        family,
     )
+
+
+def prior_and_family(scenario: Scenario, sky: Sky) -> tuple[Prior, PriorFamily | None]:
+    """The scenario's prior, or what is expected of it before there are data, and its family."""
+    family = scenario.prior.family(scenario.frequency_mhz, scenario.lmax)
+    return (scenario.prior.prior(sky) if family is None else family.expected()), family
 
 
 def _antennas(scenario: Scenario, source: BeamSource) -> Monopoles:

@@ -1,11 +1,11 @@
-"""A posterior in a small file: mean, and covariance as a diagonal less a matrix of low rank.
+"""A posterior in a small file: mean, and the prior's covariance less a matrix of low rank.
 
-In units of the prior's standard deviations the covariance is the identity wherever the data say
-nothing. Only the directions v_k in which they say something are kept, with variances c_k < 1::
+In units of the prior, S = G G^T, the covariance is the identity wherever the data say nothing.
+Only the directions v_k in which they say something are kept, with variances c_k < 1::
 
-    C = D (1 - V diag(1 - c) V^T) D,    a draw = mean + D (1 - V diag(1 - sqrt(c)) V^T) z,
+    C = G (1 - V diag(1 - c) V^T) G^T,    a draw = mean + G (1 - V diag(1 - sqrt(c)) V^T) z,
 
-D = diag(prior standard deviations), z ~ N(0, 1).
+z ~ N(0, 1). For independent modes G = diag(prior standard deviations).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
@@ -35,6 +36,7 @@ LAYOUT = Layout(
         "prior_std": Variable(("mode",), low=0.0),
         "directions": Variable(("mode", "rank")),
         "variances": Variable(("rank",), low=0.0, high=1.0),
+        "prior_root": Variable(("mode", "mode"), optional=True),
     },
     {"about": Attribute("text")},
 )
@@ -49,17 +51,20 @@ class CompactPosterior(Described):
     mean : (modes,) array
         In K.
     prior_std : (modes,) array
-        Prior standard deviations D, in K.
+        Prior standard deviations, in K.
     directions : (modes, rank) array
-        V: orthonormal columns, in units of ``prior_std``.
+        V: orthonormal columns, in units of the prior.
     variances : (rank,) array
         c, below 1.
+    prior_root : (modes, modes) array or None
+        G, in K; None if it is the diagonal of ``prior_std``.
     """
 
     mean: Float[np.ndarray, " modes"]
     prior_std: Float[np.ndarray, " modes"]
     directions: Float[np.ndarray, "modes rank"]
     variances: Float[np.ndarray, " rank"]
+    prior_root: Float[np.ndarray, "modes modes"] | None = None
 
     def description(self) -> tuple[str, ...]:
         return (
@@ -88,10 +93,10 @@ class CompactPosterior(Described):
         Raises
         ------
         InputError
-            If the prior is not diagonal.
+            If the prior is over pixels.
         """
-        scale = posterior.prior.diagonal_root()
-        if scale is None:
+        prior = on_host(posterior.prior)
+        if not prior.invertible:
             raise InputError("only posteriors over harmonic coefficients have a compact form")
         lower = np.tril(np.asarray(posterior.lower))
         # the singular values of L: its eigenvalues squared are lost where Lambda is formed
@@ -101,7 +106,9 @@ class CompactPosterior(Described):
         directions = left[:, kept]
         if posterior.basis is not None:
             directions = np.asarray(posterior.basis) @ directions
-        return cls(np.asarray(posterior.mean), np.asarray(scale), directions, variances[kept])
+        root = None if prior.independent else prior.colour(np.eye(prior.rank)).T
+        width = np.sqrt(prior.variance())
+        return cls(np.asarray(posterior.mean), width, directions, variances[kept], root)
 
     def covariance(self) -> Float[np.ndarray, "modes modes"]:
         """Compute C as a matrix.
@@ -112,7 +119,7 @@ class CompactPosterior(Described):
             In K^2.
         """
         inner = (self.directions * (1.0 - self.variances)) @ self.directions.T
-        return self.prior_std[:, None] * (np.eye(len(self.mean)) - inner) * self.prior_std
+        return self._coloured(self._coloured(np.eye(len(self.mean)) - inner).T)
 
     def std(self) -> Float[np.ndarray, " modes"]:
         """Compute the standard deviation of every coefficient.
@@ -122,9 +129,8 @@ class CompactPosterior(Described):
         (modes,) array
             In K.
         """
-        squared = self.directions**2
-        outside = 1.0 - squared.sum(1)
-        return self.prior_std * np.sqrt(outside + squared @ self.variances)
+        seen = self._coloured(self.directions.T) ** 2
+        return np.sqrt(self.prior_std**2 - (1.0 - self.variances) @ seen)
 
     def sample(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n modes"]:
         """Draw from the posterior.
@@ -143,7 +149,11 @@ class CompactPosterior(Described):
         """
         z = rng.standard_normal((n, len(self.mean)))
         z = z - (z @ self.directions) * (1.0 - np.sqrt(self.variances)) @ self.directions.T
-        return self.mean + self.prior_std * z
+        return self.mean + self._coloured(z)
+
+    def _coloured(self, u: Float[np.ndarray, "n modes"]) -> Float[np.ndarray, "n modes"]:
+        """G u of every row."""
+        return u * self.prior_std if self.prior_root is None else u @ self.prior_root.T
 
     def write(self, path: Path, metadata: dict[str, object]) -> None:
         """Write a NumPy .npz file.
@@ -156,6 +166,7 @@ class CompactPosterior(Described):
             What JSON can hold; it is written under the name ``about``.
         """
         ell, m = mode_numbers(lmax_of(len(self.mean)))
+        root = {} if self.prior_root is None else {"prior_root": self.prior_root}
         with path.open("wb") as file:
             np.savez(
                 file,
@@ -165,6 +176,7 @@ class CompactPosterior(Described):
                 variances=self.variances,
                 ell=ell,
                 m=m,
+                **root,
                 about=json.dumps({"format": formats.COMPACT_POSTERIOR, **metadata}),
             )
 
@@ -195,4 +207,5 @@ def read_compact(path: str | Path) -> tuple[CompactPosterior, dict[str, object]]
     if not isinstance(metadata, dict) or metadata.get("format") != formats.COMPACT_POSTERIOR:
         raise InputError(f"{path} does not say that it is {LAYOUT.what}")
     names = ("mean", "prior_std", "directions", "variances")
-    return CompactPosterior(*(found.arrays[name] for name in names)), metadata
+    arrays = [found.arrays[name] for name in names]
+    return CompactPosterior(*arrays, found.arrays.get("prior_root")), metadata

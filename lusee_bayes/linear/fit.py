@@ -1,13 +1,13 @@
-"""Whether data fit a model, in three words, with the thresholds that part them.
+"""Whether data fit: chi^2 tests, one rate of false alarms for all of them, and words.
 
-If the model holds, chi^2 of all n data, the sky included, follows a chi^2 distribution with n
-degrees of freedom, and ::
+If a model holds, chi^2 of n degrees of freedom has ::
 
-    p = 2 min(P(chi^2_n > chi^2), P(chi^2_n < chi^2))
+    p = 2 min(P(chi^2_n > chi^2), P(chi^2_n < chi^2)),
 
-is uniform from 0 to 1: too large a chi^2 counts as much as too small a one. The best of k such
+uniform from 0 to 1: too large a chi^2 counts as much as too small a one. The best of k such
 probabilities is judged by k p, which is below any bound at most that often, however they depend on
-one another (Bonferroni).
+one another (Bonferroni). A report makes all of its tests at one rate, so that a report of data that
+fit says otherwise at most once in 1 / ``FALSE_ALARM``.
 """
 
 from __future__ import annotations
@@ -20,17 +20,41 @@ import numpy as np
 
 from lusee_bayes.core.lazy import special
 
-Level = Literal["consistent", "in tension", "does not fit"]
-LEVELS: tuple[Level, ...] = ("consistent", "in tension", "does not fit")
-# Data of a model that holds are called in tension once in a hundred runs. Real skies are not drawn
-# from the prior, which alone makes probabilities of 1e-3 (the fiducial sky); nothing that is right
-# in data and instrument has been seen to make less than 1e-6, and chance does not in any number of
-# runs that a mission makes.
-TENSION, MISFIT = 1e-2, 1e-6
-THRESHOLDS = (
-    f"consistent: p of at least {TENSION:g}; in tension: from {MISFIT:g} to {TENSION:g}; does not "
-    f"fit: below {MISFIT:g}"
+Level = Literal["consistent", "unlike the prior", "does not fit"]
+LEVELS: tuple[Level, ...] = ("consistent", "unlike the prior", "does not fit")
+# of a report of data that fit: a mission makes some hundred of them
+FALSE_ALARM = 1e-3
+RULE = (
+    f"A test stands out if its p times the number of tests is below {FALSE_ALARM:g}: by chance "
+    f"once in {1.0 / FALSE_ALARM:.0f} reports"
 )
+
+
+@dataclass(frozen=True)
+class ChiSquare:
+    """A chi^2 with its degrees of freedom, which need not be whole.
+
+    Attributes
+    ----------
+    chi2, degrees : float
+    """
+
+    chi2: float
+    degrees: float
+
+    @property
+    def p(self) -> float:
+        """Probability of a chi^2 as far out on its side, if the model holds."""
+        return two_sided(self.chi2, self.degrees)
+
+    def words(self) -> str:
+        """p, and chi^2 with what is expected of it."""
+        return f"p {probability(self.p)}, {self.found()}"
+
+    def found(self, most: str = "") -> str:
+        """chi^2 with what is expected of it; ``most``: words before that."""
+        expected = f"{most}{self.degrees:.0f} +- {np.sqrt(2.0 * self.degrees):.0f}"
+        return f"chi^2 {self.chi2:.0f}, expected {expected}"
 
 
 @dataclass(frozen=True)
@@ -39,15 +63,12 @@ class Fit:
 
     Attributes
     ----------
-    level : {"consistent", "in tension", "does not fit"}
-    p : float
-        Two-sided, of all data.
+    level : {"consistent", "unlike the prior", "does not fit"}
     text : str
-        The verdict in sentences, with what stands out.
+        The verdict in sentences: what stands out, and what to do.
     """
 
     level: Level
-    p: float
     text: str
 
 
@@ -69,20 +90,9 @@ def two_sided(chi2: float, n: float | int) -> float:
     return float(min(1.0, 2.0 * min(special.chdtr(n, chi2), special.chdtrc(n, chi2))))
 
 
-def level_of(p: float, n: int = 1) -> Level:
-    """Sort a probability, the smallest of ``n``, into one of the three levels.
-
-    Parameters
-    ----------
-    p : float
-        Uniform if the model holds.
-    n : int
-        How many there were to choose from.
-    """
-    corrected = n * p
-    if corrected >= TENSION:
-        return "consistent"
-    return "in tension" if corrected >= MISFIT else "does not fit"
+def stands_out(p: float, among: int) -> bool:
+    """Whether a probability, one of ``among`` of a report, is too small for chance."""
+    return among * p < FALSE_ALARM
 
 
 def worst(levels: Sequence[Level]) -> Level:
@@ -104,33 +114,3 @@ def probability(p: float) -> str:
         Such as "= 0.62", or "< 1e-300" where it is too small for a float.
     """
     return f"= {p:.2g}" if p > 0 else "< 1e-300"
-
-
-def sentence(level: Level, what: str = "data") -> str:
-    """The verdict's first words.
-
-    Parameters
-    ----------
-    level : {"consistent", "in tension", "does not fit"}
-    what : str
-        What is judged, in the plural.
-    """
-    return {
-        "consistent": f"Consistent: the {what} fit the model",
-        "in tension": f"In tension: the {what} and the model agree poorly",
-        "does not fit": f"Does not fit: the {what} contradict the model",
-    }[level]
-
-
-def size_of_residuals(chi2: float, n: int, p: float) -> str:
-    """``chi^2`` with what is expected of it, and its p-value; says if it is too small.
-
-    Parameters
-    ----------
-    chi2 : float
-    n : int
-    p : float
-        From :func:`two_sided`.
-    """
-    text = f"p {probability(p)}; chi^2 {chi2:.0f}, expected {n} +- {np.sqrt(2.0 * n):.0f}"
-    return text + (", smaller than chance allows" if chi2 < n and p < TENSION else "")

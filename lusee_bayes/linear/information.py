@@ -18,20 +18,29 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array, compiled, namespace, on_processor, placed
+from lusee_bayes.core.arrays import (
+    Array,
+    compiled,
+    namespace,
+    on_processor,
+    placed,
+    repeated,
+)
 from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import cholesky, gram_matrix, scaled, solve_lower
+from lusee_bayes.core.linalg import (
+    cholesky,
+    gram_matrix,
+    precise_residual,
+    solve_lower,
+)
 from lusee_bayes.core.representation import Described, number
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
 from lusee_bayes.linear.normal_matrix import has_structure, is_within_times, normal_matrix
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.solver import CONVERGENCE
+from lusee_bayes.linear.solver import CONVERGENCE, MAX_REFINEMENTS
 from lusee_bayes.noise.covariance import Covariance, Factor
 from lusee_bayes.sky.priors import Prior
-
-# how often the solution is repeated on what is left of the gradient
-REFINEMENTS = 3
 
 
 class Information(Described, eqx.Module):
@@ -83,7 +92,7 @@ class Information(Described, eqx.Module):
         coupling : Coupling
             A, of shape (data, modes).
         prior : Prior
-            Diagonal in the modes. Its posterior mean becomes the reference sky.
+            Over the same modes. Its posterior mean becomes the reference sky.
         noise : Covariance
             N, in K^2.
         offset : (data,) array or None
@@ -106,8 +115,7 @@ class Information(Described, eqx.Module):
         ------
         InputError
             If ``data`` is not float64, not finite or of another length, N is not positive definite,
-            the prior is not diagonal in the modes, ``key`` is missing, or the mean does not
-            converge.
+            the prior is over pixels, ``key`` is missing, or the mean does not converge.
         """
         require_float64("the data", data)
         require_shape("the data", data, (noise.size,))
@@ -127,9 +135,9 @@ class Information(Described, eqx.Module):
         zero, n_data = xp.zeros(prior.size), xp.asarray(float(noise.size))
         vector, misfit = gradient_and_misfit(coupling, factor, centred, zero)
         first = cls(matrix, vector, zero, misfit, xp.asarray(factor.log_det()), n_data)
-        root = _diagonal_root(prior, n_modes=matrix.shape[0])
-        lower = _precision_root(matrix, root)
-        mean = prior.colour(_condition(first, root, lower, prior.white_mean, 1)[0])
+        _require_modes(prior, len(zero))
+        lower = _precision_root(matrix, prior)
+        mean = prior.colour(_condition(first, prior, lower, 1)[0])
         vector, misfit = gradient_and_misfit(coupling, factor, centred, mean)
         perturbations = None
         if n_perturbations:
@@ -140,7 +148,7 @@ class Information(Described, eqx.Module):
                 [gradient_and_misfit(coupling, factor, n, zero)[0] for n in drawn]
             )
         information = cls(matrix, vector, mean, misfit, first.log_det, n_data, perturbations)
-        return information, information._posterior(prior, lower, 2)
+        return information, information._posterior(prior, lower)
 
     def description(self) -> tuple[str, ...]:
         return (
@@ -204,7 +212,7 @@ class Information(Described, eqx.Module):
         Parameters
         ----------
         prior : Prior
-            Diagonal in the modes.
+            Over the same modes.
 
         Returns
         -------
@@ -214,14 +222,16 @@ class Information(Described, eqx.Module):
         Raises
         ------
         InputError
-            If the prior is not diagonal in the modes, or the mean does not converge.
+            If the prior is over pixels or has another size, or the mean does not converge.
         """
-        lower = _precision_root(self.matrix, _diagonal_root(prior, self.n_modes))
-        return self._posterior(prior, lower, REFINEMENTS)
+        _require_modes(prior, self.n_modes)
+        return self._posterior(prior, _precision_root(self.matrix, prior))
 
-    def _posterior(self, prior: Prior, lower: Array, refinements: int) -> Posterior:
-        root = _diagonal_root(prior, self.n_modes)
-        u, log_evidence, moved = _condition(self, root, lower, prior.white_mean, refinements)
+    def _posterior(self, prior: Prior, lower: Array) -> Posterior:
+        u, log_evidence, moved = _condition(self, prior, lower, MAX_REFINEMENTS)
+        if not is_traced(moved) and not float(moved) <= CONVERGENCE:
+            # m0 is far from the mean, so that the gradient is the small difference of large numbers
+            u, log_evidence, moved = _condition(self, prior, lower, MAX_REFINEMENTS, precise=True)
         # rounding grows with u, which is of order one where the data are what the prior allows
         if not is_traced(moved) and not float(moved) <= (
             accepted := CONVERGENCE * max(1.0, float(np.sqrt(np.mean(np.square(u)))))
@@ -234,12 +244,12 @@ class Information(Described, eqx.Module):
         return Posterior(prior, u, lower, None, log_evidence, moved)
 
 
-def _diagonal_root(prior: Prior, n_modes: int) -> Float[Array, " modes"]:
-    root = prior.diagonal_root()
-    if root is None:
-        raise InputError("information about modes needs a prior over the same modes")
-    require_shape("the prior", root, (n_modes,))
-    return root
+def _require_modes(prior: Prior, n_modes: int) -> None:
+    if not prior.invertible or prior.size != n_modes:
+        raise InputError(
+            f"information about {n_modes} modes needs a prior over the same modes, got "
+            f"{type(prior).__name__} over {prior.size} unknowns"
+        )
 
 
 @compiled
@@ -253,39 +263,58 @@ def gradient_and_misfit(
 
 
 @compiled
-def _precision_root(matrix: Float[Array, "modes modes"], root: Float[Array, " modes"]) -> Array:
-    """L of the precision 1 + G M G of u = m / root."""
-    precision = scaled(matrix, root)
-    diagonal = np.diag_indices(len(root))
+def _precision_root(matrix: Float[Array, "modes modes"], prior: Prior) -> Array:
+    """L of the precision 1 + G^T M G of u = G^-1 m."""
+    precision = prior.sandwich(matrix)
+    diagonal = np.diag_indices(len(precision))
     return cholesky(placed(precision, diagonal, precision[diagonal] + 1.0), overwrite=True)
 
 
 @compiled
 def _condition(
     information: Information,
-    root: Array,
+    prior: Prior,
     lower: Array,
-    prior_mean: Array | None,
     refinements: int,
+    *,
+    precise: bool = False,
 ) -> tuple[Array, Array, Array]:
     """Mean of u, ln p(d), and the last step in standard deviations.
 
-    u is found as a correction to that of m0; components without prior power are zero.
+    u is found as a correction to that of m0; components without prior power are zero. The solution
+    is repeated on what is left of the gradient, up to so many times, as long as that gains.
     """
     xp = namespace(information)
-    start = xp.where(root > 0, information.reference / xp.where(root > 0, root, 1.0), 0.0)
-    here = information.recentred(start * root)
-    expected = xp.zeros_like(root) if prior_mean is None else prior_mean
-    correction, moved = xp.zeros_like(root), xp.asarray(np.inf)
-    for _ in range(refinements):
-        pull = here.vector - here.matrix @ (root * correction)
-        gradient = root * pull - (start + correction - expected)
+    start = prior.whiten(information.reference)
+    mean = prior.white_mean
+    expected = xp.zeros_like(start) if mean is None else mean
+    here = information.recentred(prior.colour(start))
+
+    def unfinished(state):
+        _, moved, before, count = state
+        # what is left may be rounding, which no refinement makes smaller
+        settled = (moved < CONVERGENCE) & (moved > 0.5 * before)
+        more = (moved > 1e-3 * CONVERGENCE) & ~settled & (count < refinements)
+        return (count < 1) | more
+
+    def refine(state):
+        correction, before, _, count = state
+        shift = prior.colour(correction)
+        if precise:
+            pull = precise_residual(here.vector, here.matrix, shift)
+        else:
+            pull = here.vector - here.matrix @ shift
+        gradient = prior.colour_columns(pull[None])[0] - (start + correction - expected)
         half = solve_lower(lower, gradient[:, None], transpose=False)
-        correction = correction + solve_lower(lower, half, transpose=True)[:, 0]
-        moved = xp.asarray(xp.linalg.norm(half))
+        step = solve_lower(lower, half, transpose=True)[:, 0]
+        return correction + step, xp.asarray(xp.linalg.norm(half)), before, count + 1
+
+    never = xp.asarray(np.inf)
+    first = (xp.zeros_like(start), never, never, xp.asarray(0))
+    correction, moved, _, _ = repeated(xp, unfinished, refine, first)
     u = start + correction
     log_evidence = -0.5 * (
-        here.recentred(u * root).misfit
+        here.recentred(prior.colour(u)).misfit
         + (u - expected) @ (u - expected)
         + here.log_det
         + 2.0 * xp.log(xp.diagonal(lower)).sum()

@@ -1,7 +1,8 @@
 """Groups of data against their prediction by all others, with A and N of any kind as matrices.
 
 With N = L L^T and (A S A^T + N)^-1 = L^-T (1 - H^T H) L^-1 (:meth:`Solver.half`), the columns of
-L^-1 that belong to a group give K_ss.
+L^-1 that belong to a group, E, give K_ss = E^T (1 - H^T H) E and (K^-1 N K^-1)_ss =
+E^T (1 - H^T H)^2 E.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.linear.left_out import LeftOut
+from lusee_bayes.linear.left_out import LeftOut, Missed, log_det_of
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import Factor
 
@@ -46,19 +47,20 @@ class DenseLeftOut(LeftOut):
         white = solver.surprise(data)
         rest = white - self._half.T @ (self._half @ white)
         self._u = np.asarray(solver.factor.whiten_transpose(rest))
+        self._gram = np.asarray(self._half @ self._half.T)
         self.u = layout.scatter(self._u)
         self.inverse_diagonal = np.full(self.u.shape, np.nan)
 
     def stretch(self, times):
-        return self._chi2(np.flatnonzero(times[self._layout.time]))
+        return self._missed(np.flatnonzero(times[self._layout.time]))
 
     def together(self, times):
         return self.stretch(times)
 
     def product(self, number):
-        return self._chi2(np.flatnonzero(self._layout.product == number))
+        return self._missed(np.flatnonzero(self._layout.product == number))
 
-    def _chi2(self, index: Int[np.ndarray, " group"]) -> float:
+    def _missed(self, index: Int[np.ndarray, " group"]) -> Missed:
         columns = []
         for first in range(0, len(index), COLUMNS):
             chosen = index[first : first + COLUMNS]
@@ -72,7 +74,11 @@ class DenseLeftOut(LeftOut):
         block = white.T @ white - inside.T @ inside
         where = (self._layout.product[index], self._layout.time[index])
         self.inverse_diagonal[where] = np.diagonal(block)
-        return float(self._u[index] @ cho_solve(cho_factor(block), self._u[index]))
+        root = cho_factor(block)
+        # of noise alone (K^-1 N K^-1)_ss is K_ss less that
+        sky = inside.T @ inside - inside.T @ (self._gram @ inside)
+        chi2 = self._u[index] @ cho_solve(root, self._u[index])
+        return Missed(float(chi2), float(np.trace(cho_solve(root, sky))), log_det_of(root[0]))
 
 
 @eqx.filter_jit

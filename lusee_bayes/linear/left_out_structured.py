@@ -10,14 +10,19 @@ A' = [A, T], C' the posterior covariance of both. With D = (N_0^-1)_ss ::
 The rows of a stretch of time are A = U R: a few smooth functions U of time for every product. With
 D = c c^T, c^T U = Q B (QR), W = C'^(T/2) R^T B^T and the whitened w = c^-1 u ::
 
-    chi^2_s = |w|^2 - |b|^2 + b^T (1 - W^T W)^-1 b,    b = Q^T w,
+    chi^2_s = |w|^2 - |b|^2 + b^T (1 - W^T W)^-1 b,    b = Q^T w,    |K_ss| = |D| |1 - W^T W|,
 
 and a datum's own entry of K_ss comes from the same Q and W. A product, or all data of a turntable
 angle, have more data than there are modes; they are taken out of the normal matrix instead, ::
 
-    chi^2_s = |w|^2 + h^T (C'^-1 - A'^T D A')^-1 h,    h = A'^T u_s.
+    chi^2_s = |w|^2 + h^T (C'^-1 - A'^T D A')^-1 h,    h = A'^T u_s,
+    |K_ss| = |D| |C'^-1 - A'^T D A'| |C'|.
 
 For a long run nothing of the size data x modes is formed.
+
+Without the group the covariance of the modes grows from C to C_w, and the trace of that, in white
+coordinates, is the number of directions that only the group measures (:mod:`.left_out`). It is
+told by z^T (C_w - C) z of some random z with entries +-1.
 """
 
 from __future__ import annotations
@@ -34,15 +39,24 @@ from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.core.threads import once
 from lusee_bayes.instrument.coupling import CouplingMatrix, turned_about_pole
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.linear.left_out import LeftOut
+from lusee_bayes.linear.left_out import LeftOut, Missed, log_det_of
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.normal_matrix import summed
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.stretches import Part, roots_of_blocks, smooth_functions, weigh
+from lusee_bayes.linear.stretches import (
+    Part,
+    log_det_of_weights,
+    roots_of_blocks,
+    smooth_functions,
+    weigh,
+)
 from lusee_bayes.noise.covariance import LowRankUpdate
 
 # C^(1/2) A^T is kept up to this size (a month at lmax 47: 0.1 GB); it is made by so many times
 KEPT_BYTES, CHUNK = 2.5e8, 64
+# random directions for traces: a trace t is then good to sqrt(2 t / 200), at most a tenth of the
+# scatter of chi^2_s
+PROBES = 200
 
 
 class StructuredLeftOut(LeftOut):
@@ -51,8 +65,7 @@ class StructuredLeftOut(LeftOut):
     Parameters
     ----------
     model : LinearGaussian
-        With structure in time, noise within times (and templates), and a prior that is diagonal in
-        the modes.
+        With structure in time, noise within times (and templates), and a prior over modes.
     posterior : Posterior
         Of these data, through the normal matrix.
     data : (data,) array
@@ -69,7 +82,7 @@ class StructuredLeftOut(LeftOut):
         shape = self._coupling.layout.n_products, self._coupling.layout.n_times
         self._complete = replace(self._coupling, layout=DataLayout(*shape))
         self._tilts = self._coupling.pointing.tilt_factors()
-        self._scale = model.prior.diagonal_root()
+        self._prior = model.prior
         self._lower = posterior.lower
         scatter = self._coupling.layout.scatter
         u = np.asarray(model.noise.solve(np.asarray(data) - model.predict(posterior.mean)))
@@ -86,6 +99,11 @@ class StructuredLeftOut(LeftOut):
         self._v = self._pulled(self._complete, weighted)
         # C'^(1/2) of every amplitude
         across = cho_solve((self._q, True), self._v)
+        signs = np.random.default_rng(0).integers(0, 2, (len(self._lower), PROBES))
+        self._probes = np.pad(2.0 * signs - 1.0, ((0, n), (0, 0)))
+        # C'^(1/2) of the random directions, whose amplitudes are zero
+        self._probed = self._probes.copy()
+        self._probed[: len(signs)] = solve_lower(self._lower, 2.0 * signs - 1.0, transpose=False)
         self._amplitudes = np.concatenate(
             [
                 -solve_lower(self._lower, across.T, transpose=False),
@@ -94,7 +112,7 @@ class StructuredLeftOut(LeftOut):
         )
 
     def stretch(self, times):
-        outside, inside, halves = 0.0, [], []
+        outside, log_det, inside, halves = 0.0, 0.0, [], []
         for run, span in self._coupling.pointing.runs():
             here = np.flatnonzero(times[span]) + span.start
             if not here.size:
@@ -108,15 +126,18 @@ class StructuredLeftOut(LeftOut):
                 halves.append(w)
                 inside.append(q.T @ white)
                 outside += white @ white - inside[-1] @ inside[-1]
+                log_det += part.log_det()
                 seen = part.coloured(q)
                 left = part.diagonal() - ((seen @ (w.T @ w)) * seen).sum(1)
                 self.inverse_diagonal[part.where] = left.reshape(self.u[part.where].shape)
-        return float(outside + _between(np.concatenate(halves, axis=1), np.concatenate(inside)))
+        half, b = np.concatenate(halves, axis=1), np.concatenate(inside)
+        return self._between(half, b, outside, log_det)
 
     def together(self, times):
         squared = float((self.u * self._y)[:, times].sum())
         every = np.ones(len(self.u), dtype=bool)
-        return squared + self._taken_out(self._weights * times, self.u * times, every)
+        log_det = log_det_of_weights(self._weights[..., times])
+        return self._taken_out(self._weights * times, self.u * times, every, squared, log_det)
 
     def product(self, number):
         own, mixing = self._weights[number], 0.0
@@ -130,15 +151,17 @@ class StructuredLeftOut(LeftOut):
             )
         here = own > 0
         white = np.divide(self.u[number], np.sqrt(own), out=np.zeros(len(own)), where=here)
-        if here.sum() > len(self._scale) // 2:
+        log_det = float(np.log(own[here]).sum())
+        if here.sum() > self._prior.size // 2:
             weights = mixing * own
             if self._weights.ndim == 3:
                 weights = mixing[:, None] * mixing[None] * own
             used = mixing.any(axis=1)
-            return float(white @ white + self._taken_out(weights, mixing * self.u[number], used))
+            pull, squared = mixing * self.u[number], float(white @ white)
+            return self._taken_out(weights, pull, used, squared, log_det)
         half = self._half(self._mixed(mixing))[:, : self.u.shape[1]]
         half = half + self._amplitudes @ np.einsum("jt,jta->at", mixing, self._t)
-        return float(_between((half * np.sqrt(own))[:, here], white[here]))
+        return self._between((half * np.sqrt(own))[:, here], white[here], 0.0, log_det)
 
     def _mixed(self, mixing: Float[np.ndarray, "products times"]) -> np.ndarray:
         """C^(1/2) of the products' rows of every time, added with these factors."""
@@ -158,7 +181,7 @@ class StructuredLeftOut(LeftOut):
     @once
     def _kept(self) -> Float[np.ndarray, "products times modes"] | None:
         """C^(1/2) of the row of every datum, which days and products share; None if it is large."""
-        n_modes = len(self._scale)
+        n_modes = self._prior.size
         if 8 * self.u.size * n_modes > KEPT_BYTES:
             return None
         kept = np.empty((*self.u.shape, n_modes))
@@ -174,7 +197,7 @@ class StructuredLeftOut(LeftOut):
     ) -> Float[np.ndarray, "modes columns"]:
         """C^(1/2) of the rows of functions of time, for every product."""
         if len(here) == functions.shape[1] and self._kept is not None:
-            return self._kept[:, here].reshape(-1, len(self._scale)).T
+            return self._kept[:, here].reshape(-1, self._prior.size).T
         return self._whitened(self._rows(run, here, functions))
 
     def _phases(self, here: Int[np.ndarray, " times"]) -> Float[np.ndarray, "times functions"]:
@@ -229,19 +252,20 @@ class StructuredLeftOut(LeftOut):
 
     def _whitened(self, rows: Float[np.ndarray, "rows modes"]) -> Float[np.ndarray, "modes rows"]:
         """C^(1/2) of combinations of modes."""
-        return solve_lower(self._lower, (rows * self._scale).T, transpose=False)
+        return solve_lower(self._lower, self._prior.colour_columns(rows).T, transpose=False)
 
     def _pulled(
         self, coupling: CouplingMatrix, grid: Float[np.ndarray, "products times columns"]
     ) -> Float[np.ndarray, "columns modes"]:
         """Columns of A^T in white coordinates, as rows."""
         pulled = [coupling.transpose_mv(x.ravel()) for x in np.moveaxis(grid, 2, 0)]
-        return np.reshape(pulled, (grid.shape[2], len(self._scale))) * self._scale
+        rows = np.reshape(pulled, (grid.shape[2], self._prior.size))
+        return self._prior.colour_columns(rows)
 
     @once
     def _precision(self) -> Float[np.ndarray, "rank rank"]:
         """C'^-1."""
-        n = len(self._scale)
+        n = self._prior.size
         precision = np.empty((n + len(self._q),) * 2)
         precision[:n, :n] = self._lower @ self._lower.T
         precision[:n, :n] += self._v.T @ cho_solve((self._q, True), self._v)
@@ -254,16 +278,18 @@ class StructuredLeftOut(LeftOut):
         weights: Float[np.ndarray, "..."],
         pull: Float[np.ndarray, "products times"],
         used: Bool[np.ndarray, " products"],
-    ) -> float:
-        """h^T (C'^-1 - A'^T D A')^-1 h of a group, given its D and how u pulls at its data.
+        squared: float,
+        log_det: float,
+    ) -> Missed:
+        """``squared`` + h^T (C'^-1 - A'^T D A')^-1 h, given D and how u pulls at a group's data.
 
-        ``used``: the products that D and u have a part in.
+        ``used``: the products that D and u have a part in. ``log_det``: ln|D|.
         """
-        n, weighted = len(self._scale), weigh(weights, self._t)
+        n, weighted = self._prior.size, weigh(weights, self._t)
         coupling = self._complete if used.all() else of_products(self._complete, used)
         within = weights[used] if weights.ndim == 2 else weights[used][:, used]
         left = self._precision.copy()
-        left[:n, :n] -= self._scale[:, None] * summed(coupling, within) * self._scale
+        left[:n, :n] -= self._prior.sandwich(summed(coupling, within))
         if len(self._q):
             taken = self._pulled(coupling, weighted[used])
             left[n:, :n] -= taken
@@ -274,7 +300,32 @@ class StructuredLeftOut(LeftOut):
             np.einsum("kt,kta->a", pull, self._t),
         ]
         h = np.concatenate(h)
-        return float(h @ cho_solve(cho_factor(left, lower=True, overwrite_a=True), h))
+        root = cho_factor(left, lower=True, overwrite_a=True)
+        grown = (self._probes * cho_solve(root, self._probes)).sum() - (self._probed**2).sum()
+        log_det += log_det_of(root[0]) - log_det_of(self._lower) - log_det_of(self._q)
+        return Missed(float(squared + h @ cho_solve(root, h)), float(grown / PROBES), log_det)
+
+    def _between(
+        self,
+        half: Float[np.ndarray, "rank n"],
+        b: Float[np.ndarray, " n"],
+        outside: float,
+        log_det: float,
+    ) -> Missed:
+        """``outside`` + b^T (1 - W^T W)^-1 b, in whichever of the two spaces is smaller.
+
+        ``log_det``: ln|D|.
+        """
+        rank, n = half.shape
+        if n <= rank:
+            root = cho_factor(np.eye(n) - half.T @ half)
+            seen = half.T @ self._probed
+            chi2, grown = b @ cho_solve(root, b), (seen * cho_solve(root, seen)).sum()
+        else:
+            root, h = cho_factor(np.eye(rank) - half @ half.T), half @ b
+            chi2 = b @ b + h @ cho_solve(root, h)
+            grown = (self._probed * cho_solve(root, self._probed)).sum() - (self._probed**2).sum()
+        return Missed(float(outside + chi2), float(grown / PROBES), log_det + log_det_of(root[0]))
 
 
 def of_products(coupling: CouplingMatrix, used: Bool[np.ndarray, " products"]) -> CouplingMatrix:
@@ -287,12 +338,3 @@ def of_products(coupling: CouplingMatrix, used: Bool[np.ndarray, " products"]) -
         by_order=by_product[:, :, used].reshape(n_runs, n_orders, -1, n_degrees),
         layout=DataLayout(int(used.sum()), coupling.layout.n_times),
     )
-
-
-def _between(half: Float[np.ndarray, "rank n"], b: Float[np.ndarray, " n"]) -> float:
-    """b^T (1 - W^T W)^-1 b, in whichever of the two spaces is smaller."""
-    rank, n = half.shape
-    if n <= rank:
-        return float(b @ cho_solve(cho_factor(np.eye(n) - half.T @ half), b))
-    h = half @ b
-    return float(b @ b + h @ cho_solve(cho_factor(np.eye(rank) - half @ half.T), h))

@@ -187,8 +187,8 @@ class LinearGaussian(Described, eqx.Module):
             d, in K.
         form : {"map", "data", "root", "structured"}, optional
             As for :meth:`factorise`, or "structured": through A^T N^-1 A without A. That is the
-            default where A and N have structure in time, the prior is diagonal in the modes, and
-            the data are as many as these.
+            default where A and N have structure in time, the prior is over modes, and the data
+            are as many as these.
 
         Returns
         -------
@@ -208,9 +208,8 @@ class LinearGaussian(Described, eqx.Module):
     @property
     def is_structured(self) -> bool:
         """Whether the posterior is found without A by default; see :meth:`condition`."""
-        diagonal = self.prior.diagonal_root() is not None
         enough = self.n_data >= self.prior.size
-        return diagonal and enough and has_structure(self.coupling, self.noise)
+        return self.prior.invertible and enough and has_structure(self.coupling, self.noise)
 
     def inform(
         self,

@@ -1,9 +1,6 @@
 """Variances of all pixels of a map, from the covariance of its harmonic coefficients.
 
-diag(Y C Y^T) ring by ring: on a ring of HEALPix pixels y_lm = lambda_l|m|(theta) f_m(phi), so that
-C shrinks to a matrix over m <= m' of each ring before any pixel is looked at. N_modes^2 operations
-a ring, where products with Y take N_modes^2 a pixel; a ring and its mirror image in the south,
-where lambda has the sign (-1)^(l + m), share half of them.
+diag(Y C Y^T) ring by ring; see :mod:`lusee_bayes.core.order_products`.
 """
 
 from __future__ import annotations
@@ -14,8 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.harmonics import azimuth_functions, lmax_of, mode_numbers, polar_functions
+from lusee_bayes.core.harmonics import azimuth_functions, lmax_of, polar_functions
 from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.order_products import modes_by_order, order_products
+from lusee_bayes.sky.priors import Prior
 
 
 def pixel_std(covariance: Float[Array, "modes modes"], nside: int) -> Float[np.ndarray, " pixels"]:
@@ -34,32 +33,8 @@ def pixel_std(covariance: Float[Array, "modes modes"], nside: int) -> Float[np.n
         In K, in RING order.
     """
     covariance = np.asarray(covariance)
-    lmax = lmax_of(covariance.shape[0])
-    heights, place, azimuth = _rings(nside, lmax)
-    # rings from the equator on are in the south
-    polar = polar_functions(heights[: len(heights) // 2 + 1], lmax)
-    by_order, first = _orders(lmax)
-    ell, m = mode_numbers(lmax)
-    polar, odd = polar[:, by_order], ((ell + m) % 2 == 1)[by_order]
-    mirrored = np.where(odd, -polar, polar)
-    both = np.zeros((2 * lmax + 1, len(heights), 2 * lmax + 1))
-    for order, rows in enumerate(np.split(np.arange(len(m)), first[1:])):
-        # the matrix is symmetric: those of m < m' count twice, those of m > m' are left out
-        begin, starts = rows[0], first[order:] - rows[0]
-        here = covariance[by_order[rows]].take(by_order[begin:], axis=1)
-        here[:, len(rows) :] *= 2.0
-        even_part, odd_part = (
-            polar[:, rows[some]] @ here[some] for some in (~odd[rows], odd[rows])
-        )
-        # the equator is its own mirror image
-        north, south = both[order, : len(polar)], both[order, ::-1][: len(polar)]
-        total = even_part + odd_part
-        total *= polar[:, begin:]
-        north[:, order:] = np.add.reduceat(total, starts, axis=1)
-        np.subtract(even_part, odd_part, out=total)
-        total *= mirrored[:, begin:]
-        south[:, order:] = np.add.reduceat(total, starts, axis=1)
-    between = both.transpose(1, 0, 2)
+    heights, place, azimuth = _rings(nside, lmax_of(covariance.shape[0]))
+    between = order_products(covariance, heights)
     return np.sqrt(_on_pixels(((azimuth @ between) * azimuth).sum(2), place))
 
 
@@ -83,17 +58,40 @@ def independent_pixel_std(
     variance = np.asarray(variance)
     lmax = lmax_of(len(variance))
     heights, place, azimuth = _rings(nside, lmax)
-    by_order, first = _orders(lmax)
+    by_order, first = modes_by_order(lmax)
     weighted = polar_functions(heights, lmax) ** 2 * variance
     of_orders = np.add.reduceat(weighted[:, by_order], first, axis=1)
     return np.sqrt(_on_pixels((azimuth**2 @ of_orders[:, :, None])[:, :, 0], place))
 
 
-def _orders(lmax: int) -> tuple[np.ndarray, np.ndarray]:
-    """The packed modes by growing m, and where each m begins."""
-    _, m = mode_numbers(lmax)
-    by_order = np.argsort(m, kind="stable")
-    return by_order, np.searchsorted(m[by_order], np.arange(-lmax, lmax + 1))
+def prior_pixel_std(
+    prior: Prior, nside: int, *, monopole: bool = True
+) -> Float[np.ndarray, " pixels"]:
+    """Compute :func:`pixel_std` of a prior.
+
+    Parameters
+    ----------
+    prior : Prior
+        Over harmonic coefficients.
+    nside : int
+        HEALPix resolution.
+    monopole : bool
+        Whether the monopole varies, too; else it is taken for known.
+
+    Returns
+    -------
+    (pixels,) array
+        In K, in RING order.
+    """
+    first = slice(0, 0 if monopole else 1)
+    if prior.independent:
+        variance = np.array(prior.variance())
+        variance[first] = 0.0
+        return independent_pixel_std(variance, nside)
+    covariance = np.array(prior.covariance())
+    covariance[first] = 0.0
+    covariance[:, first] = 0.0
+    return pixel_std(covariance, nside)
 
 
 @lru_cache(maxsize=2)

@@ -11,7 +11,7 @@ from jaxtyping import Float, PRNGKeyArray
 from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import inverse_from_cholesky, scaled, solve_lower
+from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower
 from lusee_bayes.core.representation import Described, number
 from lusee_bayes.sky.priors import Prior
 
@@ -75,11 +75,9 @@ class Posterior(Described, eqx.Module):
         InputError
             If rounding in the map-space form makes one of them wrong by more than ``PRECISION``.
         """
-        white, rounding = _white_std(self)
+        std, rounding = _std(self)
         _require_precise(rounding)
-        scale = self.prior.diagonal_root()
-        eye = namespace(self).eye(self.prior.size)
-        return self.std_of(eye) if scale is None else scale * white
+        return std
 
     def std_of(self, directions: Float[Array, "n unknowns"]) -> Float[Array, " n"]:
         """Compute the standard deviation of linear combinations of the unknowns.
@@ -146,11 +144,7 @@ class Posterior(Described, eqx.Module):
         InputError
             If the prior is over pixels or has C_ell = 0: then R has no inverse.
         """
-        scale = self.prior.diagonal_root()
-        if scale is None or (not is_traced(scale) and not bool((scale > 0).all())):
-            raise InputError(
-                "only draws of harmonic coefficients with C_ell > 0 at every ell can be whitened"
-            )
+        self.prior.require_density()
         return _whiten(self, namespace(self).asarray(skies))
 
     def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
@@ -263,22 +257,23 @@ def _rounding(posterior: Posterior, variance: Float[Array, " white"]) -> Float[A
 
 
 @compiled
-def _white_std(posterior: Posterior) -> tuple[Float[Array, " white"], Float[Array, ""]]:
-    """Standard deviations of u, and their :func:`_rounding`."""
-    white = _std_of(posterior, None)
-    return white, _rounding(posterior, white**2)
+def _std(posterior: Posterior) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
+    """Standard deviations of m, and the :func:`_rounding` of those of u."""
+    xp, basis = namespace(posterior), posterior.basis
+    eye = xp.eye(posterior.prior.rank)
+    # the rows of H, where H^T H is the covariance of u
+    rows = solve_lower(posterior.lower, eye if basis is None else basis.T, transpose=False)
+    if basis is not None:
+        rows = xp.concatenate([rows, eye - basis @ basis.T])
+    rounding = _rounding(posterior, (rows**2).sum(0))
+    return xp.sqrt((posterior.prior.colour(rows) ** 2).sum(0)), rounding
 
 
 @compiled
-def _std_of(
-    posterior: Posterior, directions: Float[Array, "n unknowns"] | None
-) -> Float[Array, " n"]:
-    """Standard deviations of given directions of m, or with None of every component of u."""
+def _std_of(posterior: Posterior, directions: Float[Array, "n unknowns"]) -> Float[Array, " n"]:
+    """Standard deviations of given directions of m."""
     xp = namespace(posterior)
-    if directions is None:
-        white = xp.eye(posterior.prior.rank)
-    else:
-        white = posterior.prior.colour_columns(directions)
+    white = posterior.prior.colour_columns(directions)
     inside = white if posterior.basis is None else white @ posterior.basis
     half = solve_lower(posterior.lower, inside.T, transpose=False)
     variance = (half**2).sum(0)
@@ -300,10 +295,7 @@ def _covariance(
         half = solve_lower(posterior.lower, posterior.basis.T, transpose=False)
         white = half.T @ half + xp.eye(rank) - posterior.basis @ posterior.basis.T
     rounding = _rounding(posterior, xp.diagonal(white))
-    root = posterior.prior.diagonal_root()
-    if root is not None:
-        return scaled(white, root, overwrite=True), rounding
-    return posterior.prior.colour(posterior.prior.colour(white).T), rounding
+    return posterior.prior.colour_covariance(white), rounding
 
 
 @compiled
@@ -319,7 +311,7 @@ def _times_root(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array
 @compiled
 def _whiten(posterior: Posterior, skies: Float[Array, "n unknowns"]) -> Float[Array, "n white"]:
     """The inverse of :func:`_times_root`, for skies less the mean."""
-    u = skies / posterior.prior.diagonal_root()[None] - posterior.white_mean[None]
+    u = posterior.prior.whiten(skies) - posterior.white_mean[None]
     inside = u if posterior.basis is None else u @ posterior.basis
     white = inside @ namespace(posterior).tril(posterior.lower)
     if posterior.basis is None:

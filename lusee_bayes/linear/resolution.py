@@ -37,21 +37,18 @@ def resolution_rows(
     InputError
         If the prior is not over harmonic coefficients.
     """
-    if posterior.prior.diagonal_root() is None:
+    if not posterior.prior.invertible:
         raise InputError("resolution needs a prior over harmonic coefficients")
     return _rows(posterior, namespace(posterior).asarray(directions))
 
 
 @compiled
 def _rows(posterior: Posterior, directions: Float[Array, "n modes"]) -> Float[Array, "n modes"]:
-    """y D (1 - C_w) D^-1 in white coordinates, D the prior's standard deviations."""
-    scale = posterior.prior.diagonal_root()
-    white = directions * scale[None]
+    """y G (1 - C_w) G^-1, C_w the covariance of u."""
+    white = posterior.prior.colour_columns(directions)
     inside = white if posterior.basis is None else white @ posterior.basis
     half = solve_lower(posterior.lower, inside.T, transpose=False)
     known = inside - solve_lower(posterior.lower, half, transpose=True).T
     if posterior.basis is not None:
         known = known @ posterior.basis.T
-    xp = namespace(posterior)
-    divisor = xp.where(scale > 0, scale, 1.0)
-    return xp.where((scale > 0)[None], known / divisor[None], 0.0)
+    return posterior.prior.whiten_columns(known)

@@ -50,6 +50,10 @@ class Part:
         """The diagonal of D = c c^T."""
         return self.root**2 if self.root.ndim == 1 else (self.root**2).sum(2).T.ravel()
 
+    def log_det(self) -> float:
+        """ln|D| of the data that are there."""
+        return _log_det_of_roots(self.root)
+
 
 def smooth_functions(
     phases: Float[np.ndarray, "times functions"], azimuth: Float[np.ndarray, " times"]
@@ -94,3 +98,14 @@ def roots_of_blocks(
     present = np.diagonal(by_time, axis1=1, axis2=2) > 0
     missing = np.eye(len(blocks)) * ~present[:, None]
     return np.linalg.cholesky(by_time + missing) * present[:, None] * present[:, :, None]
+
+
+def log_det_of_weights(weights: np.ndarray) -> float:
+    """ln|D| of the data that are there, for D as in :func:`weigh`."""
+    root = np.sqrt(weights).ravel() if weights.ndim == 2 else roots_of_blocks(weights)
+    return _log_det_of_roots(root)
+
+
+def _log_det_of_roots(root: Float[np.ndarray, "..."]) -> float:
+    diagonal = root if root.ndim == 1 else np.diagonal(root, axis1=1, axis2=2)
+    return 2.0 * float(np.log(diagonal[diagonal > 0]).sum())

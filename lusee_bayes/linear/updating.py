@@ -23,7 +23,10 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.sky.priors import HarmonicPrior, IndependentPrior
+from lusee_bayes.sky.priors import IndependentPrior
+
+# priors are the same if they differ by less, as a part of variances and standard deviations
+SAME = 1e-9
 
 
 def deviation_model(posterior: Posterior, model: LinearGaussian) -> LinearGaussian:
@@ -135,21 +138,31 @@ def _in_deviations(
 
 def _require_same_prior(posterior: Posterior, model: LinearGaussian) -> None:
     old, new = posterior.prior, model.prior
-    same = isinstance(old, HarmonicPrior) and isinstance(new, HarmonicPrior)
-    if not same or old.size != new.size:
+    if not (old.invertible and new.invertible) or old.size != new.size:
         raise InputError(
             f"the earlier posterior has {old.size} modes, the new data's model {new.size}; give "
             "both the same lmax and a prior over harmonic coefficients"
         )
-    if not np.allclose(old.spectrum, new.spectrum, rtol=1e-9, atol=0.0):
-        ell = int(np.argmax(np.abs(np.asarray(old.spectrum / new.spectrum) - 1.0)))
+    before, now = np.asarray(old.variance()), np.asarray(new.variance())
+    if not np.allclose(before, now, rtol=SAME, atol=0.0):
+        k = int(np.argmax(np.abs(before - now) / np.maximum(before, now).clip(min=1e-300)))
         raise InputError(
-            f"the earlier posterior has another prior: C_ell = {float(old.spectrum[ell]):.4g} at "
-            f"ell = {ell}, now {float(new.spectrum[ell]):.4g}; give both the same sky and prior"
+            f"the earlier posterior has another prior: a variance of {before[k]:.4g} K^2 at "
+            f"ell = {int(np.sqrt(k))}, now {now[k]:.4g}; give both the same sky and prior"
         )
-    widths, zero = np.asarray(new.diagonal_root()), np.zeros(new.size)
-    apart = [np.asarray(zero if prior.mean is None else prior.mean) for prior in (old, new)]
-    if (np.abs(apart[0] - apart[1]) > 1e-9 * widths).any():
+    widths = np.sqrt(now)
+    if not (old.independent and new.independent):
+        apart = np.abs(np.asarray(old.covariance()) - np.asarray(new.covariance()))
+        if (apart > SAME * widths[:, None] * widths).any():
+            raise InputError(
+                "the earlier posterior has another prior, with other correlations of the modes; "
+                "give both the same sky and prior"
+            )
+    means = [
+        np.zeros(p.size) if p.white_mean is None else np.asarray(p.colour(p.white_mean))
+        for p in (old, new)
+    ]
+    if (np.abs(means[0] - means[1]) > SAME * widths).any():
         raise InputError(
             "the earlier posterior has a prior with another mean; give both the same "
             "prior.mean_file"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from lusee_bayes.linear.fit import THRESHOLDS
+from lusee_bayes.linear.fit import RULE
 from lusee_bayes.report import html
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
 from lusee_bayes.results.provenance import Provenance
@@ -20,7 +20,8 @@ HEADER = {
     "information_bits": "bits",
     "log_evidence": "ln evidence",
     "log_evidence_less_best": "less the best",
-    "p": "p of the data",
+    "instrument_p": "p of the instrument",
+    "prior_p": "p of the prior",
     "mean_std_k": "mean standard deviation [K]",
 }
 
@@ -38,7 +39,7 @@ def comparison_page(runs: Sequence[FinishedRun], figures: Path) -> str:
         f"Side by side: {names}",
         [
             html.paragraph(caveat or same, "verdict" if caveat is None else "verdict tense"),
-            html.paragraph(f"{THRESHOLDS}.", "threshold"),
+            html.paragraph(f"{RULE}.", "threshold"),
             html.table(list(HEADER.values()), rows),
             html.subsection("Where they come from"),
             html.table(("run", "data", "dates, UTC", "command", "made"), origins(runs)),

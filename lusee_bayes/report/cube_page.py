@@ -6,10 +6,11 @@ from pathlib import Path
 
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_json
-from lusee_bayes.linear.fit import level_of
+from lusee_bayes.linear.fit import stands_out
 from lusee_bayes.report import head, html
 from lusee_bayes.report.cube_explorer import cube_explorer
 from lusee_bayes.report.run_details import details
+from lusee_bayes.results.cube_fit import N_TESTS
 from lusee_bayes.results.saved import (
     CHANNEL_SUMMARY,
     COVERAGE,
@@ -36,8 +37,8 @@ FIGURES = {
     ),
     "chi2": (
         "Chi-squared of every channel over its expectation",
-        "chi² of every channel over its expectation, of its data under the model, or, of a joint "
-        "posterior, of the residuals about the map; grey: two standard deviations.",
+        "What no sky explains of every channel's data: chi² over its expectation, whatever the "
+        "prior; grey: two standard deviations.",
     ),
 }
 SECTIONS = [
@@ -126,8 +127,9 @@ def _tests(folder: Path, summary: dict) -> str:
     ]
     bad = [t["level"] != "consistent" for t in tests]
     note = html.paragraph(
-        "All channels together: a small excess that no channel shows by itself is seen in the sum "
-        "and in the number of channels above the median."
+        "All channels together: what no sky explains, whatever the prior, and what the prior does "
+        "not expect. A small excess that no channel shows by itself is seen in the sum and in the "
+        "number of channels above the median."
     )
     return note + html.table(("joint test", "found", "p", "smallest of", "verdict"), rows, bad)
 
@@ -157,18 +159,18 @@ def _pulls(folder: Path, summary: dict) -> list[str]:
 
 
 def _coverage(folder: Path, channels: list[dict]) -> str:
-    """Share of pixels within one standard deviation of the truth, a row for each channel."""
+    """Share of pixels whose 68 % interval holds the truth, a row for each channel."""
     where = folder / "summary.json"
     bands = [entries(where, channel, "coverage", COVERAGE) for channel in channels]
     header = ("MHz", *(band["name"] for band in bands[0]))
     rows = [
-        (f"{c['frequency_mhz']:g}", *(f"{band['within_1']:.1%}" for band in mine))
+        (f"{c['frequency_mhz']:g}", *(f"{band['held_68']:.1%}" for band in mine))
         for c, mine in zip(channels, bands, strict=True)
     ]
-    chance = ", ".join(f"{100 * band['error_1']:.1f}" for band in bands[0])
+    scatter = ", ".join(f"{100 * band['scatter_68']:.1f}" for band in bands[0])
     note = html.paragraph(
-        "Share of pixels whose true temperature is within one standard deviation of the mean; "
-        f"expected: 68.3 %, by chance up to about ± {chance} % in the columns."
+        "Share of pixels whose 68 % interval holds the true temperature. Where error bars are "
+        f"right, it scatters by {scatter} % in the columns (lowest channel)."
     )
     return html.folded(
         "are the error bars right? coverage by latitude", note, html.table(header, rows)
@@ -176,18 +178,26 @@ def _coverage(folder: Path, channels: list[dict]) -> str:
 
 
 def _table(channels: list[dict]) -> str:
-    header = ("MHz", "data", "missing", "p", "chi² about the map", "expected", "first ell, SNR < 1")
+    header = (
+        "MHz",
+        "data",
+        "missing",
+        "p of the instrument",
+        "chi² about the map",
+        "expected",
+        "first ell, SNR < 1",
+    )
     rows = [
         (
             f"{c['frequency_mhz']:g}",
             c["n_data"],
             c["n_missing"],
-            f"{c['p']:.2g}",
+            f"{c['instrument_p']:.2g}",
             f"{c['chi2']:.0f}",
             f"{c['chi2_expected']:.0f}" if "chi2_expected" in c else "unknown",
             "" if c.get("ell_cross") is None else c["ell_cross"],
         )
         for c in channels
     ]
-    bad = [level_of(c["p"], len(channels)) != "consistent" for c in channels]
+    bad = [stands_out(c["instrument_p"], N_TESTS * len(channels)) for c in channels]
     return html.folded("every channel", html.table(header, rows, bad))

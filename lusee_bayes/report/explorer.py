@@ -118,16 +118,19 @@ def explorer_data(folder: Path, diagnostics: xr.Dataset) -> dict[str, object]:
 
 
 def _point_spread(diagnostics: xr.Dataset) -> dict[str, object]:
-    """The resolution matrix in white coordinates, as point_spread.js reads it."""
+    """The resolution matrix in units of the prior, as point_spread.js reads it."""
     lmax = min(LARGEST_ELL, lmax_of(diagnostics.sizes["mode"]))
     n = n_modes(lmax)
     ell, _ = mode_numbers(lmax)
     steps = diagnostics["resolution_step"].values[: ell[-1] + 1, : ell[-1] + 1]
     known = diagnostics["resolution"].values[:n, :n].astype(np.int8)
+    symmetric = bool((known == known.T).all())
+    entries = known[np.triu_indices(n)] if symmetric else known
     return {
         "lmax": lmax,
         "nside": KERNEL_NSIDE,
-        "triangle": base64.b64encode(known[np.triu_indices(n)].tobytes()).decode(),
+        "symmetric": symmetric,
+        "entries": base64.b64encode(entries.tobytes()).decode(),
         "steps": packed(steps),
         "prior_std": packed(diagnostics["prior_std"].values[:n]),
     }

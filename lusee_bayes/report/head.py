@@ -9,7 +9,7 @@ from typing import Any
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import read_text
 from lusee_bayes.core.version import __version__
-from lusee_bayes.linear.fit import THRESHOLDS
+from lusee_bayes.linear.fit import LEVELS, RULE
 from lusee_bayes.report import html
 from lusee_bayes.results.map_files import text_hash
 from lusee_bayes.results.provenance import Provenance
@@ -30,18 +30,27 @@ FILES = {
     "spectra.csv": "fidelity and power, a row for each multipole",
     "sources.csv": "fluxes of point sources",
     "summary.csv": "ArviZ's summary of the draws",
+    "coverage.json": "coverage of every sky, and the verdicts",
+    "coverage.csv": "coverage, a row for each sky and part of it",
+    "coverage.md": "the same as tables to read",
+    "priors.json": "all that is told of every prior, and the verdict",
+    "priors.csv": "the same, a row for each prior",
+    "priors.md": "the same as a table to read",
     "validation.json": "the checks and their thresholds",
     "summary.json": "the figures of this page",
     "sampling.json": "the figures of this page",
     "scenario.yaml": "the resolved scenario: running it again gives the same numbers",
     "provenance.json": "where the data come from, command, version, date",
 }
-CLASSES = {"consistent": "verdict", "in tension": "verdict tense", "does not fit": "verdict bad"}
+# how verdicts look
+GOOD, TENSE, BAD = "verdict", "verdict tense", "verdict bad"
+CLASSES = dict(zip(LEVELS, (GOOD, TENSE, BAD), strict=True))
 
 
 def verdict(level: str, text: str) -> str:
-    """The verdict on a fit, with the thresholds of its three levels."""
-    return f"{html.paragraph(text, CLASSES[level])}\n{html.paragraph(THRESHOLDS, 'threshold')}"
+    """The verdict on a fit, with the rule behind it."""
+    rule = html.paragraph(f"{RULE}.", "threshold")
+    return f"{html.paragraph(text, CLASSES[level])}\n{rule}"
 
 
 def doubts(path: Path, found: Mapping[str, Any]) -> str:
@@ -55,7 +64,7 @@ def doubts(path: Path, found: Mapping[str, Any]) -> str:
     told = found.get("doubts", [])
     if not isinstance(told, list) or not all(isinstance(text, str) for text in told):
         raise InputError(f"{path}: doubts is no list of texts; make the results anew")
-    return "\n".join(html.paragraph(f"Doubtful: {text}", CLASSES["in tension"]) for text in told)
+    return "\n".join(html.paragraph(f"Doubtful: {text}", TENSE) for text in told)
 
 
 def about(folder: Path, channels: str) -> str:

@@ -11,6 +11,7 @@ from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_table
 from lusee_bayes.linear.fit import probability
 from lusee_bayes.report import head, html
+from lusee_bayes.report.coverage_table import COVERAGE_HEADER, coverage_cells
 from lusee_bayes.report.explorer import explorer
 from lusee_bayes.report.run_details import details
 from lusee_bayes.results.finished_runs import FinishedRun
@@ -77,7 +78,8 @@ def _map(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
         bands = entries(folder / "summary.json", summary, "coverage", COVERAGE)
     return [
         html.paragraph(
-            f"{hidden:.1%} of the sky never rose above the horizon: there the map is the prior's. "
+            f"{summary['prior'] or ''} {hidden:.1%} of the sky never rose above the horizon: there "
+            "the map is the prior's. "
             "The share from the prior is that of a pixel's variance, the monopole left out."
         ),
         explorer(folder, found),
@@ -103,26 +105,16 @@ def _map(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
 
 def coverage_table(bands: list[dict]) -> list[str]:
     """How often error bars hold the truth, by band of latitude, as summary.json tells it."""
-    rows = [
-        (
-            band["name"],
-            f"{band['sky']:.0%}",
-            f"{band['within_1']:.1%} (68.3 ± {100 * band['error_1']:.1f})",
-            f"{band['within_2']:.1%} (95.4 ± {100 * band['error_2']:.1f})",
-            f"{band['rms']:.2f}",
-        )
-        for band in bands
-    ]
     return [
         html.subsection("Are the error bars right?"),
         html.paragraph(
-            "Share of pixels whose true temperature is within one and two standard deviations of "
-            "the mean; in brackets what is expected, with its scatter. rms of (mean - truth) / "
-            "standard deviation is 1 where error bars are right. An isotropic prior allows every "
-            "direction the same structure: a real sky has more of it in the plane, where error "
-            "bars can be too small, and less towards the poles, where they are too large."
+            "Share of pixels whose true temperature lies within central intervals of four levels; "
+            "the rms pull, (truth - mean) / standard deviation; the largest pull and, in brackets, "
+            "what the largest pull of 95 % of skies does not exceed. ± is the scatter where error "
+            "bars are right, of skies drawn from the posterior: neighbouring pixels err alike, so "
+            "that a narrow band counts few independent ones."
         ),
-        html.table(("Galactic latitude", "sky", "within 1 sigma", "within 2 sigma", "rms"), rows),
+        html.table(COVERAGE_HEADER, map(coverage_cells, bands)),
     ]
 
 
@@ -184,15 +176,14 @@ def _by_ell(run: FinishedRun) -> str:
 
 def _data(folder: Path, found: xr.Dataset) -> list[str]:
     kinds = found["group_kind"].values
-    header = ("", "data", "chi² given all others", "its p", "p of the others without it")
+    header = ("", "data", "chi² given all others", "expected", "p", "p of the others without it")
     parts = [
         html.paragraph(
-            "Each datum, and each product, day and turntable angle as a whole, is compared with "
-            "what all other data predict of it. A group stands out if its p times the number of "
-            "groups is below 0.01. A bad group spoils the predictions of others too; the culprit "
-            "is the group whose removal makes the rest fit (last column). Days may also stand out "
-            "because the sky is brighter in places than the prior expects and no other day has "
-            "seen them as well."
+            "Each product, day and turntable angle as a whole is compared with what all other data "
+            "predict of it, whatever the prior: chi² counts what no sky explains, and directions "
+            "of the sky that only this group has seen take a degree of freedom each. A bad group "
+            "spoils the predictions of others too; the culprit is the group whose removal makes "
+            "the rest fit (last column)."
         ),
         _figure(
             folder,
@@ -236,6 +227,7 @@ def _group_row(found: xr.Dataset, row: int) -> tuple[str, ...]:
         str(found["group_name"].values[row]),
         str(int(found["group_n"].values[row])),
         f"{float(found['group_chi2'].values[row]):.1f}",
+        f"{float(found['group_degrees'].values[row]):.1f}",
         probability(float(found["group_p"].values[row])).removeprefix("= "),
         "no others" if np.isnan(others) else probability(others).removeprefix("= "),
     )

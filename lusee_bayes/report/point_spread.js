@@ -1,10 +1,10 @@
 "use strict";
-// Point-spread functions of any direction: y^T R, R = D (1 - C_w) D^-1, D the prior's widths.
+// Point-spread functions of any direction: y^T R, R = D K D^-1, D the prior's widths.
 function pointSpread(page) {
   const { lmax, nside } = page;
   const n = (lmax + 1) ** 2;
-  // the upper triangle of 1 - C_w row by row, in steps of its block of multipoles
-  const packed = new Int8Array(skyView.bytes(page.triangle).buffer);
+  // K row by row, of a symmetric one the upper triangle, in steps of its block of multipoles
+  const packed = new Int8Array(skyView.bytes(page.entries).buffer);
   const steps = skyView.floats(page.steps);
   const width = skyView.floats(page.prior_std);
   const ellOf = Int32Array.from({ length: n }, (_, k) => Math.floor(Math.sqrt(k)));
@@ -50,11 +50,11 @@ function pointSpread(page) {
     for (let i = 0; i < n; i += 1) {
       const ofEll = (lmax + 1) * ellOf[i];
       let sum = 0;
-      for (let j = i; j < n; j += 1, k += 1) {
+      for (let j = page.symmetric ? i : 0; j < n; j += 1, k += 1) {
         if (!packed[k]) continue;
         const value = packed[k] * steps[ofEll + ellOf[j]];
-        sum += value * white[j];
-        if (j > i) known[j] += value * white[i];
+        if (page.symmetric) sum += value * white[j];
+        if (j > i || !page.symmetric) known[j] += value * white[i];
       }
       known[i] += sum;
     }

@@ -88,9 +88,9 @@ def sample_page(folder: Path, name: str) -> str:
         f"{sampling['mean_acceptance']:.2f}."
     )
     reasons = warnings_of(table, sampling)
-    kind = "consistent" if not reasons else "in tension"
+    kind = head.TENSE if reasons else head.GOOD
     if worst > FAR or sampling["divergences"] > FEW * sampling["chains"] * sampling["draws"]:
-        kind = "does not fit"
+        kind = head.BAD
     sections = [("summary", "Summary"), ("pictures", "Pictures")]
     sections += [("files", "Files and citation"), ("run", "The run")]
     parts = [html.section("summary", "Summary", html.table(header, map(_short, rows)))]
@@ -108,7 +108,7 @@ def sample_page(folder: Path, name: str) -> str:
         f"{name}: draws of {sampling['program']}",
         [
             html.contents(sections),
-            html.paragraph(" ".join([verdict, *reasons]), head.CLASSES[kind]),
+            html.paragraph(" ".join([verdict, *reasons]), kind),
             html.paragraph(CRITERIA, "threshold"),
             head.doubts(folder / "sampling.json", sampling),
             head.about(folder, f"draws of the program {sampling['program']}"),

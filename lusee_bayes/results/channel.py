@@ -9,18 +9,16 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 import xarray as xr
-from jaxtyping import Float, PRNGKeyArray, Shaped
+from jaxtyping import Float, Shaped
 
 from lusee_bayes.core.arrays import Array, on_host
-from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, per_mode, power_spectrum
+from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, power_spectrum
 from lusee_bayes.core.representation import Described, extent
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference
 from lusee_bayes.experiment.plausibility import about_information
-from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.metrics import (
     correlation,
@@ -30,10 +28,10 @@ from lusee_bayes.linear.metrics import (
     signal_to_noise,
 )
 from lusee_bayes.linear.pixel_variance import pixel_std
+from lusee_bayes.results.coverage import Counts, Coverage
+from lusee_bayes.results.draws import deviations, draw_key
 from lusee_bayes.results.observed import Observed
 
-# what the scenario's seed is folded with for posterior draws and for perturbations of information
-DRAWS, PERTURBATIONS = 1, 7
 # numbers of a channel that a file keeps as attributes
 NUMBERS = (
     "log_evidence",
@@ -41,16 +39,13 @@ NUMBERS = (
     "chi2",
     "chi2_expected",
     "chi2_model",
+    "instrument_chi2",
+    "instrument_chi2_expected",
     "refinement",
     "n_data",
     "n_missing",
     "rounds",
 )
-
-
-def draw_key(scenario: Scenario) -> PRNGKeyArray:
-    """The key of a scenario's posterior draws."""
-    return jax.random.fold_in(jax.random.key(scenario.seed), DRAWS)
 
 
 @dataclass(frozen=True, repr=False)
@@ -81,12 +76,17 @@ class ChannelResult(Described):
     chi2_model : float
         Of the data under the model, sky included: a chi^2 distribution of ``n_data`` degrees of
         freedom. NaN for a channel of a joint posterior, which has no model of its own.
+    instrument_chi2, instrument_chi2_expected : float
+        Of the channel's own data, what no sky explains (:mod:`.split`). NaN for a map of its own,
+        whose diagnostics have it.
     refinement : float
         Last correction of the mean, in standard deviations.
     n_data, n_missing, rounds : int
         Data, samples left out, and how often the gain term was built.
     doubts : tuple of str
         What is doubtful about measured data, a sentence each.
+    coverage : tuple of Coverage
+        How often error bars hold the truth, by latitude; empty where it is not known.
     """
 
     frequency_mhz: float
@@ -109,6 +109,9 @@ class ChannelResult(Described):
     n_missing: int
     rounds: int
     doubts: tuple[str, ...] = ()
+    coverage: tuple[Coverage, ...] = ()
+    instrument_chi2: float = np.nan
+    instrument_chi2_expected: float = np.nan
 
     def description(self) -> tuple[str, ...]:
         return (
@@ -155,6 +158,10 @@ class ChannelResult(Described):
             columns["snr_independent"] = self.snr(self.independent)
         return columns
 
+    def coverage_rows(self) -> list[dict[str, float | str]] | None:
+        """:attr:`coverage` for summary.json; None where the truth is not known."""
+        return [band.row() for band in self.coverage] or None
+
     def maps(self) -> dict[str, Float[np.ndarray, " pixels"]]:
         """HEALPix RING maps by name, in K: mean, std and, where known, truth and residual."""
         maps = {"mean": modes_to_map(self.mean, self.nside), "std": self.pixel_std}
@@ -186,7 +193,9 @@ class ChannelResult(Described):
         variables["pixel_std"] = (("pixel",), self.pixel_std)
         variables["highest_altitude"] = (("pixel",), self.highest_altitude)
         numbers = {name: getattr(self, name) for name in ("frequency_mhz", *NUMBERS)}
-        return xr.Dataset(variables, attrs={**numbers, "doubts": json.dumps(self.doubts)})
+        texts = {"doubts": self.doubts, "coverage": self.coverage_rows() or []}
+        told = {name: json.dumps(value) for name, value in texts.items()}
+        return xr.Dataset(variables, attrs={**numbers, **told})
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset) -> ChannelResult:
@@ -200,6 +209,7 @@ class ChannelResult(Described):
             truth=arrays.pop("truth", None),
             independent=independent,
             doubts=tuple(json.loads(dataset.attrs["doubts"])),
+            coverage=tuple(map(Coverage.from_row, json.loads(dataset.attrs["coverage"]))),
             **arrays,
             **numbers,
             **counts,
@@ -235,25 +245,25 @@ def channel_of_posterior(
     fraction = np.divide(
         variance, prior_variance, out=np.zeros(len(variance)), where=prior_variance > 0
     )
-    if judged is inference:  # each mode that the data determine takes one from N_data
-        expected = inference.model.n_data - float((1.0 - fraction)[prior_variance > 0].sum())
-    else:
-        expected = expected_chi2(judged.posterior, inference.model.n_data)
+    mean, truth = np.asarray(posterior.mean), _array(data.truth)
+    width, found = pixel_std(covariance, scenario.map_nside), ()
+    if truth is not None:
+        found = Counts.of_pixels(width, truth - mean, deviations(posterior, scenario)).coverage()
     return ChannelResult(
         frequency_mhz=scenario.frequency_mhz,
-        mean=np.asarray(posterior.mean),
+        mean=mean,
         std=np.sqrt(variance),
         prior_std=np.sqrt(prior_variance),
         prior_fraction=mean_over_m(fraction),
-        pixel_std=pixel_std(covariance, scenario.map_nside),
+        pixel_std=width,
         highest_altitude=highest_altitude(data.observation, scenario.map_nside),
         draws=np.asarray(on_host(posterior).sample(draw_key(scenario), n_draws)),
-        truth=_array(data.truth),
+        truth=truth,
         independent=None,
         log_evidence=float(posterior.log_evidence),
         information_bits=float(posterior.information_bits()),
         chi2=float(inference.model.chi2(posterior.mean, data.data)),
-        chi2_expected=expected,
+        chi2_expected=expected_chi2(judged.posterior, inference.model.n_data),
         chi2_model=float(judged.model.chi2(judged.posterior.mean, data.data))
         + float(judged.posterior.prior_chi2()),
         refinement=float(posterior.refinement),
@@ -261,6 +271,7 @@ def channel_of_posterior(
         n_missing=data.n_missing,
         rounds=inference.rounds,
         doubts=(*experiment.doubts, *about_information(float(posterior.information_bits()))),
+        coverage=found,
     )
 
 
@@ -271,6 +282,7 @@ def channel_of_information(
     covariance: Float[Array, "modes modes"] | None,
     draws: Float[Array, "n modes"],
     *,
+    compared: Float[np.ndarray, "more modes"] | None = None,
     independent: Float[Array, " modes"] | None = None,
     log_evidence: float = np.nan,
     information_bits: float = np.nan,
@@ -290,6 +302,8 @@ def channel_of_information(
         In K^2; None if only the draws tell.
     draws : (n, modes) array
         In K.
+    compared : (more, modes) array, optional
+        Draws less mean for :class:`.Counts`, where the truth is known, in K.
     independent, log_evidence, information_bits, chi2_model, refinement
         See :class:`ChannelResult`.
     """
@@ -301,14 +315,16 @@ def channel_of_information(
     else:
         std = np.sqrt(np.diagonal(np.asarray(covariance)))
         expected = float(information.n_data - np.vdot(information.matrix, covariance))
-    prior_std = np.sqrt(per_mode(observed.spectrum))
+    width, found = pixel_std(covariance, round(np.sqrt(observed.highest_altitude.size / 12))), ()
+    if compared is not None and observed.truth is not None:
+        found = Counts.of_pixels(width, observed.truth - np.asarray(mean), compared).coverage()
     return ChannelResult(
         frequency_mhz=observed.frequency_mhz,
         mean=np.asarray(mean),
         std=std,
-        prior_std=prior_std,
-        prior_fraction=mean_over_m(std**2 / prior_std**2),
-        pixel_std=pixel_std(covariance, round(np.sqrt(observed.highest_altitude.size / 12))),
+        prior_std=observed.prior_std,
+        prior_fraction=mean_over_m(std**2 / observed.prior_std**2),
+        pixel_std=width,
         highest_altitude=observed.highest_altitude,
         draws=np.asarray(draws),
         truth=observed.truth,
@@ -323,6 +339,9 @@ def channel_of_information(
         n_missing=observed.n_missing,
         rounds=observed.rounds,
         doubts=(*observed.doubts, *about_information(information_bits)),
+        coverage=found,
+        instrument_chi2=observed.instrument.chi2,
+        instrument_chi2_expected=observed.instrument.degrees,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import xarray as xr
@@ -11,7 +11,9 @@ from jaxtyping import Float
 
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference
+from lusee_bayes.linear.fit import ChiSquare
 from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.split import Split
 from lusee_bayes.results.observed import Observed
 
 # numbers that a file keeps as attributes
@@ -40,8 +42,10 @@ class ChannelInformation:
         cls, experiment: Experiment, information: Information, inference: Inference
     ) -> ChannelInformation:
         """Of an experiment and what was inferred from its data."""
-        sky = np.asarray(experiment.setup.sky.modes)
-        return cls(information, Observed.of(experiment, inference.rounds), sky)
+        sky, posterior = np.asarray(experiment.setup.sky.modes), inference.posterior
+        chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
+        split = Split.of(posterior, chi2, inference.model.n_data)
+        return cls(information, Observed.of(experiment, inference.rounds, split.instrument), sky)
 
     def to_dataset(self) -> xr.Dataset:
         """All of it, for :meth:`from_dataset`."""
@@ -51,7 +55,7 @@ class ChannelInformation:
             "vector": ("mode", np.asarray(information.vector)),
             "reference": ("mode", np.asarray(information.reference)),
             "sky": ("mode", self.sky),
-            "spectrum": ("ell", observed.spectrum),
+            "prior_std": ("mode", observed.prior_std),
             "highest_altitude": ("pixel", observed.highest_altitude),
         }
         if observed.truth is not None:
@@ -61,6 +65,7 @@ class ChannelInformation:
             variables["perturbations"] = (("draw", "mode"), perturbations)
         numbers = {name: float(getattr(information, name)) for name in OF_INFORMATION}
         numbers |= {name: getattr(observed, name) for name in OF_CHANNEL}
+        numbers |= asdict(observed.instrument)
         return xr.Dataset(variables, attrs={**numbers, "doubts": json.dumps(observed.doubts)})
 
     @classmethod
@@ -75,11 +80,12 @@ class ChannelInformation:
         )
         observed = Observed(
             float(dataset.attrs["frequency_mhz"]),
-            arrays["spectrum"],
+            arrays["prior_std"],
             arrays.get("truth"),
             arrays["highest_altitude"],
             int(dataset.attrs["n_missing"]),
             int(dataset.attrs["rounds"]),
+            ChiSquare(float(dataset.attrs["chi2"]), float(dataset.attrs["degrees"])),
             tuple(json.loads(dataset.attrs["doubts"])),
         )
         return cls(information, observed, arrays["sky"])

@@ -29,6 +29,8 @@ BASE_BYTES, BYTES_A_DATUM = 0.75e9, 450
 # n x n arrays at the peak of a posterior, of one channel or of all together, and floating-point
 # operations in n^3
 SQUARES, JOINT_SQUARES, OPERATIONS = 8, 4, 12
+# what learning a prior adds to them: about five steps with all modes
+LEARNING_SQUARES, LEARNING_OPERATIONS = 4, 80
 # pixels of every map of a report, and of what each is made of
 MAPS = 12
 # seconds of everything that is not linear algebra
@@ -126,6 +128,9 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
         # the normal matrix of every channel is kept
         squares += n_channels * n_modes**2 / 2.0
     operations = OPERATIONS * (float(n) ** 3 + n_channels * float(n_modes) ** 3)
+    if scenario.prior.is_learned and not scenario.joint:
+        squares += LEARNING_SQUARES * float(n_modes) ** 2
+        operations += LEARNING_OPERATIONS * n_channels * float(n_modes) ** 3
     gain = scenario.noise.gain
     if gain is not None and gain.treatment == "marginalised":
         # N couples all times, and A is formed

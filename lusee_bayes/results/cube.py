@@ -17,9 +17,8 @@ from lusee_bayes.core.progress import peak_memory_gb
 from lusee_bayes.core.representation import Described, extent
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.linear.fit import THRESHOLDS, Fit, two_sided
+from lusee_bayes.linear.fit import RULE, ChiSquare, Fit
 from lusee_bayes.results.channel import ChannelResult
-from lusee_bayes.results.coverage import coverage_rows
 from lusee_bayes.results.cube_fit import ChannelFits
 from lusee_bayes.results.joint_components import Components
 from lusee_bayes.sky.landmarks import LANDMARKS
@@ -69,32 +68,18 @@ class CubeResult(Described):
             return None
         return np.stack([c.snr(c.independent if independent else None) for c in self.channels])
 
-    @property
-    def p(self) -> float | None:
-        """Probability of chi^2 of all data under the joint model; None if unknown."""
-        if self.components is None or np.isnan(self.components.chi2):
-            return None
-        n_data = sum(channel.n_data for channel in self.channels)
-        return two_sided(self.components.chi2, n_data)
-
     def fits(self) -> ChannelFits:
         """chi^2 of every channel, and the tests of all of them together."""
-        n_data = self.stacked("n_data").astype(np.float64)
-        if self.components is None:
-            about = float(self.stacked("chi2").sum()), float(self.stacked("chi2_expected").sum())
-            chi2 = self.stacked("chi2_model")
-            return ChannelFits(self.frequencies_mhz, chi2, n_data, residuals=about)
-        expected = self.stacked("chi2_expected")
-        bound = bool(np.isnan(expected).any())
-        known = not np.isnan(self.components.chi2)
-        return ChannelFits(
-            self.frequencies_mhz,
-            self.stacked("chi2"),
-            n_data if bound else expected,
-            (self.components.chi2, int(n_data.sum())) if known else None,
-            joint=True,
-            bound=bound,
-        )
+        chi2, degrees = self.stacked("instrument_chi2"), self.stacked("instrument_chi2_expected")
+        components, n_data = self.components, float(self.stacked("n_data").sum())
+        bound = components is not None and bool(np.isnan(components.chi2))
+        if components is None:
+            total = float(self.stacked("chi2_model").sum())
+        else:
+            total = float(self.stacked("chi2").sum()) if bound else components.chi2
+        rest = ChiSquare(total - float(chi2.sum()), n_data - float(degrees.sum()))
+        joint = components is not None
+        return ChannelFits(self.frequencies_mhz, chi2, degrees, rest, bound, joint)
 
     @cached_property
     def fit(self) -> Fit:
@@ -123,7 +108,7 @@ class CubeResult(Described):
 
     def lines(self) -> list[str]:
         """What a terminal shows."""
-        return [self.headline(), self.verdict(), THRESHOLDS, *self.doubts()]
+        return [self.headline(), self.verdict(), RULE, *self.doubts()]
 
     def doubts(self) -> list[str]:
         """What is doubtful about the data, with the channel."""
@@ -174,7 +159,9 @@ class CubeResult(Described):
         channels = []
         for channel, p in zip(self.channels, self.fits().p().tolist(), strict=True):
             numbers = {
-                "p": p,
+                "instrument_p": p,
+                "instrument_chi2": channel.instrument_chi2,
+                "instrument_chi2_expected": channel.instrument_chi2_expected,
                 "chi2_model": channel.chi2_model,
                 "chi2": channel.chi2,
                 "chi2_expected": channel.chi2_expected,
@@ -185,8 +172,8 @@ class CubeResult(Described):
                 "information_bits": channel.information_bits,
             }
             known = {name: value for name, value in numbers.items() if not np.isnan(value)}
-            if channel.truth is not None:
-                known["coverage"] = coverage_rows(channel.maps(), self.scenario.lmax)
+            if channel.coverage:
+                known["coverage"] = channel.coverage_rows()
             channels.append(
                 {"frequency_mhz": channel.frequency_mhz, "ell_cross": channel.ell_cross, **known}
             )
@@ -220,13 +207,12 @@ class CubeResult(Described):
             "information_bits": components.information_bits,
             "refinement_sigma": components.refinement,
         }
-        joint = {
+        return {
             "components": list(components.prior.names),
             "solver": components.solver,
             "iterations": components.iterations,
             **{name: v for name, v in numbers.items() if not np.isnan(v)},
         }
-        return joint if self.p is None else joint | {"p": self.p}
 
     def spectra(self) -> list[dict[str, float]]:
         """Rows of spectra.csv: one for every channel and ell."""

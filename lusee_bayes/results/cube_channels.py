@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import jax
+import numpy as np
 
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
@@ -15,16 +15,13 @@ from lusee_bayes.experiment.experiment import build, with_truth
 from lusee_bayes.experiment.inference import inform
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.joint_skies import channel_sky
-from lusee_bayes.results.channel import (
-    PERTURBATIONS,
-    ChannelResult,
-    channel_of_information,
-    draw_key,
-)
+from lusee_bayes.results.channel import ChannelResult, channel_of_information
 from lusee_bayes.results.channel_files import ChannelFiles, identity_of
 from lusee_bayes.results.channel_information import ChannelInformation
 from lusee_bayes.results.channel_threads import each_channel
+from lusee_bayes.results.coverage import N_DRAWS
 from lusee_bayes.results.cube import CubeResult
+from lusee_bayes.results.draws import deviations, draw_key, perturbation_key
 from lusee_bayes.results.joint_components import (
     LEAST_DRAWS,
     Components,
@@ -82,8 +79,8 @@ def cube_result(
         experiment = build(channel, measured)
         if truth:
             experiment = with_truth(experiment)
-        key = jax.random.fold_in(jax.random.key(channel.seed), PERTURBATIONS)
-        information, inference = inform(experiment, key, n_draws if iterative else 0)
+        n_perturbations = n_draws if iterative else 0
+        information, inference = inform(experiment, perturbation_key(channel), n_perturbations)
         known = ChannelInformation.of(experiment, information, inference)
         if scenario.joint:
             files.write(channel, wanted, known.to_dataset())
@@ -95,6 +92,7 @@ def cube_result(
             posterior.mean,
             posterior.covariance(),
             posterior.sample(draw_key(channel), n_draws),
+            compared=None if known.observed.truth is None else deviations(posterior, channel),
             log_evidence=float(posterior.log_evidence),
             information_bits=float(posterior.information_bits()),
             chi2_model=float(information.chi2(posterior.mean) + posterior.prior_chi2()),
@@ -106,9 +104,14 @@ def cube_result(
     group.barrier("channels")
     components = None
     if scenario.joint:
-        components = solve_components(scenario, files, n_draws, group, stages)
+        # coverage is compared with draws; after conjugate gradients with those that there are
+        known = (data is None or truth) and not iterative
+        n_solved = max(n_draws, N_DRAWS) if known else n_draws
+        components = solve_components(scenario, files, n_solved, group, stages)
         each_channel(
-            lambda channel: _write_joint_sky(channel, channels, components, scenario, files),
+            lambda channel: _write_joint_sky(
+                channel, channels, components, scenario, files, n_draws
+            ),
             channels,
             group,
             stages,
@@ -125,6 +128,7 @@ def _write_joint_sky(
     components: Components,
     scenario: Scenario,
     files: ChannelFiles,
+    n_draws: int,
 ) -> None:
     if files.has(channel, "result"):
         return
@@ -143,7 +147,8 @@ def _write_joint_sky(
         known.information,
         sky.mean,
         sky.covariance,
-        sky.draws,
+        sky.draws[:n_draws],
+        compared=np.asarray(sky.draws) - np.asarray(sky.mean),
         independent=known.information.reference,
     )
     files.write(channel, "result", found.to_dataset())

@@ -22,10 +22,13 @@ from lusee_bayes.core.harmonics import (
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference
-from lusee_bayes.linear.pixel_variance import independent_pixel_std
+from lusee_bayes.linear.pixel_variance import prior_pixel_std
 from lusee_bayes.linear.residuals import residuals
-from lusee_bayes.results.channel import ChannelResult, draw_key
+from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.diagnostics_file import group_variables
+from lusee_bayes.results.draws import draw_key
+from lusee_bayes.results.strengths import strengths, strengths_in_words
+from lusee_bayes.sky.priors import Prior
 
 REGION_NSIDE = 8
 N_DRAWS = 4
@@ -60,22 +63,29 @@ def diagnostics(
     """
     scenario, data = experiment.scenario, experiment.data
     posterior, nside, lmax = on_host(inference.posterior), channel.nside, experiment.scenario.lmax
-    found = residuals(judged.model, judged.posterior, data)
-    fit = found.fit()
+    found = residuals(judged.model, judged.posterior, data, channel.chi2_model)
     draws = np.asarray(posterior.sample(draw_key(scenario), N_DRAWS))
-    known, steps = packed_resolution(covariance, channel.prior_std)
-    # the prior leaves the monopole wide open, which any data settle; with it the prior's share
-    # would be close to zero everywhere
-    rest_prior = np.where(np.arange(len(covariance)) > 0, channel.prior_std**2, 0.0)
+    prior = on_host(inference.model.prior)
+    usual = 0.0 if prior.white_mean is None else prior.colour(prior.white_mean)
+    deviation = channel.mean - usual
+    known, steps = packed_resolution(covariance, prior)
     monopole = 1.0 / np.sqrt(4.0 * np.pi)
     with_monopole = 2.0 * modes_to_map(covariance[0], nside) - monopole * covariance[0, 0]
     left = channel.pixel_std**2 - monopole * with_monopole
-    share = left / independent_pixel_std(rest_prior, nside) ** 2
+    # the prior leaves the monopole wide open, which any data settle; with it the prior's share
+    # would be close to zero everywhere
+    rest_prior = prior_pixel_std(prior, nside, monopole=False) ** 2
+    share = left / rest_prior
+    expected = prior.variance() - np.diagonal(covariance)
+    strong = strengths_in_words(strengths(deviation, expected, rest_prior - left))
+    fit = found.fit(strong)
     rows = region_rows(nside, lmax)
     seen = rows @ covariance
     region_variance = (seen * rows).sum(1)
     with_monopole = 2.0 * seen[:, 0] - rows[:, 0] * covariance[0, 0]
-    region_share = (region_variance - rows[:, 0] * with_monopole) / (rows**2 @ rest_prior)
+    without = np.where(np.arange(len(covariance)) > 0, rows, 0.0)
+    region_prior = (prior.colour_columns(without) ** 2).sum(1)
+    region_share = (region_variance - rows[:, 0] * with_monopole) / region_prior
 
     def on_grid(values: Float[np.ndarray, " data"]) -> Float[np.ndarray, "products times"]:
         return np.where(data.layout.present, data.layout.scatter(values), np.nan)
@@ -103,8 +113,12 @@ def diagnostics(
             "format": formats.DIAGNOSTICS,
             "level": fit.level,
             "verdict": fit.text,
-            "chi2": found.chi2,
-            "p": fit.p,
+            "instrument_chi2": found.split.instrument.chi2,
+            "instrument_chi2_expected": found.split.instrument.degrees,
+            "instrument_p": found.split.instrument.p,
+            "prior_chi2": found.split.prior.chi2,
+            "prior_chi2_expected": found.split.prior.degrees,
+            "prior_p": found.split.prior.p,
             "extremes": [f"{kind} {group.name}" for kind, group in found.extremes()] or "none",
             "suspects": [f"{kind} {group.name}" for kind, group in found.suspects()] or "none",
             "frequency_mhz": scenario.frequency_mhz,
@@ -113,19 +127,20 @@ def diagnostics(
 
 
 def packed_resolution(
-    covariance: Float[np.ndarray, "modes modes"], prior_std: Float[np.ndarray, " modes"]
+    covariance: Float[np.ndarray, "modes modes"], prior: Prior
 ) -> tuple[Int8[np.ndarray, "modes modes"], Float[np.ndarray, "ells ells"]]:
     """Pack what the data know of the modes, for point-spread functions of any direction.
 
-    The resolution matrix is R = 1 - C S^-1 = D (1 - D^-1 C D^-1) D^-1, with S = D^2. The symmetric
-    matrix in the middle is kept with a byte for each entry, in steps of its pair of multipoles.
+    The resolution matrix is R = 1 - C S^-1 = D K D^-1, with D the prior's standard deviations. K,
+    which is symmetric where S is diagonal, is kept with a byte for each entry, in steps of its pair
+    of multipoles.
 
     Parameters
     ----------
     covariance : (modes, modes) array
         Of the posterior, in K^2.
-    prior_std : (modes,) array
-        D, in K.
+    prior : Prior
+        S, over the same modes, with NumPy's arrays.
 
     Returns
     -------
@@ -134,9 +149,15 @@ def packed_resolution(
     (ells, ells) array
         The steps.
     """
-    widths = np.where(prior_std > 0, prior_std, np.inf)
-    white = np.diag((prior_std > 0).astype(np.float64)) - covariance / np.outer(widths, widths)
-    ell, _ = mode_numbers(lmax_of(len(prior_std)))
+    width = np.sqrt(prior.variance())
+    power = width > 0
+    # row by row, D^-1 C S^-1 D
+    left = prior.whiten_columns(prior.whiten(covariance))
+    left *= np.divide(width[None], width[:, None], out=np.zeros(left.shape), where=power[:, None])
+    white = np.diag(power.astype(np.float64)) - left
+    if prior.independent:  # but for rounding
+        white = (white + white.T) / 2.0
+    ell, _ = mode_numbers(lmax_of(len(width)))
     starts = np.flatnonzero(np.diff(ell, prepend=-1))
     largest = np.maximum.reduceat(np.abs(white), starts, axis=0)
     largest = np.maximum.reduceat(largest, starts, axis=1)

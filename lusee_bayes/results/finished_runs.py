@@ -150,7 +150,8 @@ def comparison_rows(runs: Sequence[FinishedRun]) -> list[dict[str, object]]:
             "level": run.diagnostics.attrs["level"],
             **{key: run.summary[key] for key in keys},
             "log_evidence_less_best": run.summary["log_evidence"] - best if comparable else None,
-            "p": float(run.diagnostics.attrs["p"]),
+            "instrument_p": float(run.diagnostics.attrs["instrument_p"]),
+            "prior_p": float(run.diagnostics.attrs["prior_p"]),
             "mean_std_k": float(run.std.mean()),
         }
         for run in runs

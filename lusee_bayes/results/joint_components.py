@@ -17,10 +17,10 @@ from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.iterative_joint import DIRECT_UNKNOWNS, solve_iteratively
 from lusee_bayes.linear.joint import ComponentSums, component_posterior, summed
 from lusee_bayes.linear.joint_skies import paired
-from lusee_bayes.results.channel import draw_key
 from lusee_bayes.results.channel_files import ChannelFiles
 from lusee_bayes.results.channel_information import ChannelInformation
 from lusee_bayes.results.channel_threads import each_channel
+from lusee_bayes.results.draws import draw_key
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 # draws where conjugate gradients have no other way to tell standard deviations

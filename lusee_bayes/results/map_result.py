@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from textwrap import wrap
 
 import jax
 import pandas as pd
@@ -18,13 +19,14 @@ from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference, infer
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.terms import beam_rms_difference
-from lusee_bayes.linear.fit import THRESHOLDS
+from lusee_bayes.linear.fit import RULE
 from lusee_bayes.linear.metrics import effective_resolution_deg
 from lusee_bayes.linear.updating import composed, deviation_model
 from lusee_bayes.results.channel import ChannelResult, channel_of_posterior
-from lusee_bayes.results.coverage import coverage_rows
 from lusee_bayes.results.diagnostics import diagnostics
 from lusee_bayes.results.fluxes import flux_lines, flux_table
+from lusee_bayes.results.prior_words import prior_sentence, prior_summary
+from lusee_bayes.results.saved import JUDGED
 from lusee_bayes.results.updatable import Updatable, read_updatable
 
 
@@ -63,7 +65,8 @@ class MapResult(Described):
         channel = self.channel
         return (
             f"{channel.frequency_mhz:g} MHz, lmax = {self.scenario.lmax}, {channel.n_data} data",
-            *self.lines(),
+            self.headline(),
+            *wrap(self.verdict(), 100)[:2],
         )
 
     @property
@@ -89,12 +92,13 @@ class MapResult(Described):
             "chi2_expected": channel.chi2_expected,
             "level": self.diagnostics.attrs["level"],
             "verdict": self.verdict(),
-            "p": self.diagnostics.attrs["p"],
-            "coverage": coverage_rows(channel.maps(), self.scenario.lmax),
+            **{name: self.diagnostics.attrs[name] for name in JUDGED},
+            "coverage": channel.coverage_rows(),
             "n_data": channel.n_data,
             "n_missing": channel.n_missing,
             "n_modes": len(channel.mean),
             "rounds": channel.rounds,
+            **prior_summary(self.experiment),
             "beam_rms_difference": beam_rms_difference(self.experiment.setup),
             "mean_refinement_sigma": channel.refinement,
             "never_observed_fraction": channel.never_observed,
@@ -126,9 +130,10 @@ class MapResult(Described):
         return ", ".join(parts)
 
     def lines(self) -> list[str]:
-        """What a terminal shows: headline, fluxes, verdict with its thresholds."""
+        """What a terminal shows: headline, fluxes, verdict with its rule."""
         fluxes = [] if self.fluxes is None else flux_lines(self.fluxes)
-        return [self.headline(), *fluxes, self.verdict(), THRESHOLDS, *self.channel.doubts]
+        prior = prior_sentence(self.experiment)
+        return [self.headline(), prior, *fluxes, self.verdict(), RULE, *self.channel.doubts]
 
 
 def map_result(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.harmonics import power_spectrum
 from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.linear.fit import ChiSquare
 from lusee_bayes.linear.metrics import highest_altitude
 
 
@@ -19,32 +19,36 @@ class Observed:
     Attributes
     ----------
     frequency_mhz : float
-    spectrum : (ells,) array
-        C_ell of the channel's own prior, in K^2.
+    prior_std : (modes,) array
+        Of the channel's own prior, in K.
     truth : (modes,) array or None
     highest_altitude : (pixels,) array
     n_missing, rounds : int
+    instrument : ChiSquare
+        What no sky explains of the channel's own data.
     doubts : tuple of str
     """
 
     frequency_mhz: float
-    spectrum: Float[np.ndarray, " ells"]
+    prior_std: Float[np.ndarray, " modes"]
     truth: Float[np.ndarray, " modes"] | None
     highest_altitude: Float[np.ndarray, " pixels"]
     n_missing: int
     rounds: int
+    instrument: ChiSquare
     doubts: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, experiment: Experiment, rounds: int) -> Observed:
-        """Of an experiment."""
+    def of(cls, experiment: Experiment, rounds: int, instrument: ChiSquare) -> Observed:
+        """Of an experiment, and what no sky explains of its data."""
         data, nside = experiment.data, experiment.scenario.map_nside
         return cls(
             experiment.scenario.frequency_mhz,
-            power_spectrum(np.sqrt(np.asarray(experiment.setup.prior.variance()))),
+            np.sqrt(np.asarray(experiment.setup.prior.variance())),
             None if data.truth is None else np.asarray(data.truth),
             highest_altitude(data.observation, nside),
             data.n_missing,
             rounds,
+            instrument,
             experiment.doubts,
         )

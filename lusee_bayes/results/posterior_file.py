@@ -13,6 +13,7 @@ from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.results.map_result import MapResult
+from lusee_bayes.sky.priors import Prior
 
 
 def write_posterior(result: MapResult, path: Path) -> None:
@@ -39,11 +40,22 @@ def posterior_dataset(result: MapResult) -> xr.Dataset:
         lower = np.tril(np.asarray(posterior.lower))
         variables["precision_root"] = (("mode", "mode_2"), lower)
         variables["white_mean"] = ("mode", np.asarray(posterior.white_mean))
-        if posterior.prior.mean is not None:
-            variables["prior_mean"] = ("mode", np.asarray(posterior.prior.mean), {"units": "K"})
+        variables |= _prior_variables(posterior.prior)
         attrs["log_evidence"] = float(posterior.log_evidence)
         attrs["data_digests"] = json.dumps(result.digests)
     return xr.Dataset(variables, coords={"ell": ("mode", ell), "m": ("mode", m)}, attrs=attrs)
+
+
+def _prior_variables(prior: Prior) -> dict[str, tuple]:
+    """What ``prior_std`` does not tell of the prior."""
+    variables = {}
+    if not prior.independent:
+        root = np.asarray(prior.colour(np.eye(prior.rank))).T
+        variables["prior_root"] = (("mode", "mode_2"), root, {"units": "K"})
+    if prior.white_mean is not None:
+        mean = np.asarray(prior.colour(prior.white_mean))
+        variables["prior_mean"] = ("mode", mean, {"units": "K"})
+    return variables
 
 
 def about(scenario: Scenario) -> dict[str, object]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.linear.fit import LEVELS
+from lusee_bayes.linear.levels import NAMES
 
 MODES = Variable(("mode",))
 WIDTHS = Variable(("mode",), low=0.0)
@@ -11,6 +12,16 @@ NUMBER, COUNT, TEXT = Attribute(), Attribute("integer", low=0.0), Attribute("tex
 KINDS = ("product", "day", "angle")
 LEVEL = Attribute("text", choices=LEVELS)
 HINT = "give the folder of a finished run"
+# the two parts of chi^2 of a map's data
+JUDGED = {
+    f"{part}_{name}": attribute
+    for part in ("instrument", "prior")
+    for name, attribute in (
+        ("p", Attribute(low=0.0, high=1.0)),
+        ("chi2", NUMBER),
+        ("chi2_expected", NUMBER),
+    )
+}
 
 POSTERIOR = Layout(
     "a posterior of lusee-bayes map",
@@ -30,6 +41,7 @@ UPDATABLE = Layout(
         "precision_root": Variable(("mode", "mode_2"), optional=True),
         "white_mean": Variable(("mode",), optional=True),
         "prior_mean": Variable(("mode",), optional=True),
+        "prior_root": Variable(("mode", "mode_2"), optional=True),
     },
     {
         **POSTERIOR.attributes,
@@ -67,6 +79,7 @@ DIAGNOSTICS = Layout(
         "group_kind": Variable(("group",), "text", choices=KINDS, optional=True),
         "group_name": Variable(("group",), "text", optional=True),
         "group_n": Variable(("group",), "integer", low=0.0, optional=True),
+        "group_degrees": Variable(("group",), low=0.0, optional=True),
         "group_chi2": Variable(("group",), optional=True),
         "group_p": Variable(("group",), low=0.0, high=1.0, optional=True),
         "group_others_p": Variable(("group",), low=0.0, high=1.0, finite=False, optional=True),
@@ -75,8 +88,7 @@ DIAGNOSTICS = Layout(
         "frequency_mhz": Attribute(low=0.0),
         "level": LEVEL,
         "verdict": TEXT,
-        "p": Attribute(low=0.0, high=1.0),
-        "chi2": NUMBER,
+        **JUDGED,
     },
 )
 # summary.json, sampling.json; what is null is not known
@@ -92,6 +104,8 @@ MAP_SUMMARY = Layout(
         **dict.fromkeys(("log_evidence", "information_bits", "chi2", "chi2_expected"), NUMBER),
         **dict.fromkeys(("n_data", "n_missing", "n_modes", "rounds"), COUNT),
         "mean_refinement_sigma": NUMBER,
+        # runs before priors were learned do not say it
+        "prior": Attribute("text", optional=True),
     },
 )
 CUBE_SUMMARY = Layout(
@@ -110,7 +124,7 @@ CHANNEL_SUMMARY = Layout(
         "frequency_mhz": Attribute(low=0.0),
         "n_data": COUNT,
         "n_missing": COUNT,
-        "p": Attribute(low=0.0, high=1.0),
+        "instrument_p": Attribute(low=0.0, high=1.0),
         "chi2": NUMBER,
         "chi2_expected": Attribute(optional=True),
         "ell_cross": Attribute("integer", optional=True),
@@ -121,12 +135,66 @@ JOINT_SUMMARY = Layout(
     attributes={"solver": TEXT, "iterations": COUNT, "refinement_sigma": NUMBER},
 )
 COVERAGE = Layout(
-    "the coverage of a band of latitude",
+    "the coverage of a part of the sky",
     attributes={
         "name": TEXT,
-        **dict.fromkeys(("sky", "within_1", "within_2", "error_1", "error_2", "rms"), NUMBER),
+        "n": COUNT,
+        **{f"{kind}_{name}": NUMBER for kind in ("held", "scatter") for name in NAMES},
+        **dict.fromkeys(("rms", "rms_scatter", "largest", "allowed"), NUMBER),
     },
 )
+SKIES = Layout(
+    "the coverage of given skies",
+    attributes={
+        "passed": Attribute("boolean"),
+        **dict.fromkeys(("verdict", "thresholds"), TEXT),
+        **dict.fromkeys(("frequency_mhz", "peak_memory_gb"), NUMBER),
+    },
+)
+SKY = Layout(
+    "the coverage of a given sky",
+    attributes={
+        "passed": Attribute("boolean"),
+        **dict.fromkeys(("name", "sentence"), TEXT),
+        **dict.fromkeys(("log_evidence", "chi2_model"), NUMBER),
+        "n_data": COUNT,
+        "level": LEVEL,
+    },
+)
+SKY_ERRORS = Layout(
+    "the errors of a band of latitude",
+    attributes={"name": TEXT, **dict.fromkeys(("rms_error_k", "std_over_sky"), NUMBER)},
+)
+PRIORS = Layout(
+    "a comparison of priors",
+    attributes={"verdict": TEXT, **dict.fromkeys(("frequency_mhz", "peak_memory_gb"), NUMBER)},
+)
+PRIOR = Layout(
+    "the data under a prior",
+    attributes={
+        **dict.fromkeys(("name", "prior"), TEXT),
+        "parameters": COUNT,
+        "log_evidence": NUMBER,
+        **{f"{x}_{y}": NUMBER for x in ("chi2", "degrees") for y in ("instrument", "prior")},
+    },
+)
+SAMPLED = Layout(
+    "an evidence by importance sampling",
+    attributes={
+        **dict.fromkeys(("log_evidence", "error", "effective"), NUMBER),
+        "draws": COUNT,
+        "trusted": Attribute("boolean"),
+    },
+)
+HELD_OUT = Layout(
+    "groups of data that were left out",
+    attributes={
+        "kind": Attribute("text", choices=KINDS),
+        **dict.fromkeys(("groups", "n"), COUNT),
+        **dict.fromkeys(("chi2", "log_density"), NUMBER),
+    },
+)
+SNR = Layout("the SNR at a multipole", attributes={"ell": COUNT, "snr": NUMBER})
 JOINT_TEST = Layout(
     "a joint test of all channels",
     attributes={

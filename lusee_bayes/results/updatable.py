@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
@@ -17,7 +20,7 @@ from lusee_bayes.core.reading import reading
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.saved import HINT, UPDATABLE
-from lusee_bayes.sky.priors import HarmonicPrior
+from lusee_bayes.sky.priors import DensePrior, HarmonicPrior, Prior
 
 
 @dataclass(frozen=True)
@@ -54,9 +57,8 @@ def read_updatable(folder: str | Path, scenario: Scenario) -> Updatable:
             f"{path} holds {len(here['mean'])} modes, expected {n} for lmax = {scenario.lmax}"
         )
     none = jnp.zeros(())
-    mean = jnp.asarray(here["prior_mean"]) if "prior_mean" in here else None
     posterior = Posterior(
-        HarmonicPrior(jnp.asarray(power_spectrum(here["prior_std"])), mean=mean),
+        _prior(here),
         jnp.asarray(here["white_mean"]),
         jnp.asarray(here["precision_root"]),
         None,
@@ -66,3 +68,11 @@ def read_updatable(folder: str | Path, scenario: Scenario) -> Updatable:
     with reading(path, UPDATABLE.what):
         digests = tuple(str(digest) for digest in json.loads(said["data_digests"]))
     return Updatable(posterior, digests)
+
+
+def _prior(arrays: Mapping[str, Float[np.ndarray, "..."]]) -> Prior:
+    """The prior that :func:`.posterior_dataset` wrote."""
+    mean = jnp.asarray(arrays["prior_mean"]) if "prior_mean" in arrays else None
+    if "prior_root" in arrays:
+        return DensePrior(jnp.asarray(arrays["prior_root"]), mean=mean)
+    return HarmonicPrior(jnp.asarray(power_spectrum(arrays["prior_std"])), mean=mean)

@@ -10,7 +10,7 @@ import numpy as np
 from lusee_bayes.core.destinations import require_target
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.experiment import Experiment, build
+from lusee_bayes.experiment.experiment import Experiment, simulated
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import write_four_port, write_waterfall
@@ -60,7 +60,7 @@ def run_simulate(
         several = scenario.model_copy(update={"frequencies_mhz": tuple(frequencies_mhz)})
         channels = several.channels()
     experiments = [
-        build(channel, stages=Stages(stages.console, verbose=stages.verbose))
+        simulated(channel, stages=Stages(stages.console, verbose=stages.verbose))
         for channel in channels
     ]
     data = [experiment.data for experiment in experiments]

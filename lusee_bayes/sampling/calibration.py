@@ -20,13 +20,13 @@ from jaxtyping import Float, Int, Key, PRNGKeyArray
 from scipy import stats
 
 from lusee_bayes.core.arrays import Array
+from lusee_bayes.linear.levels import LEVELS
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.solver import Solver
 from lusee_bayes.sampling.least import N_BINS, require_simulations
 
-# ranks among 99 draws take 100 values, so that the levels below are met exactly
+# ranks among 99 draws take 100 values, so that LEVELS are met exactly
 N_DRAWS = 99
-LEVELS = (0.50, 0.68, 0.90, 0.95)
 
 # chance that a true posterior fails the verdict over all quantities
 FALSE_ALARM = 1e-3
@@ -265,7 +265,7 @@ class SkyQuantities(eqx.Module):
     def __call__(self, sky: Float[Array, " modes"], data: Float[Array, " data"]) -> dict:
         """Compute the quantities of one sky, given the data."""
         solver = self.solver
-        u = sky / solver.prior.diagonal_root()
+        u = solver.prior.whiten(sky)
         white = solver.factor.whiten(data if solver.offset is None else data - solver.offset)
         return {
             "mode": sky[np.array(self.modes)],

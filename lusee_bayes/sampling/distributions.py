@@ -13,8 +13,6 @@ from jaxtyping import Float, PRNGKeyArray
 from numpyro import distributions as dist
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import is_traced
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, Factor
 from lusee_bayes.sky.priors import Prior
@@ -23,7 +21,7 @@ HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
 
 
 class SkyPrior(dist.Distribution):
-    """m ~ N(mu, S) for a prior whose root is diagonal; event (unknowns,).
+    """m ~ N(mu, S); event (unknowns,).
 
     Parameters
     ----------
@@ -40,18 +38,9 @@ class SkyPrior(dist.Distribution):
     pytree_data_fields = ("prior",)
 
     def __init__(self, prior: Prior, *, validate_args: bool | None = None):
-        scale = prior.diagonal_root()
-        if scale is None:
-            raise InputError("a prior over pixels has no density; sample harmonic coefficients")
-        if not is_traced(scale) and not bool((scale > 0).all()):
-            raise InputError("the prior spectrum is zero at some ell and has no density; drop it")
+        prior.require_density()
         self.prior = prior
         super().__init__(event_shape=(prior.size,), validate_args=validate_args)
-
-    @property
-    def scale(self) -> Float[Array, " unknowns"]:
-        """Prior standard deviation of every unknown, in K."""
-        return self.prior.diagonal_root()
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Skies of the prior, ``(*sample_shape, unknowns)``, in K."""
@@ -60,12 +49,10 @@ class SkyPrior(dist.Distribution):
 
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute ln p(m) of one sky, or of every row of an array of skies."""
-        scale = self.scale
-        row = (*(1,) * (value.ndim - 1), -1)
-        u = value / scale.reshape(row)
+        u = self.prior.whiten(value)
         if self.prior.white_mean is not None:
-            u = u - self.prior.white_mean.reshape(row)
-        return -0.5 * (u**2).sum(-1) - jnp.log(scale).sum() - scale.shape[0] * HALF_LOG_2PI
+            u = u - self.prior.white_mean.reshape(*(1,) * (value.ndim - 1), -1)
+        return -0.5 * (u**2).sum(-1) - self.prior.log_det() - self.prior.size * HALF_LOG_2PI
 
 
 class CorrelatedNormal(dist.Distribution):

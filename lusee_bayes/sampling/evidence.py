@@ -27,6 +27,7 @@ from numpyro.infer.util import potential_energy
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.linear.importance import LogMean
 from lusee_bayes.sampling.mode import LaplaceApproximation, laplace_approximation
 from lusee_bayes.sampling.programs import Program
 from lusee_bayes.sampling.promotion import numpyro_promotion
@@ -93,11 +94,8 @@ def estimate_evidence(
     laplace = laplace_approximation(program.model, arguments).require_converged()
     with numpyro_promotion():
         weights = np.asarray(_log_weights(program, arguments, laplace, n, jax.random.key(seed)))
-    relative = np.exp(weights - weights.max())
-    log_mean = weights.max() + np.log(relative.mean())
-    effective = relative.sum() ** 2 / (relative**2).sum()
-    error = relative.std(ddof=1) / relative.mean() / np.sqrt(n)
-    return Evidence(float(log_mean), float(error), float(effective), laplace)
+    found = LogMean.of(weights)
+    return Evidence(found.value, found.error, found.effective, laplace)
 
 
 @eqx.filter_jit

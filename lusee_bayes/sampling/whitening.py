@@ -21,7 +21,6 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.sampling.distributions import SkyPrior
 from lusee_bayes.systematics.chart import Chart
 
 # the site of z is that of m with this appended
@@ -78,10 +77,9 @@ class Whitening(eqx.Module):
         Raises
         ------
         InputError
-            If the sky's prior has no density (see :class:`SkyPrior`).
+            If the sky's prior has no density.
         """
-        log_det = jnp.log(SkyPrior(posterior.prior).scale).sum()
-        log_det = log_det - jnp.log(jnp.diagonal(posterior.lower)).sum()
+        log_det = posterior.prior.log_det() - jnp.log(jnp.diagonal(posterior.lower)).sum()
         root = posterior.root()
         return cls(posterior.mean, root, log_det, ((site, (root.shape[0],)),))
 

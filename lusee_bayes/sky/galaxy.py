@@ -255,7 +255,7 @@ def _fluctuations(nside: int, seed: int) -> np.ndarray:
     return healpy.alm2map(alm * np.sqrt(spectrum[ell]), nside, lmax=lmax)
 
 
-def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int = 1) -> np.ndarray:
+def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> np.ndarray:
     """Compute the brightness temperature of the diffuse sky.
 
     The synchrotron emission is multiplied by exp(g - var(g)/2), g a Gaussian field drawn from
@@ -273,8 +273,8 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int = 1) -> np.ndarr
         Frequency in MHz, 1 to 50.
     nside : int
         A power of two.
-    seed : int
-        Of the random component, not negative.
+    seed : int or None
+        Of the random component, not negative; None leaves it out.
 
     Returns
     -------
@@ -293,7 +293,7 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int = 1) -> np.ndarr
         )
     if not healpy.isnsideok(nside, nest=True):
         raise InputError(f"nside is {nside}, expected a power of two; use 64, for example")
-    if seed < 0:
+    if seed is not None and seed < 0:
         raise InputError(f"seed is {seed}, expected an integer >= 0; use 1, for example")
 
     north = np.arange(6 * nside**2 + 2 * nside)  # with the equator, which is its own mirror
@@ -303,5 +303,6 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int = 1) -> np.ndarr
     pixels = np.stack([north, south])
     synchrotron[pixels], depth[pixels] = _northern_slabs(nside).synchrotron(frequency_mhz)
 
-    texture = np.exp(_fluctuations(nside, seed) - 0.5 * FLUCTUATION_RMS**2)
-    return brightness(synchrotron * texture, depth, frequency_mhz)
+    if seed is not None:
+        synchrotron *= np.exp(_fluctuations(nside, seed) - 0.5 * FLUCTUATION_RMS**2)
+    return brightness(synchrotron, depth, frequency_mhz)

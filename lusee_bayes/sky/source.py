@@ -46,7 +46,7 @@ class SkySource(ABC):
 
 
 @lru_cache(maxsize=4)
-def _galaxy_modes(frequency_mhz: float, seed: int, lmax: int) -> np.ndarray:
+def _galaxy_modes(frequency_mhz: float, seed: int | None, lmax: int) -> np.ndarray:
     """Compute the diffuse sky's coefficients, read-only: variations of a scenario share one sky."""
     nside = 64 if lmax <= 95 else 128
     modes = map_to_modes(galaxy_map(frequency_mhz, nside=nside, seed=seed), lmax)
@@ -60,13 +60,14 @@ class GalaxySource(SkySource):
 
     Attributes
     ----------
-    seed : int
-        Chooses the random small-scale structure, which is the same at all frequencies.
+    seed : int or None
+        Chooses the random small-scale structure, which is the same at all frequencies; None leaves
+        it out.
     sources : tuple of PointSource
         The sources that are added to the diffuse sky.
     """
 
-    seed: int = 1
+    seed: int | None = 1
     sources: tuple[PointSource, ...] = BRIGHT_SOURCES
 
     def at(self, frequency_mhz: float, lmax: int) -> Sky:

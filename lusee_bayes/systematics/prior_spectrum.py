@@ -37,8 +37,14 @@ class PowerSpectrum(Scale):
     tilt_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
-        """Sample the sites ``amplitude`` and ``tilt``, if they are not known."""
-        spectrum = model.prior.spectrum
+        """Sample the sites ``amplitude`` and ``tilt``, if they are not known.
+
+        Raises
+        ------
+        InputError
+            If the prior has no C_ell.
+        """
+        spectrum = _spectrum(model)
         if self.log_amplitude_std is not None:
             prior = uncertain_scale(1.0, self.log_amplitude_std)
             spectrum = spectrum * numpyro.sample("amplitude", prior)
@@ -71,9 +77,9 @@ class SpectrumBands(Scale):
         Raises
         ------
         InputError
-            If a band begins above the model's highest ell.
+            If a band begins above the model's highest ell, or the prior has no C_ell.
         """
-        spectrum = model.prior.spectrum
+        spectrum = _spectrum(model)
         lmax = spectrum.shape[0] - 1
         if self.edges[-1] > lmax:
             raise InputError(f"a band begins at ell = {self.edges[-1]}, above lmax = {lmax}")
@@ -81,3 +87,12 @@ class SpectrumBands(Scale):
         normal = dist.LogNormal(jnp.zeros(len(self.edges) + 1), self.log_std).to_event(1)
         power = numpyro.sample("band_power", normal)
         return replace(model, prior=HarmonicPrior(spectrum * power[band], mean=model.prior.mean))
+
+
+def _spectrum(model: LinearGaussian) -> Float[Array, " ells"]:
+    if not isinstance(model.prior, HarmonicPrior):
+        raise InputError(
+            f"a sampled spectrum is that of an isotropic prior, got {type(model.prior).__name__}; "
+            "use a HarmonicPrior"
+        )
+    return model.prior.spectrum

@@ -27,7 +27,7 @@ def test_examples_are_of_the_command_and_can_be_parsed(name, line):
     assert (program, arguments[0]) == ("lusee-bayes", name)
     # an unknown option or a value of the wrong type raises
     command, *_ = app.parse_args(arguments, exit_on_error=False, print_error=False)
-    assert command.__name__ == f"{name}_command"
+    assert command.__name__ == f"{name.replace('-', '_')}_command"
 
 
 def test_keys_are_listed(capsys):

@@ -27,6 +27,14 @@ def test_packing_is_ell_squared_plus_ell_plus_m():
     assert [h.lmax_of(h.n_modes(lmax)) for lmax in (0, 1, 47)] == [0, 1, 47]
 
 
+def test_many_maps_at_once_are_those_of_healpy():
+    modes = np.random.default_rng(5).standard_normal((h.n_modes(LMAX), 3))
+    maps = h.columns_to_maps(modes, 4)
+    for column in range(3):
+        expected = h.modes_to_map(modes[:, column], 4)
+        np.testing.assert_allclose(maps[:, column], expected, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("n", [0, 2, 3, 2303])
 def test_a_number_that_is_no_square_is_refused(n):
     with pytest.raises(InputError, match=f"{n} coefficients"):

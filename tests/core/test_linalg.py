@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from decimal import localcontext
 from functools import partial
 from threading import Event, Thread
 
@@ -13,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference_linear import exact
 from scipy.linalg.lapack import dpotri
 
 from lusee_bayes.core.errors import InputError
@@ -25,8 +27,12 @@ from lusee_bayes.core.linalg import (
     gram_matrix,
     inverse_from_cholesky,
     invert_lower,
+    outer_sandwich,
+    precise_residual,
+    sandwich,
     solve_lower,
     symmetric_product,
+    times_lower,
 )
 
 
@@ -154,3 +160,36 @@ def test_other_threads_go_on_meanwhile():
     lower = np.eye(2000)
     assert min(longest_pause(partial(invert_factorised, lower)) for _ in range(3)) < 0.5
     assert max(longest_pause(partial(dpotri, lower.T, lower=0)) for _ in range(3)) > 0.5
+
+
+@ARRAYS
+@pytest.mark.parametrize("n", [5, 80])
+def test_products_with_a_triangle(n, xp):
+    rng = np.random.default_rng(n)
+    lower, matrix, x = np.tril(rng.normal(size=(n, n))), spd(n), rng.normal(size=(70, n))
+    given = [xp.asarray(a) for a in (lower, matrix, x)]
+    close = partial(np.testing.assert_allclose, rtol=0, atol=1e-12 * n)
+    close(times_lower(given[2], given[0], transpose=False), x @ lower)
+    close(times_lower(given[2], given[0], transpose=True), x @ lower.T)
+    for found, expected in (
+        (sandwich(given[1], given[0]), lower.T @ matrix @ lower),
+        (outer_sandwich(given[1], given[0]), lower @ matrix @ lower.T),
+    ):
+        close(found, expected)
+        np.testing.assert_array_equal(found, np.asarray(found).T)
+
+
+@ARRAYS
+def test_a_residual_of_large_numbers_is_precise(xp):
+    """Rows over twelve orders of magnitude that cancel; the truth in 60 digits."""
+    rng = np.random.default_rng(0)
+    matrix = rng.normal(size=(40, 40)) * np.geomspace(1.0, 1e12, 40)[:, None]
+    x = rng.normal(size=40)
+    vector = matrix @ x  # equal up to rounding
+    with localcontext(prec=60):
+        truth = (exact(vector) - exact(matrix) @ exact(x)).astype(float)
+    scale = np.abs(matrix) @ np.abs(x)
+    found = precise_residual(*(xp.asarray(a) for a in (vector, matrix, x)))
+    # 23 bits more than those of a float
+    assert (np.abs(found - truth) / scale).max() < 1e-21
+    assert (np.abs(vector - np.asarray(matrix @ x) - truth) / scale).max() > 1e-17

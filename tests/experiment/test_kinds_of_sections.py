@@ -11,6 +11,7 @@ from lusee_bayes.experiment.schema import (
     FileSkySection,
     GalaxySection,
     IsotropicPriorSection,
+    ModulatedPriorSection,
     MonopoleBeamSection,
     ResponseSection,
     ScalarBeamSection,
@@ -127,12 +128,12 @@ def scalar(tmp_path):
 def test_the_old_fiducial_scenario_is_the_fiducial_scenario(tmp_path):
     found = old_scenario(tmp_path / "old.yaml")
     assert found == load_scenario("fiducial")
-    assert found.prior == IsotropicPriorSection()
+    assert found.prior == IsotropicPriorSection(spectrum="sky")
     # written again, it has no key of another kind
     tree = yaml.safe_load(found.to_yaml())
     assert set(tree["beam"]) == set(MonopoleBeamSection.model_fields)
     assert set(tree["sky"]) == set(GalaxySection.model_fields)
-    assert "spectrum" not in tree["prior"]
+    assert tree["prior"]["spectrum"] == "sky"
 
 
 def test_what_an_old_scenario_says_of_the_embedded_antennas_is_kept(tmp_path):
@@ -190,6 +191,20 @@ def test_the_sky_of_a_short_file(tmp_path, text, kind):
     assert type(load_scenario(path).sky) is kind
 
 
+def test_a_prior_takes_the_place_of_another(tmp_path):
+    """``--set`` leaves the keys of the kind that was there, which the other kind drops."""
+    found = load_scenario("fiducial", ["prior.model=modulated", "prior.amplitude=0.03"])
+    assert found.prior == ModulatedPriorSection(amplitude=0.03)
+    (tmp_path / "again.yaml").write_text(found.to_yaml())
+    assert load_scenario(tmp_path / "again.yaml") == found
+    plain = load_scenario("fiducial", ["prior.model=modulated"])
+    (tmp_path / "plain.yaml").write_text(plain.to_yaml())
+    back = load_scenario(tmp_path / "plain.yaml", ["prior.model=isotropic"])
+    assert back == load_scenario("fiducial", ["prior.spectrum=learned"])
+    (tmp_path / "short.yaml").write_text("prior: {tilt_std: 0.5}")
+    assert load_scenario(tmp_path / "short.yaml").prior == IsotropicPriorSection(tilt_std=0.5)
+
+
 def test_the_file_tells_which_beams_they_are(tmp_path, response, scalar):
     path = tmp_path / "short.yaml"
     for file, kind in [(response, ResponseSection), (scalar, ScalarBeamSection)]:
@@ -222,7 +237,14 @@ def test_the_file_tells_which_beams_they_are(tmp_path, response, scalar):
         (["beam.file=arm.fits", "beam.tapper=true"], "'beam.tapper'; did you mean 'taper'?"),
         (["beam.model=luseepy"], "beam.file is missing"),
         (["sky.model=file"], "sky.file is missing"),
-        (["prior.spectrum=maps"], "unknown key 'prior.spectrum'"),
+        (["prior.spectrum=maps"], "prior.spectrum is 'maps', but .*'learned' or 'sky'"),
+        (["prior.model=gaussian"], "prior.model is 'gaussian', which is unknown"),
+        (["prior.amplitude=0.1"], "amplitude is an entry of model modulated, not of isotropic"),
+        (
+            ["prior={model: modulated, scale: 2}"],
+            "scale is an entry of model isotropic, not of modulated",
+        ),
+        (["prior={model: modulated, amplitude: 0}"], "prior.amplitude is 0, but .*greater than 0"),
         (["output.drawz=3"], "unknown key 'output.drawz'; did you mean 'draws'?"),
         (["output.draws=-1"], "output.draws is -1, but .*greater than or equal to 0"),
     ],

@@ -50,7 +50,7 @@ def test_skies_from_the_prior_are_calibrated_at_full_size():
     for seed in range(n_skies):
         sky, data = model.sample(jax.random.key(100 + seed))
         posterior = solver.condition(data)
-        white = np.asarray((sky - posterior.mean) / model.prior.diagonal_root())
+        white = np.asarray(model.prior.whiten(sky - posterior.mean))
         total += np.sum((lower.T @ white) ** 2)
     n = n_skies * model.prior.size
     assert abs(total / n - 1.0) < 4 * np.sqrt(2 / n)

@@ -1,4 +1,4 @@
-"""Verdicts of three levels: probabilities uniform where the model holds, and thresholds."""
+"""Probabilities are uniform where the model holds; one rate of false alarms for all."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lusee_bayes.linear.fit import LEVELS, MISFIT, TENSION, level_of, two_sided, worst
+from lusee_bayes.linear.fit import FALSE_ALARM, LEVELS, ChiSquare, stands_out, two_sided, worst
 
 
 @pytest.mark.parametrize("n", [1, 40, 5232])
@@ -25,21 +25,25 @@ def test_both_sides_count():
     assert 0.999 < two_sided(float(stats.chi2.median(100)), 100) <= 1.0
 
 
-def test_levels_at_their_thresholds():
+def test_one_rate_for_all_tests_of_a_report():
     below = 1.0 - 1e-9
-    assert level_of(TENSION) == "consistent"
-    assert level_of(TENSION * below) == level_of(MISFIT) == "in tension"
-    assert level_of(MISFIT * below) == level_of(0.0) == "does not fit"
+    assert not stands_out(FALSE_ALARM, 1) and stands_out(FALSE_ALARM * below, 1)
     # the best of many is nothing special
-    assert level_of(1e-3, 10) == "consistent"
-    assert level_of(1e-3, 9) == "in tension"
-    assert worst(["in tension", "consistent"]) == "in tension"
+    assert not stands_out(1e-4, 10) and stands_out(1e-4, 9)
+    assert worst(["unlike the prior", "consistent"]) == "unlike the prior"
     assert worst(list(LEVELS)) == "does not fit"
 
 
-def test_the_least_of_many_is_called_tense_once_in_a_hundred():
-    """Bonferroni: at most TENSION, and for independent groups nearly that."""
-    p = np.random.default_rng(2).uniform(size=(40_000, 45)).min(axis=1)
-    tense = np.mean([level_of(float(x), 45) != "consistent" for x in p])
-    exact = 1.0 - (1.0 - TENSION / 45) ** 45
-    assert tense == pytest.approx(exact, abs=4 * np.sqrt(exact / len(p)))
+def test_the_least_of_many_stands_out_once_in_a_thousand():
+    """Bonferroni: at most FALSE_ALARM, and for independent groups nearly that."""
+    p = np.random.default_rng(2).uniform(size=(100_000, 45)).min(axis=1)
+    found = np.mean([stands_out(float(x), 45) for x in p])
+    exact = 1.0 - (1.0 - FALSE_ALARM / 45) ** 45
+    assert found == pytest.approx(exact, abs=4 * np.sqrt(exact / len(p)))
+
+
+def test_what_was_found_is_told_with_what_was_expected():
+    part = ChiSquare(130.0, 98.0)
+    assert part.p == pytest.approx(2 * stats.chi2.sf(130.0, 98.0))
+    assert part.words() == f"p = {part.p:.2g}, chi^2 130, expected 98 +- 14"
+    assert ChiSquare(1e9, 98.0).words().startswith("p < 1e-300, chi^2 1000000000")

@@ -9,6 +9,7 @@ from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.linear import left_out_structured
+from lusee_bayes.linear.held_out import held_out
 from lusee_bayes.linear.left_out_dense import DenseLeftOut
 from lusee_bayes.linear.left_out_structured import StructuredLeftOut
 from lusee_bayes.linear.stretches import FEW_TIMES, smooth_functions
@@ -28,6 +29,11 @@ KINDS = {
 }
 
 
+def agree(found, expected):
+    assert found.chi2 == pytest.approx(expected.chi2, rel=1e-8)
+    assert found.log_det == pytest.approx(expected.log_det, rel=1e-8)
+
+
 @pytest.mark.parametrize("kept", [0.0, left_out_structured.KEPT_BYTES])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("size", [FEW, MANY, OFTEN], ids=["few", "many", "often"])
@@ -42,13 +48,40 @@ def test_it_is_what_matrices_say(size, kind, kept, monkeypatch):
     np.testing.assert_allclose(structured.u, dense.u, rtol=0, atol=1e-9 * np.abs(dense.u).max())
     day = observation.hours // 24
     for k in np.unique(day):
-        assert structured.stretch(day == k) == pytest.approx(dense.stretch(day == k), rel=1e-8)
+        agree(structured.stretch(day == k), dense.stretch(day == k))
     np.testing.assert_allclose(structured.inverse_diagonal, dense.inverse_diagonal, rtol=1e-8)
     angle = np.array(observation.turntable_deg)[observation.run] == 40.0
-    assert structured.together(angle) == pytest.approx(dense.together(angle), rel=1e-8)
+    agree(structured.together(angle), dense.together(angle))
     for product in (0, 2, 15):
-        expected = dense.product(product)
-        assert structured.product(product) == pytest.approx(expected, rel=1e-8)
+        agree(structured.product(product), dense.product(product))
+
+
+def test_densities_of_groups_are_what_the_covariance_of_the_data_says():
+    """ln p(d_s | others) = ln p(d) - ln p(others), each of K = A S A^T + N as a matrix."""
+    e = build(load_scenario("fiducial", [*FEW, NOISY]))
+    model = full_model(e.setup)
+    a, n = (np.asarray(x) for x in (model.coupling.dense(), model.noise.dense()))
+    k = a @ np.diag(model.prior.variance()) @ a.T + n
+    less = e.data.data if model.offset is None else e.data.data - model.offset
+
+    def log_density(chosen):
+        block = k[np.ix_(chosen, chosen)]
+        value = np.linalg.slogdet(block)[1] + less[chosen] @ np.linalg.solve(block, less[chosen])
+        return -0.5 * (value + chosen.sum() * np.log(2.0 * np.pi))
+
+    every = np.ones(len(less), dtype=bool)
+    day = e.data.observation.hours[e.data.layout.time] // 24
+    groups = {
+        "product": [e.data.layout.product == j for j in range(16)],
+        "day": [day == j for j in np.unique(day)],
+    }
+    for found in held_out(model, model.condition(e.data.data), e.data):
+        chosen = groups.pop(found.kind)
+        expected = sum(log_density(every) - log_density(~inside) for inside in chosen)
+        assert (found.groups, found.n) == (len(chosen), len(less))
+        # sums of differences of thousands, from blocks with condition numbers of 1e6
+        assert found.log_density == pytest.approx(expected, abs=1e-3)
+    assert not groups
 
 
 def test_smooth_functions_are_few_and_make_up_every_phase():

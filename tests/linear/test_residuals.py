@@ -14,6 +14,7 @@ from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.linear.residuals import residuals
+from lusee_bayes.linear.split import WIDER
 
 RUNS = "observation.runs=[{cycles: 0.03}, {cycles: 0.03, turntable_deg: 40}, {cycles: 0.02}]"
 
@@ -45,16 +46,35 @@ def flagged(data, flags):
     return replace(data, layout=layout, data=layout.gather(data.layout.scatter(data.data)))
 
 
-def by_hand(model, data, index):
+def judged(model, data):
+    """The residuals of a model's data."""
+    posterior = model.condition(data.data)
+    total = model.chi2(posterior.mean, data.data) + posterior.prior_chi2()
+    return residuals(model, posterior, data, float(total))
+
+
+def by_hand(model, data, index, prior):
     """chi^2 of some data given all others, by the textbook's conditional of a Gaussian."""
-    a = np.asarray(model.coupling.dense())
-    k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
+    k = covariance_of(model, prior)
     d = np.asarray(data.data)
     rest = np.setdiff1d(np.arange(len(d)), index)
     gain = np.linalg.solve(k[np.ix_(rest, rest)], k[np.ix_(rest, index)]).T
     off = d[index] - gain @ d[rest]
     covariance = k[np.ix_(index, index)] - gain @ k[np.ix_(rest, index)]
     return off, covariance, float(off @ np.linalg.solve(covariance, off))
+
+
+def covariance_of(model, prior):
+    a = np.asarray(model.coupling.dense())
+    return a @ np.diag(np.asarray(prior.variance())) @ a.T + np.asarray(model.noise.dense())
+
+
+def degrees_by_hand(model, index, prior):
+    """Mean of chi^2 of some data given all others, of noise alone, and of sky a hundredth of it."""
+    inverse = np.linalg.inv(covariance_of(model, prior))
+    noise = inverse @ np.asarray(model.noise.dense()) @ inverse
+    alone = np.trace(np.linalg.solve(inverse[np.ix_(index, index)], noise[np.ix_(index, index)]))
+    return alone + (len(index) - alone) / WIDER**2
 
 
 FLAGS = np.zeros((16, 24), dtype=bool)
@@ -87,7 +107,8 @@ FLAGS[3, 5], FLAGS[:, 11] = True, True
 )
 def test_groups_and_single_data_by_hand(case):
     model, data = simulated(*case["overrides"], flags=case.get("flags"))
-    found = residuals(model, model.condition(data.data), data)
+    found = judged(model, data)
+    wide, whole = found.split.wide.prior, found.split.instrument
     layout, run = data.layout, data.observation.run
     hours = data.observation.hours
     assert [g.name for g in found.products] == list(data.labels)
@@ -98,28 +119,34 @@ def test_groups_and_single_data_by_hand(case):
         (found.products[7], found.days[1], found.angles[1]), members, strict=True
     ):
         index = np.flatnonzero(member)
-        _, _, expected = by_hand(model, data, index)
+        _, _, expected = by_hand(model, data, index, wide)
         assert group.n == len(index)
-        assert group.chi2 == pytest.approx(expected, rel=1e-8)
-        assert group.p == pytest.approx(both_sides(expected, len(index)), rel=1e-6)
+        assert group.chi2 == pytest.approx(expected, rel=1e-6)
+        # 200 random directions tell a trace t to sqrt(2 t / 200), matrices tell it exactly
+        degrees = degrees_by_hand(model, index, wide)
+        assert group.degrees == pytest.approx(
+            degrees, abs=4 * np.sqrt((len(index) - degrees) / 100)
+        )
+        assert group.p == pytest.approx(both_sides(group.chi2, group.degrees), rel=1e-6)
         assert group.others_p == pytest.approx(
-            both_sides(found.chi2 - expected, layout.size - len(index)), rel=1e-6
+            both_sides(whole.chi2 - group.chi2, whole.degrees - group.degrees), rel=1e-6
         )
     for datum in (0, 33, layout.size - 1):
-        off, covariance, _ = by_hand(model, data, np.array([datum]))
-        assert found.z[datum] == pytest.approx(off[0] / np.sqrt(covariance[0, 0]), abs=1e-8)
+        off, covariance, _ = by_hand(model, data, np.array([datum]), wide)
+        assert found.z[datum] == pytest.approx(off[0] / np.sqrt(covariance[0, 0]), abs=1e-6)
     mean = model.condition(data.data).mean
     predicted = np.asarray(model.predict(mean))
     np.testing.assert_allclose(found.predicted, predicted, rtol=0, atol=1e-6 * predicted.max())
-    assert found.p > 1e-3 and found.suspects() == []
-    assert "fit the model" in found.fit().text
+    assert found.fit().level == "consistent" and found.suspects() == []
+    assert found.fit().text.startswith("Consistent: instrument and noise fit (p ")
 
 
 def test_one_group_is_everything():
     model, data = simulated("observation.runs=[{cycles: 0.02}]")
-    found = residuals(model, model.condition(data.data), data)
+    found = judged(model, data)
     (angle,) = found.angles
-    assert (angle.chi2, angle.n) == (found.chi2, data.layout.size)
+    whole = found.split.instrument
+    assert (angle.chi2, angle.degrees, angle.n) == (whole.chi2, whole.degrees, data.layout.size)
     assert np.isnan(angle.others_p)
 
 
@@ -140,11 +167,15 @@ def test_what_is_wrong_is_pointed_at(kind, name):
         "turntable angle": data.observation.run[None] == 1,
     }[kind] & np.ones((16, 24), dtype=bool)
     bad = corrupted(data, where, 40.0 * np.sqrt(float(model.noise.diagonal().mean())))
-    found = residuals(model, model.condition(bad.data), bad)
+    found = judged(model, bad)
     assert found.fit().level == "does not fit"
     verdict = found.fit().text
     assert (kind, name) in [(k, group.name) for k, group in found.suspects()]
-    assert f"{kind} {name}" in verdict and "The others fit without" in verdict
+    assert (
+        f"{kind} {name}" in verdict
+        and "The others fit without" in verdict
+        and "leave it out" in verdict
+    )
     # and no other of its kind
     assert len(found.suspects()) == len({k for k, _ in found.suspects()})
 
@@ -156,6 +187,6 @@ def test_what_no_group_explains():
     rng = np.random.default_rng(1)
     noise = 3.0 * np.sqrt(float(model.noise.diagonal().mean()))
     bad = corrupted(data, slice(None), noise * rng.standard_normal((16, 24)))
-    found = residuals(model, model.condition(bad.data), bad)
+    found = judged(model, bad)
     assert found.suspects() == []
     assert "No single product, day or turntable angle" in found.fit().text

@@ -75,7 +75,7 @@ def test_what_does_not_fit_is_refused():
     _, _, models, parts = two_cycles("lmax=4", runs)
     first = models[0].condition(parts[0].data, form="root")
     other = replace(models[1], prior=HarmonicPrior(2.0 * models[1].prior.spectrum))
-    with pytest.raises(InputError, match="has another prior: C_ell = .* at ell = 0"):
+    with pytest.raises(InputError, match=r"has another prior: a variance of .* K\^2 at ell = 0"):
         deviation_model(first, other)
     few = models[1].condition(parts[1].data, form="data")
     with pytest.raises(InputError, match="condition with form='root'"):

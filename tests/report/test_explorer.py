@@ -17,6 +17,7 @@ from lusee_bayes.linear.resolution import resolution_rows
 from lusee_bayes.report.explorer import KERNEL_NSIDE, std_scale
 from lusee_bayes.results.diagnostics import packed_resolution
 from lusee_bayes.results.diagnostics_file import read_diagnostics
+from lusee_bayes.sky.priors import IndependentPrior
 
 needs_node = pytest.mark.skipif(NODE is None, reason="no node on this machine")
 POINTS = [(0.0, 0.0), (280.0, -32.0), (123.4, 56.7), (33.0, -89.0), (180.0, 90.0)]
@@ -66,7 +67,7 @@ def test_the_resolution_matrix_is_packed_by_its_definition():
     prior = np.array([50.0, *rng.uniform(1, 2, 8)])
     root = rng.standard_normal((9, 9)) * 0.1
     covariance = root @ root.T
-    packed, steps = packed_resolution(covariance, prior)
+    packed, steps = packed_resolution(covariance, IndependentPrior(prior))
     ell, _ = mode_numbers(2)
     white = packed * steps[np.ix_(ell, ell)]
     r = np.diag(prior) @ white @ np.diag(1 / prior)

@@ -71,8 +71,9 @@ class UnevenPrior(lb.HarmonicPrior):
 
     weights: Float[Array, " modes"]
 
-    def diagonal_root(self):
-        return super().diagonal_root() * jnp.sqrt(self.weights)
+    @property
+    def widths(self):
+        return super().widths * jnp.sqrt(self.weights)
 
     def variance(self):
         return super().variance() * self.weights

@@ -21,8 +21,14 @@ LMAX = int(os.environ.get("LUSEE_BAYES_TEST_LMAX", "31"))
 
 
 @pytest.mark.long
-def test_nuts_agrees_with_every_mean_every_variance_and_the_covariance():
-    experiment = build(lb.load_scenario("gain_1e-2", [f"lmax={LMAX}"]))
+@pytest.mark.parametrize(
+    "scenario",
+    [("gain_1e-2",), ("fiducial", "prior={model: modulated, amplitude: 0.04}")],
+    ids=["gains", "correlated modes"],
+)
+def test_nuts_agrees_with_every_mean_every_variance_and_the_covariance(scenario):
+    name, *overrides = scenario
+    experiment = build(lb.load_scenario(name, [f"lmax={LMAX}", *overrides]))
     inference, data = infer(experiment), experiment.data
     model, posterior = inference.model, inference.posterior
     program = load_program("sky")

@@ -33,6 +33,7 @@ NOISES = {
     "exact": ("fiducial", "noise.radiometer.form=exact"),
     "gain": ("gain_1e-2",),
     "beam": ("beam_4MHz",),
+    "correlated modes": ("fiducial", "prior={model: modulated, amplitude: 0.04}"),
 }
 # a chain or two of each structure of N is run every time, the others by make long
 EVERY_NOISE = pytest.mark.parametrize(
@@ -84,7 +85,7 @@ class Witness:
 
         A quarter of the draws is enough for most, and takes a quarter of the time.
         """
-        white_mean = self.posterior.mean / wrong.prior.diagonal_root()
+        white_mean = wrong.prior.whiten(self.posterior.mean)
         moved = eqx.tree_at(lambda p: p.white_mean, wrong, white_mean)
         np.testing.assert_allclose(moved.mean, self.posterior.mean, rtol=1e-12)
         return failed(self.judge(moved, draws))
@@ -126,8 +127,9 @@ class UnevenPrior(lb.HarmonicPrior):
 
     weights: Float[Array, " modes"]
 
-    def diagonal_root(self):
-        return super().diagonal_root() * jnp.sqrt(self.weights)
+    @property
+    def widths(self):
+        return super().widths * jnp.sqrt(self.weights)
 
     def variance(self):
         return super().variance() * self.weights
@@ -151,6 +153,24 @@ def test_hmc_finds_the_analytic_posterior(noise):
     # the test can tell: prior and data both shape this posterior
     left = np.asarray(w.posterior.prior_fraction())
     assert left.min() < 0.1 and left.max() > 0.5
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_hmc_finds_it_where_the_prior_correlates_modes():
+    w = witness("correlated modes")
+    found = w.judge(w.posterior)
+    assert found.passed, failed(found)
+    assert found.rhat.max() < 1.01
+    assert not w.chains.statistics["diverging"].any()
+    left = np.asarray(w.posterior.prior_fraction())
+    assert left.min() < 0.1 and left.max() > 0.3
+    # without its correlations, or its mean, the prior is another one
+    variances = jnp.diag(w.model.prior.variance())
+    alone = lb.DensePrior.of_covariance(variances, jnp.asarray(w.model.prior.mean))
+    assert not w.judge(w.condition(prior=alone)).passed
+    centred = replace(w.model.prior, mean=None)
+    assert "mean" in failed(w.judge(w.condition(prior=centred)))
 
 
 @pytest.mark.long

@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference_linear import assert_draws_follow, posterior
+from reference_linear import posterior, random_covariance
 from scipy.special import eval_legendre
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
-from lusee_bayes.sky.priors import HarmonicPrior, PixelPrior
+from lusee_bayes.sky.priors import DensePrior, HarmonicPrior, IndependentPrior, PixelPrior
+from lusee_bayes.testing import check_prior
 
 SPECTRUM = np.array([4.0, 1.0, 0.0, 0.25])  # nothing at ell = 2
 LMAX, NSIDE = 3, 2
@@ -55,31 +56,67 @@ def test_pixel_covariance_obeys_the_addition_theorem(pixel):
     np.testing.assert_allclose(pixel.variance(), np.diag(expected), rtol=1e-14)
 
 
-@pytest.mark.parametrize("kind", ["harmonic", "pixel"])
-def test_the_two_ways_of_colouring_agree(kind, request):
-    prior = request.getfixturevalue(kind)
-    rng = np.random.default_rng(0)
-    u, a = jnp.asarray(rng.normal(size=(5, prior.rank))), rng.normal(size=(7, prior.size))
-    root = np.asarray(prior.colour(jnp.eye(prior.rank))).T
-    np.testing.assert_allclose(prior.colour(u), np.asarray(u) @ root.T, atol=1e-14)
-    np.testing.assert_allclose(prior.colour(u[0]), np.asarray(u[0]) @ root.T, atol=1e-14)
-    np.testing.assert_allclose(prior.colour_columns(jnp.asarray(a)), a @ root, atol=1e-13)
+def dense_covariance() -> np.ndarray:
+    return random_covariance(np.random.default_rng(4), 16, scale=3.0)
 
 
-def test_draws_have_the_covariance(harmonic):
-    draws = np.asarray(harmonic.sample(jax.random.key(0), 20_000))
-    assert draws.shape == (20_000, 16)
-    known = PER_MODE > 0
-    assert (draws[:, ~known] == 0.0).all()
-    assert_draws_follow(draws[:, known], np.zeros(known.sum()), np.diag(PER_MODE[known]))
-    assert harmonic.sample(jax.random.key(0)).shape == (16,)
+ROOT, MEAN = np.linspace(0.5, 2.0, 6), np.linspace(-2.0, 5.0, 16)
+HOLES = np.where(PER_MODE > 0, MEAN, 0.0)
+KINDS = {
+    "harmonic": lambda: (HarmonicPrior(jnp.asarray(SPECTRUM)), np.diag(PER_MODE)),
+    "harmonic about a mean": lambda: (
+        HarmonicPrior(jnp.asarray(SPECTRUM), mean=jnp.asarray(HOLES)),
+        np.diag(PER_MODE),
+        HOLES,
+    ),
+    "independent": lambda: (IndependentPrior(jnp.asarray(ROOT)), np.diag(ROOT**2)),
+    "pixels": lambda: (PixelPrior(jnp.asarray(SPECTRUM), NSIDE), pixel_covariance()),
+    "dense": lambda: (DensePrior.of_covariance(dense_covariance()), dense_covariance()),
+    "dense about a mean": lambda: (
+        DensePrior.of_covariance(jnp.asarray(dense_covariance()), jnp.asarray(MEAN)),
+        dense_covariance(),
+        MEAN,
+    ),
+}
 
 
-def test_pixel_draws_have_the_covariance(pixel):
-    draws = pixel.sample(jax.random.key(1), 20_000)
-    assert draws.shape == (20_000, 48)
-    assert_draws_follow(draws, np.zeros(48), pixel_covariance())
-    assert pixel.sample(jax.random.key(0)).shape == (48,)
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_prior_keeps_the_contract(kind):
+    check_prior(*KINDS[kind]())
+
+
+def test_the_contract_notices_a_wrong_prior():
+    class Transposed(DensePrior):
+        def colour_columns(self, a):
+            return a @ self.root.T
+
+    class Uncentred(DensePrior):
+        @property
+        def white_mean(self):
+            return None if self.mean is None else self.mean
+
+    prior = DensePrior.of_covariance(dense_covariance(), MEAN)
+    for wrong in (Transposed, Uncentred):
+        with pytest.raises(AssertionError):
+            check_prior(wrong(prior.root, mean=prior.mean), dense_covariance(), MEAN)
+    with pytest.raises(AssertionError):
+        check_prior(prior, 1.1 * dense_covariance(), MEAN)
+
+
+def test_covariances_that_cannot_be_are_refused():
+    covariance = dense_covariance()
+    skewed, singular = covariance.copy(), covariance - 10.0 * np.eye(16)
+    skewed[3, 1] += 1e-6
+    with pytest.raises(InputError, match=r"not symmetric: S\[1, 3\] = .*S\[3, 1\]"):
+        DensePrior.of_covariance(skewed)
+    with pytest.raises(InputError, match="not positive definite: its lowest eigenvalue is -"):
+        DensePrior.of_covariance(jnp.asarray(singular))
+    with pytest.raises(InputError, match="lower triangular with a positive diagonal"):
+        DensePrior(covariance)
+    with pytest.raises(InputError, match="the prior mean has shape"):
+        DensePrior.of_covariance(covariance, np.zeros(9))
+    with pytest.raises(InputError, match="the prior covariance holds NaN"):
+        DensePrior.of_covariance(np.full((4, 4), np.nan))
 
 
 @pytest.mark.parametrize("build", [HarmonicPrior, lambda s: PixelPrior(s, NSIDE)])

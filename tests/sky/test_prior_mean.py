@@ -131,8 +131,13 @@ def test_residuals_are_those_of_the_data_less_the_mean(small_experiment):
     sigma = np.asarray(one.std())
     # both means are refined to 1e-6 sigma
     assert np.abs((one.mean - mean - other.mean) / sigma).max() < 1e-5
-    first, second = residuals(about_mean, one, data), residuals(about_zero, other, less)
-    np.testing.assert_allclose(first.chi2, second.chi2, rtol=1e-6)
+    first, second = (
+        residuals(model, p, d, float(model.chi2(p.mean, d.data) + p.prior_chi2()))
+        for model, p, d in ((about_mean, one, data), (about_zero, other, less))
+    )
+    for part in ("instrument", "prior"):
+        a, b = getattr(first.split, part), getattr(second.split, part)
+        np.testing.assert_allclose([a.chi2, a.degrees], [b.chi2, b.degrees], rtol=1e-5)
     for a, b in zip(first.days + first.products, second.days + second.products, strict=True):
         np.testing.assert_allclose(a.chi2, b.chi2, rtol=1e-5)
 

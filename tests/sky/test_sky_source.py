@@ -7,9 +7,10 @@ import healpy
 import numpy as np
 import pytest
 from astropy.io import fits
+from reference import real_harmonics
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import modes_to_map, to_healpy
+from lusee_bayes.core.harmonics import map_to_modes, modes_to_map, to_healpy
 from lusee_bayes.sky import (
     SKY_READERS,
     FileSource,
@@ -22,6 +23,7 @@ from lusee_bayes.sky import (
     write_alms,
 )
 from lusee_bayes.testing import assert_refused, check_sky_source
+from lusee_bayes.testing.skies import SmoothSky, SpottySky
 
 NSIDE, LMAX = 16, 8
 # healpy's iterated quadrature of a map of NSIDE 16 without power above ell = 4, rms
@@ -122,6 +124,47 @@ def test_the_galaxy_keeps_the_contract():
     source = GalaxySource()
     check_sky_source(source, frequency_mhz=25.0, lmax=16, slice_rtol=1e-4, missing_mhz=60.0)
     assert_refused(lambda: source.at(0.5, 16))
+
+
+@pytest.mark.parametrize("kind", [SmoothSky, SpottySky])
+def test_the_test_skies_keep_the_contract(kind):
+    # the background's plane has power above lmax, 6e-6 between 8 and 191
+    check_sky_source(kind(), frequency_mhz=10.0, lmax=16, slice_rtol=1e-4)
+    mean = kind().at(20.0, 8).mean_temperature
+    assert mean == pytest.approx(3e5 * 2**-2.5, rel=0.05)
+    first, second = (np.asarray(kind(seed).at(10.0, 8).modes) for seed in (1, 2))
+    assert np.abs(first - second).max() > 1e-3 * np.abs(first).max()
+
+
+def test_the_smooth_sky_is_positive_and_smooth():
+    for seed in range(5):
+        sky = SmoothSky(seed)
+        pattern = sky.pattern()
+        assert pattern.min() > 0.0
+        spectrum = np.asarray(sky.at(10.0, 31).spectrum())
+        # blobs of 15 degrees: exp(-(ell sigma)^2), 1e-9 of the power at ell = 20
+        assert spectrum[20:].max() < 1e-6 * spectrum[1:4].max()
+
+
+def test_the_spotty_sky_has_a_steep_number_count():
+    """N(> 2 S) / N(> S) = 2^-1.5 within the scatter of counts; sources add up to a tenth."""
+    theta, phi, share = SpottySky().sources()
+    for level in (2.0, 5.0):
+        above = share > level * share.min()
+        brighter = int((share > 2.0 * level * share.min()).sum())
+        expected = above.sum() * 2.0**-1.5
+        assert abs(brighter - expected) < 4.0 * np.sqrt(expected)
+    assert share.sum() == pytest.approx(1.0)
+    assert SpottySky().background().min() > 0.0
+    # half of them lie in the plane
+    latitude = 90.0 - np.degrees(theta)
+    assert 0.5 < np.mean(np.abs(latitude) < 15.0) < 0.75
+    # one source after the other, by its own harmonics
+    sky = SpottySky().at(10.0, 4)
+    modes = 0.9 * map_to_modes(SpottySky().background(), 4)
+    for t, p, s in zip(theta, phi, share, strict=True):
+        modes += 0.1 * 4.0 * np.pi * s * real_harmonics(t, p, 4)
+    np.testing.assert_allclose(sky.modes, 3e5 * modes, rtol=0, atol=1e-9 * 3e5)
 
 
 @pytest.mark.parametrize("frequency", [0.0, -3.0, np.nan])

@@ -17,7 +17,13 @@ from lusee_bayes.experiment.schema.noise import (
 )
 from lusee_bayes.experiment.schema.observation import ObservationSection, RunSection
 from lusee_bayes.experiment.schema.output import OutputSection
-from lusee_bayes.experiment.schema.prior import IsotropicPriorSection, PriorSection
+from lusee_bayes.experiment.schema.prior import (
+    PRIOR_SECTIONS,
+    IsotropicPriorSection,
+    LocalScalesPriorSection,
+    ModulatedPriorSection,
+    PriorSection,
+)
 from lusee_bayes.experiment.schema.section import Frequency, Section, Seed
 from lusee_bayes.experiment.schema.sky import (
     SKY_SECTIONS,
@@ -30,6 +36,7 @@ from lusee_bayes.experiment.schema.spectral import SpectralSection
 
 __all__ = [
     "BEAM_SECTIONS",
+    "PRIOR_SECTIONS",
     "SKY_SECTIONS",
     "BeamErrorSection",
     "BeamSection",
@@ -38,6 +45,8 @@ __all__ = [
     "GainSection",
     "GalaxySection",
     "IsotropicPriorSection",
+    "LocalScalesPriorSection",
+    "ModulatedPriorSection",
     "MonopoleBeamSection",
     "NoiseSection",
     "ObservationSection",

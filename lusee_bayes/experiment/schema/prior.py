@@ -1,25 +1,47 @@
-"""The prior on the sky."""
+"""The prior on the sky: one section for each kind, selected by ``model``.
+
+A new kind is a class here, which makes its :class:`Prior`, and its name in ``PRIOR_SECTIONS``.
+"""
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import or_
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+import numpy as np
+from pydantic import BeforeValidator, Field, model_validator
 
-from lusee_bayes.experiment.schema.section import Positive, Section
-from lusee_bayes.sky import Sky
+from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.core.reading import require_file
+from lusee_bayes.experiment.schema.section import Positive, Section, without_other_kinds
+from lusee_bayes.sky import BRIGHT_SOURCES, Sky
+from lusee_bayes.sky.isotropic_family import IsotropicFamily
+from lusee_bayes.sky.local_scales import embedded_local_scales
+from lusee_bayes.sky.modulated import Modulation, relative_spectrum
+from lusee_bayes.sky.modulated_family import ModulatedFamily
+from lusee_bayes.sky.prior_family import PriorFamily
 from lusee_bayes.sky.prior_files import read_mean, read_spectrum
 from lusee_bayes.sky.priors import HarmonicPrior, Prior
+from lusee_bayes.sky.template import EmbeddedTemplate, Template, read_template
+
+# the template that no file is needed for
+EMBEDDED = "embedded"
+LEARNED = "learned from these data"
 
 
 class IsotropicPriorSection(Section):
-    """Independent coefficients: C_ell the spectrum of the scenario's sky, or of a file; mean 0.
+    """Independent coefficients: C_ell learned from the data, the sky's own, or a file's; mean 0.
 
-    Where C_ell is not known, an amplitude and a tilt are sampled, C_ell A ((ell + 1) / 10)^tilt, or
-    one amplitude for every band of ell.
+    ``sky`` takes C_ell of the scenario's sky, which simulations know and observers do not: the
+    paper's setting. With it or with a file's, an amplitude and a tilt can be sampled,
+    C_ell A ((ell + 1) / 10)^tilt, or one amplitude for every band of ell.
 
     Attributes
     ----------
+    spectrum : {"learned", "sky"}
+        Where C_ell comes from, if not from a file: by default learned, unless another entry acts on
+        a C_ell that is known.
     scale : float
         Multiplies C_ell.
     spectrum_file : str
@@ -42,6 +64,7 @@ class IsotropicPriorSection(Section):
     """
 
     model: Literal["isotropic"] = "isotropic"
+    spectrum: Literal["learned", "sky"] = "learned"
     scale: Positive = 1.0
     spectrum_file: str | None = None
     mean_file: str | None = None
@@ -54,19 +77,36 @@ class IsotropicPriorSection(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _spectrum_had_one_value(cls, value: Any) -> Any:
-        """``spectrum: sky`` was an entry once, with this one value."""
-        if isinstance(value, dict) and value.get("spectrum") == "sky":
-            return {name: v for name, v in value.items() if name != "spectrum"}
-        return value
+    def _known_where_something_acts_on_it(cls, value: Any) -> Any:
+        if not isinstance(value, dict) or value.get("spectrum") is not None:
+            return value
+        acting = ("scale", "mean_file", "log_amplitude_std", "tilt_std", "band_edges")
+        known = any(value.get(name) for name in acting)
+        return {**value, "spectrum": "sky" if known else "learned"}
 
     @model_validator(mode="after")
     def _one_parameterisation(self) -> IsotropicPriorSection:
         if self.band_edges and (self.log_amplitude_std or self.tilt_std):
             raise ValueError("give either band_edges or log_amplitude_std and tilt_std")
+        if self.is_learned and (self.samples or self.scale != 1.0 or self.mean_file is not None):
+            raise ValueError(
+                "a learned C_ell has no scale, no mean_file and nothing to sample; give "
+                "spectrum=sky or a spectrum_file with them"
+            )
         if list(self.band_edges) != sorted(set(self.band_edges)):
             raise ValueError("band_edges must grow from one to the next")
         return self
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether the data tell C_ell."""
+        return self.spectrum == "learned" and self.spectrum_file is None
+
+    def family(self, frequency_mhz: float, lmax: int) -> PriorFamily | None:
+        """The family that data choose a prior of, up to an ell; None if C_ell is given."""
+        if not self.is_learned:
+            return None
+        return IsotropicFamily.around(_mean_temperature(frequency_mhz), lmax)
 
     def prior(self, sky: Sky) -> Prior:
         """S, and the mean, at the frequency and up to the lmax of a model sky."""
@@ -81,10 +121,191 @@ class IsotropicPriorSection(Section):
         return HarmonicPrior(spectrum * self.scale, mean=mean)
 
     @property
+    def origin(self) -> str:
+        """Where C_ell comes from."""
+        if self.spectrum_file is not None:
+            return f"of {self.spectrum_file}"
+        return LEARNED if self.is_learned else "of the scenario's own sky"
+
+    @property
     def has_files(self) -> bool:
         """Whether the prior is read from files, which are of one frequency."""
         return self.spectrum_file is not None or self.mean_file is not None
 
+    @property
+    def samples(self) -> bool:
+        """Whether something of the prior is to be sampled."""
+        known = self.log_amplitude_std is None and self.tilt_std is None
+        return not known or bool(self.band_edges)
 
-# a further prior joins here, selected by ``model``
-PriorSection = IsotropicPriorSection
+
+class ModulatedPriorSection(Section):
+    """A template, and Gaussian deviations in proportion to it.
+
+    Their C_ell is learned from the data, or A^2 ((ell + 1) / 10)^tilt where A is given.
+
+    Attributes
+    ----------
+    template : str
+        ``embedded``, the diffuse Galaxy without random structure, or a file: a map in K, Galactic,
+        coefficients, or posterior.nc of another map.
+    file_frequency_mhz : float
+        What the file was made for; by default what it says, or the scenario's frequency.
+    spectral_index : float
+        Scales the file from its frequency to the scenario's.
+    smoothing_deg : float
+        Full width at half maximum of a Gaussian beam that the file's sky is smoothed with.
+    amplitude : float
+        A, of deviations relative to the template; by default C_ell is learned.
+    tilt : float
+        Slope of C_ell.
+    scale_std : float
+        Standard deviation of the template's overall scale, about 1.
+    monopole_std : float
+        Standard deviation of the monopole, over that of the template.
+    sources : bool
+        Give the catalogue's sources fluxes of their own, each as uncertain as it is large; a file
+        holds them already, the embedded template does not.
+    """
+
+    model: Literal["modulated"] = "modulated"
+    template: str = EMBEDDED
+    file_frequency_mhz: Positive | None = None
+    spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
+    smoothing_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
+    amplitude: Positive | None = None
+    tilt: Annotated[float, Field(ge=-20, le=20)] = -2.4
+    scale_std: Positive = 0.5
+    monopole_std: Positive = 1.0
+    sources: bool = True
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether the data tell C_ell."""
+        return self.amplitude is None
+
+    def family(self, frequency_mhz: float, lmax: int) -> PriorFamily | None:
+        """The family that data choose a prior of, up to an ell; None if C_ell is given."""
+        if not self.is_learned:
+            return None
+        return ModulatedFamily.of(self.modulation(frequency_mhz, lmax))
+
+    def prior(self, sky: Sky) -> Prior:
+        """S and the mean at the frequency and up to the lmax of a model sky."""
+        modulation = self.modulation(sky.frequency_mhz, sky.lmax)
+        spectrum = relative_spectrum(modulation.lmax_deviations, self.amplitude, self.tilt)
+        return modulation.prior(spectrum)
+
+    def modulation(self, frequency_mhz: float, lmax: int) -> Modulation:
+        """All of the prior but C_ell."""
+        sources = BRIGHT_SOURCES if self.sources else ()
+        fluxes = np.reshape(
+            [source.modes(frequency_mhz, lmax) for source in sources], (-1, n_modes(lmax))
+        )
+        return Modulation.of(
+            self._template(frequency_mhz, lmax),
+            lmax,
+            sources=fluxes,
+            sources_in_template=self.has_files,
+            scale_std=self.scale_std,
+            monopole_std=self.monopole_std,
+        )
+
+    def _template(self, frequency_mhz: float, lmax: int) -> Template:
+        if self.template == EMBEDDED:
+            return EmbeddedTemplate(frequency_mhz)
+        path = require_file(self.template, "template of the prior", "check prior.template")
+        return read_template(
+            path,
+            frequency_mhz,
+            lmax,
+            file_frequency_mhz=self.file_frequency_mhz,
+            spectral_index=self.spectral_index,
+            smoothing_deg=self.smoothing_deg,
+        )
+
+    @property
+    def origin(self) -> str:
+        """Where C_ell comes from."""
+        return LEARNED if self.is_learned else "given in the scenario"
+
+    @property
+    def has_files(self) -> bool:
+        """Whether the prior is read from files, which are of one frequency."""
+        return self.template != EMBEDDED
+
+    @property
+    def samples(self) -> bool:
+        """Whether something of the prior is to be sampled."""
+        return False
+
+
+class LocalScalesPriorSection(Section):
+    """A template, and Gaussian deviations whose strength at every place and scale is learned.
+
+    The template is the embedded diffuse Galaxy; how much of it there is, whether the catalogue's
+    sources are there, C_ell of the deviations, and how their strength goes with the template's
+    brightness, with the Galactic plane and from place to place are all told by the data.
+
+    Attributes
+    ----------
+    sources : bool
+        Allow for the catalogue's sources.
+    """
+
+    model: Literal["local_scales"] = "local_scales"
+    sources: bool = True
+
+    @property
+    def origin(self) -> str:
+        """Where C_ell comes from."""
+        return LEARNED
+
+    @property
+    def has_files(self) -> bool:
+        """Whether the prior is read from files, which are of one frequency."""
+        return False
+
+    @property
+    def samples(self) -> bool:
+        """Whether something of the prior is to be sampled."""
+        return False
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether the data tell C_ell."""
+        return True
+
+    def family(self, frequency_mhz: float, lmax: int) -> PriorFamily:
+        """The family that data choose a prior of, up to an ell."""
+        return embedded_local_scales(frequency_mhz, lmax, BRIGHT_SOURCES if self.sources else ())
+
+
+PRIOR_SECTIONS = {
+    section.model_fields["model"].default: section
+    for section in (LocalScalesPriorSection, IsotropicPriorSection, ModulatedPriorSection)
+}
+
+
+def _one_kind(value: Any) -> Any:
+    """``prior`` without a model is that of its entries: isotropic, as scenarios had it before."""
+    if not isinstance(value, dict):
+        return value
+    tree = dict(value)
+    if not tree.get("model"):
+        told = set(tree) & set(IsotropicPriorSection.model_fields) - {"model"}
+        default = IsotropicPriorSection if told else LocalScalesPriorSection
+        tree["model"] = default.model_fields["model"].default
+    if tree["model"] != "isotropic":  # another kind in the place of the paper's prior
+        tree.pop("spectrum", None)
+    return without_other_kinds(tree, PRIOR_SECTIONS, strict=True)
+
+
+def _mean_temperature(frequency_mhz: float) -> float:
+    """Of the embedded sky, in K."""
+    return float(EmbeddedTemplate(frequency_mhz).modes(0)[0] / np.sqrt(4.0 * np.pi))
+
+
+PriorSection = Annotated[
+    reduce(or_, PRIOR_SECTIONS.values()), Field(discriminator="model"), BeforeValidator(_one_kind)
+]

@@ -14,8 +14,8 @@ class PriorSpectrumTerm(Term):
 
     def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
         prior = setup.scenario.prior
+        if not prior.samples:
+            return []
         if prior.band_edges:
             return [("sampled", SpectrumBands(prior.band_edges, prior.log_band_std))]
-        if prior.log_amplitude_std is None and prior.tilt_std is None:
-            return []
         return [("sampled", PowerSpectrum(prior.log_amplitude_std, prior.tilt_std))]

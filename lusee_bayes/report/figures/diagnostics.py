@@ -79,6 +79,8 @@ def residuals(found: xr.Dataset) -> Figure:
     right.set(xlabel=f"p-value (drawn down to {LEAST_P:g})", xlim=(LEAST_P / 3, 3))
     right.grid(axis="y", lw=0.3)
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, fontsize=8)
-    level, p = found.attrs["level"], probability(found.attrs["p"])
-    figure.suptitle(f"Residuals at {found.attrs['frequency_mhz']:g} MHz: {level} (p {p})")
+    p = probability(found.attrs["instrument_p"])
+    figure.suptitle(
+        f"Residuals at {found.attrs['frequency_mhz']:g} MHz: p {p} of what no sky explains"
+    )
     return figure

@@ -8,6 +8,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.linear.levels import LEVELS
 from lusee_bayes.linear.metrics import highest_altitude
 from lusee_bayes.report.figures.drawing import (
     BLUE,
@@ -21,7 +22,7 @@ from lusee_bayes.report.figures.drawing import (
 )
 from lusee_bayes.report.figures.mollweide import mollweide
 from lusee_bayes.results.sample_result import SampleResult
-from lusee_bayes.sampling.calibration import LEVELS, Ranks
+from lusee_bayes.sampling.calibration import Ranks
 from lusee_bayes.sampling.least import N_BINS
 from lusee_bayes.sampling.validation import Comparison
 

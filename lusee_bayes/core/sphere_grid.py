@@ -1,0 +1,208 @@
+"""Products of fields on the sphere: harmonic transforms on Gauss-Legendre rings.
+
+The rule is exact up to degree 2 ``band``. With ``band`` twice that of the harmonics, it
+integrates their products with each other and with a field of the same band exactly. A transform
+takes one matrix product for every order m, and one FFT for every ring.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.arrays import Array, as_complex, namespace
+from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import SQRT2, azimuth_functions, lmax_of, mode_numbers, n_modes
+from lusee_bayes.core.lazy import special
+from lusee_bayes.core.linalg import mirrored
+from lusee_bayes.core.order_products import order_products
+
+
+class SphereGrid(eqx.Module):
+    """Real harmonics up to ``lmax`` on the rings of a Gauss-Legendre rule.
+
+    Attributes
+    ----------
+    theta : (rings,) array
+        Of each ring, from the pole, in radians.
+    weights : (rings,) array
+        Solid angle of each point of a ring; those of all points add up to 4 pi.
+    legendre : (orders, rings, ells) array
+        lambda_lm(theta) for m = 0..lmax, times sqrt(2) where m > 0.
+    n_phi : int
+        Points on a ring; the first is at azimuth zero.
+    """
+
+    theta: Float[Array, " rings"]
+    weights: Float[Array, " rings"]
+    legendre: Float[Array, "orders rings ells"]
+    n_phi: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, lmax: int, band: int) -> SphereGrid:
+        """Make the grid, in NumPy.
+
+        Parameters
+        ----------
+        lmax : int
+            Highest ell of the harmonics.
+        band : int
+            The rule is exact up to degree 2 ``band``.
+
+        Raises
+        ------
+        InputError
+            If ``band`` is below ``lmax``: the harmonics are not orthogonal on such a grid.
+        """
+        if band < lmax:
+            raise InputError(
+                f"a grid of band limit {band} does not hold harmonics up to ell = {lmax}; give a "
+                "band limit of lmax at least"
+            )
+        x, weights = np.polynomial.legendre.leggauss(band + 1)
+        theta, n_phi = np.arccos(x), 2 * band + 2
+        # ells, orders, rings
+        table = special.sph_legendre_p_all(lmax, lmax, theta)[0][:, : lmax + 1]
+        table = np.ascontiguousarray(table.transpose(1, 2, 0))
+        table[1:] *= SQRT2
+        return cls(theta, weights * (2.0 * np.pi / n_phi), table, n_phi)
+
+    @property
+    def lmax(self) -> int:
+        """Highest ell of the harmonics."""
+        return self.legendre.shape[0] - 1
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of rings, and of points on each."""
+        return self.legendre.shape[1], self.n_phi
+
+    def directions(self) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+        """Return theta and phi of every point in radians, ring after ring."""
+        phi = 2.0 * np.pi * np.arange(self.n_phi) / self.n_phi
+        return np.repeat(np.asarray(self.theta), self.n_phi), np.tile(phi, self.shape[0])
+
+    def synthesise(self, modes: Float[Array, "*batch modes"]) -> Float[Array, "*batch rings phi"]:
+        """Compute the fields of real packed coefficients at the grid's points.
+
+        Parameters
+        ----------
+        modes : (..., modes) array
+
+        Raises
+        ------
+        InputError
+            For coefficients of another lmax.
+        """
+        batch = modes.shape[:-1]
+        require_shape("the coefficients", modes, (*batch, n_modes(self.lmax)))
+        xp, lmax = namespace(modes, self.legendre), self.lmax
+        order, ell = np.mgrid[: lmax + 1, : lmax + 1]
+        plus = np.where(ell >= order, ell * (ell + 1) + order, 0)
+        minus = np.where(ell >= order, ell * (ell + 1) - order, 0)
+        flat = modes.reshape(-1, modes.shape[-1])
+        # where ell < m the table is zero; the sine of m = 0 is left out below
+        both = xp.stack([flat[:, plus], flat[:, minus]])
+        columns = both.reshape(-1, lmax + 1, lmax + 1).transpose(1, 2, 0)
+        rings = (self.legendre @ columns).transpose(2, 1, 0).reshape(2, *batch, -1, lmax + 1)
+        factor = np.where(np.arange(lmax + 1) > 0, 0.5, 1.0) * self.n_phi
+        row = (*(1,) * (len(batch) + 1), -1)
+        sine = factor * (np.arange(lmax + 1) > 0)
+        amplitude = as_complex(rings[0] * factor.reshape(row), rings[1] * sine.reshape(row))
+        return xp.fft.irfft(amplitude, n=self.n_phi, axis=-1)
+
+    def analyse(self, field: Float[Array, "*batch rings phi"]) -> Float[Array, "*batch modes"]:
+        """Integrate fields with every harmonic: coefficients of their part up to lmax.
+
+        Parameters
+        ----------
+        field : (..., rings, phi) array
+            Values at the grid's points.
+
+        Raises
+        ------
+        InputError
+            For values of another grid.
+        """
+        batch = field.shape[:-2]
+        require_shape("the field", field, (*batch, *self.shape))
+        xp, lmax = namespace(field, self.legendre), self.lmax
+        weights = self.weights.reshape(*(1,) * len(batch), -1, 1)
+        amplitude = xp.fft.rfft(field * weights, axis=-1)[..., : lmax + 1]
+        both = xp.stack([amplitude.real, amplitude.imag])
+        columns = both.reshape(-1, self.shape[0], lmax + 1).transpose(2, 1, 0)
+        table = (self.legendre.transpose(0, 2, 1) @ columns).transpose(2, 0, 1)
+        cosine, sine = table.reshape(2, -1, lmax + 1, lmax + 1)
+        ell, m = mode_numbers(lmax)
+        picked = xp.where((m >= 0)[None], cosine[:, np.abs(m), ell], sine[:, np.abs(m), ell])
+        return picked.reshape(*batch, n_modes(lmax))
+
+    def product_matrix(
+        self, field: Float[np.ndarray, "rings phi"], lmax: int | None = None
+    ) -> Float[np.ndarray, "rows modes"]:
+        """Compute int y_i f y_j dOmega: multiplication by a field, as a matrix over harmonics.
+
+        On a ring, products of cosines and sines of m phi and m' phi only need the field's Fourier
+        amplitudes at m - m' and m + m'; no harmonic is formed on the grid.
+
+        Parameters
+        ----------
+        field : (rings, phi) array
+            f at the grid's points.
+        lmax : int, optional
+            Highest ell of i; by default, and at most, that of the grid, which is that of j.
+
+        Returns
+        -------
+        (rows, modes) array
+            Symmetric, where both have the same lmax.
+
+        Raises
+        ------
+        InputError
+            For values of another grid.
+        """
+        require_shape("the field", field, self.shape)
+        highest, table = self.lmax, np.asarray(self.legendre)
+        lmax = highest if lmax is None else lmax
+        square = lmax == highest
+        fourier = np.fft.fft(np.asarray(field) * np.asarray(self.weights)[:, None], axis=1).T
+        transposed = np.ascontiguousarray(table[: lmax + 1, :, : lmax + 1].transpose(0, 2, 1))
+        matrix = np.empty((n_modes(lmax), n_modes(highest)))
+        for m in range(highest + 1):
+            others = np.arange(m if square else 0, lmax + 1)
+            low, high = fourier[others - m], fourier[(others + m) % self.n_phi]
+            # cos m'phi cos m phi, sin sin, sin m'phi cos m phi, cos m'phi sin m phi
+            factors = (low + high).real, (low - high).real, (low + high).imag, (high - low).imag
+            signs = (1, 1), (-1, -1), (-1, 1), (1, -1)
+            degrees = np.arange(m, highest + 1)
+            for factor, (sign, own) in zip(factors, signs, strict=True):
+                if own < 0 and m == 0:  # sin 0
+                    continue
+                columns = table[m][:, m:][None] * (0.5 * factor)[:, :, None]
+                blocks = transposed[others[0] :] @ columns  # m', its ells, those of m
+                to = degrees * (degrees + 1) + own * m
+                for other, block in zip(others, blocks, strict=True):
+                    if sign < 0 and other == 0:
+                        continue
+                    ell = np.arange(other, lmax + 1)
+                    at = ell * (ell + 1) + sign * other
+                    matrix[at[:, None], to[None]] = block[other:]
+                    if square:
+                        matrix[to[:, None], at[None]] = block[other:].T
+        return mirrored(matrix) if square else matrix
+
+    def diagonal(self, matrix: Float[np.ndarray, "modes modes"]) -> Float[np.ndarray, "rings phi"]:
+        """Compute y^T C y at the grid's points: the variance of a field of covariance C.
+
+        Parameters
+        ----------
+        matrix : (modes, modes) array
+            C, symmetric, of harmonics up to any lmax.
+        """
+        between = order_products(matrix, np.asarray(self.theta))
+        phi = 2.0 * np.pi * np.arange(self.n_phi) / self.n_phi
+        azimuth = azimuth_functions(phi, lmax_of(matrix.shape[0]))
+        return ((azimuth @ between) * azimuth).sum(2)

@@ -1,0 +1,73 @@
+"""A prior whose parameters the data of an experiment tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.experiment.terms import Around
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.learning import Learned, learn
+from lusee_bayes.linear.marginal_information import marginalised
+from lusee_bayes.sky.prior_family import PriorFamily
+
+# parameters are learned up to this ell first, in a tenth of the time, where there are more
+COARSE_LMAX = 24
+
+
+def with_learned_prior(setup: Setup, data: Visibilities) -> tuple[Setup, Learned | None]:
+    """The setup with the prior that data tell, and how it was learned; None for one that is given.
+
+    Systematics are in N as far as they are marginalised, around the data where they need a signal.
+
+    Parameters
+    ----------
+    setup : Setup
+    data : Visibilities
+
+    Raises
+    ------
+    InputError
+        As :func:`.learn`.
+    """
+    if setup.family is None:
+        return setup, None
+    learned = learned_prior(setup, setup.family, about_sky(setup, data))
+    return replace(setup, prior=learned.prior), learned
+
+
+def about_sky(setup: Setup, data: Visibilities) -> Information:
+    """What data say of the sky; only its reference sky depends on the setup's prior."""
+    return full_model(setup, Around(data)).inform(data.data)[0]
+
+
+def learned_prior(setup: Setup, family: PriorFamily, information: Information) -> Learned:
+    """Learn the prior of a family, up to a lower ell first where there are many.
+
+    Parameters
+    ----------
+    setup : Setup
+        Of the scenario that the family is of.
+    family : PriorFamily
+    information : Information
+        What the data say of the sky (:func:`about_sky`).
+
+    Raises
+    ------
+    InputError
+        As :func:`.learn`.
+    """
+    scenario, seed = setup.scenario, setup.scenario.seed
+    if scenario.lmax <= COARSE_LMAX:
+        return learn(family, information, seed=seed)
+    coarse = scenario.prior.family(scenario.frequency_mhz, COARSE_LMAX)
+    n = n_modes(COARSE_LMAX)
+    variance = np.asarray(setup.prior.variance())[n:]
+    first = learn(coarse, marginalised(information, n, variance), seed=seed)
+    start = family.start_from(coarse, first.parameters)
+    return learn(family, information, start=start, seed=seed)

@@ -1,0 +1,153 @@
+"""One data set mapped under several priors, and which of them it prefers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.tables import write_csv
+from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.experiment import Experiment, observed, with_truth
+from lusee_bayes.experiment.learned_prior import about_sky, learned_prior
+from lusee_bayes.experiment.named_priors import named_priors
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.linear.importance import LogMean, require_draws, sampled_evidence
+from lusee_bayes.linear.information import Information
+from lusee_bayes.report.figures import priors as prior_figures
+from lusee_bayes.results.cost import require_resources
+from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
+from lusee_bayes.results.provenance import Provenance
+from lusee_bayes.runs.folder import (
+    Output,
+    RunKind,
+    require_single_frequency,
+    run_folder,
+    write_run,
+)
+from lusee_bayes.runs.origins import origin_of
+
+# draws of a prior's parameters
+DRAWS = 100
+
+
+@dataclass(frozen=True)
+class ComparePriorsRun:
+    """A finished comparison: its result, its folder and the files in it."""
+
+    result: PriorComparison
+    folder: Path
+    files: list[Path]
+
+
+def run_compare_priors(
+    scenario: Scenario,
+    folder: str | Path,
+    priors: Sequence[str] | None = None,
+    *,
+    data: Path | None = None,
+    truth: bool = False,
+    draws: int = DRAWS,
+    name: str = "the scenario",
+    replace: bool = False,
+    stages: Stages | None = None,
+) -> ComparePriorsRun:
+    """Map one data set under several priors, and say which of them it prefers.
+
+    A, N and the data are the same for all; what :func:`run_map` would find is found for each. The
+    folder is written in one transaction.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of one frequency.
+    folder : path
+        Of the results.
+    priors : sequence of str, optional
+        Names (:func:`.named_priors`), two or more; by default all that can be.
+    data : Path, optional
+        Visibilities to map; without them the scenario's own are simulated.
+    truth : bool
+        The given data are of the scenario's own sky.
+    draws : int
+        Of learned parameters, for importance sampling; 0 for none.
+    name : str
+        Of the scenario, for the title.
+    replace : bool
+        Replace results of another run in the folder.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        As :func:`.named_priors`, for a scenario of several frequencies or one that samples
+        something, and as :func:`run_map`.
+    """
+    stages = stages or Stages()
+    require_single_frequency("compare-priors", bool(scenario.frequencies_mhz))
+    if scenario.samples:
+        raise InputError(
+            "the scenario says that something is to be sampled, and compare-priors makes maps, "
+            "which can only marginalise; set treatment=marginalised"
+        )
+    if draws:
+        require_draws(draws)
+    sections = named_priors(priors, scenario, known_sky=data is None or truth)
+    names = ",".join(sections)
+    origin = origin_of(scenario, data, truth=truth or None, priors=names, draws=draws)
+    with run_folder(folder, COMPARE_PRIORS, origin, replace=replace) as place:
+        measured = None if data is None else read_data(data, scenario)
+        require_resources(scenario, measured, stages)
+        experiment = observed(scenario, measured, stages)
+        if truth:
+            experiment = with_truth(experiment)
+        with stages("data"):
+            information = about_sky(experiment.setup, experiment.data)
+        found = []
+        for prior, section in sections.items():
+            with stages(prior):
+                setup = experiment.setup.with_prior(section)
+                found.append(_under(prior, setup, experiment, information, draws))
+        result = PriorComparison(name, scenario, tuple(found), stages.seconds)
+        provenance = Provenance.of_experiment(experiment, data)
+        files = write_run(place, result, COMPARE_PRIORS, origin, stages, provenance)
+        return ComparePriorsRun(result, place, files)
+
+
+def _under(
+    name: str, setup: Setup, experiment: Experiment, information: Information, draws: int
+) -> UnderPrior:
+    """What the data say under one prior, or a family of them."""
+    if setup.family is None:
+        evidence = float(information.posterior(setup.prior).log_evidence)
+        return UnderPrior.of(name, replace(experiment, setup=setup), evidence, None)
+    learned = learned_prior(setup, setup.family, information)
+    sampled: LogMean | None = None
+    if draws:
+        seed = setup.scenario.seed
+        sampled = sampled_evidence(setup.family, information, learned, draws, seed)
+    setup = replace(setup, prior=learned.prior)
+    mapped = replace(experiment, setup=setup, learned=learned)
+    return UnderPrior.of(name, mapped, learned.log_evidence, sampled)
+
+
+def _write_texts(result: PriorComparison, folder: Path) -> None:
+    (folder / "priors.json").write_text(json.dumps(result.as_json(), indent=2) + "\n")
+    (folder / "priors.md").write_text(result.as_markdown())
+    (folder / "scenario.yaml").write_text(result.scenario.to_yaml())
+
+
+# what the folder of a comparison of priors holds; a new file is one line here
+COMPARE_PRIORS = RunKind(
+    "compare-priors",
+    outputs=(
+        Output(_write_texts),
+        Output(lambda result, folder: write_csv(folder / "priors.csv", result.rows())),
+    ),
+    figures={"priors": prior_figures.priors},
+)

@@ -1,0 +1,119 @@
+"""A validation on given skies: do error bars hold for skies that the prior does not draw?"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.tables import write_csv
+from lusee_bayes.experiment.experiment import under_sky
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.report.figures import coverage as coverage_figures
+from lusee_bayes.results.cost import require_resources
+from lusee_bayes.results.map_result import map_result
+from lusee_bayes.results.provenance import Provenance
+from lusee_bayes.results.sky_coverage import SkiesResult, SkyCoverage, draws_needed
+from lusee_bayes.runs.folder import (
+    Output,
+    RunKind,
+    require_single_frequency,
+    run_folder,
+    write_run,
+)
+from lusee_bayes.runs.given_skies import given_skies
+from lusee_bayes.runs.origins import origin_of
+
+
+@dataclass(frozen=True)
+class SkiesRun:
+    """A finished validation on given skies: its result, its folder and the files in it."""
+
+    result: SkiesResult
+    folder: Path
+    files: list[Path]
+
+
+def run_skies(
+    scenario: Scenario,
+    folder: str | Path,
+    skies: Sequence[str | Path],
+    *,
+    name: str = "the scenario",
+    replace: bool = False,
+    stages: Stages | None = None,
+) -> SkiesRun:
+    """Map given skies with the prior of a scenario, and count how often error bars hold them.
+
+    Data of each sky are simulated with the scenario's instrument and noise; its name adds to the
+    seed. The folder is written in one transaction.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of one frequency.
+    folder : path
+        Of the results.
+    skies : sequence of str or Path
+        Names or files (:func:`.given_skies`), one or more.
+    name : str
+        Of the scenario, for the title.
+    replace : bool
+        Replace results of another run in the folder.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        For no sky, one that there is not, a scenario of several frequencies or one that samples
+        something, and as :func:`run_map`.
+    """
+    stages = stages or Stages()
+    require_single_frequency("--skies", bool(scenario.frequencies_mhz))
+    if scenario.samples:
+        raise InputError(
+            "the scenario says that something is to be sampled, and --skies makes maps, which can "
+            "only marginalise; set treatment=marginalised"
+        )
+    given = given_skies(skies)
+    if not given:
+        raise InputError("--skies: name at least one sky, such as embedded:2, smooth or a file")
+    names = ", ".join(f"{sky.name} {sky.digest}".strip() for sky in given)
+    origin = origin_of(scenario, skies=names)
+    with run_folder(folder, SKIES, origin, replace=replace) as place:
+        n_draws = draws_needed(len(given))
+        require_resources(scenario, None, stages, n_draws)
+        setup, found = set_up(scenario, None, stages), []
+        with stages.progress("skies", len(given)) as update:
+            for number, sky in enumerate(given):
+                update(number, sky.name)
+                # noise of its own for each sky, whatever the others are
+                seed = scenario.seed + zlib.crc32(sky.name.encode())
+                experiment = under_sky(setup, sky.source, seed)
+                found.append(SkyCoverage.of(sky.name, map_result(experiment), n_draws))
+        result = SkiesResult(name, scenario, tuple(found), n_draws, stages.seconds)
+        provenance = Provenance.of(scenario, setup.observation, None, known_sky=True)
+        return SkiesRun(result, place, write_run(place, result, SKIES, origin, stages, provenance))
+
+
+def _write_texts(result: SkiesResult, folder: Path) -> None:
+    (folder / "coverage.json").write_text(json.dumps(result.as_json(), indent=2) + "\n")
+    (folder / "coverage.md").write_text(result.as_markdown())
+    (folder / "scenario.yaml").write_text(result.scenario.to_yaml())
+
+
+# what the folder of a validation on given skies holds; a new file is one line here
+SKIES = RunKind(
+    "validate --skies",
+    outputs=(
+        Output(_write_texts),
+        Output(lambda result, folder: write_csv(folder / "coverage.csv", result.rows())),
+    ),
+    figures={"coverage": coverage_figures.coverage, "pulls": coverage_figures.pulls},
+)

@@ -1,0 +1,286 @@
+"""A Gaussian sky whose strength varies from place to place, and is learned.
+
+::
+
+    m = T + s_T x_1 T + s_0 x_0 Y_00 + sum_b f_b s_b y(b) + R sum_j w_j P [sqrt(v_j) n_j]
+
+T is a template; its scale and the monopole are wide. y(b) are point sources of the catalogue. n_j
+is white noise on the sphere, v_j(p) a positive field, P the harmonic analysis, w_j windows in ell
+an octave wide with sum_j w_j^2 = 1, and R = diag(C_ell^1/2). Where all v_j = 1 the last term is an
+isotropic field of spectrum C_ell. Its covariance is R sum_j w_j W(v_j) w_j R, W(v) being the matrix
+of multiplication by v. The logarithm of v_j is a sum of covariates: the template seen with the
+band's resolution, the same where nothing is absorbed, the Galactic plane, a field of a few large
+harmonics, and cells of 15 degrees whose factors have a power-law tail: compact departures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.harmonics import n_modes, per_mode, sum_over_m
+from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES, PointSource
+from lusee_bayes.sky.learned_spectrum import SpectrumBasis
+from lusee_bayes.sky.local_strength import (
+    N_CELLS,
+    Band,
+    SmoothedTemplate,
+    expected_covariates,
+    windows,
+)
+from lusee_bayes.sky.prior_family import Hyperprior, Member, PriorFamily
+from lusee_bayes.sky.priors import DensePrior
+from lusee_bayes.sky.template import EmbeddedTemplate, Template
+
+# frequency in MHz at which the Galaxy is nearly transparent
+TRANSPARENT_MHZ = 50.0
+# fluctuations of the texture relative to the template's mean, where its spectrum is started
+RELATIVE_STRENGTH = 0.05
+# standard deviations of the template's scale, and of the monopole in units of the template's
+SCALE_WIDTH = MONOPOLE_WIDTH = 1.0
+# of ln f^2: whether the catalogue's sources are there at all is left to the data
+SOURCES_WIDTH = 3.0
+
+
+@dataclass(frozen=True)
+class LocalScales(PriorFamily):
+    """The family of priors of the module's equation.
+
+    Attributes
+    ----------
+    mean : (modes,) array
+        T, in K.
+    wide : (modes, 2) array
+        Template and monopole, times their standard deviations, in K.
+    sources : (modes, sources) array
+        Catalogued sources, in K.
+    spectrum : SpectrumBasis
+        C_ell.
+    bands : tuple of Band
+    covariates : (centre, width) arrays
+        What is expected of the coefficients of the bands' bases.
+    """
+
+    mean: Float[np.ndarray, " modes"]
+    wide: Float[np.ndarray, "modes 2"]
+    sources: Float[np.ndarray, "modes sources"]
+    spectrum: SpectrumBasis
+    bands: tuple[Band, ...]
+    covariates: tuple[Float[np.ndarray, " covariates"], Float[np.ndarray, " covariates"]]
+
+    @classmethod
+    def of(
+        cls,
+        template: Template,
+        transparent: Template,
+        lmax: int,
+        frequency_mhz: float,
+        sources: tuple[PointSource, ...] = BRIGHT_SOURCES,
+    ) -> LocalScales:
+        """Make the family.
+
+        Parameters
+        ----------
+        template : Template
+            T.
+        transparent : Template
+            The same sky where hardly anything is absorbed.
+        lmax : int
+        frequency_mhz : float
+            Of the sources' fluxes.
+        sources : tuple of PointSource
+            The catalogue.
+
+        Raises
+        ------
+        InputError
+            If a template is not positive everywhere.
+        """
+        smoothed = [SmoothedTemplate.of(each) for each in (template, transparent)]
+        bands = tuple(Band.of(window, *smoothed) for window in windows(lmax))
+        mean = template.modes(lmax)
+        monopole = np.zeros_like(mean)
+        monopole[0] = mean[0]
+        strength = RELATIVE_STRENGTH * np.exp(smoothed[0].mean_log)
+        return cls(
+            mean,
+            np.stack([SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole], axis=1),
+            np.reshape(
+                [source.modes(frequency_mhz, lmax) for source in sources], (-1, n_modes(lmax))
+            ).T,
+            SpectrumBasis.around(4.0 * np.pi * strength**2 / 100.0, lmax),
+            bands,
+            expected_covariates(),
+        )
+
+    @property
+    def hyperprior(self) -> Hyperprior:
+        centre, width = self.covariates
+        return Hyperprior(
+            np.concatenate([self.spectrum.centre, [0.0], centre]),
+            np.concatenate([self.spectrum.width, [SOURCES_WIDTH], width]),
+            N_CELLS,
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return SpectrumBasis.names
+
+    def at(self, parameters: Float[np.ndarray, " parameters"]) -> LocalScalesMember:
+        return LocalScalesMember(self, *self._split(parameters))
+
+    def averaged(self, parameters, spread):
+        member = self.at(parameters)
+        ells, flux, covariates, _ = self._split(np.eye(len(parameters)))
+        strengths = []
+        for band, strength in zip(self.bands, member.strengths, strict=True):
+            weight = band.window**2 * (2.0 * np.arange(len(band.window)) + 1.0)
+            spectrum = (weight / weight.sum()) @ self.spectrum.matrix @ ells
+            rows = spectrum[None] + band.covariates @ covariates
+            strengths.append(strength * np.exp(0.5 * spread(rows)))
+        fluxes = float(np.exp(member.fluxes[0] + 0.5 * spread(flux)[0]))
+        return _covariance(self, fluxes, _texture(self, member.spectrum, strengths))
+
+    def prior(self, covariance):
+        return DensePrior.of_covariance(covariance, mean=self.mean)
+
+    def start_from(self, coarse, parameters):
+        power, *others = coarse._split(parameters)
+        more = np.zeros(len(self.spectrum.centre) - len(power))
+        return np.concatenate([power, more, *others])
+
+    def _split(self, parameters: np.ndarray) -> list[np.ndarray]:
+        """Those of the spectrum, of the sources, of the covariates and of the cells."""
+        n_spectrum, n_covariates = len(self.spectrum.centre), len(self.covariates[0])
+        return np.split(parameters, np.cumsum([n_spectrum, 1, n_covariates]))
+
+
+def _covariance(
+    family: LocalScales, flux: float, texture: Float[np.ndarray, "modes modes"]
+) -> Float[np.ndarray, "modes modes"]:
+    sources = flux * (family.sources @ family.sources.T)
+    return family.wide @ family.wide.T + sources + texture
+
+
+def _texture(
+    family: LocalScales,
+    spectrum: Float[np.ndarray, " ells"],
+    strengths: list[Float[np.ndarray, " points"]],
+) -> Float[np.ndarray, "modes modes"]:
+    total = np.zeros((len(family.mean),) * 2)
+    for band, strength in zip(family.bands, strengths, strict=True):
+        scale = _scale(band, spectrum)
+        part = band.grid.product_matrix(strength.reshape(band.grid.shape))
+        total[: len(scale), : len(scale)] += scale[:, None] * part * scale
+    return total
+
+
+def _scale(band: Band, spectrum: Float[np.ndarray, " ells"]) -> Float[np.ndarray, " modes"]:
+    """w_j C_ell^1/2 of every mode up to the band's last."""
+    ells = slice(band.grid.lmax + 1)
+    return per_mode(band.window[ells] * np.sqrt(spectrum[ells]))
+
+
+@dataclass(frozen=True)
+class LocalScalesMember(Member):
+    """One prior of :class:`LocalScales`.
+
+    Attributes
+    ----------
+    family : LocalScales
+    power, fluxes, coefficients, factors : arrays
+        Parameters of the spectrum, the sources, the covariates and the cells.
+    """
+
+    family: LocalScales
+    power: Float[np.ndarray, " spectrum"]
+    fluxes: Float[np.ndarray, "1"]
+    coefficients: Float[np.ndarray, " covariates"]
+    factors: Float[np.ndarray, " cells"]
+
+    @cached_property
+    def spectrum(self) -> Float[np.ndarray, " ells"]:
+        """C_ell, in K^2."""
+        return np.exp(self.family.spectrum.matrix @ self.power)
+
+    @cached_property
+    def strengths(self) -> list[Float[np.ndarray, " points"]]:
+        """v_j of every band."""
+        return [
+            np.exp(band.covariates @ self.coefficients + band.cells @ self.factors)
+            for band in self.family.bands
+        ]
+
+    @cached_property
+    def texture(self) -> Float[np.ndarray, "modes modes"]:
+        """Covariance of the last term of the module's equation, in K^2."""
+        return _texture(self.family, self.spectrum, self.strengths)
+
+    @property
+    def covariance(self):
+        return _covariance(self.family, float(np.exp(self.fluxes[0])), self.texture)
+
+    def traces(self, matrix):
+        family = self.family
+        ells = 0.5 * sum_over_m(np.einsum("ij,ij->i", self.texture, matrix))
+        sources = 0.5 * np.einsum("is,ij,js->", family.sources, matrix, family.sources)
+        fields = []
+        for band in family.bands:
+            scale = _scale(band, self.spectrum)
+            n = len(scale)
+            fields.append(band.grid.diagonal(scale[:, None] * matrix[:n, :n] * scale)[None])
+        return self._gathered(ells[:, None], np.array([sources]), fields)[:, 0]
+
+    def forms(self, columns):
+        family = self.family
+        ells = 0.5 * sum_over_m((columns * (self.texture @ columns)).T).T
+        sources = 0.5 * ((family.sources.T @ columns) ** 2).sum(0)
+        fields = []
+        for band in family.bands:
+            scale = _scale(band, self.spectrum)
+            fields.append(band.grid.synthesise((scale[:, None] * columns[: len(scale)]).T) ** 2)
+        return self._gathered(ells, sources, fields)
+
+    def _gathered(
+        self,
+        ells: Float[np.ndarray, "ells n"],
+        sources: Float[np.ndarray, " n"],
+        fields: list[np.ndarray],
+    ) -> Float[np.ndarray, "parameters n"]:
+        """Derivatives by the parameters, from those by ln C_ell, ln f^2 and the strengths."""
+        family = self.family
+        covariates = np.zeros((len(self.coefficients), len(sources)))
+        cells = np.zeros((N_CELLS, len(sources)))
+        for band, strength, field in zip(family.bands, self.strengths, fields, strict=True):
+            area = 0.5 * np.repeat(np.asarray(band.grid.weights), band.grid.n_phi) * strength
+            by_point = field.reshape(len(field), -1)
+            covariates += (by_point @ (band.covariates * area[:, None])).T
+            cells += band.cells.multiply(area[:, None]).T @ by_point.T
+        return np.concatenate(
+            [
+                family.spectrum.matrix.T @ ells,
+                np.exp(self.fluxes[0]) * sources[None],
+                covariates,
+                cells,
+            ]
+        )
+
+
+def embedded_local_scales(
+    frequency_mhz: float, lmax: int, sources: tuple[PointSource, ...] = BRIGHT_SOURCES
+) -> LocalScales:
+    """Make the family whose template is the embedded diffuse sky.
+
+    Parameters
+    ----------
+    frequency_mhz : float
+    lmax : int
+    sources : tuple of PointSource
+        That may be there.
+    """
+    template = EmbeddedTemplate(frequency_mhz)
+    clear = EmbeddedTemplate(max(TRANSPARENT_MHZ, frequency_mhz))
+    return LocalScales.of(template, clear, lmax, frequency_mhz, sources)

@@ -1,0 +1,315 @@
+"""A prior whose modes are correlated, through all of the closed form.
+
+Three oracles: textbook matrices; the same problem in other coordinates, m' = Q m, A' = A Q^T,
+S' = Q S Q^T with an orthogonal Q, whose answers are Q times those of independent modes; and a dense
+prior that happens to be diagonal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from decimal import localcontext
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference_linear import (
+    assert_draws_follow,
+    exact,
+    posterior,
+    random_covariance,
+    solve_exactly,
+)
+from scipy.stats import multivariate_normal, ortho_group
+
+from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.instrument.coupling import DenseCoupling
+from lusee_bayes.linear.compact import CompactPosterior, read_compact
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.left_out_dense import DenseLeftOut
+from lusee_bayes.linear.left_out_structured import StructuredLeftOut
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.pixel_variance import pixel_std, prior_pixel_std
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.linear.residuals import residuals
+from lusee_bayes.linear.resolution import resolution_rows
+from lusee_bayes.linear.updating import updated
+from lusee_bayes.noise import beam_error_noise
+from lusee_bayes.noise.covariance import DenseCovariance, DiagonalCovariance
+from lusee_bayes.results.forecast import informed_modes
+from lusee_bayes.sampling.distributions import Marginal, SkyPrior
+from lusee_bayes.sampling.whitening import Whitening
+from lusee_bayes.sky.priors import DensePrior, HarmonicPrior
+
+N = 25
+RNG = np.random.default_rng(3)
+SPECTRUM = np.array([4.0, 1.0, 0.5, 0.25, 0.1])
+PER_MODE = np.repeat(SPECTRUM, [1, 3, 5, 7, 9])
+MEAN = 3.0 * RNG.normal(size=N)
+TURN = ortho_group.rvs(N, random_state=2)
+S = TURN * PER_MODE @ TURN.T
+# condition numbers below 1e4 x 40 data x eps
+CLOSE = 1e-10
+
+
+def problem(n_data: int, *, turned: bool) -> tuple[LinearGaussian, np.ndarray]:
+    """A model and its data, in the coordinates of independent modes or of correlated ones."""
+    rng = np.random.default_rng(n_data)
+    a, noise = rng.normal(size=(n_data, N)), random_covariance(rng, n_data)
+    sky = MEAN + np.sqrt(PER_MODE) * rng.normal(size=N)
+    data = a @ sky + np.linalg.cholesky(noise) @ rng.normal(size=n_data)
+    if turned:
+        prior = DensePrior.of_covariance(jnp.asarray(S), jnp.asarray(TURN @ MEAN))
+        a = a @ TURN.T
+    else:
+        prior = HarmonicPrior(jnp.asarray(SPECTRUM), mean=jnp.asarray(MEAN))
+    return LinearGaussian(jnp.asarray(a), prior, DenseCovariance(jnp.asarray(noise))), data
+
+
+@lru_cache
+def solved(n_data: int, form: str, *, turned: bool) -> Posterior:
+    model, data = problem(n_data, turned=turned)
+    return model.condition(jnp.asarray(data), form)
+
+
+SIZES = [(40, "map"), (40, "root"), (40, "structured"), (12, "data"), (12, "structured")]
+
+
+@pytest.mark.parametrize(("n_data", "form"), SIZES)
+def test_a_turned_problem_has_the_turned_posterior(n_data, form):
+    found, expected = (solved(n_data, form, turned=turned) for turned in (True, False))
+    covariance = TURN @ np.asarray(expected.covariance()) @ TURN.T
+    np.testing.assert_allclose(found.mean, TURN @ expected.mean, atol=CLOSE)
+    np.testing.assert_allclose(found.covariance(), covariance, atol=CLOSE)
+    np.testing.assert_allclose(found.std(), np.sqrt(np.diag(covariance)), rtol=CLOSE)
+    np.testing.assert_allclose(found.std_of(TURN.T), expected.std(), rtol=CLOSE)
+    for name in ("log_evidence", "information_bits", "prior_chi2"):
+        a, b = (getattr(p, name) for p in (found, expected))
+        value, wanted = (x() if callable(x) else x for x in (a, b))
+        np.testing.assert_allclose(value, wanted, rtol=CLOSE)
+    left = np.diag(covariance) / np.diag(S)
+    np.testing.assert_allclose(found.prior_fraction(), left, rtol=CLOSE)
+    assert informed_modes(found) == informed_modes(expected)
+    rows = np.asarray(resolution_rows(expected, TURN)) @ TURN.T
+    np.testing.assert_allclose(resolution_rows(found, np.eye(N)), rows, atol=CLOSE)
+    exact = np.eye(N) - covariance @ np.linalg.inv(S)
+    np.testing.assert_allclose(resolution_rows(found, np.eye(N)), exact, atol=1e3 * CLOSE)
+
+
+@pytest.mark.parametrize(("n_data", "form"), SIZES)
+def test_textbook_matrices_and_scipys_evidence(n_data, form):
+    model, data = problem(n_data, turned=True)
+    a, noise = np.asarray(model.coupling.dense()), np.asarray(model.noise.dense())
+    found = on_host(solved(n_data, form, turned=True))
+    answer = posterior(a, S, noise, data - a @ TURN @ MEAN)
+    np.testing.assert_allclose(found.mean, answer.mean + TURN @ MEAN, atol=CLOSE)
+    np.testing.assert_allclose(found.std(), answer.std, rtol=CLOSE)
+    np.testing.assert_allclose(found.covariance(), answer.covariance, atol=CLOSE)
+    evidence = multivariate_normal.logpdf(data, a @ TURN @ MEAN, a @ S @ a.T + noise)
+    np.testing.assert_allclose(found.log_evidence, evidence, rtol=CLOSE)
+    chi2 = model.chi2(found.mean, jnp.asarray(data)) + found.prior_chi2()
+    centred = data - a @ TURN @ MEAN
+    expected = centred @ np.linalg.solve(a @ S @ a.T + noise, centred)
+    np.testing.assert_allclose(chi2, expected, rtol=CLOSE)
+    white = found.whiten(found.sample(jax.random.key(0), 4000))
+    assert_draws_follow(white, np.zeros(N), np.eye(N))
+    assert_draws_follow(
+        found.sample(jax.random.key(1), 4000), answer.mean + TURN @ MEAN, answer.covariance
+    )
+
+
+@pytest.mark.parametrize(("n_data", "form"), [(40, "map"), (12, "data")])
+def test_a_compact_posterior_is_the_posterior(n_data, form, tmp_path):
+    full = solved(n_data, form, turned=True)
+    compact = CompactPosterior.of(full, tolerance=1e-12)
+    compact.write(tmp_path / "c.npz", {"lmax": 4})
+    compact, _ = read_compact(tmp_path / "c.npz")
+    np.testing.assert_allclose(compact.covariance(), full.covariance(), atol=1e-9)
+    np.testing.assert_allclose(compact.std(), full.std(), rtol=1e-9)
+    draws = compact.sample(np.random.default_rng(0), 4000)
+    assert_draws_follow(draws, np.asarray(full.mean), np.asarray(full.covariance()))
+    assert len(compact.variances) == min(n_data, N)
+
+
+def test_densities_and_coordinates():
+    model, data = problem(40, turned=True)
+    sky = RNG.normal(size=(3, N))
+    expected = multivariate_normal.logpdf(sky, TURN @ MEAN, S)
+    site = SkyPrior(model.prior)
+    np.testing.assert_allclose(site.log_prob(jnp.asarray(sky)), expected, rtol=CLOSE)
+    np.testing.assert_allclose(
+        Marginal(model).log_prob(jnp.asarray(data)), model.log_prob(jnp.asarray(data)), rtol=1e-12
+    )
+    found = model.condition(jnp.asarray(data))
+    sign, log_det = np.linalg.slogdet(np.asarray(found.covariance()))
+    assert sign == 1.0
+    np.testing.assert_allclose(Whitening.of(found).log_det, 0.5 * log_det, rtol=CLOSE)
+
+
+def test_a_beam_error_holds_the_correlated_sky():
+    direction = RNG.normal(size=(12, N))
+    prior = problem(40, turned=True)[0].prior
+    found = beam_error_noise(DenseCoupling(jnp.asarray(direction)), prior).dense()
+    moment = S + np.outer(TURN @ MEAN, TURN @ MEAN)
+    np.testing.assert_allclose(found, direction @ moment @ direction.T, rtol=1e-10)
+
+
+def test_updates():
+    model, data = problem(40, turned=True)
+    noise = DiagonalCovariance(jnp.linspace(0.5, 2.0, 40))
+    model = replace(model, noise=noise)
+
+    def part(rows: slice) -> LinearGaussian:
+        some = DiagonalCovariance(noise.variance[rows])
+        return LinearGaussian(model.coupling.dense()[rows], model.prior, some)
+
+    first, rest = slice(0, 30), slice(30, 40)
+    earlier = part(first).condition(jnp.asarray(data[first]), "root")
+    found = updated(earlier, part(rest), jnp.asarray(data[rest]))
+    whole = model.condition(jnp.asarray(data))
+    np.testing.assert_allclose(found.mean, whole.mean, atol=CLOSE)
+    np.testing.assert_allclose(found.covariance(), whole.covariance(), atol=CLOSE)
+    np.testing.assert_allclose(found.log_evidence, whole.log_evidence, rtol=CLOSE)
+    widths = np.sqrt(np.diag(S))
+    other = DensePrior.of_covariance(np.diag(widths**2), TURN @ MEAN)
+    for prior, match in (
+        (replace(model.prior, root=1.01 * model.prior.root), "has another prior: a variance of"),
+        (other, "other correlations of the modes"),
+        (replace(model.prior, mean=None), "another mean"),
+    ):
+        with pytest.raises(InputError, match=match):
+            updated(earlier, replace(part(rest), prior=prior), jnp.asarray(data[rest]))
+
+
+def test_pixels_of_the_prior():
+    prior = DensePrior.of_covariance(S)
+    np.testing.assert_array_equal(prior_pixel_std(prior, 4), pixel_std(prior.covariance(), 4))
+    rest = S.copy()
+    rest[0] = rest[:, 0] = 0.0
+    np.testing.assert_allclose(
+        prior_pixel_std(prior, 4, monopole=False), pixel_std(rest, 4), rtol=1e-12
+    )
+    even = HarmonicPrior(SPECTRUM)
+    np.testing.assert_allclose(
+        prior_pixel_std(even, 4, monopole=False),
+        prior_pixel_std(DensePrior.of_covariance(np.diag(PER_MODE)), 4, monopole=False),
+        rtol=1e-12,
+    )
+
+
+NOISES = {
+    "diagonal": (),
+    "blocks": ("noise.radiometer.form=exact",),
+    "templates": ("noise.beam={shift_mhz: 4}",),
+}
+
+
+@lru_cache
+def observed(noise: str):
+    """An experiment with structure in time, its model, and the model of a dense prior."""
+    # noise a thousand times larger than the telescope's, so that matrices by hand can be inverted
+    runs = "observation.runs=[{cycles: 0.04}, {cycles: 0.03, turntable_deg: 40}]"
+    given = ["lmax=5", runs, "noise.radiometer.factor=1e6", *NOISES[noise]]
+    experiment = build(load_scenario("fiducial", given))
+    model = full_model(experiment.setup)
+    width = np.sqrt(np.asarray(model.prior.variance()))
+    rng = np.random.default_rng(6)
+    correlated = random_covariance(rng, len(width)) * width * width[:, None]
+    mean = jnp.asarray(0.3 * width * rng.normal(size=len(width)))
+    dense = DensePrior.of_covariance(jnp.asarray(correlated), mean)
+    return experiment, model, replace(model, prior=dense)
+
+
+@pytest.mark.parametrize("noise", NOISES)
+def test_structure_in_time_gives_what_matrices_give(noise):
+    experiment, _, model = observed(noise)
+    data = experiment.data.data
+    a, n = np.asarray(model.coupling.dense()), np.asarray(model.noise.dense())
+    s, mean = np.asarray(model.prior.covariance()), np.asarray(model.prior.mean)
+    assert model.is_structured
+    found = model.condition(data)
+    shift = a @ mean if model.offset is None else a @ mean + np.asarray(model.offset)
+    answer = posterior(a, s, n, np.asarray(data) - shift)
+    # S over N is 1e8 at most, whose square root the matrices by hand lose
+    sigma = answer.std
+    assert (np.abs(np.asarray(found.mean) - mean - answer.mean) / sigma).max() < 1e-5
+    np.testing.assert_allclose(found.std(), sigma, rtol=1e-6)
+    np.testing.assert_allclose(found.log_evidence, answer.log_prob, rtol=1e-7)
+    structured = StructuredLeftOut(model, found, data)
+    dense = DenseLeftOut(model, data, experiment.data.layout)
+    observation = experiment.data.observation
+    day = observation.hours // 24
+    for k in np.unique(day):
+        same(structured.stretch(day == k), dense.stretch(day == k))
+    np.testing.assert_allclose(structured.inverse_diagonal, dense.inverse_diagonal, rtol=1e-7)
+    angle = np.array(observation.turntable_deg)[observation.run] == 40.0
+    same(structured.together(angle), dense.together(angle))
+    for product in (0, 2, 15):
+        same(structured.product(product), dense.product(product))
+
+
+def same(one, other):
+    """chi^2 to rounding; the number of directions, a trace t, from 200 random ones."""
+    assert one.chi2 == pytest.approx(other.chi2, rel=1e-7)
+    assert one.directions == pytest.approx(
+        other.directions, abs=5 * np.sqrt(other.directions / 100)
+    )
+    assert one.log_det == pytest.approx(other.log_det, rel=1e-7)
+
+
+def test_a_diagonal_one_gives_the_isotropic_results():
+    experiment, model, _ = observed("blocks")
+    diagonal = DensePrior.of_covariance(jnp.diag(model.prior.variance()))
+    data = experiment.data
+    one, other = model.condition(data.data), replace(model, prior=diagonal).condition(data.data)
+    sigma = np.asarray(one.std())
+    assert (np.abs(np.asarray(one.mean - other.mean)) / sigma).max() < 1e-8
+    np.testing.assert_allclose(other.std(), sigma, rtol=CLOSE)
+    np.testing.assert_allclose(other.log_evidence, one.log_evidence, rtol=CLOSE)
+    first, second = (
+        residuals(m, p, data, float(m.chi2(p.mean, data.data) + p.prior_chi2()))
+        for m, p in ((model, one), (replace(model, prior=diagonal), other))
+    )
+    for part in ("instrument", "prior"):
+        a, b = getattr(first.split, part), getattr(second.split, part)
+        np.testing.assert_allclose([b.chi2, b.degrees], [a.chi2, a.degrees], rtol=1e-7)
+    np.testing.assert_allclose(second.z, first.z, rtol=1e-7)
+
+
+def test_a_mean_far_from_the_reference_sky_is_exact():
+    """Signal to noise from 1 to 1e6 in mixed directions; the same equations in 60 digits."""
+    rng = np.random.default_rng(1)
+    a = rng.normal(size=(60, N)) * np.geomspace(1.0, 1e6, N) @ TURN.T
+    other = ortho_group.rvs(N, random_state=3)
+    prior = DensePrior.of_covariance(other * np.geomspace(1.0, 1e-2, N) @ other.T)
+    data = a @ (prior.root @ rng.normal(size=N)) + rng.normal(size=60)
+    matrix, vector, zero = a.T @ a, a.T @ data, np.zeros(())
+    information = Information(
+        matrix, vector, np.zeros(N), np.asarray(data @ data), zero, np.asarray(60.0)
+    )
+    found = information.posterior(prior)
+    assert float(found.refinement) < 1e-6
+    with localcontext(prec=60):
+        g, m, v = (exact(x) for x in (prior.root, (matrix + matrix.T) / 2.0, vector))
+        precision = g.T @ m @ g + exact(np.eye(N))
+        u = solve_exactly(precision, (g.T @ v)[:, None])[0][:, 0].astype(float)
+    # in posterior standard deviations
+    off = np.linalg.norm(found.lower.T @ (found.white_mean - u))
+    assert off < 1e-6
+    # in plain arithmetic the gradient is not good enough
+    plain = u_of_plain_refinements(information, prior, found.lower)
+    assert np.linalg.norm(found.lower.T @ (plain - u)) > 1e-5
+
+
+def u_of_plain_refinements(information, prior, lower):
+    u = np.zeros(N)
+    for _ in range(5):
+        gradient = prior.root.T @ (information.vector - information.matrix @ prior.colour(u)) - u
+        u = u + np.linalg.solve(lower @ lower.T, gradient)
+    return u

@@ -1,0 +1,128 @@
+"""Learning a prior's parameters against brute-force maximisation, and data of known parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+import pytest
+from jaxtyping import TypeCheckError
+from scipy.optimize import minimize
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.learning import learn
+from lusee_bayes.linear.marginal_information import marginalised
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.noise.covariance import DiagonalCovariance
+from lusee_bayes.sky.isotropic_family import IsotropicFamily
+from lusee_bayes.sky.local_scales import embedded_local_scales
+from lusee_bayes.sky.priors import HarmonicPrior
+
+LMAX, N_DATA = 6, 120
+
+
+def information_of(sky: np.ndarray, noise: float = 30.0, seed: int = 2) -> Information:
+    """Of data of a sky through a random A."""
+    rng = np.random.default_rng(seed)
+    coupling = rng.standard_normal((N_DATA, len(sky))) / np.sqrt(len(sky))
+    data = coupling @ sky + noise * rng.standard_normal(N_DATA)
+    model = LinearGaussian(
+        coupling,
+        HarmonicPrior(np.full(LMAX + 1, 1e8)),
+        DiagonalCovariance(np.full(N_DATA, noise**2)),
+    )
+    return model.inform(data)[0]
+
+
+@dataclass(frozen=True)
+class Case:
+    family: IsotropicFamily
+    information: Information
+    truth: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    family = IsotropicFamily.around(2e4, LMAX)
+    rng = np.random.default_rng(1)
+    truth = family.hyperprior.start()
+    truth[:2] += [0.7, -0.3]
+    sky = np.asarray(family.prior(family.at(truth).covariance).sample(jax.random.key(4)))
+    return Case(family, information_of(np.array(sky), seed=int(rng.integers(100))), truth)
+
+
+def log_density(case: Case, theta: np.ndarray) -> float:
+    """ln p(d, theta), by the posterior's own evidence."""
+    prior = case.family.prior(case.family.at(theta).covariance)
+    evidence = float(case.information.posterior(prior).log_evidence)
+    return evidence + case.family.hyperprior.log_density(theta)
+
+
+def test_the_maximum_is_that_of_a_general_optimiser(case):
+    """Nelder-Mead knows no gradient; ln p there and here agree to what is said to be settled."""
+    found = learn(case.family, case.information)
+    start = case.family.hyperprior.start()
+    other = minimize(
+        lambda x: -log_density(case, x),
+        start,
+        method="Powell",
+        options={"xtol": 1e-4, "ftol": 1e-9, "maxiter": 200},
+    )
+    here = log_density(case, found.parameters)
+    assert here > -other.fun - 0.05
+    std = np.sqrt(np.diagonal(found.covariance))
+    assert np.abs(found.parameters - other.x).max() < 0.5 * std.max()
+    assert (np.abs(found.parameters - case.truth) < 4.0 * std).all()
+
+
+def test_the_curvature_is_that_of_the_evidence(case):
+    """The expected curvature and the one at these data differ by their scatter: factor of two."""
+    found = learn(case.family, case.information)
+    for i in (0, len(found.parameters) - 1):
+        step = np.zeros(len(found.parameters))
+        step[i] = 0.1
+        values = [log_density(case, found.parameters + s) for s in (step, 0.0 * step, -step)]
+        curvature = -(values[0] - 2.0 * values[1] + values[2]) / 0.01
+        expected = np.linalg.inv(found.covariance)[i, i]
+        assert 0.5 < curvature / expected < 2.0
+
+
+def test_learning_gains_over_the_start_under_local_scales():
+    """A sky of a strong plane is told from one without it."""
+    family = embedded_local_scales(25.0, LMAX)
+    theta = family.hyperprior.start()
+    sky = np.asarray(family.prior(family.at(theta).covariance).sample(jax.random.key(7)))
+    information = information_of(sky)
+    found = learn(family, information)
+    before = float(information.posterior(family.expected()).log_evidence)
+    after = float(information.posterior(found.prior).log_evidence)
+    assert after > before - 1.0
+    assert np.isfinite(found.log_evidence)
+    assert [row["name"] for row in found.as_rows()] == list(family.names)
+
+
+def test_others_integrated_out(case):
+    """The evidence of the first modes alone, with the others' prior in it, is that of all."""
+    spectrum = np.geomspace(1e8, 1e5, LMAX + 1)
+    prior = HarmonicPrior(spectrum)
+    everything = case.information.posterior(prior)
+    n = 16
+    few = marginalised(case.information, n, np.asarray(prior.variance())[n:])
+    found = few.posterior(HarmonicPrior(spectrum[:4]))
+    assert float(found.log_evidence) == pytest.approx(float(everything.log_evidence), abs=1e-6)
+    np.testing.assert_allclose(found.mean, everything.mean[:n], rtol=1e-7, atol=1e-4)
+    np.testing.assert_allclose(found.std(), everything.std()[:n], rtol=1e-7)
+    with pytest.raises((InputError, TypeCheckError)):
+        marginalised(case.information, n, np.ones(3))
+
+
+def test_nothing_settles_without_steps(case, monkeypatch):
+    monkeypatch.setattr("lusee_bayes.linear.learning.MAX_STEPS", 0)
+    with pytest.raises(InputError, match=r"did not settle in 0 steps.*prior\.model"):
+        learn(case.family, case.information)
+    # a family far from its own start is still found
+    far = replace(case.family, log_monopole=case.family.log_monopole + 1.0)
+    monkeypatch.undo()
+    assert learn(far, case.information).steps > 0

@@ -1,0 +1,123 @@
+"""One data set under several priors: which it prefers, what the run leaves, and bad input."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from lusee_bayes.cli.main import main
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.named_priors import NAMED
+from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.results.map_result import map_result
+from lusee_bayes.runs.compare_priors_run import run_compare_priors
+from lusee_bayes.sky import write_alms
+from lusee_bayes.testing import small_scenario
+
+SIZES = {"lmax": 8, "cycles": 0.15}
+SMALL = ["--set", "lmax=8", "--set", "observation.runs.0.cycles=0.15"]
+FILES = {
+    "priors.csv",
+    "priors.json",
+    "priors.md",
+    "provenance.json",
+    "report.html",
+    "scenario.yaml",
+    "manifest.json",
+}
+
+
+def run(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("priors") / "out"
+    code = run("compare-priors", "fiducial", *SMALL, "--draws", 60, "-q", "-o", folder)
+    assert code == 0
+    return folder
+
+
+def test_what_a_run_leaves(finished, capsys):
+    assert {path.name for path in finished.iterdir() if path.is_file()} == FILES
+    found = json.loads((finished / "priors.json").read_text())
+    assert [one["name"] for one in found["priors"]] == list(NAMED)
+    best = max(found["priors"], key=lambda one: one["log_evidence"])
+    assert found["best"] == best["name"] and best["name"] in found["verdict"]
+    with (finished / "priors.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for row, one in zip(rows, found["priors"], strict=True):
+        assert row["prior"] == one["name"]
+        assert float(row["log_evidence"]) == one["log_evidence"]
+        assert float(row["day_log_density"]) == one["held_out"][1]["log_density"]
+    page = (finished / "report.html").read_text()
+    assert found["verdict"] in page and "68% hold, |b| &gt; 30 deg" in page
+    assert found["verdict"] in (finished / "priors.md").read_text()
+    (finished / "report.html").unlink()
+    assert run("report", finished) == 0
+    assert (finished / "report.html").read_text() == page
+    assert run("info", finished) == 0
+    assert found["verdict"] in capsys.readouterr().out
+
+
+def test_it_is_what_separate_maps_find(finished):
+    """Each in a scenario of its own, from the simulation to the map."""
+    found = json.loads((finished / "priors.json").read_text())["priors"]
+    for one in found[:2]:  # learned, and given
+        scenario = small_scenario(**SIZES).model_copy(update={"prior": NAMED[one["name"]]})
+        experiment = build(scenario)
+        result = map_result(experiment)
+        learned = experiment.learned
+        expected = result.channel.log_evidence if learned is None else learned.log_evidence
+        # the reference sky of the quadratic form differs: rounding of sums of 1e10
+        assert one["log_evidence"] == pytest.approx(expected, abs=1e-3)
+        assert [row["name"] for row in one["coverage"]] == [
+            row["name"] for row in result.channel.coverage_rows()
+        ]
+        for row, other in zip(one["coverage"], result.channel.coverage_rows(), strict=True):
+            assert row["rms"] == pytest.approx(other["rms"], rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["isotropic-sky", "modulated"])
+def test_data_of_a_prior_prefer_it(name, tmp_path):
+    """A sky drawn from a prior; its mean is the model's, since antennas are warm."""
+    scenario = small_scenario(**SIZES)
+    setup = set_up(scenario).with_prior(NAMED[name])
+    sky = np.array(setup.prior.sample(jax.random.key(11)))
+    sky[0] = setup.sky.modes[0]
+    path = write_alms(tmp_path / "sky.fits", sky, {})
+    drawn = small_scenario(f"sky={{model: file, file: {path}}}", "sky.sources=null", **SIZES)
+    result = run_compare_priors(
+        drawn, tmp_path / "out", ["isotropic-sky", "modulated"], draws=0
+    ).result
+    assert result.best.name == name
+    assert f"The data prefer {name}" in result.headline()
+    products = {one.name: one.held_out[0].log_density for one in result.priors}
+    assert max(products, key=products.get) == name
+    assert result.priors[0].sampled is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--priors", "isotropic,modulatd"], "no prior 'modulatd'; did you mean 'modulated'?"),
+        (["--priors", "isotropic"], "1 given, and a comparison needs two or more of isotropic"),
+        (["--priors", "isotropic,isotropic"], "give each prior once"),
+        (["--priors", "isotropic,isotropic-sky", "--data", "x.nc"], "C_ell of the scenario's sky"),
+        (["--set", "frequencies_mhz=[10, 20]"], "compare-priors is for a single frequency"),
+        (["--set", "prior.tilt_std=0.1"], "something is to be sampled"),
+        (["--draws", "1"], "two draws or more, got 1"),
+    ],
+    ids=str,
+)
+def test_bad_input_is_one_sentence(arguments, message, tmp_path, capsys):
+    (tmp_path / "x.nc").touch()
+    arguments = [str(tmp_path / "x.nc") if word == "x.nc" else word for word in arguments]
+    assert run("compare-priors", "fiducial", *SMALL, *arguments, "-o", tmp_path / "x") == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "x").exists()

@@ -1,0 +1,151 @@
+"""The log-normal sky: T exp(s) and its harmonic coefficients."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import healpy as hp
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from lusee_bayes.core.arrays import on_device
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
+from lusee_bayes.sky import BRIGHT_SOURCES
+from lusee_bayes.sky.galaxy import FLUCTUATION_RMS, galaxy_map
+from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
+from lusee_bayes.sky.template import EmbeddedTemplate, Template
+
+LMAX, MHZ = 5, 25.0
+LEVEL = np.array([0.5])
+SPECTRUM = deviation_spectrum(LMAX, 0.2, -2.0, LEVEL)
+
+
+@dataclass(frozen=True)
+class Waves(Template):
+    """A positive template that no low degree holds."""
+
+    lowest: float = 1000.0
+
+    def at(self, theta, phi):
+        return self.lowest * np.exp(1.0 + np.cos(3.0 * theta) + np.sin(theta) * np.sin(phi))
+
+
+@pytest.fixture(scope="module")
+def sky() -> LogNormalSky:
+    return LogNormalSky.of(Waves(), SPECTRUM, MHZ, BRIGHT_SOURCES[:2], band=40)
+
+
+@pytest.fixture(scope="module")
+def white(sky) -> np.ndarray:
+    return np.random.default_rng(0).standard_normal((3, sky.size))
+
+
+def by_quadrature(sky: LogNormalSky, white: np.ndarray) -> np.ndarray:
+    """m of one u: a matrix of harmonics at the points of a rule of its own, source by source."""
+    x, w = np.polynomial.legendre.leggauss(60)
+    phi = 2.0 * np.pi * np.arange(130) / 130
+    theta, phi = (v.ravel() for v in np.meshgrid(np.arccos(x), phi, indexing="ij"))
+    harmonics = synthesis_matrix(theta, phi, LMAX)
+    ell = np.floor(np.sqrt(np.arange(n_modes(LMAX)))).astype(int)
+    logarithm = harmonics @ (np.sqrt(np.asarray(sky.spectrum)[ell]) * white[: n_modes(LMAX)])
+    field = Waves().at(theta, phi) * np.exp(logarithm) * np.repeat(w, 130) * 2.0 * np.pi / 130
+    modes = harmonics.T @ field
+    for source, eta in zip(sky.sources, white[n_modes(LMAX) :], strict=True):
+        factor = stats.expon.ppf(stats.norm.cdf(eta))
+        modes = modes + factor * source.modes(MHZ, LMAX)
+    return modes
+
+
+def test_modes_are_integrals_of_the_template_times_exp(sky, white):
+    found = sky.modes(white)
+    assert found.shape == (3, n_modes(LMAX))
+    for row, u in zip(found, white, strict=True):
+        expected = by_quadrature(sky, u)
+        # both rules resolve exp(s) to rounding; the template is entire
+        np.testing.assert_allclose(row, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+
+
+def test_jax_computes_the_same(sky, white):
+    found = on_device(sky).modes(jnp.asarray(white))
+    np.testing.assert_allclose(found, sky.modes(white), rtol=0, atol=1e-11 * float(found.max()))
+
+
+def test_the_jacobian_is_the_derivative(sky, white):
+    expected = np.asarray(jax.jacfwd(on_device(sky).modes)(jnp.asarray(white[0])))
+    found = sky.jacobian(white[0])
+    assert found.shape == (n_modes(LMAX), n_modes(LMAX) + 2)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_pixels_are_the_template_times_exp_and_hold_the_sources(sky, white):
+    nside = 8
+    found = sky.pixels(white, nside)
+    bare = white.copy()
+    bare[:, n_modes(LMAX) :] = -40.0  # sources of no flux
+    diffuse = sky.pixels(bare, nside)
+    theta, phi = hp.pix2ang(nside, np.arange(12 * nside**2))
+    logarithm = sky.logarithm(white) @ synthesis_matrix(theta, phi, LMAX).T
+    expected = Waves().at(theta, phi)[None] * np.exp(logarithm)
+    np.testing.assert_allclose(diffuse, expected, rtol=1e-9)  # HEALPix's transform: 1e-11
+    extra = (found - diffuse).sum(1) * hp.nside2pixarea(nside)
+    fluxes = [source.kelvin_steradian(MHZ) for source in sky.sources]
+    np.testing.assert_allclose(extra, sky.source_factors(white) @ fluxes, rtol=1e-9)
+    assert ((found - diffuse) > 1e-6).sum() == 3 * 2
+
+
+def test_no_pixel_of_any_draw_is_negative():
+    """Deviations by factors of e^20: band-limited maps of these skies are negative somewhere."""
+    wild = LogNormalSky.of(Waves(), deviation_spectrum(LMAX, 30.0, 0.0, LEVEL), MHZ, band=40)
+    white = np.asarray(wild.sample(jax.random.key(1), 50))
+    assert (wild.pixels(white, 8) > 0.0).all()
+
+
+def test_sources_have_exponential_fluxes(sky):
+    draws = np.asarray(sky.sample(jax.random.key(0), 4000))
+    factors = sky.source_factors(draws)
+    assert stats.kstest(factors.ravel(), "expon").pvalue > 1e-3
+    far = np.concatenate([np.zeros((1, n_modes(LMAX))), [[-30.0, 8.0]]], axis=1)
+    # -ln(1 - p) is p where p is tiny
+    expected = stats.norm.cdf(-30.0), stats.expon.isf(stats.norm.sf(8.0))
+    np.testing.assert_allclose(sky.source_factors(far)[0], expected, rtol=1e-12)
+
+
+def test_a_power_law_leaves_the_level_alone(sky):
+    changed = sky.with_power_law(0.05, -3.0).spectrum
+    ell = np.arange(1, LMAX + 1)
+    np.testing.assert_allclose(changed[1:], 0.05**2 * ((ell + 1) / 10.0) ** -3.0, rtol=1e-14)
+    assert changed[0] == LEVEL[0]
+
+
+def test_power_law_slopes_are_derivatives_of_the_root(sky):
+    def root(theta):
+        return jnp.log(sky.with_power_law(jnp.exp(theta[0]), theta[1]).root()[: n_modes(LMAX)])
+
+    slopes = np.asarray(jax.jacfwd(root)(jnp.asarray([-2.0, -1.0]))).T
+    np.testing.assert_allclose(sky.power_law_slopes(), slopes, atol=1e-14)
+
+
+def test_the_embedded_template_is_the_galaxy_without_its_random_part():
+    """galaxy_map's texture is 1 on average, so that many seeds average to the template."""
+    template = EmbeddedTemplate(MHZ).pixels(8)
+    ratios = np.array([galaxy_map(MHZ, nside=8, seed=seed) for seed in range(40)]) / template
+    # 768 pixels of 40 seeds, whose texture has this rms at most
+    assert np.abs(ratios.mean(0) - 1.0).max() < 5.0 * FLUCTUATION_RMS / np.sqrt(40)
+
+
+def test_refusals():
+    with pytest.raises(InputError, match="template must be positive"):
+        LogNormalSky.of(Waves(0.0), SPECTRUM, MHZ, band=20)
+    with pytest.raises(InputError, match="template must be positive"):
+        LogNormalSky.of(Waves(-1.0), SPECTRUM, MHZ, band=20)
+    for wrong in (0.0, -1.0):
+        spectrum = SPECTRUM.copy()
+        spectrum[3] = wrong
+        with pytest.raises(InputError, match="no power at ell = 3"):
+            LogNormalSky.of(Waves(), spectrum, MHZ, band=20)
+    with pytest.raises(InputError, match="does not hold harmonics"):
+        LogNormalSky.of(Waves(), SPECTRUM, MHZ, band=LMAX - 1)
