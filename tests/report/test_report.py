@@ -221,7 +221,8 @@ def test_a_page_without_groups(tmp_path, monkeypatch):
     a = np.asarray(model.coupling.dense())
     k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
     expected = np.asarray(data) @ np.linalg.solve(k, np.asarray(data))
-    assert found.attrs["chi2"] == pytest.approx(expected, rel=1e-4)
+    told = found.attrs["instrument_chi2"] + found.attrs["prior_chi2"]
+    assert told == pytest.approx(expected, rel=1e-4)
     page = (run.folder / "report.html").read_text()
     assert "By product" not in page and run.result.verdict() in page
 
