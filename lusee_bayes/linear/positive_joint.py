@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -45,6 +45,7 @@ SETTLED, SETTLED_LAW = 0.1, 0.05
 MAX_ROUNDS, HALVINGS = 60, 20
 
 
+@runtime_checkable
 class Channels(Protocol):
     """The channels of a joint posterior, wherever their data are."""
 
