@@ -13,6 +13,9 @@ from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.joint_skies import ChannelSky, channel_sky
 from lusee_bayes.linear.positive_joint import PositiveMode, diffuse_part, linearised
 
+# draws whose fields are on the grid at once
+CHUNK = 32
+
 
 def positive_sky(
     mode: PositiveMode,
@@ -48,9 +51,7 @@ def positive_sky(
     """
     skies, exponent = mode.skies, mode.exponents[channel]
     relative = linearised(skies, channel, information, exponent)
-    found = on_host(
-        channel_sky(mode.prior, channel, relative, mode.fields, spread, draws, key)
-    )
+    found = on_host(channel_sky(mode.prior, channel, relative, mode.fields, spread, draws, key))
     beside = diffuse_part(skies, channel, information)
     slope = skies.jacobian(channel, exponent)
     covariance = beside.whole_covariance(symmetric_product(slope @ found.covariance, slope.T))
@@ -58,8 +59,12 @@ def positive_sky(
     shape = len(draws), len(beside.patterns)
     flux_key = jax.random.fold_in(jax.random.fold_in(key, channel), 1)
     z = np.asarray(jax.random.normal(flux_key, shape, dtype=jnp.float64))
-    drawn = [skies.modes(channel, draw) for draw in found.draws]
-    skies_drawn = beside.whole_skies(np.reshape(drawn, (len(draws), len(mean))), z)
+    drawn = np.empty((len(draws), len(mean)))
+    for first in range(0, len(draws), CHUNK):
+        here = slice(first, first + CHUNK)
+        drawn[here] = skies.modes(channel, np.asarray(found.draws[here]))
     whole = on_host(information)
     expected = whole.n_data - np.vdot(whole.matrix, covariance)
-    return ChannelSky(mean, covariance, skies_drawn, whole.chi2(mean), np.asarray(expected))
+    return ChannelSky(
+        mean, covariance, beside.whole_skies(drawn, z), whole.chi2(mean), np.asarray(expected)
+    )

@@ -38,8 +38,8 @@ FIELDS = {
     "curvature": lambda x, y: np.log(x) ** 2,
     "absorption": lambda x, y: -(y**FREE_FREE_SLOPE),
 }
-# band limit of the grid: this many times that of the map, and at least so much, since what the
-# grid does not resolve of a template folds back into the map
+# band limit of the grid: this many times that of the exponents, and at least so much: what the grid
+# does not resolve of a template folds back into the map, at 96 by 5 % of it in the plane
 GRID, LEAST_GRID = 3, 192
 
 
@@ -106,6 +106,7 @@ class PositiveSkies(Described, eqx.Module):
         turnover_mhz: float = 5.0,
         sources: Float[np.ndarray, "channels sources modes"] | None = None,
         lmax_fields: int | None = None,
+        band: int | None = None,
     ) -> PositiveSkies:
         """Make them of a template for every frequency.
 
@@ -125,6 +126,8 @@ class PositiveSkies(Described, eqx.Module):
             Of point sources, in K.
         lmax_fields : int, optional
             Highest ell of the exponents; by default ``lmax``.
+        band : int, optional
+            Band limit of the grid; by default 192, or three times that of the exponents.
 
         Raises
         ------
@@ -145,7 +148,7 @@ class PositiveSkies(Described, eqx.Module):
                 f"the lmax of the fields is {highest}, that of the maps {lmax}; give the fields as "
                 "many modes at least"
             )
-        grid = SphereGrid.of(highest, max(GRID * highest, LEAST_GRID))
+        grid = SphereGrid.of(highest, max(GRID * highest, LEAST_GRID) if band is None else band)
         at = grid.directions()
         levels = np.stack([template.at(*at).reshape(grid.shape) for template in templates])
         require_positive("the template", levels, "a sky whose logarithm is modelled has no holes")
@@ -170,35 +173,35 @@ class PositiveSkies(Described, eqx.Module):
         return n_modes(self.grid.lmax)
 
     def values(
-        self, channel: int, exponent: Float[np.ndarray, " modes"]
-    ) -> Float[np.ndarray, "rings phi"]:
+        self, channel: int, exponent: Float[np.ndarray, "*batch columns"]
+    ) -> Float[np.ndarray, "*batch rings phi"]:
         """Compute T_f exp(phi) on the grid, in K: positive; too large a phi makes it infinite.
 
         Parameters
         ----------
         channel : int
-        exponent : (modes,) array
+        exponent : (..., modes) array
             phi.
         """
         with np.errstate(over="ignore"):
             return self.levels[channel] * np.exp(self.grid.synthesise(exponent))
 
     def modes(
-        self, channel: int, exponent: Float[np.ndarray, " modes"]
-    ) -> Float[np.ndarray, " modes"]:
+        self, channel: int, exponent: Float[np.ndarray, "*batch columns"]
+    ) -> Float[np.ndarray, "*batch modes"]:
         """Compute the sky without point sources: real packed coefficients, Galactic, in K.
 
         Parameters
         ----------
         channel : int
-        exponent : (modes,) array
+        exponent : (..., modes) array
             phi.
         """
         with np.errstate(invalid="ignore"):
-            return self.grid.analyse(self.values(channel, exponent))[: n_modes(self.lmax)]
+            return self.grid.analyse(self.values(channel, exponent))[..., : n_modes(self.lmax)]
 
     def jacobian(
-        self, channel: int, exponent: Float[np.ndarray, " modes"]
+        self, channel: int, exponent: Float[np.ndarray, " columns"]
     ) -> Float[np.ndarray, "modes columns"]:
         """Compute W, in K.
 

@@ -41,7 +41,8 @@ def skies_of(frequencies, names, n_sources=0):
     points = synthesis_matrix(np.array([0.4, 1.9]), np.array([2.0, 4.0]), LMAX)[:n_sources]
     sources = np.stack([20.0 * (f / 20.0) ** -2.5 * points for f in frequencies])
     templates = [Band(f) for f in frequencies]
-    return PositiveSkies.of(frequencies, templates, LMAX, names, sources=sources)
+    # that of the templates and fields is far below
+    return PositiveSkies.of(frequencies, templates, LMAX, names, sources=sources, band=24)
 
 
 def quadrature():
@@ -49,7 +50,12 @@ def quadrature():
     x, weights = np.polynomial.legendre.leggauss(40)
     phi = 2.0 * np.pi * np.arange(80) / 80
     theta, azimuth = np.repeat(np.arccos(x), 80), np.tile(phi, 40)
-    return theta, azimuth, synthesis_matrix(theta, azimuth, LMAX), np.repeat(weights, 80) * np.pi / 40
+    return (
+        theta,
+        azimuth,
+        synthesis_matrix(theta, azimuth, LMAX),
+        np.repeat(weights, 80) * np.pi / 40,
+    )
 
 
 def observed(skies, laws, seed=0, noise=0.05, n_data=40):
@@ -58,8 +64,9 @@ def observed(skies, laws, seed=0, noise=0.05, n_data=40):
     exponents = np.asarray(laws.prior(skies).sample(jax.random.key(seed)))
     found = []
     for k, exponent in enumerate(exponents):
-        sky = skies.modes(k, exponent) + rng.exponential(size=skies.sources.shape[1]) @ (
-            skies.sources[k]
+        sky = (
+            skies.modes(k, exponent)
+            + rng.exponential(size=skies.sources.shape[1]) @ (skies.sources[k])
         )
         a = rng.standard_normal((n_data + 2 * k, N))
         sigma = noise * np.sqrt((a @ sky) ** 2).mean() * rng.uniform(0.5, 2.0, len(a))
@@ -74,7 +81,9 @@ def rough(skies, level=0.3):
     """Laws of fields that are as strong as the templates, so that nothing is linear."""
     laws = FieldLaws.of(skies)
     parameters = laws.parameters.copy()
-    parameters[:, 0] = np.log(level * np.where(np.arange(len(parameters)) < len(laws.means), 1, 0.3))
+    parameters[:, 0] = np.log(
+        level * np.where(np.arange(len(parameters)) < len(laws.means), 1, 0.3)
+    )
     parameters[:, 1] = -1.0
     return laws.with_parameters(parameters)
 
@@ -142,9 +151,7 @@ def test_the_gaussian_is_that_of_one_big_model(case):
     mean = wide * (inverse @ (white.T @ ((d - offset) / sigma)))
     covariance = inverse * wide[:, None] * wide[None]
 
-    evidence = stats.multivariate_normal(
-        offset, (a * wide**2) @ a.T + np.diag(sigma**2)
-    ).logpdf(d)
+    evidence = stats.multivariate_normal(offset, (a * wide**2) @ a.T + np.diag(sigma**2)).logpdf(d)
     np.testing.assert_allclose(mode.posterior.log_evidence, evidence, rtol=1e-9)
     std = np.sqrt(np.diagonal(covariance))[: fields * N]
     far = (mode.fields.ravel() - mean[: fields * N]) / std
