@@ -50,7 +50,9 @@ class Channels(Protocol):
     """The channels of a joint posterior, wherever their data are."""
 
     def each(
-        self, function: Callable[[int, Information], dict[str, np.ndarray]]
+        self,
+        function: Callable[[int, Information], dict[str, np.ndarray]],
+        shapes: dict[str, tuple[int, ...]],
     ) -> dict[str, np.ndarray]:
         """Call a function with number and information of every channel; its arrays, stacked."""
 
@@ -76,11 +78,13 @@ class ChannelsInMemory:
     informations: tuple[Information, ...]
 
     def each(
-        self, function: Callable[[int, Information], dict[str, np.ndarray]]
+        self,
+        function: Callable[[int, Information], dict[str, np.ndarray]],
+        shapes: dict[str, tuple[int, ...]],
     ) -> dict[str, np.ndarray]:
         """Call a function with number and information of every channel; its arrays, stacked."""
         found = [function(k, information) for k, information in enumerate(self.informations)]
-        return {name: np.stack([part[name] for part in found]) for name in found[0]}
+        return {name: np.stack([part[name] for part in found]) for name in shapes}
 
     def summed(
         self,
@@ -222,6 +226,10 @@ def find_mode(
     fields = np.zeros((len(skies.names), skies.n_fields)) if start is None else start
     exponents = skies.mixing @ fields
     here = _Point(fields, exponents, _chi2(skies, channels, exponents))
+    shapes: dict[str, tuple[int, ...]] = {"exponent": (skies.n_fields,), "chi2": ()}
+    if learn:
+        shapes |= dict.fromkeys(("power", "known"), (skies.grid.lmax + 1,))
+    last = np.zeros_like(laws.parameters)
     for rounds in range(MAX_ROUNDS):
         prior = laws.prior(skies)
 
@@ -245,22 +253,23 @@ def find_mode(
         ) -> dict[str, np.ndarray]:
             return _judged(prior, channel, relative(channel, information), maps, spread)
 
-        found = channels.each(judged)
+        found = channels.each(judged, shapes)
         there = _Point(maps, found["exponent"], float(found["chi2"].sum()))
         energy = here.energy(prior)
         moved = np.sqrt(max(energy - there.energy(prior), 0.0))
         if report is not None:
             report(rounds, f"{moved:.2g} sigma")
-        better = laws
+        change = np.zeros_like(laws.parameters)
         if learn:
-            better = laws.matched(*_powers(posterior, prior, found))
-        change = np.abs(better.parameters - laws.parameters).max()
-        if moved < SETTLED and change < SETTLED_LAW:
+            change = laws.matched(*_powers(posterior, prior, found)).parameters - laws.parameters
+            # a law that nothing depends on may go to and fro
+            change = np.where(change * last < 0, 0.5, 1.0) * change
+        if moved < SETTLED and np.abs(change).max() < SETTLED_LAW:
             return PositiveMode(
                 skies, laws, here.exponents, posterior, energy, float(moved), rounds
             )
         here = _descended(skies, channels, prior, here, there)
-        laws = better
+        laws, last = laws.with_parameters(laws.parameters + change), change
     raise InputError(
         f"the positive skies did not settle in {MAX_ROUNDS} rounds: the last moved by {moved:.2g} "
         "standard deviations; the data are far from anything that the templates allow: use "
@@ -275,7 +284,7 @@ def _chi2(
         diffuse = diffuse_part(skies, channel, information).without()
         return {"chi2": np.asarray(diffuse.chi2(skies.modes(channel, exponents[channel])))}
 
-    return float(channels.each(chi2)["chi2"].sum())
+    return float(channels.each(chi2, {"chi2": ()})["chi2"].sum())
 
 
 def _judged(

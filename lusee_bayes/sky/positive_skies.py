@@ -159,6 +159,24 @@ class PositiveSkies(Described, eqx.Module):
         mixing = np.stack([FIELDS[name](x, y) for name in names], axis=1)
         return cls(frequencies, mixing, grid, levels, sources, lmax, names)
 
+    def coarser(self, lmax: int, lmax_fields: int) -> PositiveSkies:
+        """Make the same of maps and fields with fewer modes.
+
+        Parameters
+        ----------
+        lmax, lmax_fields : int
+            Highest ell of the maps, and of the exponents.
+        """
+        return PositiveSkies(
+            self.frequencies_mhz,
+            self.mixing,
+            SphereGrid.of(lmax_fields, len(self.grid.theta) - 1),
+            self.levels,
+            self.sources[:, :, : n_modes(lmax)],
+            lmax,
+            self.names,
+        )
+
     def description(self) -> tuple[str, ...]:
         return (
             f"{len(self.levels)} channels, {extent(self.frequencies_mhz, 'MHz')}, "

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
@@ -37,6 +38,17 @@ POSTERIOR = Layout(
 LEAST_BAND = 128
 # points whose azimuthal functions are kept at once
 CHUNK = 20_000
+
+
+@lru_cache(maxsize=1)
+def _slabs(points: bytes) -> tuple[Slabs, Int[np.ndarray, " points"]]:
+    """Lines of sight, the same at all frequencies, and the line of each latitude and longitude."""
+    latitude, longitude = np.frombuffer(points).reshape(2, -1)
+    # lines of sight above and below the plane share what is symmetric: each once for both
+    both, of_point = np.unique(
+        np.stack([np.abs(latitude).round(12), longitude]), axis=1, return_inverse=True
+    )
+    return Slabs.towards(np.degrees(both[1]), np.degrees(both[0])), of_point.ravel()
 
 
 class Template(ABC):
@@ -90,14 +102,10 @@ class EmbeddedTemplate(Template):
     frequency_mhz: float
 
     def at(self, theta, phi):
-        latitude = 0.5 * np.pi - np.asarray(theta)
-        # lines of sight above and below the plane share what is symmetric: each once for both
-        both, of_point = np.unique(
-            np.stack([np.abs(latitude), phi], axis=1), axis=0, return_inverse=True
-        )
-        slabs = Slabs.towards(np.degrees(both[:, 1]), np.degrees(both[:, 0]))
+        points = np.stack([0.5 * np.pi - np.asarray(theta), phi]).astype(np.float64)
+        slabs, of_point = _slabs(points.tobytes())
         sides = brightness(*slabs.synchrotron(self.frequency_mhz), self.frequency_mhz)
-        return sides[(latitude < 0).astype(int), of_point.ravel()]
+        return sides[(points[0] < 0).astype(int), of_point]
 
     def pixels(self, nside):
         return galaxy_map(self.frequency_mhz, nside, seed=None)

@@ -1,4 +1,4 @@
-"""Positive skies of several frequencies: their mode and Gaussian, against scipy and one big model."""
+"""Positive joint skies: mode and Gaussian against scipy and one big model of all channels."""
 
 from dataclasses import dataclass
 
@@ -28,7 +28,7 @@ FREQUENCIES = np.array([5.0, 9.0, 16.0, 30.0])
 
 @dataclass(frozen=True)
 class Band(Template):
-    """A bright band along the equator, steeper at low frequencies; smooth, so that grids hold it."""
+    """A bright band along the equator, so smooth that grids hold it."""
 
     frequency_mhz: float
 
@@ -117,12 +117,12 @@ def case():
     laws = rough(skies, 0.1)
     seen = observed(skies, laws, seed=3)
     channels = ChannelsInMemory(tuple(s[-1] for s in seen))
-    return skies, laws, seen, channels, find_mode(skies, laws, channels)
+    return skies, laws, seen, find_mode(skies, laws, channels)
 
 
 def test_the_gaussian_is_that_of_one_big_model(case):
     """All channels stacked: unknowns are fields, residuals and the sources' fluxes."""
-    skies, _, seen, channels, mode = case
+    skies, _, seen, mode = case
     prior, fields = mode.prior, len(skies.names)
     theta, phi, y, weights = quadrature()
     n_sources = skies.sources.shape[1]
@@ -170,7 +170,7 @@ def test_the_gaussian_is_that_of_one_big_model(case):
 
 
 def test_draws_scatter_as_the_covariance_says_and_are_positive(case):
-    skies, _, seen, _, mode = case
+    skies, _, seen, mode = case
     n = 3000
     draws = np.asarray(mode.posterior.sample(jax.random.key(1), n)).reshape(n, -1, N)
     spread = paired(mode.posterior.covariance(), mode.prior)
