@@ -193,6 +193,7 @@ def test_far_templates_are_reached_in_shorter_steps():
     assert np.exp(skies.grid.synthesise(mode.exponents[0])).mean() > 10.0
 
 
+@pytest.mark.long
 def test_learned_laws_maximise_the_evidence():
     skies = skies_of(FREQUENCIES, ("level", "index"))
     laws = rough(skies, 0.1)

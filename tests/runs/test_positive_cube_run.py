@@ -2,14 +2,16 @@
 
 import json
 
+import healpy
 import numpy as np
 import pytest
 import xarray as xr
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.core.harmonics import modes_to_map, n_modes
 from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.results.cube_channels import cube_result
 from lusee_bayes.results.positive_components import lmax_of_fields, positive_skies
 
 SMALL = [
@@ -48,6 +50,29 @@ def test_files_of_a_run_agree_with_each_other(tmp_path, capsys):
     assert "component maps: level, index" in page and "is not used" in page
     assert main(["info", str(tmp_path / "out" / "posterior.nc")]) == 0
     assert "25 modes (lmax 4) at 3 frequencies" in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_joint_maps_of_low_frequencies_are_no_worse_than_independent_ones(tmp_path):
+    """5 and 6 MHz, where absorption reddens the plane, and the errors towards the centre."""
+    frequencies = [5.0, 6.0, 8.0, 12.0, 20.0, 40.0]
+    scenario = load_scenario(
+        "fiducial",
+        ["lmax=10", "joint=true", "spectral.model=positive", f"frequencies_mhz={frequencies}"],
+    )
+    cube = cube_result(scenario, tmp_path)
+    mean, truth, independent = (cube.stacked(n) for n in ("mean", "truth", "independent"))
+    # but for the monopole, which all know well
+    worse = np.linalg.norm((independent - truth)[:, 1:], axis=1)
+    better = np.linalg.norm((mean - truth)[:, 1:], axis=1)
+    assert (worse / better > 1.0).all()
+    nside = scenario.map_nside
+    lon, lat = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)
+    centre = (np.abs((lon + 180.0) % 360.0 - 180.0) < 10.0) & (np.abs(lat) < 10.0)
+    for channel in cube.channels:
+        z = (modes_to_map(channel.mean - channel.truth, nside) / channel.pixel_std)[centre]
+        # lmax 10 resolves one or two places there: 3 sigma at most
+        assert np.sqrt((z**2).mean()) < 3.0
 
 
 def test_bad_input_is_refused_in_a_sentence():
