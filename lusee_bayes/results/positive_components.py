@@ -17,7 +17,7 @@ from lusee_bayes.results.joint_channels import ChannelsInFiles
 from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES
 from lusee_bayes.sky.modulated import DEVIATIONS
 from lusee_bayes.sky.positive_skies import PositiveSkies
-from lusee_bayes.sky.template import EmbeddedTemplate
+from lusee_bayes.sky.template import EmbeddedTemplate, galactic_share
 
 
 def lmax_of_fields(scenario: Scenario, lmax: int | None = None) -> int:
@@ -74,6 +74,7 @@ def positive_skies(scenario: Scenario) -> PositiveSkies:
         reference_mhz=section.reference_mhz,
         turnover_mhz=section.turnover_mhz,
         sources=sources,
+        weight=galactic_share,
         lmax_fields=lmax_of_fields(scenario),
     )
 

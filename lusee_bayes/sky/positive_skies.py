@@ -2,22 +2,21 @@
 
 ::
 
-    ln m_f = ln T_f + a_0 + a_1 ln x + a_2 ln^2 x - a_3 y^-2.1 + r_f,    x = nu / nu_ref,
-    y = nu / nu_turnover,
+    ln m_f = ln T_f + w phi_f,    phi_f = a_0 + a_1 ln x + a_2 ln^2 x - a_3 y^-2.1 + r_f,
+    x = nu / nu_ref,    y = nu / nu_turnover,
 
 with a template T_f at every frequency, a_0 its level at nu_ref, a_1 the change of its spectral
 index, a_2 that of its curvature, a_3 the change of the optical depth of ionised gas at nu_turnover
 (Altenhoff et al. 1960), and a residual r_f of every channel; all of them vary over the sky and have
-no unit. The exponent of a channel is linear in them, its sky is positive. About any exponent phi,
+no unit. The weight w says how strong they are from place to place, the same at all frequencies. The
+exponent of a channel is linear in them, its sky is positive. About any exponent phi, ::
 
-::
-
-    dm_f = W d(phi),    W_ij = int y_i T_f exp(phi) y_j dOmega.
+    dm_f = W d(phi),    W_ij = int y_i w T_f exp(w phi) y_j dOmega.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -78,6 +77,8 @@ class PositiveSkies(Described, eqx.Module):
         Where products are taken; its lmax is that of the exponents.
     levels : (channels, rings, phi) array
         T_f on the grid, in K.
+    weight : (rings, phi) array
+        w on the grid.
     sources : (channels, sources, modes) array
         F_fj y(n_j) of point sources that may be there besides, in K.
     lmax : int
@@ -90,6 +91,7 @@ class PositiveSkies(Described, eqx.Module):
     mixing: Float[np.ndarray, "channels fields"]
     grid: SphereGrid
     levels: Float[np.ndarray, "channels rings phi"]
+    weight: Float[np.ndarray, "rings phi"]
     sources: Float[np.ndarray, "channels sources modes"]
     lmax: int = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
@@ -105,6 +107,7 @@ class PositiveSkies(Described, eqx.Module):
         reference_mhz: float = 20.0,
         turnover_mhz: float = 5.0,
         sources: Float[np.ndarray, "channels sources modes"] | None = None,
+        weight: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
         lmax_fields: int | None = None,
         band: int | None = None,
     ) -> PositiveSkies:
@@ -124,6 +127,8 @@ class PositiveSkies(Described, eqx.Module):
             nu_ref and nu_turnover.
         sources : (channels, sources, modes) array, optional
             Of point sources, in K.
+        weight : callable, optional
+            w of theta and phi, Galactic, in radians; by default one.
         lmax_fields : int, optional
             Highest ell of the exponents; by default ``lmax``.
         band : int, optional
@@ -133,7 +138,7 @@ class PositiveSkies(Described, eqx.Module):
         ------
         InputError
             For unknown names, fewer channels than fields, another number of templates than of
-            frequencies, and templates that are not positive everywhere.
+            frequencies, and templates or weights that are not positive everywhere.
         """
         frequencies = np.asarray(frequencies_mhz, dtype=np.float64)
         check_fields(names, len(frequencies))
@@ -152,12 +157,14 @@ class PositiveSkies(Described, eqx.Module):
         at = grid.directions()
         levels = np.stack([template.at(*at).reshape(grid.shape) for template in templates])
         require_positive("the template", levels, "a sky whose logarithm is modelled has no holes")
+        strength = np.ones(grid.shape) if weight is None else weight(*at).reshape(grid.shape)
+        require_positive("the weight of the fields", strength)
         if sources is None:
             sources = np.zeros((len(frequencies), 0, n_modes(lmax)))
         require_shape("the sources", sources, (len(frequencies), None, n_modes(lmax)))
         x, y = frequencies / reference_mhz, frequencies / turnover_mhz
         mixing = np.stack([FIELDS[name](x, y) for name in names], axis=1)
-        return cls(frequencies, mixing, grid, levels, sources, lmax, names)
+        return cls(frequencies, mixing, grid, levels, strength, sources, lmax, names)
 
     def coarser(self, lmax: int, lmax_fields: int) -> PositiveSkies:
         """Make the same of maps and fields with fewer modes.
@@ -172,6 +179,7 @@ class PositiveSkies(Described, eqx.Module):
             self.mixing,
             SphereGrid.of(lmax_fields, len(self.grid.theta) - 1),
             self.levels,
+            self.weight,
             self.sources[:, :, : n_modes(lmax)],
             lmax,
             self.names,
@@ -193,7 +201,7 @@ class PositiveSkies(Described, eqx.Module):
     def values(
         self, channel: int, exponent: Float[np.ndarray, "*batch columns"]
     ) -> Float[np.ndarray, "*batch rings phi"]:
-        """Compute T_f exp(phi) on the grid, in K: positive; too large a phi makes it infinite.
+        """Compute T_f exp(w phi) on the grid, in K: positive; too large a phi makes it infinite.
 
         Parameters
         ----------
@@ -202,7 +210,7 @@ class PositiveSkies(Described, eqx.Module):
             phi.
         """
         with np.errstate(over="ignore"):
-            return self.levels[channel] * np.exp(self.grid.synthesise(exponent))
+            return self.levels[channel] * np.exp(self.weight * self.grid.synthesise(exponent))
 
     def modes(
         self, channel: int, exponent: Float[np.ndarray, "*batch columns"]
@@ -229,4 +237,5 @@ class PositiveSkies(Described, eqx.Module):
         exponent : (modes,) array
             phi.
         """
-        return self.grid.product_matrix(self.values(channel, exponent), self.lmax)
+        field = self.weight * self.values(channel, exponent)
+        return self.grid.product_matrix(field, self.lmax)

@@ -26,7 +26,7 @@ from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.netcdf_files import read_netcdf
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.sky.galaxy import Slabs, brightness, galaxy_map
+from lusee_bayes.sky.galaxy import MAXIMUM_MHZ, Slabs, background, brightness, galaxy_map
 from lusee_bayes.sky.source import GalaxySource, read_sky_file
 
 POSTERIOR = Layout(
@@ -49,6 +49,26 @@ def _slabs(points: bytes) -> tuple[Slabs, Int[np.ndarray, " points"]]:
         np.stack([np.abs(latitude).round(12), longitude]), axis=1, return_inverse=True
     )
     return Slabs.towards(np.degrees(both[1]), np.degrees(both[0])), of_point.ravel()
+
+
+def galactic_share(
+    theta: Float[np.ndarray, " points"], phi: Float[np.ndarray, " points"]
+) -> Float[np.ndarray, " points"]:
+    """Compute the Galaxy's share of the embedded diffuse sky, where it is transparent.
+
+    The rest is the extragalactic background, which is the same everywhere.
+
+    Parameters
+    ----------
+    theta, phi : (points,) array
+        Galactic, in radians; theta from the north pole.
+    """
+    points = np.stack([0.5 * np.pi - np.asarray(theta), phi]).astype(np.float64)
+    slabs, of_point = _slabs(points.tobytes())
+    synchrotron, depth = slabs.synchrotron(MAXIMUM_MHZ)
+    whole = brightness(synchrotron, depth, MAXIMUM_MHZ)
+    share = 1.0 - background(MAXIMUM_MHZ) * np.exp(-depth) / whole
+    return share[(points[0] < 0).astype(int), of_point]
 
 
 class Template(ABC):

@@ -37,12 +37,17 @@ class Band(Template):
         return scale * np.exp(-1.5 * np.cos(theta) ** 2 + 0.4 * np.sin(theta) * np.cos(phi))
 
 
+def weight(theta, phi):
+    return 0.6 + 0.3 * np.sin(theta) ** 2 + 0.1 * np.sin(theta) * np.sin(phi)
+
+
 def skies_of(frequencies, names, n_sources=0):
     points = synthesis_matrix(np.array([0.4, 1.9]), np.array([2.0, 4.0]), LMAX)[:n_sources]
     sources = np.stack([20.0 * (f / 20.0) ** -2.5 * points for f in frequencies])
     templates = [Band(f) for f in frequencies]
-    # that of the templates and fields is far below
-    return PositiveSkies.of(frequencies, templates, LMAX, names, sources=sources, band=24)
+    return PositiveSkies.of(
+        frequencies, templates, LMAX, names, sources=sources, weight=weight, band=24
+    )
 
 
 def quadrature():
@@ -99,7 +104,7 @@ def test_the_mode_of_one_channel_is_that_of_a_direct_minimisation():
 
     def residuals(white):
         field = y @ (root * white[:N] + rest * white[N:])
-        sky = y.T @ (weights * template * np.exp(field))
+        sky = y.T @ (weights * template * np.exp(weight(theta, phi) * field))
         return np.concatenate([(d - a @ sky) / sigma, white])
 
     direct = optimize.least_squares(residuals, np.zeros(2 * N), xtol=1e-15, ftol=1e-15, gtol=1e-12)
@@ -129,9 +134,10 @@ def test_the_gaussian_is_that_of_one_big_model(case):
     size = fields * N + len(seen) * (N + n_sources)
     to_skies, constants, wide = [], [], np.ones(size)
     wide[: fields * N] = np.asarray(prior.roots).ravel()
+    strength = weight(theta, phi)
     for k in range(len(seen)):
-        level = Band(FREQUENCIES[k]).at(theta, phi) * np.exp(y @ mode.exponents[k])
-        slope = y.T @ ((weights * level)[:, None] * y)
+        level = Band(FREQUENCIES[k]).at(theta, phi) * np.exp(strength * (y @ mode.exponents[k]))
+        slope = y.T @ ((weights * strength * level)[:, None] * y)
         matrix = np.zeros((N, size))
         for c in range(fields):
             matrix[:, c * N : (c + 1) * N] = prior.mixing[k, c] * slope
