@@ -36,6 +36,7 @@ from lusee_bayes.experiment.schema import (
     SourcesSection,
     SpectralSection,
 )
+from lusee_bayes.sky.positive_skies import check_fields
 from lusee_bayes.sky.spectral_prior import check_components
 
 # the scenarios that ship with the package
@@ -101,6 +102,8 @@ class Scenario(Section):
         if self.joint and self.spectral.model == "components":
             n = len(self.frequencies_mhz)
             check_components(self.spectral.components, n, self.spectral.residual)
+        if self.joint and self.spectral.model == "positive":
+            check_fields(self.spectral.fields, len(self.frequencies_mhz))
         return self
 
     @field_validator("nside")

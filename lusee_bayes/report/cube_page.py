@@ -113,9 +113,11 @@ def _how(joint: dict | None, evidence: float | None) -> str:
     if joint["iterations"]:
         solver += f" ({joint['iterations']} iterations)"
     names = ", ".join(name.replace("_", " ") for name in joint["components"])
+    # runs of older versions do not say it
+    prior = f" {joint['prior']}" if joint.get("prior") else ""
     return (
         f"All channels share one posterior; component maps: {names}. Solved by {solver}, last step "
-        f"{joint['refinement_sigma']:.1g} sigma.{known}"
+        f"{joint['refinement_sigma']:.1g} sigma.{known}{prior}"
     )
 
 

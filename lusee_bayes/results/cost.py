@@ -22,6 +22,7 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.observation import CYCLE_DAYS
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.results.joint_components import is_iterative
+from lusee_bayes.results.positive_components import lmax_of_fields
 
 # measured at lmax 12 to 80 and up to 3e5 data (docs/commands.md): what is there before anything is
 # computed, and what each datum takes from reading to the report
@@ -29,6 +30,8 @@ BASE_BYTES, BYTES_A_DATUM = 0.75e9, 450
 # n x n arrays at the peak of a posterior, of one channel or of all together, and floating-point
 # operations in n^3
 SQUARES, JOINT_SQUARES, OPERATIONS = 8, 4, 12
+# of positive joint skies, those that learn the laws of their fields among them
+ROUNDS = 8
 # what learning a prior adds to them: about five steps with all modes
 LEARNING_SQUARES, LEARNING_OPERATIONS = 4, 80
 # pixels of every map of a report, and of what each is made of
@@ -122,12 +125,16 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
     n_data = 16 * n_times(scenario) if n_data is None else n_data
     n_modes = (scenario.lmax + 1) ** 2
     direct = scenario.joint and not is_iterative(scenario)
-    n = n_modes * (len(scenario.spectral.components) if direct else 1)
+    n, rounds = n_modes, 1
+    if scenario.joint and scenario.spectral.model == "positive":
+        n, rounds = len(scenario.spectral.fields) * (lmax_of_fields(scenario) + 1) ** 2, ROUNDS
+    elif direct:
+        n *= len(scenario.spectral.components)
     squares = float(JOINT_SQUARES if direct else SQUARES) * float(n) ** 2
     if scenario.joint:
         # the normal matrix of every channel is kept
         squares += n_channels * n_modes**2 / 2.0
-    operations = OPERATIONS * (float(n) ** 3 + n_channels * float(n_modes) ** 3)
+    operations = rounds * OPERATIONS * (float(n) ** 3 + n_channels * float(n_modes) ** 3)
     if scenario.prior.is_learned and not scenario.joint:
         squares += LEARNING_SQUARES * float(n_modes) ** 2
         operations += LEARNING_OPERATIONS * n_channels * float(n_modes) ** 3

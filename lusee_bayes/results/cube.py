@@ -21,6 +21,7 @@ from lusee_bayes.linear.fit import RULE, ChiSquare, Fit
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.cube_fit import ChannelFits
 from lusee_bayes.results.joint_components import Components
+from lusee_bayes.results.prior_words import joint_prior_sentence
 from lusee_bayes.sky.landmarks import LANDMARKS
 
 
@@ -106,9 +107,14 @@ class CubeResult(Described):
             )
         return ", ".join(parts)
 
+    def prior_words(self) -> str:
+        """Which prior the skies of a joint posterior have, in a sentence."""
+        return joint_prior_sentence(self.scenario)
+
     def lines(self) -> list[str]:
         """What a terminal shows."""
-        return [self.headline(), self.verdict(), RULE, *self.doubts()]
+        prior = [] if self.components is None else [self.prior_words()]
+        return [self.headline(), *prior, self.verdict(), RULE, *self.doubts()]
 
     def doubts(self) -> list[str]:
         """What is doubtful about the data, with the channel."""
@@ -208,6 +214,7 @@ class CubeResult(Described):
             "refinement_sigma": components.refinement,
         }
         return {
+            "prior": self.prior_words(),
             "components": list(components.prior.names),
             "solver": components.solver,
             "iterations": components.iterations,
@@ -239,7 +246,10 @@ class CubeResult(Described):
         }
         if components is not None:
             maps, mixing = np.asarray(components.mean), np.asarray(components.prior.mixing)
-            variables["component_mean"] = (("component", "mode"), maps, {"units": "K"})
+            # fields of positive skies may have more modes than the maps
+            dims = ("component", "mode" if components.mode is None else "field_mode")
+            unit = "K" if components.mode is None else "1"
+            variables["component_mean"] = (dims, maps, {"units": unit})
             variables["mixing"] = (("frequency", "component"), mixing, {"units": "1"})
         return xr.Dataset(
             variables,

@@ -15,6 +15,7 @@ from lusee_bayes.experiment.experiment import build, with_truth
 from lusee_bayes.experiment.inference import inform
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.joint_skies import channel_sky
+from lusee_bayes.linear.positive_skies import positive_sky
 from lusee_bayes.results.channel import ChannelResult, channel_of_information
 from lusee_bayes.results.channel_files import ChannelFiles, identity_of
 from lusee_bayes.results.channel_information import ChannelInformation
@@ -133,15 +134,26 @@ def _write_joint_sky(
     if files.has(channel, "result"):
         return
     known = ChannelInformation.from_dataset(files.read(channel, "information"))
-    sky = channel_sky(
-        components.prior,
-        channels.index(channel),
-        known.information,
-        components.mean,
-        components.spread,
-        components.draws,
-        draw_key(scenario),
-    )
+    number, key = channels.index(channel), draw_key(scenario)
+    if components.mode is not None:
+        sky = positive_sky(
+            components.mode,
+            number,
+            known.information,
+            np.asarray(components.spread),
+            np.asarray(components.draws),
+            key,
+        )
+    else:
+        sky = channel_sky(
+            components.prior,
+            number,
+            known.information,
+            components.mean,
+            components.spread,
+            components.draws,
+            key,
+        )
     found = channel_of_information(
         known.observed,
         known.information,

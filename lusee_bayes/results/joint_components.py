@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from threading import get_ident
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -13,14 +11,15 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.process_group import ProcessGroup
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.iterative_joint import DIRECT_UNKNOWNS, solve_iteratively
-from lusee_bayes.linear.joint import ComponentSums, component_posterior, summed
+from lusee_bayes.linear.joint import component_posterior
 from lusee_bayes.linear.joint_skies import paired
+from lusee_bayes.linear.positive_joint import PositiveMode
+from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.channel_files import ChannelFiles
-from lusee_bayes.results.channel_information import ChannelInformation
-from lusee_bayes.results.channel_threads import each_channel
 from lusee_bayes.results.draws import draw_key
+from lusee_bayes.results.joint_channels import ChannelsInFiles
+from lusee_bayes.results.positive_components import lmax_of_fields, positive_mode
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 # draws where conjugate gradients have no other way to tell standard deviations
@@ -29,7 +28,7 @@ LEAST_DRAWS = 50
 
 @dataclass(frozen=True)
 class Components:
-    """The joint posterior of the component maps, in K.
+    """The joint posterior of the component maps: in K, of positive skies fields without unit.
 
     Attributes
     ----------
@@ -46,6 +45,9 @@ class Components:
         Distance left, in standard deviations.
     solver : str
     iterations : int
+        Of conjugate gradients, or rounds of positive skies.
+    mode : PositiveMode or None
+        Of positive skies.
     """
 
     prior: SpectralPrior
@@ -58,11 +60,18 @@ class Components:
     refinement: float
     solver: str
     iterations: int
+    mode: PositiveMode | None = None
 
 
 def is_iterative(scenario: Scenario) -> bool:
-    """Whether a joint posterior is solved by conjugate gradients: as said, or as it fits."""
+    """Whether a joint posterior is solved by conjugate gradients: as said, or as it fits.
+
+    InputError for positive skies with too many unknowns for a direct solution.
+    """
     section = scenario.spectral
+    if section.model == "positive":
+        lmax_of_fields(scenario)
+        return False
     if section.solver != "auto":
         return section.solver == "conjugate_gradients"
     count = len(section.components)
@@ -96,17 +105,20 @@ def solve_components(
         If conjugate gradients do not converge, or data are too precise to be solved for.
     """
     channels = scenario.channels()
+    at_hand = ChannelsInFiles(channels, files, group, stages)
+    if scenario.spectral.model == "positive":
+        return _positive(scenario, at_hand, n_draws, stages)
     small = [files.read(channel, "information", ["reference", "sky"]) for channel in channels]
     reference = np.array([np.asarray(s["reference"]) for s in small])
     skies = np.array([np.asarray(s["sky"]) for s in small])
     prior = scenario.spectral.prior(np.array(scenario.frequencies_mhz), skies)
     if not is_iterative(scenario):
-        return _direct(prior, scenario, files, reference, n_draws, group, stages)
+        return _direct(prior, scenario, at_hand, reference, n_draws, stages)
     section = scenario.spectral
     with stages.progress("conjugate gradients", section.iterations) as report:
         found = solve_iteratively(
             prior,
-            _informations(channels, files),
+            (at_hand.read(number) for number in range(len(channels))),
             reference,
             draw_key(scenario),
             tolerance=section.tolerance,
@@ -128,52 +140,41 @@ def solve_components(
     )
 
 
-def _informations(channels: tuple[Scenario, ...], files: ChannelFiles) -> Iterator[Information]:
-    for channel in channels:
-        yield ChannelInformation.from_dataset(files.read(channel, "information")).information
+def _positive(
+    scenario: Scenario, channels: ChannelsInFiles, n_draws: int, stages: Stages
+) -> Components:
+    mode = positive_mode(scenario, channels, stages)
+    with stages("joint posterior"):
+        found = _gaussian(mode.prior, mode.posterior, scenario, n_draws, mode.energy, mode.rounds)
+    return replace(found, refinement=mode.moved, solver="Gauss-Newton rounds", mode=mode)
 
 
 def _direct(
     prior: SpectralPrior,
     scenario: Scenario,
-    files: ChannelFiles,
+    channels: ChannelsInFiles,
     reference: np.ndarray,
     n_draws: int,
-    group: ProcessGroup,
     stages: Stages,
 ) -> Components:
-    channels = scenario.channels()
-    start = ComponentSums.empty(prior, reference)
-    by_thread: dict[int, ComponentSums] = {}
-    number = {channel.frequency_mhz: k for k, channel in enumerate(channels)}
-
-    def add(channel: Scenario) -> None:
-        (information,) = _informations((channel,), files)
-        # every thread has sums of its own, on its device
-        before = by_thread.get(get_ident())
-        if before is None:
-            before = ComponentSums.empty(prior, reference)
-        after = summed(before, prior, number[channel.frequency_mhz], information)
-        by_thread[get_ident()] = jax.block_until_ready(after)
-
-    each_channel(add, channels, group, stages, "joint sums")
+    information = channels.summed(prior, reference, lambda _, information: information)
     with stages("joint posterior"):
-        leaves, shape = jax.tree.flatten(start)
-        # with the empty ones: a process may have no channels
-        parts = [jax.tree.leaves(sums) for sums in (start, *by_thread.values())]
-        # everything but the maps that all is written about is a sum
-        whole = [
-            leaf
-            if leaf is start.reference
-            else group.total(np.asarray(sum(np.asarray(part[k]) for part in parts)))
-            for k, leaf in enumerate(leaves)
-        ]
-        information = jax.tree.unflatten(shape, whole).information()
         posterior = component_posterior(information, prior)
         chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
-        components, modes = prior.n_components, posterior.mean.shape[0] // prior.n_components
-        spread = jax.block_until_ready(paired(posterior.covariance(), prior))
-        draws = posterior.sample(draw_key(scenario), n_draws)
+        return _gaussian(prior, posterior, scenario, n_draws, chi2, 0)
+
+
+def _gaussian(
+    prior: SpectralPrior,
+    posterior: Posterior,
+    scenario: Scenario,
+    n_draws: int,
+    chi2: float,
+    iterations: int,
+) -> Components:
+    components, modes = prior.n_components, posterior.mean.shape[0] // prior.n_components
+    spread = jax.block_until_ready(paired(posterior.covariance(), prior))
+    draws = posterior.sample(draw_key(scenario), n_draws)
     return Components(
         prior,
         posterior.mean.reshape(components, modes),
@@ -184,5 +185,5 @@ def _direct(
         float(posterior.information_bits()),
         float(posterior.refinement),
         "direct",
-        0,
+        iterations,
     )

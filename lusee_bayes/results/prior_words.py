@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.experiment.scenario import Scenario
 
 
 def prior_sentence(experiment: Experiment) -> str:
@@ -32,3 +33,20 @@ def prior_summary(experiment: Experiment) -> dict[str, object]:
         # the parameters integrated out, too
         "log_evidence_learned": None if learned is None else learned.log_evidence,
     }
+
+
+def joint_prior_sentence(scenario: Scenario) -> str:
+    """Which prior the skies of a joint posterior have.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of joint channels.
+    """
+    section, kept = scenario.spectral, f"prior.model={scenario.prior.model} is not used"
+    if section.model == "positive":
+        return (
+            f"Prior spectral.model=positive: the embedded template times the exponential of "
+            f"{', '.join(section.fields)}, their C_ell learned from these data; {kept}."
+        )
+    return f"Prior spectral.model={section.model}, C_ell of the scenario's own skies; {kept}."

@@ -132,7 +132,13 @@ CHANNEL_SUMMARY = Layout(
 )
 JOINT_SUMMARY = Layout(
     "the figures of a joint posterior",
-    attributes={"solver": TEXT, "iterations": COUNT, "refinement_sigma": NUMBER},
+    attributes={
+        "solver": TEXT,
+        "iterations": COUNT,
+        "refinement_sigma": NUMBER,
+        # runs of older versions do not say it
+        "prior": Attribute("text", optional=True),
+    },
 )
 COVERAGE = Layout(
     "the coverage of a part of the sky",

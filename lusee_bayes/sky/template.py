@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
@@ -25,7 +26,7 @@ from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.netcdf_files import read_netcdf
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.sky.galaxy import Slabs, brightness, galaxy_map
+from lusee_bayes.sky.galaxy import MAXIMUM_MHZ, Slabs, background, brightness, galaxy_map
 from lusee_bayes.sky.source import GalaxySource, read_sky_file
 
 POSTERIOR = Layout(
@@ -37,6 +38,37 @@ POSTERIOR = Layout(
 LEAST_BAND = 128
 # points whose azimuthal functions are kept at once
 CHUNK = 20_000
+
+
+@lru_cache(maxsize=1)
+def _slabs(points: bytes) -> tuple[Slabs, Int[np.ndarray, " points"]]:
+    """Lines of sight, the same at all frequencies, and the line of each latitude and longitude."""
+    latitude, longitude = np.frombuffer(points).reshape(2, -1)
+    # lines of sight above and below the plane share what is symmetric: each once for both
+    both, of_point = np.unique(
+        np.stack([np.abs(latitude).round(12), longitude]), axis=1, return_inverse=True
+    )
+    return Slabs.towards(np.degrees(both[1]), np.degrees(both[0])), of_point.ravel()
+
+
+def galactic_share(
+    theta: Float[np.ndarray, " points"], phi: Float[np.ndarray, " points"]
+) -> Float[np.ndarray, " points"]:
+    """Compute the Galaxy's share of the embedded diffuse sky, where it is transparent.
+
+    The rest is the extragalactic background, which is the same everywhere.
+
+    Parameters
+    ----------
+    theta, phi : (points,) array
+        Galactic, in radians; theta from the north pole.
+    """
+    points = np.stack([0.5 * np.pi - np.asarray(theta), phi]).astype(np.float64)
+    slabs, of_point = _slabs(points.tobytes())
+    synchrotron, depth = slabs.synchrotron(MAXIMUM_MHZ)
+    whole = brightness(synchrotron, depth, MAXIMUM_MHZ)
+    share = 1.0 - background(MAXIMUM_MHZ) * np.exp(-depth) / whole
+    return share[(points[0] < 0).astype(int), of_point]
 
 
 class Template(ABC):
@@ -90,14 +122,10 @@ class EmbeddedTemplate(Template):
     frequency_mhz: float
 
     def at(self, theta, phi):
-        latitude = 0.5 * np.pi - np.asarray(theta)
-        # lines of sight above and below the plane share what is symmetric: each once for both
-        both, of_point = np.unique(
-            np.stack([np.abs(latitude), phi], axis=1), axis=0, return_inverse=True
-        )
-        slabs = Slabs.towards(np.degrees(both[:, 1]), np.degrees(both[:, 0]))
+        points = np.stack([0.5 * np.pi - np.asarray(theta), phi]).astype(np.float64)
+        slabs, of_point = _slabs(points.tobytes())
         sides = brightness(*slabs.synchrotron(self.frequency_mhz), self.frequency_mhz)
-        return sides[(latitude < 0).astype(int), of_point.ravel()]
+        return sides[(points[0] < 0).astype(int), of_point]
 
     def pixels(self, nside):
         return galaxy_map(self.frequency_mhz, nside, seed=None)

@@ -22,7 +22,7 @@ from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.terms import Around
 from lusee_bayes.linear.metrics import signal_to_noise
-from lusee_bayes.results import channel_threads, cube_channels, joint_components
+from lusee_bayes.results import channel_threads, cube_channels, joint_channels
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
 from lusee_bayes.runs.map_run import run_map
@@ -168,7 +168,7 @@ def made(monkeypatch):
 
 def test_a_process_without_channels_adds_nothing(tmp_path, monkeypatch, numbers_alone):
     """Of more processes than channels: alone, its sums leave the component maps to their prior."""
-    monkeypatch.setattr(joint_components, "each_channel", lambda *_: None)
+    monkeypatch.setattr(joint_channels, "each_channel", lambda *_: None)
     scenario = three("joint=true", "spectral.components=[power_law, curvature]")
     components = run_map(scenario, tmp_path).result.components
     np.testing.assert_array_equal(components.mean, 0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lusee_bayes.experiment.schema.section import Positive, Section
 from lusee_bayes.sky.spectral_prior import SpectralPrior
@@ -14,15 +14,23 @@ from lusee_bayes.sky.spectral_prior import SpectralPrior
 class SpectralSection(Section):
     """The prior on skies of several frequencies that are mapped together.
 
-    C_ell of the components follow from the scenario's skies.
+    C_ell of components and kernel follow from the scenario's skies; that of positive skies is
+    learned from the data.
 
     Attributes
     ----------
-    model : {"components", "kernel"}
-        A sum of maps with given spectra, or a power law times a Gaussian process in ln nu.
+    model : {"components", "kernel", "positive"}
+        A sum of maps with given spectra, a power law times a Gaussian process in ln nu, or the
+        embedded diffuse Galaxy times the exponential of fields, which is positive everywhere.
     components : tuple of str
         Spectra of the maps: a power law, its curvature (times ln nu) and its turnover (times
         1 - exp(-tau), tau = (turnover_mhz / nu)^2.1).
+    fields : tuple of str
+        What varies over positive skies: their level, spectral index and curvature (times ln nu and
+        ln^2 nu), and the optical depth at turnover_mhz, which goes as nu^-2.1.
+    sources : bool
+        Give the catalogue's sources fluxes of their own in every channel of positive skies, each as
+        uncertain as it is large.
     index : float
         Spectral index of the power law.
     reference_mhz : float
@@ -42,10 +50,14 @@ class SpectralSection(Section):
         Most iterations of conjugate gradients.
     """
 
-    model: Literal["components", "kernel"] = "components"
+    model: Literal["components", "kernel", "positive"] = "components"
     components: Annotated[
         tuple[Literal["power_law", "curvature", "turnover"], ...], Field(min_length=1)
     ] = ("power_law", "curvature", "turnover")
+    fields: Annotated[
+        tuple[Literal["level", "index", "curvature", "absorption"], ...], Field(min_length=1)
+    ] = ("level", "index", "curvature", "absorption")
+    sources: bool = True
     index: Annotated[float, Field(ge=-20, le=20)] = -2.5
     reference_mhz: Positive = 20.0
     turnover_mhz: Positive = 5.0
@@ -55,8 +67,16 @@ class SpectralSection(Section):
     tolerance: Positive = 1e-7
     iterations: Annotated[int, Field(ge=1)] = 500
 
+    @model_validator(mode="after")
+    def _positive_skies_are_solved_directly(self) -> SpectralSection:
+        if self.model == "positive" and self.solver == "conjugate_gradients":
+            raise ValueError(
+                "positive skies are solved for directly, round by round; leave out spectral.solver"
+            )
+        return self
+
     def prior(self, frequencies_mhz: np.ndarray, skies: np.ndarray) -> SpectralPrior:
-        """The prior on the skies of all channels; ``skies`` (channels, modes) model them."""
+        """The prior on linear skies of all channels; ``skies`` (channels, modes) model them."""
         common = {"index": self.index, "reference_mhz": self.reference_mhz}
         if self.model == "components":
             return SpectralPrior.components(

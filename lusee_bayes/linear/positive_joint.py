@@ -1,0 +1,340 @@
+"""One posterior for positive skies of several frequencies, by Gauss and Newton.
+
+With the exponents phi_f = sum_c s_fc a_c + r_f of :mod:`.positive_skies`, ::
+
+    E = sum_f chi^2_f(m_f(phi_f)) + sum_c a_c^T (C^c)^-1 a_c + sum_f r_f^T (R^f)^-1 r_f.
+
+About given exponents m_f is linear, m_f + W_f (phi - phi_f), and what the data of a channel say of
+phi is a quadratic form: W^T M W, W^T v. So a round is a joint posterior as :mod:`.joint` finds it,
+of maps without unit. The step to its mean is halved until E falls, and rounds are repeated until a
+step would gain nothing. Meanwhile A and tilt of the fields may be learned (:mod:`.field_laws`). The
+last posterior is the Gaussian about the mode, its evidence Laplace's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import sum_over_m
+from lusee_bayes.core.linalg import inverse_from_cholesky, symmetric_product
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.joint import (
+    ComponentSums,
+    component_posterior,
+    residual_lower,
+    summed,
+)
+from lusee_bayes.linear.joint_skies import channel_sky, paired
+from lusee_bayes.linear.patterns import Patterns
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.sky.field_laws import FieldLaws
+from lusee_bayes.sky.positive_skies import PositiveSkies
+from lusee_bayes.sky.spectral_prior import SpectralPrior
+
+# found when a round moves all unknowns together by less than this, in standard deviations, and no
+# ln A or tilt by more than that
+SETTLED, SETTLED_LAW = 0.1, 0.05
+MAX_ROUNDS, HALVINGS = 60, 20
+
+
+@runtime_checkable
+class Channels(Protocol):
+    """The channels of a joint posterior, wherever their data are."""
+
+    def each(
+        self,
+        function: Callable[[int, Information], dict[str, np.ndarray]],
+        shapes: dict[str, tuple[int, ...]],
+    ) -> dict[str, np.ndarray]:
+        """Call a function with number and information of every channel; its arrays, stacked."""
+
+    def summed(
+        self,
+        prior: SpectralPrior,
+        reference: Float[np.ndarray, "channels modes"],
+        function: Callable[[int, Information], Information],
+    ) -> Information:
+        """What a function of every channel's information says of the component maps."""
+
+
+@dataclass(frozen=True)
+class ChannelsInMemory:
+    """Channels whose information is at hand.
+
+    Attributes
+    ----------
+    informations : tuple of Information
+        In the prior's order.
+    """
+
+    informations: tuple[Information, ...]
+
+    def each(
+        self,
+        function: Callable[[int, Information], dict[str, np.ndarray]],
+        shapes: dict[str, tuple[int, ...]],
+    ) -> dict[str, np.ndarray]:
+        """Call a function with number and information of every channel; its arrays, stacked."""
+        found = [function(k, information) for k, information in enumerate(self.informations)]
+        return {name: np.stack([part[name] for part in found]) for name in shapes}
+
+    def summed(
+        self,
+        prior: SpectralPrior,
+        reference: Float[np.ndarray, "channels modes"],
+        function: Callable[[int, Information], Information],
+    ) -> Information:
+        """What a function of every channel's information says of the component maps."""
+        sums = ComponentSums.empty(prior, reference)
+        for k, information in enumerate(self.informations):
+            sums = summed(sums, prior, k, function(k, information))
+        return sums.information()
+
+
+@dataclass(frozen=True)
+class PositiveMode:
+    """The most probable skies, and the Gaussian about them.
+
+    Attributes
+    ----------
+    skies : PositiveSkies
+    laws : FieldLaws
+    exponents : (channels, modes) array
+        phi_f about which the skies are linear.
+    posterior : Posterior
+        Of the fields in one vector, the first field first; without unit.
+    energy : float
+        E: chi^2 of all data under the model, prior included.
+    moved : float
+        What the last step moved, in standard deviations of all unknowns together.
+    rounds : int
+        How many were taken.
+    """
+
+    skies: PositiveSkies
+    laws: FieldLaws
+    exponents: Float[np.ndarray, "channels modes"]
+    posterior: Posterior
+    energy: float
+    moved: float
+    rounds: int
+
+    @property
+    def prior(self) -> SpectralPrior:
+        """Of the fields."""
+        return self.laws.prior(self.skies)
+
+    @property
+    def fields(self) -> Float[np.ndarray, "fields modes"]:
+        """Posterior mean of the fields."""
+        return np.asarray(self.posterior.mean).reshape(len(self.skies.names), -1)
+
+
+def diffuse_part(skies: PositiveSkies, channel: int, information: Information) -> Patterns:
+    """What a channel's data say of its point sources, and without them of the diffuse sky."""
+    return Patterns.of(skies.sources[channel], on_host(information))
+
+
+def linearised(
+    skies: PositiveSkies,
+    channel: int,
+    information: Information,
+    exponent: Float[np.ndarray, " modes"],
+) -> Information:
+    """What a channel's data say of its exponent, the sky being linear about a given one.
+
+    Parameters
+    ----------
+    skies : PositiveSkies
+    channel : int
+    information : Information
+        Of the channel's sky, in K.
+    exponent : (modes,) array
+        phi_f.
+
+    Returns
+    -------
+    Information
+        Without unit, point sources integrated out.
+    """
+    diffuse = diffuse_part(skies, channel, information).without()
+    here = diffuse.recentred(skies.modes(channel, exponent))
+    slope = skies.jacobian(channel, exponent)
+    return replace(
+        here,
+        matrix=symmetric_product(slope.T @ here.matrix, slope),
+        vector=here.vector @ slope,
+        reference=exponent,
+    )
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Fields and exponents of all channels, and chi^2 of their skies."""
+
+    fields: Float[np.ndarray, "fields modes"]
+    exponents: Float[np.ndarray, "channels modes"]
+    chi2: float
+
+    def energy(self, prior: SpectralPrior) -> float:
+        """E under a prior."""
+        rest = self.exponents - np.asarray(prior.mixing) @ self.fields
+        roots = np.stack([prior.residual_root(k) for k in range(prior.n_channels)])
+        return self.chi2 + float(
+            ((self.fields / prior.roots) ** 2).sum() + ((rest / roots) ** 2).sum()
+        )
+
+
+def find_mode(
+    skies: PositiveSkies,
+    laws: FieldLaws,
+    channels: Channels,
+    *,
+    learn: bool = False,
+    start: Float[np.ndarray, "fields modes"] | None = None,
+    report: Callable[[int, str], None] | None = None,
+) -> PositiveMode:
+    """Find the most probable skies.
+
+    Parameters
+    ----------
+    skies : PositiveSkies
+    laws : FieldLaws
+        C_ell of the fields, or where to begin to learn them.
+    channels : Channels
+        Their data.
+    learn : bool
+        Learn A and tilt of every field and residual, by the maximum of the evidence.
+    start : (fields, modes) array, optional
+        Fields to begin with; by default zero, the templates themselves.
+    report : callable, optional
+        Told the number of every round, and how far it moved.
+
+    Raises
+    ------
+    InputError
+        If the rounds do not settle, or the data are too precise to be solved for.
+    """
+    fields = np.zeros((len(skies.names), skies.n_fields)) if start is None else start
+    exponents = skies.mixing @ fields
+    here = _Point(fields, exponents, _chi2(skies, channels, exponents))
+    shapes: dict[str, tuple[int, ...]] = {"exponent": (skies.n_fields,), "chi2": ()}
+    if learn:
+        shapes |= dict.fromkeys(("power", "known"), (skies.grid.lmax + 1,))
+    last = np.zeros_like(laws.parameters)
+    for rounds in range(MAX_ROUNDS):
+        prior = laws.prior(skies)
+
+        def relative(
+            channel: int, information: Information, at: np.ndarray = here.exponents
+        ) -> Information:
+            return linearised(skies, channel, information, at[channel])
+
+        information = channels.summed(prior, here.exponents, relative)
+        posterior = on_host(component_posterior(information, prior))
+        maps = np.asarray(posterior.mean).reshape(prior.n_components, -1)
+        spread = np.asarray(paired(posterior.covariance(), prior)) if learn else None
+
+        def judged(
+            channel: int,
+            information: Information,
+            relative: Callable = relative,
+            prior: SpectralPrior = prior,
+            maps: np.ndarray = maps,
+            spread: np.ndarray | None = spread,
+        ) -> dict[str, np.ndarray]:
+            return _judged(prior, channel, relative(channel, information), maps, spread)
+
+        found = channels.each(judged, shapes)
+        there = _Point(maps, found["exponent"], float(found["chi2"].sum()))
+        energy = here.energy(prior)
+        moved = np.sqrt(max(energy - there.energy(prior), 0.0))
+        if report is not None:
+            report(rounds, f"{moved:.2g} sigma")
+        change = np.zeros_like(laws.parameters)
+        if learn:
+            change = laws.matched(*_powers(posterior, prior, found)).parameters - laws.parameters
+            # a law that nothing depends on may go to and fro
+            change = np.where(change * last < 0, 0.5, 1.0) * change
+        if moved < SETTLED and np.abs(change).max() < SETTLED_LAW:
+            return PositiveMode(
+                skies, laws, here.exponents, posterior, energy, float(moved), rounds
+            )
+        here = _descended(skies, channels, prior, here, there)
+        laws, last = laws.with_parameters(laws.parameters + change), change
+    raise InputError(
+        f"the positive skies did not settle in {MAX_ROUNDS} rounds: the last moved by {moved:.2g} "
+        "standard deviations; the data are far from anything that the templates allow: use "
+        "spectral.model=components"
+    )
+
+
+def _chi2(
+    skies: PositiveSkies, channels: Channels, exponents: Float[np.ndarray, "channels modes"]
+) -> float:
+    def chi2(channel: int, information: Information) -> dict[str, np.ndarray]:
+        diffuse = diffuse_part(skies, channel, information).without()
+        return {"chi2": np.asarray(diffuse.chi2(skies.modes(channel, exponents[channel])))}
+
+    return float(channels.each(chi2, {"chi2": ()})["chi2"].sum())
+
+
+def _judged(
+    prior: SpectralPrior,
+    channel: int,
+    information: Information,
+    maps: Float[np.ndarray, "fields modes"],
+    spread: Float[np.ndarray, "pairs modes modes"] | None,
+) -> dict[str, np.ndarray]:
+    """Exponent and chi^2 of a channel at the mean of a linear round, and its residual's power."""
+    none = np.zeros((0, *maps.shape))
+    sky = on_host(channel_sky(prior, channel, information, maps, None, none, jax.random.key(0)))
+    found = {"exponent": np.asarray(sky.mean), "chi2": np.asarray(sky.chi2)}
+    if spread is None:
+        return found
+    root, mixing = prior.residual_root(channel), np.asarray(prior.mixing[channel])
+    inverse = inverse_from_cholesky(residual_lower(information, root))
+    first, second = np.tril_indices(len(mixing))
+    common = np.tensordot(mixing[first] * mixing[second], spread, 1)
+    # of the residual given the common part, and of what it follows of that
+    pull = (inverse * root[None]) @ information.matrix
+    variance = np.diagonal(inverse) + np.einsum("ij,ij->i", pull @ common, pull)
+    white = (sky.mean - mixing @ maps) / root
+    return {**found, "power": sum_over_m(white**2), "known": sum_over_m(1.0 - variance)}
+
+
+def _powers(
+    posterior: Posterior, prior: SpectralPrior, found: dict[str, np.ndarray]
+) -> tuple[Float[np.ndarray, "laws ells"], Float[np.ndarray, "laws ells"]]:
+    """sum_m u^2 and sum_m (1 - var u) of all fields and residuals."""
+    shape = prior.n_components, -1
+    variance = np.diagonal(inverse_from_cholesky(np.asarray(posterior.lower))).reshape(shape)
+    power = sum_over_m(np.asarray(posterior.white_mean).reshape(shape) ** 2)
+    return (
+        np.concatenate([power, found["power"]]),
+        np.concatenate([sum_over_m(1.0 - variance), found["known"]]),
+    )
+
+
+def _descended(
+    skies: PositiveSkies, channels: Channels, prior: SpectralPrior, here: _Point, there: _Point
+) -> _Point:
+    """The end of a step, or of a half, a quarter, ... of it, if E is not higher there."""
+    part, energy = 1.0, here.energy(prior)
+    for _ in range(HALVINGS):
+        fields = here.fields + part * (there.fields - here.fields)
+        exponents = here.exponents + part * (there.exponents - here.exponents)
+        trial = _Point(fields, exponents, _chi2(skies, channels, exponents))
+        # what a short step gains may be rounding
+        if trial.energy(prior) < energy + SETTLED**2:
+            return trial
+        part /= 2.0
+    return here

@@ -1,0 +1,107 @@
+"""Positive skies of the channels of a run: their most probable fields."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.linear.iterative_joint import DIRECT_UNKNOWNS
+from lusee_bayes.linear.positive_joint import MAX_ROUNDS, PositiveMode, find_mode
+from lusee_bayes.linear.positive_learning import COARSE_LMAX, learn_laws
+from lusee_bayes.results.joint_channels import ChannelsInFiles
+from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES
+from lusee_bayes.sky.modulated import DEVIATIONS
+from lusee_bayes.sky.positive_skies import PositiveSkies
+from lusee_bayes.sky.template import EmbeddedTemplate, galactic_share
+
+
+def lmax_of_fields(scenario: Scenario, lmax: int | None = None) -> int:
+    """Choose the highest ell of the fields: 1.5 times that of the map, if they can be solved for.
+
+    Structure that a map does not resolve still changes it where the sky is steep.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of positive joint skies.
+    lmax : int, optional
+        Of the map; by default the scenario's.
+
+    Raises
+    ------
+    InputError
+        If fields of the map's own lmax are too many unknowns.
+    """
+    lmax = scenario.lmax if lmax is None else lmax
+    n_fields = len(scenario.spectral.fields)
+    highest = int(np.sqrt(DIRECT_UNKNOWNS / n_fields)) - 1
+    if highest < lmax:
+        raise InputError(
+            f"positive joint skies of lmax {lmax} have {n_fields * n_modes(lmax)} unknowns, more "
+            f"than the {DIRECT_UNKNOWNS} that are solved for directly; use lmax={highest}, fewer "
+            "spectral.fields, or spectral.model=components"
+        )
+    return min(round(DEVIATIONS * lmax), highest)
+
+
+def positive_skies(scenario: Scenario) -> PositiveSkies:
+    """The skies of a scenario's channels as functions of the fields.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of positive joint skies.
+
+    Raises
+    ------
+    InputError
+        As :func:`lmax_of_fields`.
+    """
+    section, frequencies, lmax = scenario.spectral, scenario.frequencies_mhz, scenario.lmax
+    sources = None
+    if section.sources:
+        sources = np.array([[s.modes(f, lmax) for s in BRIGHT_SOURCES] for f in frequencies])
+    return PositiveSkies.of(
+        np.array(frequencies),
+        [EmbeddedTemplate(f) for f in frequencies],
+        lmax,
+        section.fields,
+        reference_mhz=section.reference_mhz,
+        turnover_mhz=section.turnover_mhz,
+        sources=sources,
+        weight=galactic_share,
+        lmax_fields=lmax_of_fields(scenario),
+    )
+
+
+def positive_mode(scenario: Scenario, channels: ChannelsInFiles, stages: Stages) -> PositiveMode:
+    """Find the most probable skies of all channels.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of positive joint skies.
+    channels : ChannelsInFiles
+    stages : Stages
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        As :func:`.find_mode`.
+    """
+    with stages("templates"):
+        skies = positive_skies(scenario)
+    silent = replace(channels, stages=Stages())
+    coarse = lmax_of_fields(scenario, min(scenario.lmax, COARSE_LMAX))
+    with stages.progress("laws of the fields", MAX_ROUNDS) as report:
+        laws = learn_laws(skies, silent, lmax_fields=coarse, report=report)
+    # all processes go on from the same ones, to the last bit
+    shared = channels.group.total(laws.parameters) / channels.group.processes
+    with stages.progress("positive skies", MAX_ROUNDS) as report:
+        return find_mode(skies, laws.with_parameters(shared), silent, report=report)

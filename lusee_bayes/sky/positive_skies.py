@@ -1,0 +1,241 @@
+"""Positive skies of several frequencies: templates times the exponential of few fields.
+
+::
+
+    ln m_f = ln T_f + w phi_f,    phi_f = a_0 + a_1 ln x + a_2 ln^2 x - a_3 y^-2.1 + r_f,
+    x = nu / nu_ref,    y = nu / nu_turnover,
+
+with a template T_f at every frequency, a_0 its level at nu_ref, a_1 the change of its spectral
+index, a_2 that of its curvature, a_3 the change of the optical depth of ionised gas at nu_turnover
+(Altenhoff et al. 1960), and a residual r_f of every channel; all of them vary over the sky and have
+no unit. The weight w says how strong they are from place to place, the same at all frequencies. The
+exponent of a channel is linear in them, its sky is positive. About any exponent phi, ::
+
+    dm_f = W d(phi),    W_ij = int y_i w T_f exp(w phi) y_j dOmega.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.checks import require_positive, require_shape
+from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.core.representation import Described, extent, listed
+from lusee_bayes.core.sphere_grid import SphereGrid
+from lusee_bayes.sky.bright_sources import FREE_FREE_SLOPE
+from lusee_bayes.sky.template import Template
+
+# how fields enter the logarithm: x is frequency / reference, y frequency / turnover
+FIELDS = {
+    "level": lambda x, y: np.ones_like(x),
+    "index": lambda x, y: np.log(x),
+    "curvature": lambda x, y: np.log(x) ** 2,
+    "absorption": lambda x, y: -(y**FREE_FREE_SLOPE),
+}
+# band limit of the grid: this many times that of the exponents, and at least so much: what the grid
+# does not resolve of a template folds back into the map, at 96 by 5 % of it in the plane
+GRID, LEAST_GRID = 3, 192
+
+
+def check_fields(names: tuple[str, ...], n_channels: int) -> None:
+    """Refuse fields that so many channels cannot tell apart.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Keys of ``FIELDS``.
+    n_channels : int
+
+    Raises
+    ------
+    InputError
+        For unknown names, and for fewer channels than fields.
+    """
+    for name in names:
+        if name not in FIELDS:
+            raise InputError(f"unknown field '{name}'; {nearest(name, FIELDS)}")
+    if not names or n_channels < len(names):
+        raise InputError(
+            f"{len(names)} fields of the logarithm need at least as many channels, got {n_channels}"
+        )
+
+
+class PositiveSkies(Described, eqx.Module):
+    """Skies of all channels as functions of their exponents; see the module's equations.
+
+    Attributes
+    ----------
+    frequencies_mhz : (channels,) array
+    mixing : (channels, fields) array
+        What the fields are multiplied with in the logarithm.
+    grid : SphereGrid
+        Where products are taken; its lmax is that of the exponents.
+    levels : (channels, rings, phi) array
+        T_f on the grid, in K.
+    weight : (rings, phi) array
+        w on the grid.
+    sources : (channels, sources, modes) array
+        F_fj y(n_j) of point sources that may be there besides, in K.
+    lmax : int
+        Of the maps.
+    names : tuple of str
+        Of the fields.
+    """
+
+    frequencies_mhz: Float[np.ndarray, " channels"]
+    mixing: Float[np.ndarray, "channels fields"]
+    grid: SphereGrid
+    levels: Float[np.ndarray, "channels rings phi"]
+    weight: Float[np.ndarray, "rings phi"]
+    sources: Float[np.ndarray, "channels sources modes"]
+    lmax: int = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls,
+        frequencies_mhz: Float[np.ndarray, " channels"],
+        templates: Sequence[Template],
+        lmax: int,
+        names: tuple[str, ...] = tuple(FIELDS),
+        *,
+        reference_mhz: float = 20.0,
+        turnover_mhz: float = 5.0,
+        sources: Float[np.ndarray, "channels sources modes"] | None = None,
+        weight: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+        lmax_fields: int | None = None,
+        band: int | None = None,
+    ) -> PositiveSkies:
+        """Make them of a template for every frequency.
+
+        Parameters
+        ----------
+        frequencies_mhz : (channels,) array
+            Frequencies in MHz.
+        templates : sequence of Template
+            T_f, in the same order.
+        lmax : int
+            Of the maps.
+        names : tuple of str
+            Keys of ``FIELDS``.
+        reference_mhz, turnover_mhz : float
+            nu_ref and nu_turnover.
+        sources : (channels, sources, modes) array, optional
+            Of point sources, in K.
+        weight : callable, optional
+            w of theta and phi, Galactic, in radians; by default one.
+        lmax_fields : int, optional
+            Highest ell of the exponents; by default ``lmax``.
+        band : int, optional
+            Band limit of the grid; by default 192, or three times that of the exponents.
+
+        Raises
+        ------
+        InputError
+            For unknown names, fewer channels than fields, another number of templates than of
+            frequencies, and templates or weights that are not positive everywhere.
+        """
+        frequencies = np.asarray(frequencies_mhz, dtype=np.float64)
+        check_fields(names, len(frequencies))
+        if len(templates) != len(frequencies):
+            raise InputError(
+                f"there are {len(templates)} templates for {len(frequencies)} frequencies; give "
+                "one for each"
+            )
+        highest = lmax if lmax_fields is None else lmax_fields
+        if highest < lmax:
+            raise InputError(
+                f"the lmax of the fields is {highest}, that of the maps {lmax}; give the fields as "
+                "many modes at least"
+            )
+        grid = SphereGrid.of(highest, max(GRID * highest, LEAST_GRID) if band is None else band)
+        at = grid.directions()
+        levels = np.stack([template.at(*at).reshape(grid.shape) for template in templates])
+        require_positive("the template", levels, "a sky whose logarithm is modelled has no holes")
+        strength = np.ones(grid.shape) if weight is None else weight(*at).reshape(grid.shape)
+        require_positive("the weight of the fields", strength)
+        if sources is None:
+            sources = np.zeros((len(frequencies), 0, n_modes(lmax)))
+        require_shape("the sources", sources, (len(frequencies), None, n_modes(lmax)))
+        x, y = frequencies / reference_mhz, frequencies / turnover_mhz
+        mixing = np.stack([FIELDS[name](x, y) for name in names], axis=1)
+        return cls(frequencies, mixing, grid, levels, strength, sources, lmax, names)
+
+    def coarser(self, lmax: int, lmax_fields: int) -> PositiveSkies:
+        """Make the same of maps and fields with fewer modes.
+
+        Parameters
+        ----------
+        lmax, lmax_fields : int
+            Highest ell of the maps, and of the exponents.
+        """
+        return PositiveSkies(
+            self.frequencies_mhz,
+            self.mixing,
+            SphereGrid.of(lmax_fields, len(self.grid.theta) - 1),
+            self.levels,
+            self.weight,
+            self.sources[:, :, : n_modes(lmax)],
+            lmax,
+            self.names,
+        )
+
+    def description(self) -> tuple[str, ...]:
+        return (
+            f"{len(self.levels)} channels, {extent(self.frequencies_mhz, 'MHz')}, "
+            f"lmax = {self.lmax}",
+            f"templates times the exponential of {len(self.names)} fields ({listed(self.names)}) "
+            "and of a residual in each",
+        )
+
+    @property
+    def n_fields(self) -> int:
+        """Modes of every field."""
+        return n_modes(self.grid.lmax)
+
+    def values(
+        self, channel: int, exponent: Float[np.ndarray, "*batch columns"]
+    ) -> Float[np.ndarray, "*batch rings phi"]:
+        """Compute T_f exp(w phi) on the grid, in K: positive; too large a phi makes it infinite.
+
+        Parameters
+        ----------
+        channel : int
+        exponent : (..., modes) array
+            phi.
+        """
+        with np.errstate(over="ignore"):
+            return self.levels[channel] * np.exp(self.weight * self.grid.synthesise(exponent))
+
+    def modes(
+        self, channel: int, exponent: Float[np.ndarray, "*batch columns"]
+    ) -> Float[np.ndarray, "*batch modes"]:
+        """Compute the sky without point sources: real packed coefficients, Galactic, in K.
+
+        Parameters
+        ----------
+        channel : int
+        exponent : (..., modes) array
+            phi.
+        """
+        with np.errstate(invalid="ignore"):
+            return self.grid.analyse(self.values(channel, exponent))[..., : n_modes(self.lmax)]
+
+    def jacobian(
+        self, channel: int, exponent: Float[np.ndarray, " columns"]
+    ) -> Float[np.ndarray, "modes columns"]:
+        """Compute W, in K.
+
+        Parameters
+        ----------
+        channel : int
+        exponent : (modes,) array
+            phi.
+        """
+        field = self.weight * self.values(channel, exponent)
+        return self.grid.product_matrix(field, self.lmax)

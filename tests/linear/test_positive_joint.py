@@ -1,0 +1,246 @@
+"""Positive joint skies: mode and Gaussian against scipy and one big model of all channels."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.joint_skies import paired
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.positive_joint import ChannelsInMemory, find_mode, linearised
+from lusee_bayes.linear.positive_skies import positive_sky
+from lusee_bayes.noise.covariance import DiagonalCovariance
+from lusee_bayes.sky.field_laws import FieldLaws
+from lusee_bayes.sky.positive_skies import PositiveSkies
+from lusee_bayes.sky.priors import HarmonicPrior
+from lusee_bayes.sky.template import Template
+
+LMAX = 3
+N = n_modes(LMAX)
+FREQUENCIES = np.array([5.0, 9.0, 16.0, 30.0])
+
+
+@dataclass(frozen=True)
+class Band(Template):
+    """A bright band along the equator, so smooth that grids hold it."""
+
+    frequency_mhz: float
+
+    def at(self, theta, phi):
+        scale = 100.0 * (self.frequency_mhz / 20.0) ** -2.5
+        return scale * np.exp(-1.5 * np.cos(theta) ** 2 + 0.4 * np.sin(theta) * np.cos(phi))
+
+
+def weight(theta, phi):
+    return 0.6 + 0.3 * np.sin(theta) ** 2 + 0.1 * np.sin(theta) * np.sin(phi)
+
+
+def skies_of(frequencies, names, n_sources=0):
+    points = synthesis_matrix(np.array([0.4, 1.9]), np.array([2.0, 4.0]), LMAX)[:n_sources]
+    sources = np.stack([20.0 * (f / 20.0) ** -2.5 * points for f in frequencies])
+    templates = [Band(f) for f in frequencies]
+    return PositiveSkies.of(
+        frequencies, templates, LMAX, names, sources=sources, weight=weight, band=24
+    )
+
+
+def quadrature():
+    """Harmonics and weights on a grid of this file's own, far finer than the maps."""
+    x, weights = np.polynomial.legendre.leggauss(40)
+    phi = 2.0 * np.pi * np.arange(80) / 80
+    theta, azimuth = np.repeat(np.arccos(x), 80), np.tile(phi, 40)
+    return (
+        theta,
+        azimuth,
+        synthesis_matrix(theta, azimuth, LMAX),
+        np.repeat(weights, 80) * np.pi / 40,
+    )
+
+
+def observed(skies, laws, seed=0, noise=0.05, n_data=40):
+    """Skies drawn from the prior, seen by random couplings."""
+    rng = np.random.default_rng(seed)
+    exponents = np.asarray(laws.prior(skies).sample(jax.random.key(seed)))
+    found = []
+    for k, exponent in enumerate(exponents):
+        sky = (
+            skies.modes(k, exponent)
+            + rng.exponential(size=skies.sources.shape[1]) @ (skies.sources[k])
+        )
+        a = rng.standard_normal((n_data + 2 * k, N))
+        sigma = noise * np.sqrt((a @ sky) ** 2).mean() * rng.uniform(0.5, 2.0, len(a))
+        d = a @ sky + sigma * rng.standard_normal(len(a))
+        wide = HarmonicPrior(jnp.asarray(np.full(LMAX + 1, (sky**2).max())))
+        model = LinearGaussian(jnp.asarray(a), wide, DiagonalCovariance(jnp.asarray(sigma**2)))
+        found.append((a, sigma, d, model.inform(jnp.asarray(d))[0]))
+    return found
+
+
+def rough(skies, level=0.3):
+    """Laws of fields that are as strong as the templates, so that nothing is linear."""
+    laws = FieldLaws.of(skies)
+    parameters = laws.parameters.copy()
+    parameters[:, 0] = np.log(
+        level * np.where(np.arange(len(parameters)) < len(laws.means), 1, 0.3)
+    )
+    parameters[:, 1] = -1.0
+    return laws.with_parameters(parameters)
+
+
+def test_the_mode_of_one_channel_is_that_of_a_direct_minimisation():
+    skies = skies_of(FREQUENCIES[2:3], ("level",))
+    laws = rough(skies)
+    prior = laws.prior(skies)
+    ((a, sigma, d, information),) = observed(skies, laws)
+    theta, phi, y, weights = quadrature()
+    template = Band(16.0).at(theta, phi)
+    root, rest = np.asarray(prior.roots)[0], np.asarray(prior.residual_root(0))
+
+    def residuals(white):
+        field = y @ (root * white[:N] + rest * white[N:])
+        sky = y.T @ (weights * template * np.exp(weight(theta, phi) * field))
+        return np.concatenate([(d - a @ sky) / sigma, white])
+
+    direct = optimize.least_squares(residuals, np.zeros(2 * N), xtol=1e-15, ftol=1e-15, gtol=1e-12)
+    mode = find_mode(skies, laws, ChannelsInMemory((information,)))
+    # what a last step of 0.1 sigma at most leaves: the curvature's own error times that step
+    np.testing.assert_allclose(mode.energy, 2.0 * direct.cost, atol=0.1**2)
+    np.testing.assert_allclose(mode.fields[0] / root, direct.x[:N], atol=0.02)
+    assert mode.rounds > 1  # the sky is not linear in its logarithm
+
+
+@pytest.fixture(scope="module")
+def case():
+    """Four channels with sources, their mode, and one big linear model about it."""
+    skies = skies_of(FREQUENCIES, ("level", "index", "absorption"), n_sources=2)
+    laws = rough(skies, 0.1)
+    seen = observed(skies, laws, seed=3)
+    channels = ChannelsInMemory(tuple(s[-1] for s in seen))
+    return skies, laws, seen, find_mode(skies, laws, channels)
+
+
+def test_the_gaussian_is_that_of_one_big_model(case):
+    """All channels stacked: unknowns are fields, residuals and the sources' fluxes."""
+    skies, _, seen, mode = case
+    prior, fields = mode.prior, len(skies.names)
+    theta, phi, y, weights = quadrature()
+    n_sources = skies.sources.shape[1]
+    size = fields * N + len(seen) * (N + n_sources)
+    to_skies, constants, wide = [], [], np.ones(size)
+    wide[: fields * N] = np.asarray(prior.roots).ravel()
+    strength = weight(theta, phi)
+    for k in range(len(seen)):
+        level = Band(FREQUENCIES[k]).at(theta, phi) * np.exp(strength * (y @ mode.exponents[k]))
+        slope = y.T @ ((weights * strength * level)[:, None] * y)
+        matrix = np.zeros((N, size))
+        for c in range(fields):
+            matrix[:, c * N : (c + 1) * N] = prior.mixing[k, c] * slope
+        at = fields * N + k * (N + n_sources)
+        matrix[:, at : at + N] = slope
+        matrix[:, at + N : at + N + n_sources] = skies.sources[k].T
+        wide[at : at + N] = np.asarray(prior.residual_root(k))
+        to_skies.append(matrix)
+        constants.append(
+            y.T @ (weights * level) - slope @ mode.exponents[k] + skies.sources[k].sum(0)
+        )
+    a = np.concatenate([s[0] @ t for s, t in zip(seen, to_skies, strict=True)])
+    offset = np.concatenate([s[0] @ c for s, c in zip(seen, constants, strict=True)])
+    d, sigma = (np.concatenate([s[k] for s in seen]) for k in (2, 1))
+    white = (a * wide) / sigma[:, None]
+    inverse = np.linalg.inv(np.eye(size) + white.T @ white)
+    mean = wide * (inverse @ (white.T @ ((d - offset) / sigma)))
+    covariance = inverse * wide[:, None] * wide[None]
+
+    evidence = stats.multivariate_normal(offset, (a * wide**2) @ a.T + np.diag(sigma**2)).logpdf(d)
+    np.testing.assert_allclose(mode.posterior.log_evidence, evidence, rtol=1e-9)
+    std = np.sqrt(np.diagonal(covariance))[: fields * N]
+    far = (mode.fields.ravel() - mean[: fields * N]) / std
+    assert np.abs(far).max() < 1e-6
+    spread = paired(mode.posterior.covariance(), prior)
+    none = np.zeros((0, fields, N))
+    for k, (s, t) in enumerate(zip(seen, to_skies, strict=True)):
+        sky = positive_sky(mode, k, s[-1], spread, none, jax.random.key(0))
+        expected = t @ covariance @ t.T
+        width = np.sqrt(np.diagonal(expected))
+        np.testing.assert_allclose(
+            sky.covariance / np.outer(width, width), expected / np.outer(width, width), atol=1e-6
+        )
+        # the exponential of the last step is linear but for its square
+        assert np.abs((sky.mean - constants[k] - t @ mean) / width).max() < 0.02
+
+
+def test_draws_scatter_as_the_covariance_says_and_are_positive(case):
+    skies, _, seen, mode = case
+    n = 3000
+    draws = np.asarray(mode.posterior.sample(jax.random.key(1), n)).reshape(n, -1, N)
+    spread = paired(mode.posterior.covariance(), mode.prior)
+    sky = positive_sky(mode, 0, seen[0][-1], spread, draws, jax.random.key(2))
+    width = np.sqrt(np.diagonal(sky.covariance))
+    # standard deviations of 3000 draws scatter by 1.3 %, the exponential adds some percent
+    np.testing.assert_allclose(sky.draws.std(0) / width, 1.0, atol=0.15)
+    assert (skies.values(0, mode.exponents[0]) > 0).all()
+
+
+def test_far_templates_are_reached_in_shorter_steps():
+    """Data of a sky twenty times the template: the first full step would overshoot by far."""
+    skies = skies_of(FREQUENCIES[:1], ("level",))
+    laws = rough(skies)
+    a, sigma, d, _ = observed(skies, laws)[0]
+    wide = HarmonicPrior(jnp.asarray(np.full(LMAX + 1, 1e12)))
+    model = LinearGaussian(jnp.asarray(a), wide, DiagonalCovariance(jnp.asarray(sigma**2)))
+    information = model.inform(jnp.asarray(20.0 * d))[0]
+    mode = find_mode(skies, laws, ChannelsInMemory((information,)))
+    assert np.exp(skies.grid.synthesise(mode.exponents[0])).mean() > 10.0
+
+
+@pytest.mark.long
+def test_learned_laws_maximise_the_evidence():
+    skies = skies_of(FREQUENCIES, ("level", "index"))
+    laws = rough(skies, 0.1)
+    channels = ChannelsInMemory(tuple(s[-1] for s in observed(skies, laws, seed=5, n_data=60)))
+    found = find_mode(skies, FieldLaws.of(skies), channels, learn=True).laws
+
+    def evidence(parameters):
+        there = found.with_parameters(parameters)
+        mode = find_mode(skies, there, channels)
+        return float(mode.posterior.log_evidence) + there.log_density()
+
+    step = 0.3
+    for law in range(len(found.parameters)):
+        for which in range(2):
+            moved = [found.parameters.copy() for _ in range(2)]
+            moved[0][law, which] -= step
+            moved[1][law, which] += step
+            low, high = (evidence(p) for p in moved)
+            here = evidence(found.parameters)
+            # the vertex of the parabola lies within half of a standard deviation
+            slope, bend = (high - low) / (2 * step), -(high + low - 2 * here) / step**2
+            assert bend > 0 and abs(slope) < 0.5 * np.sqrt(bend)
+
+
+def test_bad_input_is_refused_in_a_sentence():
+    with pytest.raises(InputError, match="unknown field 'indx'; did you mean 'index'"):
+        skies_of(FREQUENCIES, ("level", "indx"))
+    with pytest.raises(InputError, match="2 fields of the logarithm need at least as many chan"):
+        skies_of(FREQUENCIES[:1], ("level", "index"))
+    with pytest.raises(InputError, match="there are 1 templates for 4 frequencies"):
+        PositiveSkies.of(FREQUENCIES, [Band(5.0)], LMAX)
+    with pytest.raises(InputError, match="the lmax of the fields is 2, that of the maps 3"):
+        PositiveSkies.of(FREQUENCIES, [Band(f) for f in FREQUENCIES], LMAX, lmax_fields=2)
+
+    class Hole(Band):
+        def at(self, theta, phi):
+            return super().at(theta, phi) - 50.0
+
+    with pytest.raises(InputError, match="the template"):
+        PositiveSkies.of(FREQUENCIES, [Hole(f) for f in FREQUENCIES], LMAX)
+    skies = skies_of(FREQUENCIES[:1], ("level",))
+    other = Information(*(np.zeros(s) for s in ((4, 4), 4, 4, (), (), ())))
+    with pytest.raises(InputError, match="the patterns"):
+        linearised(skies, 0, other, np.zeros(N))
