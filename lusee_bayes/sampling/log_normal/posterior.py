@@ -4,6 +4,9 @@ A draw is u(x), x = u* + R z with z ~ N(0, 1) in the coordinates of :mod:`.strai
 the ratio of the posterior's density to that of the Gaussian: all are nearly one where the data
 determine the sky well, and weighted draws are those of the posterior in any case. Draws come in
 pairs z and -z: whatever is odd in z cancels in means, but for the weights.
+
+Where A and the tilt of C_ell are unknowns, too, they are drawn with u, and the weight is that of
+all three.
 """
 
 from __future__ import annotations
@@ -22,7 +25,8 @@ from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.core.representation import Described
 from lusee_bayes.linear.information import Information
 from lusee_bayes.sampling.log_normal.gauss_newton import LogNormalMode
-from lusee_bayes.sampling.log_normal.prior import STRUCTURE
+from lusee_bayes.sampling.log_normal.learning import LearnedSpectrum
+from lusee_bayes.sampling.log_normal.prior import AMPLITUDE, STRUCTURE, TILT, LogNormalPrior
 from lusee_bayes.sampling.log_normal.straight import straight_coordinates
 from lusee_bayes.sampling.whitening import Whitening
 
@@ -37,7 +41,7 @@ class SkyDraws(Described):
     Attributes
     ----------
     white : (draws, unknowns) array
-        u of every draw; the second half are the partners of the first.
+        u of every draw, with the mode's C_ell; the second half are the partners of the first.
     linear : (draws, unknowns) array
         x - u*, what u - u* would be if the posterior were Gaussian.
     skies : (draws, modes) array
@@ -128,15 +132,32 @@ class LogNormalPosterior(Described):
     mode : LogNormalMode
     coordinates : Whitening
         Straight ones, in which it is nearly N(0, 1).
+    unknown : LogNormalPrior or None
+        What is expected of A and the tilt where they are unknowns; None where they are known.
     """
 
     mode: LogNormalMode
     coordinates: Whitening
+    unknown: LogNormalPrior | None = None
 
     @classmethod
     def about(cls, mode: LogNormalMode) -> LogNormalPosterior:
-        """Make it."""
+        """Make that of u, C_ell being known."""
         return cls(mode, straight_coordinates(mode))
+
+    @classmethod
+    def learned(cls, found: LearnedSpectrum, prior: LogNormalPrior) -> LogNormalPosterior:
+        """Make that of u, A and the tilt.
+
+        Parameters
+        ----------
+        found : LearnedSpectrum
+            Where A and the tilt are most probable.
+        prior : LogNormalPrior
+            What was expected of them.
+        """
+        at = float(np.log(found.prior.amplitude)), float(found.prior.tilt)
+        return cls(found.mode, straight_coordinates(found.mode, at, found.covariance), prior)
 
     def description(self) -> tuple[str, ...]:
         chart = self.coordinates.chart
@@ -164,12 +185,15 @@ class LogNormalPosterior(Described):
             raise InputError(
                 f"draws of a log-normal sky come in pairs, got {n}; give an even number"
             )
-        z = jax.random.normal(key, (n // 2, self.mode.sky.size), dtype=jnp.float64)
+        z = jax.random.normal(key, (n // 2, self.coordinates.root.shape[1]), dtype=jnp.float64)
         z = jnp.concatenate([z, -z])
-        white, skies, energies = _draw(self.coordinates, on_device(self.mode.information), z)
+        given = on_device((self.mode.information, self.unknown))
+        white, skies, energies = _draw(self.coordinates, *given, z)
         least = 0.5 * (float(self.mode.information.misfit) + self.mode.white @ self.mode.white)
+        if self.unknown is not None:
+            least -= float(self.unknown.log_density(*np.asarray(self.coordinates.mean[:2])))
         log_weights = 0.5 * (np.asarray(z) ** 2).sum(1) - (np.asarray(energies) - least)
-        linear = np.asarray(z) @ np.asarray(self.coordinates.root).T
+        linear = np.asarray(z) @ np.asarray(self.coordinates.root[-self.mode.sky.size :]).T
         return SkyDraws(np.asarray(white), linear, np.asarray(skies), log_weights)
 
     def covariance(self) -> Float[np.ndarray, "modes modes"]:
@@ -199,14 +223,23 @@ class LogNormalPosterior(Described):
 
 @eqx.filter_jit
 def _draw(
-    coordinates: Whitening, information: Information, z: Float[Array, "draws unknowns"]
+    coordinates: Whitening,
+    information: Information,
+    unknown: LogNormalPrior | None,
+    z: Float[Array, "draws unknowns"],
 ) -> tuple[Array, Array, Array]:
-    """u, m, and minus the log density of z, without constants."""
+    """u with the mode's C_ell, m, and minus the log density of z, without constants."""
 
     def one(z):
         values, log_det = coordinates.to_values(coordinates.mean + coordinates.root @ z)
-        white = values[STRUCTURE]
-        sky = coordinates.chart.sky.modes(white)
-        return white, sky, 0.5 * (information.chi2(sky) + white @ white) - log_det
+        white, reference = values[STRUCTURE], coordinates.chart.sky
+        energy = 0.5 * white @ white - log_det
+        if unknown is not None:
+            power_law = values[AMPLITUDE], values[TILT]
+            sky = reference.with_power_law(jnp.exp(power_law[0]), power_law[1])
+            energy = energy - unknown.log_density(*power_law)
+            white = white * sky.root() / reference.root()
+        modes = reference.modes(white)
+        return white, modes, energy + 0.5 * information.chi2(modes)
 
     return jax.lax.map(one, z, batch_size=BATCH)
