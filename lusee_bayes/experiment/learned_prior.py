@@ -83,7 +83,11 @@ def learned_prior(
 
 
 def evidence_by_sampling(
-    family: PriorFamily | LogNormalPrior, information: Information, learned: Learned, n: int, seed: int
+    family: PriorFamily | LogNormalPrior,
+    information: Information,
+    learned: Learned,
+    n: int,
+    seed: int,
 ) -> LogMean:
     """Estimate ln p(d) with a family's parameters integrated out by importance sampling.
 

@@ -152,7 +152,7 @@ def whitened(program: Callable, whitening: Whitening) -> Callable:
 
 @dataclass(frozen=True)
 class _Given:
-    """A numpyro Reparam of a site to a given unconstrained value: a deterministic one and its density.
+    """What makes a site with a given unconstrained value a deterministic one and its density.
 
     ``log_det``: of coordinates that the value was made of, added to the density.
     """

@@ -4,8 +4,10 @@ With the white unknowns u of :class:`.LogNormalSky` and the information of the d
 
     E(u) = chi^2(m(u)) / 2 + |u|^2 / 2,    H = J^T M J + 1,    J = dm/du,
 
-a step is -H^-1 grad E, halved until it leads downwards. H leaves out the second derivative of m,
-which the residuals multiply: 0.1 in ln evidence at the fiducial size.
+a step is -(H + damping)^-1 grad E, halved until it leads downwards. H leaves out the second
+derivative of m, which the residuals multiply: 0.1 in ln evidence at the fiducial size. Where steps
+are too long for that, as for sources of which there is less than catalogued, they are damped: what
+the data know is not, so that they stay where chi^2 is low.
 """
 
 from __future__ import annotations
@@ -27,6 +29,9 @@ SETTLED = 1e-3
 # a step of less than one standard deviation is taken as it is: what it gains may be rounding
 SHORT = 1.0
 MAX_STEPS, HALVINGS = 50, 20
+# factor by which steps are damped more, after a poor one, or less, after a good one; what a step
+# gains is told from rounding if it is so long
+DAMPING, POOR, GOOD, ROUNDING = 4.0, 0.25, 0.75, 0.01
 
 
 class LogNormalMode(Described, eqx.Module):
@@ -103,10 +108,11 @@ def find_mode(
     require_shape("the information", information.matrix, (sky.n_modes, sky.n_modes))
     white = np.zeros(sky.size) if start is None else np.array(start, dtype=np.float64)
     require_shape("the start", white, (sky.size,))
-    here, moved = information.recentred(sky.modes(white)), np.inf
+    here, moved, damping = information.recentred(sky.modes(white)), np.inf, 0.0
     for steps in range(MAX_STEPS + 1):
         jacobian = sky.jacobian(white)
-        lower = checked_cholesky("the curvature of the posterior", _curvature(here, jacobian))
+        curvature = _curvature(here, jacobian)
+        lower = checked_cholesky("the curvature of the posterior", curvature)
         slope = white - jacobian.T @ here.vector
         half = solve_lower(lower, slope[:, None], transpose=False)
         moved = float(np.linalg.norm(half))
@@ -120,8 +126,13 @@ def find_mode(
             )
             evidence, moved = np.asarray(log_evidence), np.asarray(moved)
             return LogNormalMode(sky, here, white, jacobian, lower, evidence, moved, steps)
-        step = solve_lower(lower, half, transpose=True)[:, 0]
+        if damping:
+            damped = curvature + damping * np.eye(sky.size)
+            lower = checked_cholesky("the damped curvature", damped)
+            half = solve_lower(lower, slope[:, None], transpose=False)
+        step, energy = solve_lower(lower, half, transpose=True)[:, 0], _energy(here, white)
         white, here = _descended(sky, information, here, white, step, moved < SHORT)
+        damping = _damping(damping, (energy - _energy(here, white)) / moved**2, moved)
     raise InputError(
         f"no mode of the log-normal sky was found in {MAX_STEPS} steps (the last moved by "
         f"{moved:.2g} standard deviations); the data are far from anything that the template "
@@ -137,6 +148,20 @@ def _curvature(
     return curvature
 
 
+def _damping(damping: float, gained: float, moved: float) -> float:
+    """The next step's, after one that gained this part of what H promises of an undamped one."""
+    if moved < ROUNDING or POOR <= gained <= GOOD:
+        return damping
+    if gained < POOR:
+        return max(DAMPING * damping, 1.0)
+    return damping / DAMPING if damping > 1.0 else 0.0
+
+
+def _energy(information: Information, white: Float[np.ndarray, " unknowns"]) -> float:
+    """2 E, at the sky that the information is about."""
+    return float(information.misfit) + float(white @ white)
+
+
 def _descended(
     sky: LogNormalSky,
     information: Information,
@@ -146,13 +171,13 @@ def _descended(
     short: bool,
 ) -> tuple[Float[np.ndarray, " unknowns"], Information]:
     """The unknowns behind a step, and the information about their sky."""
-    energy = float(here.misfit) + white @ white
+    energy = _energy(here, white)
     for _ in range(HALVINGS):
         trial = white - step
         # far from the mode the sky may leave the range of numbers, which no energy is below
         with np.errstate(over="ignore", invalid="ignore"):
             there = information.recentred(sky.modes(trial))
-            if short or float(there.misfit) + trial @ trial < energy:
+            if short or _energy(there, trial) < energy:
                 return trial, there
         step = 0.5 * step
     return white, here

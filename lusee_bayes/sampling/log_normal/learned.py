@@ -26,6 +26,8 @@ from lusee_bayes.sampling.log_normal.learning import learn_spectrum
 from lusee_bayes.sampling.log_normal.posterior import LogNormalPosterior, SkyDraws
 from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
 
+# share of weighted draws below which there is doubt
+FEW = 1.0 / 16.0
 # weighted draws made for every one of equal weight, at first and at most
 EXTRA, MOST = 4, 32
 # weighted draws that tell by how much standard deviations differ from those to first order
@@ -59,12 +61,8 @@ class LearnedLogNormal(Learned):
         ----------
         key : PRNG key
         n : int
-            How many.
-
-        Raises
-        ------
-        InputError
-            If 32 n draws are worth fewer than n: the posterior is far from round.
+            How many. If 32 n weighted draws are worth fewer, some come more than once
+            (:meth:`doubts`).
         """
         sky, of_draws, of_choice = self.posterior.mode.sky, *jax.random.split(key)
         if not n:
@@ -75,8 +73,8 @@ class LearnedLogNormal(Learned):
             extra *= 2
             draws = self.posterior.sample(of_draws, extra * n)
         both = np.concatenate([draws.skies, draws.white], axis=1)
-        chosen = draws.resampled(both, of_choice, n)
-        return Drawn(*np.split(chosen, [sky.n_modes], axis=1))
+        chosen = draws.resampled(both, of_choice, min(n, int(draws.effective)))
+        return Drawn(*np.split(chosen[np.arange(n) % len(chosen)], [sky.n_modes], axis=1))
 
     def pixels(self, drawn: Drawn, nside: int) -> Float[np.ndarray, "draws pixels"]:
         """Compute drawn skies at the centres of HEALPix RING pixels: positive, in K."""
@@ -114,6 +112,17 @@ class LearnedLogNormal(Learned):
             np.stack([modes_to_map(sky, nside) for sky in skies]) for skies in (draws.skies, linear)
         )
         return first_order * np.sqrt(draws.variance(maps) / known.var(0))
+
+    def doubts(self) -> tuple[str, ...]:
+        """Say where too few of the weighted draws count."""
+        effective = self._widths.effective
+        if effective > FEW * WIDTHS:
+            return ()
+        return (
+            f"of {WIDTHS} draws of the log-normal sky {effective:.0f} count, so that its standard "
+            f"deviations are good to {1.0 / np.sqrt(2.0 * effective):.0%}; lusee-bayes sample draws "
+            "from the posterior by Hamiltonian Monte Carlo",
+        )
 
     def sampled_evidence(self, n: int, seed: int) -> LogMean:
         """Estimate ln p(d) with the sky, A and the tilt integrated out by importance sampling.

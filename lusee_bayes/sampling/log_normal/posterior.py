@@ -32,6 +32,8 @@ from lusee_bayes.sampling.whitening import Whitening
 
 # draws made at once: more take more memory, and no less time
 BATCH = 8
+# draws made by one call of the compiled program, which is the same for any number of them
+CALL = 200
 
 
 @dataclass(frozen=True, repr=False)
@@ -188,13 +190,17 @@ class LogNormalPosterior(Described):
         z = jax.random.normal(key, (n // 2, self.coordinates.root.shape[1]), dtype=jnp.float64)
         z = jnp.concatenate([z, -z])
         given = on_device((self.mode.information, self.unknown))
-        white, skies, energies = _draw(self.coordinates, *given, z)
+        full = jnp.concatenate([z, jnp.zeros((-n % CALL, z.shape[1]))])
+        calls = [
+            _draw(self.coordinates, *given, part) for part in jnp.split(full, len(full) // CALL)
+        ]
+        white, skies, energies = (np.concatenate(rows)[:n] for rows in zip(*calls, strict=True))
         least = 0.5 * (float(self.mode.information.misfit) + self.mode.white @ self.mode.white)
         if self.unknown is not None:
             least -= float(self.unknown.log_density(*np.asarray(self.coordinates.mean[:2])))
-        log_weights = 0.5 * (np.asarray(z) ** 2).sum(1) - (np.asarray(energies) - least)
+        log_weights = 0.5 * (np.asarray(z) ** 2).sum(1) - (energies - least)
         linear = np.asarray(z) @ np.asarray(self.coordinates.root[-self.mode.sky.size :]).T
-        return SkyDraws(np.asarray(white), linear, np.asarray(skies), log_weights)
+        return SkyDraws(white, linear, skies, log_weights)
 
     def covariance(self) -> Float[np.ndarray, "modes modes"]:
         """Compute that of the sky to first order about the mode, J H^-1 J^T, in K^2."""
