@@ -232,16 +232,16 @@ def channel_of_posterior(
     inference : Inference
         The posterior, and the model of the data.
     covariance : (modes, modes) array
-        Of the posterior, in K^2.
+        In K^2.
     n_draws : int
         How many draws of the posterior to keep.
     judged : Inference, optional
         The model that predicts the data and its posterior, where earlier data were there.
     """
     scenario, data, posterior = experiment.scenario, experiment.data, inference.posterior
-    judged = inference if judged is None else judged
+    judged, found = inference if judged is None else judged, ()
     prior_variance = np.asarray(inference.model.prior.variance())
-    (std, width), found = widths(experiment, covariance, scenario.map_nside), ()
+    std, width = widths(experiment, covariance, scenario.map_nside)
     fraction = np.divide(std**2, prior_variance, out=np.zeros(len(std)), where=prior_variance > 0)
     mean, truth = np.asarray(posterior.mean), _array(data.truth)
     if truth is not None:
@@ -303,18 +303,17 @@ def channel_of_information(
     compared : (more, modes) array, optional
         Draws less mean for :class:`.Counts`, where the truth is known, in K.
     known_widths : (modes,) and (pixels,) array, optional
-        Standard deviations, where the covariance does not tell them, in K.
+        Standard deviations other than the covariance's, in K.
     independent, log_evidence, information_bits, chi2_model, refinement
         See :class:`ChannelResult`.
     """
     expected = np.nan
     if covariance is None:
         spread = np.asarray(draws) - np.asarray(mean)
-        std = np.sqrt((spread**2).mean(0))
         covariance = spread.T @ spread / len(spread)
     else:
-        std = np.sqrt(np.diagonal(np.asarray(covariance)))
         expected = float(information.n_data - np.vdot(information.matrix, covariance))
+    std = np.sqrt(np.diagonal(np.asarray(covariance)))
     width, found = pixel_std(covariance, round(np.sqrt(observed.highest_altitude.size / 12))), ()
     if known_widths is not None:
         std, width = known_widths

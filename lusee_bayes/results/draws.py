@@ -57,7 +57,7 @@ def posterior_draws(
 def pixel_draws(
     experiment: Experiment, posterior: Posterior, n: int, nside: int
 ) -> Float[np.ndarray, "draws pixels"]:
-    """Draw the sky at the centres of HEALPix RING pixels, in K: the first draws of a map.
+    """Draw the sky at the centres of HEALPix RING pixels, in K.
 
     Under a log-normal prior these are the positive skies themselves, not their coefficients' maps.
     """

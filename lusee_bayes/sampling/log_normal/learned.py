@@ -26,14 +26,14 @@ from lusee_bayes.sampling.log_normal.learning import learn_spectrum
 from lusee_bayes.sampling.log_normal.posterior import LogNormalPosterior, SkyDraws
 from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
 
-# share of weighted draws below which there is doubt
-FEW = 1.0 / 16.0
-# weighted draws made for every one of equal weight, at first and at most
-EXTRA, MOST = 4, 32
-# weighted draws that tell by how much standard deviations differ from those to first order
-WIDTHS = 600
-# what the seed is folded with for them
-OF_WIDTHS = 9
+# weighted draws made at a time; so many tell standard deviations
+PART = 600
+# those of equal weight are worth so many times their number: else the heaviest come too rarely
+SPARE = 2
+# weighted draws at most for every one of equal weight
+MOST = 16
+# what the seed is folded with for weighted draws
+WEIGHTED = 9
 
 
 @dataclass(frozen=True)
@@ -61,19 +61,15 @@ class LearnedLogNormal(Learned):
         ----------
         key : PRNG key
         n : int
-            How many. If 32 n weighted draws are worth fewer, some come more than once
+            How many. If 16 n weighted draws are worth fewer, some come more than once
             (:meth:`doubts`).
         """
-        sky, of_draws, of_choice = self.posterior.mode.sky, *jax.random.split(key)
+        sky = self.posterior.mode.sky
         if not n:
             return Drawn(np.empty((0, sky.n_modes)), np.empty((0, sky.size)))
-        extra = EXTRA
-        draws = self.posterior.sample(of_draws, extra * n)
-        while draws.effective < n and extra < MOST:
-            extra *= 2
-            draws = self.posterior.sample(of_draws, extra * n)
+        draws = self._worth(n)
         both = np.concatenate([draws.skies, draws.white], axis=1)
-        chosen = draws.resampled(both, of_choice, min(n, int(draws.effective)))
+        chosen = draws.resampled(both, key, min(n, int(draws.effective)))
         return Drawn(*np.split(chosen[np.arange(n) % len(chosen)], [sky.n_modes], axis=1))
 
     def pixels(self, drawn: Drawn, nside: int) -> Float[np.ndarray, "draws pixels"]:
@@ -81,13 +77,23 @@ class LearnedLogNormal(Learned):
         return self.posterior.mode.sky.pixels(drawn.white, nside)
 
     @cached_property
-    def _widths(self) -> SkyDraws:
-        key = jax.random.fold_in(jax.random.key(self.seed), OF_WIDTHS)
-        return self.posterior.sample(key, WIDTHS)
+    def _parts(self) -> list[SkyDraws]:
+        return []
+
+    def _worth(self, n: int) -> SkyDraws:
+        """Weighted draws, made once, that are worth a few times n; else 16 n or more of them."""
+        key, number = jax.random.fold_in(jax.random.key(self.seed), WEIGHTED), 1
+        while True:
+            if len(self._parts) < number:
+                self._parts.append(self.posterior.sample(jax.random.fold_in(key, number), PART))
+            draws = SkyDraws.joined(self._parts[:number])
+            if draws.effective >= SPARE * n or number * PART >= MOST * n:
+                return draws
+            number += 1
 
     def std(self) -> Float[np.ndarray, " modes"]:
         """Compute the standard deviation of the sky's coefficients, in K."""
-        return self.posterior.std(self._widths)
+        return self.posterior.std(self._worth(1))
 
     def pixel_std(
         self, first_order: Float[np.ndarray, " pixels"], nside: int
@@ -106,7 +112,7 @@ class LearnedLogNormal(Learned):
         (pixels,) array
             In K.
         """
-        draws = self._widths
+        draws = self._worth(1)
         linear = draws.linear @ self.posterior.mode.jacobian.T
         maps, known = (
             np.stack([modes_to_map(sky, nside) for sky in skies]) for skies in (draws.skies, linear)
@@ -115,13 +121,12 @@ class LearnedLogNormal(Learned):
 
     def doubts(self) -> tuple[str, ...]:
         """Say where too few of the weighted draws count."""
-        effective = self._widths.effective
-        if effective > FEW * WIDTHS:
+        draws = self._worth(1)
+        if draws.effective * MOST > len(draws.white):
             return ()
         return (
-            f"of {WIDTHS} draws of the log-normal sky {effective:.0f} count, so that its standard "
-            f"deviations are good to {1.0 / np.sqrt(2.0 * effective):.0%}; lusee-bayes sample draws "
-            "from the posterior by Hamiltonian Monte Carlo",
+            f"of {len(draws.white)} draws of the log-normal sky {draws.effective:.0f} count: its "
+            "standard deviations and draws are rough; lusee-bayes sample has better ones",
         )
 
     def sampled_evidence(self, n: int, seed: int) -> LogMean:

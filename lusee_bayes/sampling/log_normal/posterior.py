@@ -11,6 +11,7 @@ all three.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -51,12 +52,15 @@ class SkyDraws(Described):
     log_weights : (draws,) array
         ln of the posterior's density over that which draws were made with, up to the evidence that
         Laplace's formula gives.
+    parameters : (draws, parameters) array
+        ln A and the tilt, where they are unknowns.
     """
 
     white: Float[np.ndarray, "draws unknowns"]
     linear: Float[np.ndarray, "draws unknowns"]
     skies: Float[np.ndarray, "draws modes"]
     log_weights: Float[np.ndarray, " draws"]
+    parameters: Float[np.ndarray, "draws parameters"]
 
     def description(self) -> tuple[str, ...]:
         return (
@@ -65,6 +69,16 @@ class SkyDraws(Described):
             f"ln evidence over that of Laplace: {self.evidence_gain:.3f} +- "
             f"{self.evidence_error:.3f}",
         )
+
+    @classmethod
+    def joined(cls, parts: Sequence[SkyDraws]) -> SkyDraws:
+        """Put draws of one posterior together."""
+
+        def of(name: str) -> Float[np.ndarray, "draws *n"]:
+            halves = [np.array_split(getattr(part, name), 2) for part in parts]
+            return np.concatenate([half for side in zip(*halves, strict=True) for half in side])
+
+        return cls(of("white"), of("linear"), of("skies"), of("log_weights"), of("parameters"))
 
     @property
     def weights(self) -> Float[np.ndarray, " draws"]:
@@ -199,8 +213,10 @@ class LogNormalPosterior(Described):
         if self.unknown is not None:
             least -= float(self.unknown.log_density(*np.asarray(self.coordinates.mean[:2])))
         log_weights = 0.5 * (np.asarray(z) ** 2).sum(1) - (energies - least)
-        linear = np.asarray(z) @ np.asarray(self.coordinates.root[-self.mode.sky.size :]).T
-        return SkyDraws(white, linear, skies, log_weights)
+        moved = np.asarray(z) @ np.asarray(self.coordinates.root).T
+        known = moved.shape[1] - self.mode.sky.size
+        parameters = moved[:, :known] + np.asarray(self.coordinates.mean[:known])
+        return SkyDraws(white, moved[:, known:], skies, log_weights, parameters)
 
     def covariance(self) -> Float[np.ndarray, "modes modes"]:
         """Compute that of the sky to first order about the mode, J H^-1 J^T, in K^2."""
