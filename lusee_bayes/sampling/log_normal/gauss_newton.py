@@ -26,12 +26,15 @@ from lusee_bayes.sky.log_normal import LogNormalSky
 
 # the mode is found when a step is shorter than this, in standard deviations, all unknowns together
 SETTLED = 1e-3
+# ... or than that after so many steps: rounding, where the data know something to 1e-12 of the prior
+ROUGH, PATIENCE = 0.03, 40
 # a step of less than one standard deviation is taken as it is: what it gains may be rounding
 SHORT = 1.0
-MAX_STEPS, HALVINGS = 50, 20
-# factor by which steps are damped more, after a poor one, or less, after a good one; what a step
-# gains is told from rounding if it is so long
-DAMPING, POOR, GOOD, ROUNDING = 4.0, 0.25, 0.75, 0.01
+MAX_STEPS, HALVINGS = 100, 20
+# factor by which steps are damped more, after one that gains less than this part of what H promises,
+# or less, after one that gains more; near the mode not less than what helped before. What a step
+# gains is told from rounding if so much is promised
+DAMPING, POOR, GOOD, ROUNDING = 4.0, 0.25, 0.75, 1e-5
 
 
 class LogNormalMode(Described, eqx.Module):
@@ -102,13 +105,13 @@ def find_mode(
     Raises
     ------
     InputError
-        If the information is of another lmax, or no mode is found in 50 steps.
+        If the information is of another lmax, or no mode is found in 100 steps.
     """
     sky, information = on_host((sky, information))
     require_shape("the information", information.matrix, (sky.n_modes, sky.n_modes))
     white = np.zeros(sky.size) if start is None else np.array(start, dtype=np.float64)
     require_shape("the start", white, (sky.size,))
-    here, moved, damping = information.recentred(sky.modes(white)), np.inf, 0.0
+    here, moved, damping, least = information.recentred(sky.modes(white)), np.inf, 0.0, 0.0
     for steps in range(MAX_STEPS + 1):
         jacobian = sky.jacobian(white)
         curvature = _curvature(here, jacobian)
@@ -116,7 +119,7 @@ def find_mode(
         slope = white - jacobian.T @ here.vector
         half = solve_lower(lower, slope[:, None], transpose=False)
         moved = float(np.linalg.norm(half))
-        if moved < SETTLED:
+        if moved < (SETTLED if steps < PATIENCE else ROUGH):
             log_evidence = -0.5 * (
                 float(here.misfit)
                 + white @ white
@@ -132,7 +135,13 @@ def find_mode(
             half = solve_lower(lower, slope[:, None], transpose=False)
         step, energy = solve_lower(lower, half, transpose=True)[:, 0], _energy(here, white)
         white, here = _descended(sky, information, here, white, step, moved < SHORT)
-        damping = _damping(damping, (energy - _energy(here, white)) / moved**2, moved)
+        promised = float(2.0 * step @ slope - step @ curvature @ step)
+        gained = (energy - _energy(here, white)) / max(promised, ROUNDING)
+        if promised > ROUNDING and gained < POOR:
+            damping = max(DAMPING * damping, 1.0)
+            least = damping if moved < SHORT else least
+        elif promised > ROUNDING and gained > GOOD:
+            damping = max(damping / DAMPING if damping > 1.0 else 0.0, least)
     raise InputError(
         f"no mode of the log-normal sky was found in {MAX_STEPS} steps (the last moved by "
         f"{moved:.2g} standard deviations); the data are far from anything that the template "
@@ -146,15 +155,6 @@ def _curvature(
     curvature = symmetric_product(jacobian.T @ information.matrix, jacobian)
     curvature[np.diag_indices(len(curvature))] += 1.0
     return curvature
-
-
-def _damping(damping: float, gained: float, moved: float) -> float:
-    """The next step's, after one that gained this part of what H promises of an undamped one."""
-    if moved < ROUNDING or POOR <= gained <= GOOD:
-        return damping
-    if gained < POOR:
-        return max(DAMPING * damping, 1.0)
-    return damping / DAMPING if damping > 1.0 else 0.0
 
 
 def _energy(information: Information, white: Float[np.ndarray, " unknowns"]) -> float:

@@ -26,8 +26,10 @@ from lusee_bayes.sampling.log_normal.learning import learn_spectrum
 from lusee_bayes.sampling.log_normal.posterior import LogNormalPosterior, SkyDraws
 from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
 
-# weighted draws made at a time; so many tell standard deviations
+# weighted draws made at a time
 PART = 600
+# draws of equal weight that tell by how much standard deviations differ from those to first order
+WIDTHS = 300
 # those of equal weight are worth so many times their number: else the heaviest come too rarely
 SPARE = 2
 # weighted draws at most for every one of equal weight
@@ -66,11 +68,13 @@ class LearnedLogNormal(Learned):
         """
         sky = self.posterior.mode.sky
         if not n:
-            return Drawn(np.empty((0, sky.n_modes)), np.empty((0, sky.size)))
+            none = np.empty((0, len(self.names)))
+            return Drawn(np.empty((0, sky.n_modes)), np.empty((0, sky.size)), none)
         draws = self._worth(n)
-        both = np.concatenate([draws.skies, draws.white], axis=1)
-        chosen = draws.resampled(both, key, min(n, int(draws.effective)))
-        return Drawn(*np.split(chosen[np.arange(n) % len(chosen)], [sky.n_modes], axis=1))
+        everything = np.concatenate([draws.skies, draws.white, draws.parameters], axis=1)
+        chosen = draws.resampled(everything, key, min(n, int(draws.effective)))
+        chosen = chosen[np.arange(n) % len(chosen)]
+        return Drawn(*np.split(chosen, [sky.n_modes, sky.n_modes + sky.size], axis=1))
 
     def pixels(self, drawn: Drawn, nside: int) -> Float[np.ndarray, "draws pixels"]:
         """Compute drawn skies at the centres of HEALPix RING pixels: positive, in K."""
@@ -93,7 +97,7 @@ class LearnedLogNormal(Learned):
 
     def std(self) -> Float[np.ndarray, " modes"]:
         """Compute the standard deviation of the sky's coefficients, in K."""
-        return self.posterior.std(self._worth(1))
+        return self.posterior.std(self._worth(WIDTHS))
 
     def pixel_std(
         self, first_order: Float[np.ndarray, " pixels"], nside: int
@@ -112,7 +116,7 @@ class LearnedLogNormal(Learned):
         (pixels,) array
             In K.
         """
-        draws = self._worth(1)
+        draws = self._worth(WIDTHS)
         linear = draws.linear @ self.posterior.mode.jacobian.T
         maps, known = (
             np.stack([modes_to_map(sky, nside) for sky in skies]) for skies in (draws.skies, linear)
@@ -121,7 +125,7 @@ class LearnedLogNormal(Learned):
 
     def doubts(self) -> tuple[str, ...]:
         """Say where too few of the weighted draws count."""
-        draws = self._worth(1)
+        draws = self._worth(WIDTHS)
         if draws.effective * MOST > len(draws.white):
             return ()
         return (
@@ -157,10 +161,13 @@ class Drawn:
         Coefficients, in K.
     white : (draws, unknowns) array
         u, with the mode's C_ell.
+    parameters : (draws, parameters) array
+        ln A and the tilt, where they were learned.
     """
 
     skies: Float[np.ndarray, "draws modes"]
     white: Float[np.ndarray, "draws unknowns"]
+    parameters: Float[np.ndarray, "draws parameters"]
 
 
 def learn_log_normal(
