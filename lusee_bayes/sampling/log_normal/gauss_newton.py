@@ -26,14 +26,14 @@ from lusee_bayes.sky.log_normal import LogNormalSky
 
 # the mode is found when a step is shorter than this, in standard deviations, all unknowns together
 SETTLED = 1e-3
-# ... or than that after so many steps: rounding, where the data know something to 1e-12 of the prior
-ROUGH, PATIENCE = 0.03, 40
+# ... or than that after so many steps: where the curvature is far from H, the last ones are slow
+ROUGH, PATIENCE = 0.1, 40
 # a step of less than one standard deviation is taken as it is: what it gains may be rounding
 SHORT = 1.0
 MAX_STEPS, HALVINGS = 100, 20
-# factor by which steps are damped more, after one that gains less than this part of what H promises,
-# or less, after one that gains more; near the mode not less than what helped before. What a step
-# gains is told from rounding if so much is promised
+# factor by which steps are damped more, after one that gains less than this part of what H
+# promises, or less, after one that gains more; near the mode not much less than what helped. What
+# a step gains is told from rounding if so much is promised
 DAMPING, POOR, GOOD, ROUNDING = 4.0, 0.25, 0.75, 1e-5
 
 
@@ -134,14 +134,14 @@ def find_mode(
             lower = checked_cholesky("the damped curvature", damped)
             half = solve_lower(lower, slope[:, None], transpose=False)
         step, energy = solve_lower(lower, half, transpose=True)[:, 0], _energy(here, white)
-        white, here = _descended(sky, information, here, white, step, moved < SHORT)
+        white, here = _descended(sky, here, white, step, moved < SHORT)
         promised = float(2.0 * step @ slope - step @ curvature @ step)
         gained = (energy - _energy(here, white)) / max(promised, ROUNDING)
         if promised > ROUNDING and gained < POOR:
             damping = max(DAMPING * damping, 1.0)
             least = damping if moved < SHORT else least
         elif promised > ROUNDING and gained > GOOD:
-            damping = max(damping / DAMPING if damping > 1.0 else 0.0, least)
+            damping, least = max(damping / DAMPING if damping > 1.0 else 0.0, least), 0.7 * least
     raise InputError(
         f"no mode of the log-normal sky was found in {MAX_STEPS} steps (the last moved by "
         f"{moved:.2g} standard deviations); the data are far from anything that the template "
@@ -164,7 +164,6 @@ def _energy(information: Information, white: Float[np.ndarray, " unknowns"]) -> 
 
 def _descended(
     sky: LogNormalSky,
-    information: Information,
     here: Information,
     white: Float[np.ndarray, " unknowns"],
     step: Float[np.ndarray, " unknowns"],
@@ -176,7 +175,7 @@ def _descended(
         trial = white - step
         # far from the mode the sky may leave the range of numbers, which no energy is below
         with np.errstate(over="ignore", invalid="ignore"):
-            there = information.recentred(sky.modes(trial))
+            there = here.recentred(sky.modes(trial))
             if short or _energy(there, trial) < energy:
                 return trial, there
         step = 0.5 * step
