@@ -11,9 +11,12 @@ from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import Around
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.linear.importance import LogMean, sampled_evidence
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.learning import Learned, learn
 from lusee_bayes.linear.marginal_information import marginalised
+from lusee_bayes.sampling.log_normal.learned import LearnedLogNormal, learn_log_normal
+from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
 from lusee_bayes.sky.prior_family import PriorFamily
 
 # parameters are learned up to this ell first, in a tenth of the time, where there are more
@@ -46,23 +49,29 @@ def about_sky(setup: Setup, data: Visibilities) -> Information:
     return full_model(setup, Around(data)).inform(data.data)[0]
 
 
-def learned_prior(setup: Setup, family: PriorFamily, information: Information) -> Learned:
+def learned_prior(
+    setup: Setup, family: PriorFamily | LogNormalPrior, information: Information
+) -> Learned:
     """Learn the prior of a family, up to a lower ell first where there are many.
+
+    That of a log-normal sky is Gaussian about its mode (:mod:`.learned`).
 
     Parameters
     ----------
     setup : Setup
         Of the scenario that the family is of.
-    family : PriorFamily
+    family : PriorFamily or LogNormalPrior
     information : Information
         What the data say of the sky (:func:`about_sky`).
 
     Raises
     ------
     InputError
-        As :func:`.learn`.
+        As :func:`.learn` and :func:`.learn_log_normal`.
     """
     scenario, seed = setup.scenario, setup.scenario.seed
+    if isinstance(family, LogNormalPrior):
+        return learn_log_normal(family, information, seed)
     if scenario.lmax <= COARSE_LMAX:
         return learn(family, information, seed=seed)
     coarse = scenario.prior.family(scenario.frequency_mhz, COARSE_LMAX)
@@ -71,3 +80,33 @@ def learned_prior(setup: Setup, family: PriorFamily, information: Information) -
     first = learn(coarse, marginalised(information, n, variance), seed=seed)
     start = family.start_from(coarse, first.parameters)
     return learn(family, information, start=start, seed=seed)
+
+
+def evidence_by_sampling(
+    family: PriorFamily | LogNormalPrior,
+    information: Information,
+    learned: Learned,
+    n: int,
+    seed: int,
+) -> LogMean:
+    """Estimate ln p(d) with a family's parameters integrated out by importance sampling.
+
+    Parameters
+    ----------
+    family : PriorFamily or LogNormalPrior
+    information : Information
+        What the data say of the sky.
+    learned : Learned
+        Of this family.
+    n : int
+        Number of draws.
+    seed : int
+
+    Raises
+    ------
+    InputError
+        For fewer than two draws.
+    """
+    if isinstance(learned, LearnedLogNormal):
+        return learned.sampled_evidence(n, seed)
+    return sampled_evidence(family, information, learned, n, seed)

@@ -6,12 +6,14 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+from lusee_bayes.core.arrays import on_device
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import model_to_sample
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import TERMS, Around, gain_drifts, point_sources
 from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
@@ -41,7 +43,18 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
         "gain_drifts": free("noise.gain", lambda: gain_drifts(setup, Around(data))),
         "instrument": free("noise.beam", lambda: embedded_instrument(setup)),
         "sources": free("sources", lambda: point_sources(setup)),
+        "log_normal": lambda: log_normal_prior(setup),
     }
+
+
+def log_normal_prior(setup: Setup) -> LogNormalPrior:
+    """The prior over positive skies. InputError where the scenario has another."""
+    if not isinstance(setup.family, LogNormalPrior):
+        raise InputError(
+            "the program asks for a log-normal prior, and the scenario has prior.model="
+            f"{setup.scenario.prior.model}; set prior.model=lognormal"
+        )
+    return on_device(setup.family)
 
 
 def embedded_instrument(setup: Setup) -> Instrument:

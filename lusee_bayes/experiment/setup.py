@@ -23,6 +23,7 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.source_response import source_response
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
 from lusee_bayes.sky import BRIGHT_SOURCES, Sky, galactic_unit_vector, kelvin_steradian
 from lusee_bayes.sky.prior_family import PriorFamily
 from lusee_bayes.sky.priors import Prior
@@ -57,8 +58,9 @@ class Setup:
         Visibilities of sky, background and sources through the modelled beams, in K.
     receiver : Receiver or None
         The receivers that the data say; None for others.
-    family : PriorFamily or None
-        Of which data choose the prior; None for a prior that is given.
+    family : PriorFamily, LogNormalPrior or None
+        Of which data choose the prior, or about whose mode it is Gaussian; None for a prior that
+        is given.
     """
 
     scenario: Scenario
@@ -73,7 +75,7 @@ class Setup:
     background: Float[Array, " products"]
     signal: Float[Array, "products times"]
     receiver: Receiver | None = None
-    family: PriorFamily | None = None
+    family: PriorFamily | LogNormalPrior | None = None
 
     @property
     def pointing(self) -> Pointing:
@@ -197,7 +199,9 @@ def set_up(
     )
 
 
-def prior_and_family(scenario: Scenario, sky: Sky) -> tuple[Prior, PriorFamily | None]:
+def prior_and_family(
+    scenario: Scenario, sky: Sky
+) -> tuple[Prior, PriorFamily | LogNormalPrior | None]:
     """The scenario's prior, or what is expected of it before there are data, and its family."""
     family = scenario.prior.family(scenario.frequency_mhz, scenario.lmax)
     return (scenario.prior.prior(sky) if family is None else family.expected()), family

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float, Shaped
 
-from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, power_spectrum
 from lusee_bayes.core.representation import Described, extent
 from lusee_bayes.experiment.experiment import Experiment
@@ -29,7 +29,7 @@ from lusee_bayes.linear.metrics import (
 )
 from lusee_bayes.linear.pixel_variance import pixel_std
 from lusee_bayes.results.coverage import Counts, Coverage
-from lusee_bayes.results.draws import deviations, draw_key
+from lusee_bayes.results.draws import deviations, doubts, posterior_draws, widths
 from lusee_bayes.results.observed import Observed
 
 # numbers of a channel that a file keeps as attributes
@@ -232,32 +232,29 @@ def channel_of_posterior(
     inference : Inference
         The posterior, and the model of the data.
     covariance : (modes, modes) array
-        Of the posterior, in K^2.
+        In K^2.
     n_draws : int
         How many draws of the posterior to keep.
     judged : Inference, optional
         The model that predicts the data and its posterior, where earlier data were there.
     """
     scenario, data, posterior = experiment.scenario, experiment.data, inference.posterior
-    judged = inference if judged is None else judged
+    judged, found = inference if judged is None else judged, ()
     prior_variance = np.asarray(inference.model.prior.variance())
-    variance = np.diagonal(covariance)
-    fraction = np.divide(
-        variance, prior_variance, out=np.zeros(len(variance)), where=prior_variance > 0
-    )
+    std, width = widths(experiment, covariance, scenario.map_nside)
+    fraction = np.divide(std**2, prior_variance, out=np.zeros(len(std)), where=prior_variance > 0)
     mean, truth = np.asarray(posterior.mean), _array(data.truth)
-    width, found = pixel_std(covariance, scenario.map_nside), ()
     if truth is not None:
-        found = Counts.of_pixels(width, truth - mean, deviations(posterior, scenario)).coverage()
+        found = Counts.of_pixels(width, truth - mean, deviations(experiment, posterior)).coverage()
     return ChannelResult(
         frequency_mhz=scenario.frequency_mhz,
         mean=mean,
-        std=np.sqrt(variance),
+        std=std,
         prior_std=np.sqrt(prior_variance),
         prior_fraction=mean_over_m(fraction),
         pixel_std=width,
         highest_altitude=highest_altitude(data.observation, scenario.map_nside),
-        draws=np.asarray(on_host(posterior).sample(draw_key(scenario), n_draws)),
+        draws=posterior_draws(experiment, posterior, n_draws),
         truth=truth,
         independent=None,
         log_evidence=float(posterior.log_evidence),
@@ -270,7 +267,7 @@ def channel_of_posterior(
         n_data=inference.model.n_data,
         n_missing=data.n_missing,
         rounds=inference.rounds,
-        doubts=(*experiment.doubts, *about_information(float(posterior.information_bits()))),
+        doubts=(*doubts(experiment), *about_information(float(posterior.information_bits()))),
         coverage=found,
     )
 
@@ -283,6 +280,7 @@ def channel_of_information(
     draws: Float[Array, "n modes"],
     *,
     compared: Float[np.ndarray, "more modes"] | None = None,
+    known_widths: tuple[np.ndarray, np.ndarray] | None = None,
     independent: Float[Array, " modes"] | None = None,
     log_evidence: float = np.nan,
     information_bits: float = np.nan,
@@ -304,18 +302,21 @@ def channel_of_information(
         In K.
     compared : (more, modes) array, optional
         Draws less mean for :class:`.Counts`, where the truth is known, in K.
+    known_widths : (modes,) and (pixels,) array, optional
+        Standard deviations other than the covariance's, in K.
     independent, log_evidence, information_bits, chi2_model, refinement
         See :class:`ChannelResult`.
     """
     expected = np.nan
     if covariance is None:
         spread = np.asarray(draws) - np.asarray(mean)
-        std = np.sqrt((spread**2).mean(0))
         covariance = spread.T @ spread / len(spread)
     else:
-        std = np.sqrt(np.diagonal(np.asarray(covariance)))
         expected = float(information.n_data - np.vdot(information.matrix, covariance))
+    std = np.sqrt(np.diagonal(np.asarray(covariance)))
     width, found = pixel_std(covariance, round(np.sqrt(observed.highest_altitude.size / 12))), ()
+    if known_widths is not None:
+        std, width = known_widths
     if compared is not None and observed.truth is not None:
         found = Counts.of_pixels(width, observed.truth - np.asarray(mean), compared).coverage()
     return ChannelResult(

@@ -22,7 +22,13 @@ from lusee_bayes.results.channel_information import ChannelInformation
 from lusee_bayes.results.channel_threads import each_channel
 from lusee_bayes.results.coverage import N_DRAWS
 from lusee_bayes.results.cube import CubeResult
-from lusee_bayes.results.draws import deviations, draw_key, perturbation_key
+from lusee_bayes.results.draws import (
+    deviations,
+    draw_key,
+    perturbation_key,
+    posterior_draws,
+    widths,
+)
 from lusee_bayes.results.joint_components import (
     LEAST_DRAWS,
     Components,
@@ -87,13 +93,15 @@ def cube_result(
             files.write(channel, wanted, known.to_dataset())
             return
         posterior = on_host(inference.posterior)
+        covariance = posterior.covariance()
         found = channel_of_information(
             known.observed,
             information,
             posterior.mean,
-            posterior.covariance(),
-            posterior.sample(draw_key(channel), n_draws),
-            compared=None if known.observed.truth is None else deviations(posterior, channel),
+            covariance,
+            posterior_draws(experiment, posterior, n_draws),
+            compared=None if known.observed.truth is None else deviations(experiment, posterior),
+            known_widths=widths(experiment, covariance, channel.map_nside),
             log_evidence=float(posterior.log_evidence),
             information_bits=float(posterior.information_bits()),
             chi2_model=float(information.chi2(posterior.mean) + posterior.prior_chi2()),

@@ -26,7 +26,7 @@ from lusee_bayes.linear.pixel_variance import prior_pixel_std
 from lusee_bayes.linear.residuals import residuals
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.diagnostics_file import group_variables
-from lusee_bayes.results.draws import draw_key
+from lusee_bayes.results.draws import pixel_draws
 from lusee_bayes.results.strengths import strengths, strengths_in_words
 from lusee_bayes.sky.priors import Prior
 
@@ -64,7 +64,7 @@ def diagnostics(
     scenario, data = experiment.scenario, experiment.data
     posterior, nside, lmax = on_host(inference.posterior), channel.nside, experiment.scenario.lmax
     found = residuals(judged.model, judged.posterior, data, channel.chi2_model)
-    draws = np.asarray(posterior.sample(draw_key(scenario), N_DRAWS))
+    draws = pixel_draws(experiment, posterior, N_DRAWS, nside)
     prior = on_host(inference.model.prior)
     usual = 0.0 if prior.white_mean is None else prior.colour(prior.white_mean)
     deviation = channel.mean - usual
@@ -94,7 +94,7 @@ def diagnostics(
     variables = {
         "prior_fraction": ("pixel", share),
         "highest_altitude": ("pixel", channel.highest_altitude, {"units": "sin"}),
-        "draws": (("draw", "pixel"), np.stack([modes_to_map(d, nside) for d in draws]), kelvin),
+        "draws": (("draw", "pixel"), draws, kelvin),
         "region_mean": ("region", rows @ channel.mean, kelvin),
         "region_std": ("region", np.sqrt(region_variance), kelvin),
         "region_prior_fraction": ("region", region_share),

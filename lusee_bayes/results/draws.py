@@ -1,4 +1,4 @@
-"""Which random draws a scenario's seed stands for."""
+"""Draws of a posterior, which of them a scenario's seed stands for, and standard deviations."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.harmonics import modes_to_map
+from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.linear.pixel_variance import pixel_std
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.coverage import N_DRAWS
 
@@ -26,10 +29,78 @@ def perturbation_key(scenario: Scenario) -> PRNGKeyArray:
     return jax.random.fold_in(jax.random.key(scenario.seed), PERTURBATIONS)
 
 
+def posterior_draws(
+    experiment: Experiment, posterior: Posterior, n: int, purpose: int = DRAWS
+) -> Float[np.ndarray, "draws modes"]:
+    """Draw the sky: from a Gaussian posterior, or positive skies under a log-normal prior.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    posterior : Posterior
+        The Gaussian posterior.
+    n : int
+    purpose : int
+        What the seed is folded with.
+
+    Returns
+    -------
+    (draws, modes) array
+        In K.
+    """
+    key = jax.random.fold_in(jax.random.key(experiment.scenario.seed), purpose)
+    if experiment.positive is not None:
+        return experiment.positive.drawn(key, n).skies
+    return np.asarray(on_host(posterior).sample(key, n))
+
+
+def pixel_draws(
+    experiment: Experiment, posterior: Posterior, n: int, nside: int
+) -> Float[np.ndarray, "draws pixels"]:
+    """Draw the sky at the centres of HEALPix RING pixels, in K.
+
+    Under a log-normal prior these are the positive skies themselves, not their coefficients' maps.
+    """
+    if experiment.positive is not None:
+        key = draw_key(experiment.scenario)
+        return experiment.positive.pixels(experiment.positive.drawn(key, n), nside)
+    draws = posterior_draws(experiment, posterior, n)
+    return np.stack([modes_to_map(sky, nside) for sky in draws])
+
+
 def deviations(
-    posterior: Posterior, scenario: Scenario, n: int = N_DRAWS
+    experiment: Experiment, posterior: Posterior, n: int = N_DRAWS
 ) -> Float[np.ndarray, "draws modes"]:
     """Draws of a posterior less its mean, in K, that coverage is compared with."""
-    posterior = on_host(posterior)
-    key = jax.random.fold_in(jax.random.key(scenario.seed), COMPARED)
-    return np.asarray(posterior.sample(key, n)) - np.asarray(posterior.mean)
+    draws = posterior_draws(experiment, posterior, n, COMPARED)
+    return draws - np.asarray(posterior.mean)
+
+
+def widths(
+    experiment: Experiment, covariance: Float[np.ndarray, "modes modes"], nside: int
+) -> tuple[Float[np.ndarray, " modes"], Float[np.ndarray, " pixels"]]:
+    """Standard deviations of modes and of pixels (HEALPix RING).
+
+    Parameters
+    ----------
+    experiment : Experiment
+    covariance : (modes, modes) array
+        Of the Gaussian posterior, in K^2.
+    nside : int
+        Of the pixels.
+
+    Returns
+    -------
+    (modes,) array, (pixels,) array
+        In K; under a log-normal prior those of its draws.
+    """
+    std, of_pixels = np.sqrt(np.diagonal(covariance)), pixel_std(covariance, nside)
+    if experiment.positive is None:
+        return std, of_pixels
+    return experiment.positive.std(), experiment.positive.pixel_std(of_pixels, nside)
+
+
+def doubts(experiment: Experiment) -> tuple[str, ...]:
+    """What is doubtful about an experiment's data, and about draws of its posterior."""
+    of_draws = () if experiment.positive is None else experiment.positive.doubts()
+    return (*experiment.doubts, *of_draws)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.linear.fit import ChiSquare
 from lusee_bayes.linear.metrics import highest_altitude
+from lusee_bayes.results.draws import doubts
 
 
 @dataclass(frozen=True)
@@ -50,5 +51,5 @@ class Observed:
             data.n_missing,
             rounds,
             instrument,
-            experiment.doubts,
+            doubts(experiment),
         )

@@ -22,7 +22,6 @@ from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference, infer
 from lusee_bayes.experiment.pieces import program_pieces
 from lusee_bayes.experiment.simulate import true_values
-from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling.chains import Chains
 from lusee_bayes.sampling.checkpoints import Checkpoints
@@ -192,7 +191,7 @@ def sample_result(
     n_modes = inference.posterior.mean.shape[0]
     latent = require_sampleable(program, arguments, data.data, n_modes)
     with stages("coordinates"):
-        whitening = coordinates(program, arguments, data, inference.posterior, latent)
+        whitening = coordinates(program, arguments, experiment, inference.posterior, latent)
     checkpoints = Checkpoints(folder / CHAINS, identity, resume=resume)
     times = []
     with stages.progress("sampling", sampler.warmup + sampler.draws) as update:
@@ -234,16 +233,21 @@ def sample_result(
 def coordinates(
     program: Program,
     arguments: dict,
-    data: Visibilities,
+    experiment: Experiment,
     posterior: Posterior,
     latent: list[str],
 ) -> Whitening | None:
     """White coordinates for a program: those of the analytic posterior where it samples the sky
-    alone, else those about its mode. None if no mode is found: warmup then learns scales."""
+    alone, the straight ones of a log-normal sky, else those about its mode. None if no mode is
+    found: warmup then learns scales."""
     if latent == [SKY]:
         return Whitening.of(posterior)
+    if experiment.positive is not None:
+        straight = experiment.positive.posterior.coordinates
+        if set(straight.names) == set(latent):
+            return straight
     start = {SKY: posterior.mean} if SKY in latent else {}
-    arguments = {**arguments, "data": data.data}
+    arguments = {**arguments, "data": experiment.data.data}
     starts = 1 if SKY in latent else STARTS
     chart = _chart(arguments, latent)
     found = laplace_approximation(program.model, arguments, start, SCALES, starts, chart)

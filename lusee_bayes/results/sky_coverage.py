@@ -62,7 +62,7 @@ class SkyCoverage:
         """Count over ``n_draws`` draws of a map's posterior."""
         channel = result.channel
         error = channel.truth - channel.mean
-        drawn = deviations(result.inference.posterior, result.scenario, n_draws)
+        drawn = deviations(result.experiment, result.inference.posterior, n_draws)
         return cls(
             name,
             channel,

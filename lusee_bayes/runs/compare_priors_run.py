@@ -12,11 +12,11 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.tables import write_csv
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import Experiment, observed, with_truth
-from lusee_bayes.experiment.learned_prior import about_sky, learned_prior
+from lusee_bayes.experiment.learned_prior import about_sky, evidence_by_sampling, learned_prior
 from lusee_bayes.experiment.named_priors import named_priors
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.linear.importance import LogMean, require_draws, sampled_evidence
+from lusee_bayes.linear.importance import LogMean, require_draws
 from lusee_bayes.linear.information import Information
 from lusee_bayes.report.figures import priors as prior_figures
 from lusee_bayes.results.cost import require_resources
@@ -130,7 +130,7 @@ def _under(
     sampled: LogMean | None = None
     if draws:
         seed = setup.scenario.seed
-        sampled = sampled_evidence(setup.family, information, learned, draws, seed)
+        sampled = evidence_by_sampling(setup.family, information, learned, draws, seed)
     setup = replace(setup, prior=learned.prior)
     mapped = replace(experiment, setup=setup, learned=learned)
     return UnderPrior.of(name, mapped, learned.log_evidence, sampled)

@@ -56,8 +56,8 @@ def require_sampleable(
     ------
     InputError
         If it fails when it is called, with or without data; if one of its sites cannot be sampled
-        or kept; if ``data`` is not what it observes; or if it neither samples the sky nor returns
-        a LinearGaussian to draw it from.
+        or kept; if ``data`` is not what it observes; or if it neither samples or computes the sky
+        nor returns a LinearGaussian to draw it from.
     """
     who = f"the program '{program.path or program.name}'"
     sites, collapsed = _traced(program, arguments, data, who)
@@ -72,6 +72,10 @@ def require_sampleable(
         raise InputError(f"{who} samples nothing: it has no site that is not observed")
     if SKY in latent:
         _require_shape(sites[SKY], (n_modes,), f"{who} samples")
+    elif SKY in sites and sites[SKY]["type"] == "deterministic":
+        found = jnp.shape(sites[SKY]["value"])
+        if found != (n_modes,):
+            raise InputError(f"{who} computes 'sky' with shape {found}; expected {(n_modes,)}")
     elif not collapsed:
         raise InputError(
             f"{who} has no site 'sky', and returns no LinearGaussian to draw the sky from; do one "

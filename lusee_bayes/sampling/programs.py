@@ -37,7 +37,14 @@ PIECES: dict[str, Callable[[LinearGaussian], Any]] = {
 }
 
 # ... and of the experiment: the model without those that are to be sampled, and they themselves
-EXPERIMENT_PIECES = ("gaussian", "systematics", "gain_drifts", "instrument", "sources")
+EXPERIMENT_PIECES = (
+    "gaussian",
+    "systematics",
+    "gain_drifts",
+    "instrument",
+    "sources",
+    "log_normal",
+)
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,12 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import numpyro
 from jaxtyping import Float
-from numpyro import distributions as dist
-from numpyro import handlers
-from numpyro.infer.reparam import Reparam
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.systematics.chart import Chart
 
@@ -147,15 +144,15 @@ def whitened(program: Callable, whitening: Whitening) -> Callable:
         # the determinant of all coordinates is counted once, with the first site
         log_dets = dict.fromkeys(whitening.names, 0.0) | {first: whitening.log_det + log_det}
         config = {name: _Given(values[name], log_dets[name]) for name in whitening.names}
-        with handlers.reparam(config=config):
+        with numpyro.handlers.reparam(config=config):
             return program(*args, **kwargs)
 
     return model
 
 
 @dataclass(frozen=True)
-class _Given(Reparam):
-    """A site with a given unconstrained value: a deterministic one and its density.
+class _Given:
+    """What makes a site with a given unconstrained value a deterministic one and its density.
 
     ``log_det``: of coordinates that the value was made of, added to the density.
     """

@@ -29,6 +29,7 @@ from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.representation import Described, extent
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.sky.bright_sources import PointSource
+from lusee_bayes.sky.priors import DensePrior
 from lusee_bayes.sky.template import Template
 
 # band limit of the grid: this many times that of the map, and at least so much, since what the
@@ -241,6 +242,25 @@ class LogNormalSky(Described, eqx.Module):
         slope = np.exp(-0.5 * eta**2 - log_ndtr(-eta)) / np.sqrt(2.0 * np.pi)
         matrix[:, self.n_modes :] = np.asarray(self.source_modes).T * slope
         return matrix
+
+    def linearised(self, white: Float[np.ndarray, " unknowns"]) -> DensePrior:
+        """Return the Gaussian prior that this one is to first order: m(u*) + J (u - u*).
+
+        Parameters
+        ----------
+        white : (unknowns,) array
+            u*.
+
+        Returns
+        -------
+        DensePrior
+            Of mean m(u*) - J u* and covariance J J^T, in NumPy's arrays.
+        """
+        jacobian = self.jacobian(white)
+        upper = np.linalg.qr(jacobian.T, mode="r")
+        upper *= np.where(np.diagonal(upper) < 0, -1.0, 1.0)[:, None]
+        mean = np.asarray(self.modes(np.asarray(white))) - jacobian @ white
+        return DensePrior(np.tril(upper.T), mean=mean)
 
     def pixels(
         self, white: Float[Array, "n unknowns"], nside: int

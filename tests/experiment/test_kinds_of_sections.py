@@ -239,7 +239,7 @@ def test_the_file_tells_which_beams_they_are(tmp_path, response, scalar):
         (["sky.model=file"], "sky.file is missing"),
         (["prior.spectrum=maps"], "prior.spectrum is 'maps', but .*'learned' or 'sky'"),
         (["prior.model=gaussian"], "prior.model is 'gaussian', which is unknown"),
-        (["prior.amplitude=0.1"], "amplitude is an entry of model modulated, not of isotropic"),
+        (["prior.amplitude=0.1"], "amplitude is an entry of model modulated, lognormal, not"),
         (
             ["prior={model: modulated, scale: 2}"],
             "scale is an entry of model isotropic, not of modulated",

@@ -9,6 +9,7 @@ from lusee_bayes.experiment.schema.beam import (
     ScalarBeamSection,
     section_of_file,
 )
+from lusee_bayes.experiment.schema.log_normal import LogNormalPriorSection
 from lusee_bayes.experiment.schema.noise import (
     BeamErrorSection,
     GainSection,
@@ -46,6 +47,7 @@ __all__ = [
     "GalaxySection",
     "IsotropicPriorSection",
     "LocalScalesPriorSection",
+    "LogNormalPriorSection",
     "ModulatedPriorSection",
     "MonopoleBeamSection",
     "NoiseSection",

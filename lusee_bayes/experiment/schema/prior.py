@@ -13,8 +13,9 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from lusee_bayes.core.harmonics import n_modes
-from lusee_bayes.core.reading import require_file
+from lusee_bayes.experiment.schema.log_normal import LogNormalPriorSection
 from lusee_bayes.experiment.schema.section import Positive, Section, without_other_kinds
+from lusee_bayes.experiment.schema.template import EMBEDDED, template_of
 from lusee_bayes.sky import BRIGHT_SOURCES, Sky
 from lusee_bayes.sky.isotropic_family import IsotropicFamily
 from lusee_bayes.sky.local_scales import embedded_local_scales
@@ -23,10 +24,8 @@ from lusee_bayes.sky.modulated_family import ModulatedFamily
 from lusee_bayes.sky.prior_family import PriorFamily
 from lusee_bayes.sky.prior_files import read_mean, read_spectrum
 from lusee_bayes.sky.priors import HarmonicPrior, Prior
-from lusee_bayes.sky.template import EmbeddedTemplate, Template, read_template
+from lusee_bayes.sky.template import EmbeddedTemplate, Template
 
-# the template that no file is needed for
-EMBEDDED = "embedded"
 LEARNED = "learned from these data"
 
 
@@ -212,11 +211,8 @@ class ModulatedPriorSection(Section):
         )
 
     def _template(self, frequency_mhz: float, lmax: int) -> Template:
-        if self.template == EMBEDDED:
-            return EmbeddedTemplate(frequency_mhz)
-        path = require_file(self.template, "template of the prior", "check prior.template")
-        return read_template(
-            path,
+        return template_of(
+            self.template,
             frequency_mhz,
             lmax,
             file_frequency_mhz=self.file_frequency_mhz,
@@ -283,7 +279,12 @@ class LocalScalesPriorSection(Section):
 
 PRIOR_SECTIONS = {
     section.model_fields["model"].default: section
-    for section in (LocalScalesPriorSection, IsotropicPriorSection, ModulatedPriorSection)
+    for section in (
+        LocalScalesPriorSection,
+        IsotropicPriorSection,
+        ModulatedPriorSection,
+        LogNormalPriorSection,
+    )
 }
 
 

@@ -4,8 +4,10 @@ With the white unknowns u of :class:`.LogNormalSky` and the information of the d
 
     E(u) = chi^2(m(u)) / 2 + |u|^2 / 2,    H = J^T M J + 1,    J = dm/du,
 
-a step is -H^-1 grad E, halved until it leads downwards. H leaves out the second derivative of m,
-which the residuals multiply: 0.1 in ln evidence at the fiducial size.
+a step is -(H + damping)^-1 grad E, halved until it leads downwards. H leaves out the second
+derivative of m, which the residuals multiply: 0.1 in ln evidence at the fiducial size. Where steps
+are too long for that, as for sources of which there is less than catalogued, they are damped: what
+the data know is not, so that they stay where chi^2 is low.
 """
 
 from __future__ import annotations
@@ -24,9 +26,15 @@ from lusee_bayes.sky.log_normal import LogNormalSky
 
 # the mode is found when a step is shorter than this, in standard deviations, all unknowns together
 SETTLED = 1e-3
+# ... or than that after so many steps: where the curvature is far from H, the last ones are slow
+ROUGH, PATIENCE = 0.1, 40
 # a step of less than one standard deviation is taken as it is: what it gains may be rounding
 SHORT = 1.0
-MAX_STEPS, HALVINGS = 50, 20
+MAX_STEPS, HALVINGS = 100, 20
+# factor by which steps are damped more, after one that gains less than this part of what H
+# promises, or less, after one that gains more; near the mode not much less than what helped. What
+# a step gains is told from rounding if so much is promised
+DAMPING, POOR, GOOD, ROUNDING = 4.0, 0.25, 0.75, 1e-5
 
 
 class LogNormalMode(Described, eqx.Module):
@@ -97,20 +105,21 @@ def find_mode(
     Raises
     ------
     InputError
-        If the information is of another lmax, or no mode is found in 50 steps.
+        If the information is of another lmax, or no mode is found in 100 steps.
     """
     sky, information = on_host((sky, information))
     require_shape("the information", information.matrix, (sky.n_modes, sky.n_modes))
     white = np.zeros(sky.size) if start is None else np.array(start, dtype=np.float64)
     require_shape("the start", white, (sky.size,))
-    here, moved = information.recentred(sky.modes(white)), np.inf
+    here, moved, damping, least = information.recentred(sky.modes(white)), np.inf, 0.0, 0.0
     for steps in range(MAX_STEPS + 1):
         jacobian = sky.jacobian(white)
-        lower = checked_cholesky("the curvature of the posterior", _curvature(here, jacobian))
+        curvature = _curvature(here, jacobian)
+        lower = checked_cholesky("the curvature of the posterior", curvature)
         slope = white - jacobian.T @ here.vector
         half = solve_lower(lower, slope[:, None], transpose=False)
         moved = float(np.linalg.norm(half))
-        if moved < SETTLED:
+        if moved < (SETTLED if steps < PATIENCE else ROUGH):
             log_evidence = -0.5 * (
                 float(here.misfit)
                 + white @ white
@@ -120,8 +129,19 @@ def find_mode(
             )
             evidence, moved = np.asarray(log_evidence), np.asarray(moved)
             return LogNormalMode(sky, here, white, jacobian, lower, evidence, moved, steps)
-        step = solve_lower(lower, half, transpose=True)[:, 0]
-        white, here = _descended(sky, information, here, white, step, moved < SHORT)
+        if damping:
+            damped = curvature + damping * np.eye(sky.size)
+            lower = checked_cholesky("the damped curvature", damped)
+            half = solve_lower(lower, slope[:, None], transpose=False)
+        step, energy = solve_lower(lower, half, transpose=True)[:, 0], _energy(here, white)
+        white, here = _descended(sky, here, white, step, moved < SHORT)
+        promised = float(2.0 * step @ slope - step @ curvature @ step)
+        gained = (energy - _energy(here, white)) / max(promised, ROUNDING)
+        if promised > ROUNDING and gained < POOR:
+            damping = max(DAMPING * damping, 1.0)
+            least = damping if moved < SHORT else least
+        elif promised > ROUNDING and gained > GOOD:
+            damping, least = max(damping / DAMPING if damping > 1.0 else 0.0, least), 0.7 * least
     raise InputError(
         f"no mode of the log-normal sky was found in {MAX_STEPS} steps (the last moved by "
         f"{moved:.2g} standard deviations); the data are far from anything that the template "
@@ -137,22 +157,26 @@ def _curvature(
     return curvature
 
 
+def _energy(information: Information, white: Float[np.ndarray, " unknowns"]) -> float:
+    """2 E, at the sky that the information is about."""
+    return float(information.misfit) + float(white @ white)
+
+
 def _descended(
     sky: LogNormalSky,
-    information: Information,
     here: Information,
     white: Float[np.ndarray, " unknowns"],
     step: Float[np.ndarray, " unknowns"],
     short: bool,
 ) -> tuple[Float[np.ndarray, " unknowns"], Information]:
     """The unknowns behind a step, and the information about their sky."""
-    energy = float(here.misfit) + white @ white
+    energy = _energy(here, white)
     for _ in range(HALVINGS):
         trial = white - step
         # far from the mode the sky may leave the range of numbers, which no energy is below
         with np.errstate(over="ignore", invalid="ignore"):
-            there = information.recentred(sky.modes(trial))
-            if short or float(there.misfit) + trial @ trial < energy:
+            there = here.recentred(sky.modes(trial))
+            if short or _energy(there, trial) < energy:
                 return trial, there
         step = 0.5 * step
     return white, here

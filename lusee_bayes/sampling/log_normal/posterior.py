@@ -4,10 +4,14 @@ A draw is u(x), x = u* + R z with z ~ N(0, 1) in the coordinates of :mod:`.strai
 the ratio of the posterior's density to that of the Gaussian: all are nearly one where the data
 determine the sky well, and weighted draws are those of the posterior in any case. Draws come in
 pairs z and -z: whatever is odd in z cancels in means, but for the weights.
+
+Where A and the tilt of C_ell are unknowns, too, they are drawn with u, and the weight is that of
+all three.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -22,12 +26,18 @@ from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.core.representation import Described
 from lusee_bayes.linear.information import Information
 from lusee_bayes.sampling.log_normal.gauss_newton import LogNormalMode
-from lusee_bayes.sampling.log_normal.prior import STRUCTURE
+from lusee_bayes.sampling.log_normal.learning import LearnedSpectrum
+from lusee_bayes.sampling.log_normal.prior import AMPLITUDE, STRUCTURE, TILT, LogNormalPrior
 from lusee_bayes.sampling.log_normal.straight import straight_coordinates
 from lusee_bayes.sampling.whitening import Whitening
 
 # draws made at once: more take more memory, and no less time
 BATCH = 8
+# A and the tilt are drawn from a wider normal distribution: theirs is skewed, and draws out there
+# would be few and heavy
+WIDER = 1.3
+# draws made by one call of the compiled program, which is the same for any number of them
+CALL = 200
 
 
 @dataclass(frozen=True, repr=False)
@@ -37,7 +47,7 @@ class SkyDraws(Described):
     Attributes
     ----------
     white : (draws, unknowns) array
-        u of every draw; the second half are the partners of the first.
+        u of every draw, with the mode's C_ell; the second half are the partners of the first.
     linear : (draws, unknowns) array
         x - u*, what u - u* would be if the posterior were Gaussian.
     skies : (draws, modes) array
@@ -45,12 +55,15 @@ class SkyDraws(Described):
     log_weights : (draws,) array
         ln of the posterior's density over that which draws were made with, up to the evidence that
         Laplace's formula gives.
+    parameters : (draws, parameters) array
+        ln A and the tilt, where they are unknowns.
     """
 
     white: Float[np.ndarray, "draws unknowns"]
     linear: Float[np.ndarray, "draws unknowns"]
     skies: Float[np.ndarray, "draws modes"]
     log_weights: Float[np.ndarray, " draws"]
+    parameters: Float[np.ndarray, "draws parameters"]
 
     def description(self) -> tuple[str, ...]:
         return (
@@ -60,10 +73,25 @@ class SkyDraws(Described):
             f"{self.evidence_error:.3f}",
         )
 
+    @classmethod
+    def joined(cls, parts: Sequence[SkyDraws]) -> SkyDraws:
+        """Put draws of one posterior together."""
+
+        def of(name: str) -> Float[np.ndarray, "draws *n"]:
+            halves = [np.array_split(getattr(part, name), 2) for part in parts]
+            return np.concatenate([half for side in zip(*halves, strict=True) for half in side])
+
+        return cls(of("white"), of("linear"), of("skies"), of("log_weights"), of("parameters"))
+
     @property
     def weights(self) -> Float[np.ndarray, " draws"]:
-        """Weights of the draws, one on average."""
+        """Weights of the draws, one on average.
+
+        None counts for more than the root of their number (Ionides 2008): by chance one draw in
+        10,000 would carry a tenth of a mean.
+        """
         relative = np.exp(self.log_weights - self.log_weights.max())
+        relative = np.minimum(relative, np.sqrt(len(relative)) * relative.mean())
         return relative / relative.mean()
 
     @property
@@ -128,15 +156,32 @@ class LogNormalPosterior(Described):
     mode : LogNormalMode
     coordinates : Whitening
         Straight ones, in which it is nearly N(0, 1).
+    unknown : LogNormalPrior or None
+        What is expected of A and the tilt where they are unknowns; None where they are known.
     """
 
     mode: LogNormalMode
     coordinates: Whitening
+    unknown: LogNormalPrior | None = None
 
     @classmethod
     def about(cls, mode: LogNormalMode) -> LogNormalPosterior:
-        """Make it."""
+        """Make that of u, C_ell being known."""
         return cls(mode, straight_coordinates(mode))
+
+    @classmethod
+    def learned(cls, found: LearnedSpectrum, prior: LogNormalPrior) -> LogNormalPosterior:
+        """Make that of u, A and the tilt.
+
+        Parameters
+        ----------
+        found : LearnedSpectrum
+            Where A and the tilt are most probable.
+        prior : LogNormalPrior
+            What was expected of them.
+        """
+        at = float(np.log(found.prior.amplitude)), float(found.prior.tilt)
+        return cls(found.mode, straight_coordinates(found.mode, at, found.covariance), prior)
 
     def description(self) -> tuple[str, ...]:
         chart = self.coordinates.chart
@@ -164,13 +209,26 @@ class LogNormalPosterior(Described):
             raise InputError(
                 f"draws of a log-normal sky come in pairs, got {n}; give an even number"
             )
-        z = jax.random.normal(key, (n // 2, self.mode.sky.size), dtype=jnp.float64)
+        z = jax.random.normal(key, (n // 2, self.coordinates.root.shape[1]), dtype=jnp.float64)
         z = jnp.concatenate([z, -z])
-        white, skies, energies = _draw(self.coordinates, on_device(self.mode.information), z)
+        known = z.shape[1] - self.mode.sky.size
+        drawn, z = np.asarray(z), z.at[:, :known].multiply(WIDER)
+        given = on_device((self.mode.information, self.unknown))
+        full = jnp.concatenate([z, jnp.zeros((-n % CALL, z.shape[1]))])
+        calls = [
+            _draw(self.coordinates, *given, part) for part in jnp.split(full, len(full) // CALL)
+        ]
+        white, skies, energies = (np.concatenate(rows)[:n] for rows in zip(*calls, strict=True))
+        # so far out that numbers overflow there is no density
+        outside = ~np.isfinite(energies)
+        white[outside], skies[outside], energies[outside] = self.mode.white, self.mode.modes, np.inf
         least = 0.5 * (float(self.mode.information.misfit) + self.mode.white @ self.mode.white)
-        log_weights = 0.5 * (np.asarray(z) ** 2).sum(1) - (np.asarray(energies) - least)
-        linear = np.asarray(z) @ np.asarray(self.coordinates.root).T
-        return SkyDraws(np.asarray(white), linear, np.asarray(skies), log_weights)
+        if self.unknown is not None:
+            least -= float(self.unknown.log_density(*np.asarray(self.coordinates.mean[:2])))
+        log_weights = 0.5 * (drawn**2).sum(1) + known * np.log(WIDER) - (energies - least)
+        moved = np.asarray(z) @ np.asarray(self.coordinates.root).T
+        parameters = moved[:, :known] + np.asarray(self.coordinates.mean[:known])
+        return SkyDraws(white, moved[:, known:], skies, log_weights, parameters)
 
     def covariance(self) -> Float[np.ndarray, "modes modes"]:
         """Compute that of the sky to first order about the mode, J H^-1 J^T, in K^2."""
@@ -199,14 +257,23 @@ class LogNormalPosterior(Described):
 
 @eqx.filter_jit
 def _draw(
-    coordinates: Whitening, information: Information, z: Float[Array, "draws unknowns"]
+    coordinates: Whitening,
+    information: Information,
+    unknown: LogNormalPrior | None,
+    z: Float[Array, "draws unknowns"],
 ) -> tuple[Array, Array, Array]:
-    """u, m, and minus the log density of z, without constants."""
+    """u with the mode's C_ell, m, and minus the log density of z, without constants."""
 
     def one(z):
         values, log_det = coordinates.to_values(coordinates.mean + coordinates.root @ z)
-        white = values[STRUCTURE]
-        sky = coordinates.chart.sky.modes(white)
-        return white, sky, 0.5 * (information.chi2(sky) + white @ white) - log_det
+        white, reference = values[STRUCTURE], coordinates.chart.sky
+        energy = 0.5 * white @ white - log_det
+        if unknown is not None:
+            power_law = values[AMPLITUDE], values[TILT]
+            sky = reference.with_power_law(jnp.exp(power_law[0]), power_law[1])
+            energy = energy - unknown.log_density(*power_law)
+            white = white * sky.root() / reference.root()
+        modes = reference.modes(white)
+        return white, modes, energy + 0.5 * information.chi2(modes)
 
     return jax.lax.map(one, z, batch_size=BATCH)
