@@ -33,8 +33,8 @@ import lazy_loader
 # processor, by default for longer than the others' work takes: with 2^20 cycles, a thousandth of a
 # second, a map is made in two thirds of the time
 os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "20")
-# XLA warns of every program that it finds in the cache, on some processors as of an error; what does
-# go wrong is raised
+# XLA warns of every program that it finds in the cache, and calls it an error on some processors;
+# what does go wrong is raised
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 # JAX is not imported for that: --help and completion answer without it
 os.environ["JAX_ENABLE_X64"] = "1"
