@@ -19,8 +19,8 @@ from lusee_bayes.sky.learned_spectrum import PIVOT
 from lusee_bayes.sky.positive_skies import PositiveSkies
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
-# A and the width of the mean over the sky that are expected of each field: of a template that is
-# good to a third, indices that differ by 0.1, and half of the optical depth
+# A of each field, whose rms over the sky is six times that, and the width of its mean: a template
+# good to a fifth (its mean to a half), indices that differ by 0.06, optical depths by a fifth
 EXPECTED = {
     "level": (0.03, 0.5),
     "index": (0.01, 0.2),
