@@ -33,7 +33,7 @@ WIDTHS = 300
 # those of equal weight are worth so many times their number: else the heaviest come too rarely
 SPARE = 2
 # weighted draws at most for every one of equal weight
-MOST = 16
+MOST = 8
 # what the seed is folded with for weighted draws
 WEIGHTED = 9
 
@@ -63,7 +63,7 @@ class LearnedLogNormal(Learned):
         ----------
         key : PRNG key
         n : int
-            How many. If 16 n weighted draws are worth fewer, some come more than once
+            How many. If 8 n weighted draws are worth fewer, some come more than once
             (:meth:`doubts`).
         """
         sky = self.posterior.mode.sky
@@ -85,7 +85,7 @@ class LearnedLogNormal(Learned):
         return []
 
     def _worth(self, n: int) -> SkyDraws:
-        """Weighted draws, made once, that are worth a few times n; else 16 n or more of them."""
+        """Weighted draws, made once, that are worth a few times n; else 8 n or more of them."""
         key, number = jax.random.fold_in(jax.random.key(self.seed), WEIGHTED), 1
         while True:
             if len(self._parts) < number:
