@@ -19,7 +19,7 @@ from lusee_bayes.sky.learned_spectrum import PIVOT
 from lusee_bayes.sky.positive_skies import PositiveSkies
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
-# A of each field, whose rms over the sky is six times that, and the width of its mean: a template
+# A of each field, whose rms over the sky is seven times that, and the width of its mean: a template
 # good to a fifth (its mean to a half), indices that differ by 0.06, optical depths by a fifth
 EXPECTED = {
     "level": (0.03, 0.5),
