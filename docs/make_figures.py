@@ -110,12 +110,15 @@ def given_skies(ulsa: Path | None) -> None:
     """Draw and print how often error bars hold skies that the prior does not draw, at 10 MHz."""
     files = [] if ulsa is None else [ulsa / "exp10.0MHz_sky_map_with_absorption.hdf5"]
     skies = ["embedded:1", "embedded:2", "embedded+sources:1", "smooth", "spotty", *files]
-    scenario = lb.load_scenario("fiducial", ["frequency_mhz=10", "lmax=31"])
-    with TemporaryDirectory() as folder:
-        result = lb.run_skies(scenario, folder, skies, name="fiducial").result
-    print(result.as_markdown())
-    coverage.coverage(result).savefig(HERE / "coverage.png", dpi=80)
-    coverage.pulls(result).savefig(HERE / "pulls.png", dpi=70)
+    priors = {"": "spectrum: sky", "_local_scales": "model: local_scales"}
+    for ending, prior in priors.items():
+        overrides = ["frequency_mhz=10", "lmax=31", f"prior={{{prior}}}"]
+        scenario = lb.load_scenario("fiducial", overrides)
+        with TemporaryDirectory() as folder:
+            result = lb.run_skies(scenario, folder, skies, name="fiducial").result
+        print(result.as_markdown())
+        coverage.coverage(result).savefig(HERE / f"coverage{ending}.png", dpi=80)
+        coverage.pulls(result).savefig(HERE / f"pulls{ending}.png", dpi=70)
 
 
 def point_sources() -> None:
