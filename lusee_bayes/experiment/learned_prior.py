@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import Setup
@@ -67,10 +68,17 @@ def learned_prior(
     Raises
     ------
     InputError
-        As :func:`.learn` and :func:`.learn_log_normal`.
+        As :func:`.learn` and :func:`.learn_log_normal`; for a log-normal sky if N is to be built
+        around the posterior's own prediction.
     """
     scenario, seed = setup.scenario, setup.scenario.seed
     if isinstance(family, LogNormalPrior):
+        gain = scenario.noise.gain
+        if gain is not None and gain.visibilities == "posterior":
+            raise InputError(
+                "a log-normal sky is found under one N, and noise.gain.visibilities=posterior "
+                "builds several; use noise.gain.visibilities=measured"
+            )
         return learn_log_normal(family, information, seed)
     if scenario.lmax <= COARSE_LMAX:
         return learn(family, information, seed=seed)

@@ -153,6 +153,9 @@ def test_what_it_cannot_do_is_said(run):
     scenario = small_scenario(PRIOR, "noise.gain={treatment: sampled}", **SIZES)
     with pytest.raises(InputError, match="the sky and its prior are sampled, and nothing else"):
         default_program(scenario)
+    repeated = small_scenario(PRIOR, "noise.gain={visibilities: posterior}", **SIZES)
+    with pytest.raises(InputError, match="found under one N"):
+        lb.build(repeated)
     isotropic = lb.build(small_scenario(**SIZES))
     with pytest.raises(InputError, match=r"set prior\.model=lognormal"):
         program_pieces(isotropic)["log_normal"]()
