@@ -193,7 +193,7 @@ class _Point:
         )
 
 
-def find_mode(
+def find_joint_mode(
     skies: PositiveSkies,
     laws: FieldLaws,
     channels: Channels,

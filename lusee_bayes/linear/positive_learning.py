@@ -16,7 +16,7 @@ from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.harmonics import n_modes, per_mode, power_spectrum
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.marginal_information import marginalised
-from lusee_bayes.linear.positive_joint import Channels, ChannelsInMemory, find_mode
+from lusee_bayes.linear.positive_joint import Channels, ChannelsInMemory, find_joint_mode
 from lusee_bayes.sky.field_laws import FieldLaws
 from lusee_bayes.sky.positive_skies import PositiveSkies
 
@@ -46,12 +46,12 @@ def learn_laws(
     Raises
     ------
     InputError
-        As :func:`.find_mode`.
+        As :func:`.find_joint_mode`.
     """
     lmax = min(skies.lmax, COARSE_LMAX)
     coarse = skies.coarser(lmax, lmax_fields)
     parts = _large_scales(skies, channels, n_modes(lmax))
-    mode = find_mode(coarse, FieldLaws.of(coarse), parts, learn=True, report=report)
+    mode = find_joint_mode(coarse, FieldLaws.of(coarse), parts, learn=True, report=report)
     return mode.laws
 
 

@@ -15,7 +15,7 @@ from lusee_bayes.experiment.experiment import build, with_truth
 from lusee_bayes.experiment.inference import inform
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.joint_skies import channel_sky
-from lusee_bayes.linear.positive_skies import positive_sky
+from lusee_bayes.linear.positive_channel import positive_sky
 from lusee_bayes.results.channel import ChannelResult, channel_of_information
 from lusee_bayes.results.channel_files import ChannelFiles, identity_of
 from lusee_bayes.results.channel_information import ChannelInformation

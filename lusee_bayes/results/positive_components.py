@@ -11,7 +11,7 @@ from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.iterative_joint import DIRECT_UNKNOWNS
-from lusee_bayes.linear.positive_joint import MAX_ROUNDS, PositiveMode, find_mode
+from lusee_bayes.linear.positive_joint import MAX_ROUNDS, PositiveMode, find_joint_mode
 from lusee_bayes.linear.positive_learning import COARSE_LMAX, learn_laws
 from lusee_bayes.results.joint_channels import ChannelsInFiles
 from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES
@@ -93,7 +93,7 @@ def positive_mode(scenario: Scenario, channels: ChannelsInFiles, stages: Stages)
     Raises
     ------
     InputError
-        As :func:`.find_mode`.
+        As :func:`.find_joint_mode`.
     """
     with stages("templates"):
         skies = positive_skies(scenario)
@@ -104,4 +104,4 @@ def positive_mode(scenario: Scenario, channels: ChannelsInFiles, stages: Stages)
     # all processes go on from the same ones, to the last bit
     shared = channels.group.total(laws.parameters) / channels.group.processes
     with stages.progress("positive skies", MAX_ROUNDS) as report:
-        return find_mode(skies, laws.with_parameters(shared), silent, report=report)
+        return find_joint_mode(skies, laws.with_parameters(shared), silent, report=report)

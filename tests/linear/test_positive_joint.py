@@ -13,8 +13,8 @@ from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.joint_skies import paired
 from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.linear.positive_joint import ChannelsInMemory, find_mode, linearised
-from lusee_bayes.linear.positive_skies import positive_sky
+from lusee_bayes.linear.positive_channel import positive_sky
+from lusee_bayes.linear.positive_joint import ChannelsInMemory, find_joint_mode, linearised
 from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.sky.field_laws import FieldLaws
 from lusee_bayes.sky.positive_skies import PositiveSkies
@@ -108,7 +108,7 @@ def test_the_mode_of_one_channel_is_that_of_a_direct_minimisation():
         return np.concatenate([(d - a @ sky) / sigma, white])
 
     direct = optimize.least_squares(residuals, np.zeros(2 * N), xtol=1e-15, ftol=1e-15, gtol=1e-12)
-    mode = find_mode(skies, laws, ChannelsInMemory((information,)))
+    mode = find_joint_mode(skies, laws, ChannelsInMemory((information,)))
     # what a last step of 0.1 sigma at most leaves: the curvature's own error times that step
     np.testing.assert_allclose(mode.energy, 2.0 * direct.cost, atol=0.1**2)
     np.testing.assert_allclose(mode.fields[0] / root, direct.x[:N], atol=0.02)
@@ -122,7 +122,7 @@ def case():
     laws = rough(skies, 0.1)
     seen = observed(skies, laws, seed=3)
     channels = ChannelsInMemory(tuple(s[-1] for s in seen))
-    return skies, laws, seen, find_mode(skies, laws, channels)
+    return skies, laws, seen, find_joint_mode(skies, laws, channels)
 
 
 def test_the_gaussian_is_that_of_one_big_model(case):
@@ -195,7 +195,7 @@ def test_far_templates_are_reached_in_shorter_steps():
     wide = HarmonicPrior(jnp.asarray(np.full(LMAX + 1, 1e12)))
     model = LinearGaussian(jnp.asarray(a), wide, DiagonalCovariance(jnp.asarray(sigma**2)))
     information = model.inform(jnp.asarray(20.0 * d))[0]
-    mode = find_mode(skies, laws, ChannelsInMemory((information,)))
+    mode = find_joint_mode(skies, laws, ChannelsInMemory((information,)))
     assert np.exp(skies.grid.synthesise(mode.exponents[0])).mean() > 10.0
 
 
@@ -204,11 +204,11 @@ def test_learned_laws_maximise_the_evidence():
     skies = skies_of(FREQUENCIES, ("level", "index"))
     laws = rough(skies, 0.1)
     channels = ChannelsInMemory(tuple(s[-1] for s in observed(skies, laws, seed=5, n_data=60)))
-    found = find_mode(skies, FieldLaws.of(skies), channels, learn=True).laws
+    found = find_joint_mode(skies, FieldLaws.of(skies), channels, learn=True).laws
 
     def evidence(parameters):
         there = found.with_parameters(parameters)
-        mode = find_mode(skies, there, channels)
+        mode = find_joint_mode(skies, there, channels)
         return float(mode.posterior.log_evidence) + there.log_density()
 
     step = 0.3
