@@ -12,6 +12,8 @@ os.environ["XLA_FLAGS"] = " ".join(
         f"--xla_backend_optimization_level={os.environ.get('LUSEE_BAYES_TEST_XLA_LEVEL', '0')}",
     ]
 ).strip()
+# as the package says it, for what imports JAX before
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 from jaxtyping import install_import_hook
 

@@ -10,6 +10,7 @@ from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.linear.parameter_draws import draws_with_parameters
 from lusee_bayes.linear.pixel_variance import pixel_std
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.coverage import N_DRAWS
@@ -32,7 +33,9 @@ def perturbation_key(scenario: Scenario) -> PRNGKeyArray:
 def posterior_draws(
     experiment: Experiment, posterior: Posterior, n: int, purpose: int = DRAWS
 ) -> Float[np.ndarray, "draws modes"]:
-    """Draw the sky: from a Gaussian posterior, or positive skies under a log-normal prior.
+    """Draw the sky: positive ones under a log-normal prior, else Gaussian.
+
+    Where the prior was learned, its parameters are drawn, too (:mod:`.parameter_draws`).
 
     Parameters
     ----------
@@ -51,6 +54,9 @@ def posterior_draws(
     key = jax.random.fold_in(jax.random.key(experiment.scenario.seed), purpose)
     if experiment.positive is not None:
         return experiment.positive.drawn(key, n).skies
+    if experiment.learned is not None:
+        family = experiment.setup.family
+        return draws_with_parameters(family, experiment.learned, posterior, key, n)
     return np.asarray(on_host(posterior).sample(key, n))
 
 
