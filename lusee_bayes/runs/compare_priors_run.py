@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.tables import write_csv
 from lusee_bayes.experiment.data_files import read_data
@@ -25,6 +24,7 @@ from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.runs.folder import (
     Output,
     RunKind,
+    require_marginal,
     require_single_frequency,
     run_folder,
     write_run,
@@ -90,11 +90,7 @@ def run_compare_priors(
     """
     stages = stages or Stages()
     require_single_frequency("compare-priors", bool(scenario.frequencies_mhz))
-    if scenario.samples:
-        raise InputError(
-            "the scenario says that something is to be sampled, and compare-priors makes maps, "
-            "which can only marginalise; set treatment=marginalised"
-        )
+    require_marginal("compare-priors", "set treatment=marginalised", scenario.samples)
     if draws:
         require_draws(draws)
     sections = named_priors(priors, scenario, known_sky=data is None or truth)

@@ -206,6 +206,15 @@ def write_run(
     return [folder / name for name in files]
 
 
+def require_marginal(what: str, advice: str, samples: bool) -> None:
+    """InputError where what makes maps is to sample something."""
+    if samples:
+        raise InputError(
+            f"the scenario says that something is to be sampled, and {what} can only marginalise; "
+            f"{advice}"
+        )
+
+
 def require_single_frequency(name: str, given: bool) -> None:
     """InputError where an option of single maps is given for several frequencies."""
     if given:

@@ -6,7 +6,6 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.process_group import ProcessGroup
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.tables import rows_of, write_csv
@@ -29,6 +28,7 @@ from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.runs.folder import (
     Output,
     RunKind,
+    require_marginal,
     require_single_frequency,
     run_folder,
     write_run,
@@ -96,11 +96,7 @@ def run_map(
         If the scenario samples something, or for whatever is wrong with scenario, data or folder.
     """
     group, stages = group or ProcessGroup(), stages or Stages()
-    if scenario.samples:
-        raise InputError(
-            "the scenario says that something is to be sampled, and a map can only marginalise; "
-            "use: lusee-bayes sample"
-        )
+    require_marginal("a map", "use: lusee-bayes sample", scenario.samples)
     if not scenario.frequencies_mhz:
         return _run_single(scenario, folder, data, truth, onto, replace, stages)
     output = scenario.output

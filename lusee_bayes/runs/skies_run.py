@@ -22,6 +22,7 @@ from lusee_bayes.results.sky_coverage import SkiesResult, SkyCoverage, draws_nee
 from lusee_bayes.runs.folder import (
     Output,
     RunKind,
+    require_marginal,
     require_single_frequency,
     run_folder,
     write_run,
@@ -76,11 +77,7 @@ def run_skies(
     """
     stages = stages or Stages()
     require_single_frequency("--skies", bool(scenario.frequencies_mhz))
-    if scenario.samples:
-        raise InputError(
-            "the scenario says that something is to be sampled, and --skies makes maps, which can "
-            "only marginalise; set treatment=marginalised"
-        )
+    require_marginal("--skies", "set treatment=marginalised", scenario.samples)
     given = given_skies(skies)
     if not given:
         raise InputError("--skies: name at least one sky, such as embedded:2, smooth or a file")
