@@ -42,7 +42,8 @@ def main(arguments: list[str] | None = None) -> int:
     # imports and figures make objects by the million that stay: to search them for cycles again
     # and again takes a fifth of their time
     gc.set_threshold(100_000, 20, 100)
-    COMMAND.set(shlex.join(["lusee-bayes", *(sys.argv[1:] if arguments is None else arguments)]))
+    given = sys.argv[1:] if arguments is None else arguments
+    before = COMMAND.set(shlex.join(["lusee-bayes", *given]))
     errors = Console(stderr=True, soft_wrap=True, highlight=False)
     try:
         code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
@@ -70,4 +71,6 @@ def main(arguments: list[str] | None = None) -> int:
         held = str(interrupt) or "nothing has been written"
         errors.print(f"lusee-bayes: interrupted; {held}", markup=False)
         return 130
+    finally:
+        COMMAND.reset(before)
     return code if isinstance(code, int) else 0

@@ -136,20 +136,15 @@ class Residuals:
         Returns
         -------
         list of (str, Group)
-            For each kind at most one group, with the kind; empty if all data fit. Only groups that
-            stand out are looked at, if any does.
+            With their kinds, those of a kind that say most against all others first; empty if all
+            data fit. Only groups that stand out are looked at, if any does.
         """
         if self.level() != "does not fit":
             return []
-        looked_at, found = self.extremes() or self.compared(), []
-        for kind, _ in self.kinds():
-            mine = [group for of, group in looked_at if of == kind]
-            if not mine:
-                continue
-            best = max(mine, key=lambda group: group.others_p)
-            if not stands_out(best.others_p, self.n_tests):
-                found.append((kind, best))
-        return found
+        looked_at = self.extremes() or self.compared()
+        found = [one for one in looked_at if not stands_out(one[1].others_p, self.n_tests)]
+        kinds = [kind for kind, _ in self.kinds()]
+        return sorted(found, key=lambda one: (kinds.index(one[0]), one[1].p))
 
     def fit(self, strengths: str = "") -> Fit:
         """Judge whether the data fit, and say what to do if not.
@@ -188,10 +183,19 @@ class Residuals:
             more = len(extremes) - NAMED
             named += [f"{more} more"] if more > 0 else []
             parts.append(f"Of {len(self.compared())} groups these stand out: {', '.join(named)}.")
-        if suspects:
-            without = [f"{kind} {g.name} (p {probability(g.others_p)})" for kind, g in suspects]
-            parts.append(f"The others fit without {', or without '.join(without)}: leave it out.")
-        else:
+        for kind, _ in self.kinds():
+            mine = [group for of, group in suspects if of == kind]
+            named = ", ".join(group.name for group in mine[:NAMED])
+            if len(mine) == 1:
+                p = probability(mine[0].others_p)
+                parts.append(f"The others fit without {kind} {named} (p {p}): leave it out.")
+            elif mine:
+                more = f" and {len(mine) - NAMED} more" if len(mine) > NAMED else ""
+                parts.append(
+                    f"The others fit without any one of {len(mine)} {kind}s ({named}{more}): the "
+                    "data do not tell which."
+                )
+        if not suspects:
             parts.append(f"No single product, day or turntable angle is to blame. {LOOK_AT}")
         return parts
 

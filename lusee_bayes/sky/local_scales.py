@@ -168,7 +168,7 @@ def _covariance(
 def _texture(
     family: LocalScales,
     spectrum: Float[np.ndarray, " ells"],
-    strengths: list[Float[np.ndarray, " points"]],
+    strengths: list[Float[np.ndarray, " _"]],
 ) -> Float[np.ndarray, "modes modes"]:
     total = np.zeros((len(family.mean),) * 2)
     for band, strength in zip(family.bands, strengths, strict=True):
@@ -207,7 +207,7 @@ class LocalScalesMember(Member):
         return np.exp(self.family.spectrum.matrix @ self.power)
 
     @cached_property
-    def strengths(self) -> list[Float[np.ndarray, " points"]]:
+    def strengths(self) -> list[Float[np.ndarray, " _"]]:
         """v_j of every band."""
         return [
             np.exp(band.covariates @ self.coefficients + band.cells @ self.factors)

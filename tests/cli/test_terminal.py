@@ -13,6 +13,7 @@ from rich.console import Console
 from lusee_bayes.cli.main import main
 from lusee_bayes.cli.options import show
 from lusee_bayes.cli.tables import checks_table, comparison_table
+from lusee_bayes.core.command_line import COMMAND
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
 from lusee_bayes.sampling.validation import Check
 
@@ -34,6 +35,12 @@ def with_data(run, name, change):
     diagnostics = run.diagnostics.copy(deep=True)
     diagnostics["data"] = change(diagnostics["data"])
     return replace(run, name=name, diagnostics=diagnostics)
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(["keys"], 0), (["map", "no.yaml"], 2)])
+def test_what_a_program_calls_next_is_not_said_to_be_of_a_command_before(arguments, code, capsys):
+    assert main(arguments) == code
+    assert COMMAND.get() == ""
 
 
 def test_tables_fit_eighty_columns(finished):
