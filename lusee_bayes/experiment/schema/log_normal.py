@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from lusee_bayes.experiment.schema.section import Positive, Section
-from lusee_bayes.experiment.schema.template import EMBEDDED, template_of
+from lusee_bayes.experiment.schema.section import Positive
+from lusee_bayes.experiment.schema.template import TemplateSection
 from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
 from lusee_bayes.sky import BRIGHT_SOURCES
 from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
@@ -18,7 +18,7 @@ AMPLITUDE, TILT = 0.04, -2.5
 LOG_AMPLITUDE_STD, TILT_STD = 1.0, 0.5
 
 
-class LogNormalPriorSection(Section):
+class LogNormalPriorSection(TemplateSection):
     """A template times the exponential of a Gaussian field: positive everywhere.
 
     C_ell of the field is A^2 ((ell + 1) / 10)^tilt. A and the tilt are learned from the data, or
@@ -47,11 +47,6 @@ class LogNormalPriorSection(Section):
     """
 
     model: Literal["lognormal"] = "lognormal"
-    template: str = EMBEDDED
-    file_frequency_mhz: Positive | None = None
-    spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
-    smoothing_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
-    amplitude: Positive | None = None
     tilt: Annotated[float, Field(ge=-20, le=20)] | None = None
     scale_std: Positive = 0.5
     sources: bool = True
@@ -62,21 +57,9 @@ class LogNormalPriorSection(Section):
             raise ValueError("give both amplitude and tilt, or neither, and they are learned")
         return self
 
-    @property
-    def is_learned(self) -> bool:
-        """Whether the data tell C_ell."""
-        return self.amplitude is None
-
     def family(self, frequency_mhz: float, lmax: int) -> LogNormalPrior:
         """The prior up to an ell; A and the tilt are unknowns of it where they are learned."""
-        template = template_of(
-            self.template,
-            frequency_mhz,
-            lmax,
-            file_frequency_mhz=self.file_frequency_mhz,
-            spectral_index=self.spectral_index,
-            smoothing_deg=self.smoothing_deg,
-        )
+        template = self.template_at(frequency_mhz, lmax)
         amplitude, tilt, widths = AMPLITUDE, TILT, (LOG_AMPLITUDE_STD, TILT_STD)
         if self.amplitude is not None and self.tilt is not None:
             amplitude, tilt, widths = self.amplitude, self.tilt, None
@@ -85,18 +68,3 @@ class LogNormalPriorSection(Section):
         sources = BRIGHT_SOURCES if self.sources else ()
         sky = LogNormalSky.of(template, spectrum, frequency_mhz, sources)
         return LogNormalPrior.of(sky, amplitude, tilt, widths)
-
-    @property
-    def origin(self) -> str:
-        """Where C_ell comes from."""
-        return "learned from these data" if self.is_learned else "given in the scenario"
-
-    @property
-    def has_files(self) -> bool:
-        """Whether the prior is read from files, which are of one frequency."""
-        return self.template != EMBEDDED
-
-    @property
-    def samples(self) -> bool:
-        """Whether something besides the sky and its prior is to be sampled."""
-        return False

@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.schema.log_normal import LogNormalPriorSection
 from lusee_bayes.experiment.schema.section import Positive, Section, without_other_kinds
-from lusee_bayes.experiment.schema.template import EMBEDDED, template_of
+from lusee_bayes.experiment.schema.template import LEARNED, TemplateSection
 from lusee_bayes.sky import BRIGHT_SOURCES, Sky
 from lusee_bayes.sky.isotropic_family import IsotropicFamily
 from lusee_bayes.sky.local_scales import embedded_local_scales
@@ -24,9 +24,7 @@ from lusee_bayes.sky.modulated_family import ModulatedFamily
 from lusee_bayes.sky.prior_family import PriorFamily
 from lusee_bayes.sky.prior_files import read_mean, read_spectrum
 from lusee_bayes.sky.priors import HarmonicPrior, Prior
-from lusee_bayes.sky.template import EmbeddedTemplate, Template
-
-LEARNED = "learned from these data"
+from lusee_bayes.sky.template import EmbeddedTemplate
 
 
 class IsotropicPriorSection(Section):
@@ -138,7 +136,7 @@ class IsotropicPriorSection(Section):
         return not known or bool(self.band_edges)
 
 
-class ModulatedPriorSection(Section):
+class ModulatedPriorSection(TemplateSection):
     """A template, and Gaussian deviations in proportion to it.
 
     Their C_ell is learned from the data, or A^2 ((ell + 1) / 10)^tilt where A is given.
@@ -168,20 +166,10 @@ class ModulatedPriorSection(Section):
     """
 
     model: Literal["modulated"] = "modulated"
-    template: str = EMBEDDED
-    file_frequency_mhz: Positive | None = None
-    spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
-    smoothing_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
-    amplitude: Positive | None = None
     tilt: Annotated[float, Field(ge=-20, le=20)] = -2.4
     scale_std: Positive = 0.5
     monopole_std: Positive = 1.0
     sources: bool = True
-
-    @property
-    def is_learned(self) -> bool:
-        """Whether the data tell C_ell."""
-        return self.amplitude is None
 
     def family(self, frequency_mhz: float, lmax: int) -> PriorFamily | None:
         """The family that data choose a prior of, up to an ell; None if C_ell is given."""
@@ -202,38 +190,13 @@ class ModulatedPriorSection(Section):
             [source.modes(frequency_mhz, lmax) for source in sources], (-1, n_modes(lmax))
         )
         return Modulation.of(
-            self._template(frequency_mhz, lmax),
+            self.template_at(frequency_mhz, lmax),
             lmax,
             sources=fluxes,
             sources_in_template=self.has_files,
             scale_std=self.scale_std,
             monopole_std=self.monopole_std,
         )
-
-    def _template(self, frequency_mhz: float, lmax: int) -> Template:
-        return template_of(
-            self.template,
-            frequency_mhz,
-            lmax,
-            file_frequency_mhz=self.file_frequency_mhz,
-            spectral_index=self.spectral_index,
-            smoothing_deg=self.smoothing_deg,
-        )
-
-    @property
-    def origin(self) -> str:
-        """Where C_ell comes from."""
-        return LEARNED if self.is_learned else "given in the scenario"
-
-    @property
-    def has_files(self) -> bool:
-        """Whether the prior is read from files, which are of one frequency."""
-        return self.template != EMBEDDED
-
-    @property
-    def samples(self) -> bool:
-        """Whether something of the prior is to be sampled."""
-        return False
 
 
 class LocalScalesPriorSection(Section):
