@@ -15,7 +15,8 @@ from astropy.time import Time, TimeDelta
 from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.instrument.observation import Observation, unannounced_leap_seconds
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.times import unannounced_leap_seconds
 
 BODIES = (
     "Sun",

@@ -1,4 +1,4 @@
-"""Site, times and turntable angles of an observation, and the orientation of the Moon.
+"""Site, times, windows and turntable angles of an observation.
 
 Frames: Galactic (of the sky), MCMF (fixed to the Moon, from lunarsky), topocentric (x East,
 y North, z up). Orientations come from lunarsky's own coordinate transformation at every time:
@@ -7,29 +7,31 @@ nothing assumes that the Moon turns about a fixed axis, unless ``fixed_axis`` as
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import astropy.units as u
-import erfa
 import numpy as np
 from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_body_barycentric
 from astropy.time import Time
 from jaxtyping import Bool, Float, Int
-from lunarsky import MCMF
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.core.checks import require_finite, require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.representation import Described, listed
+from lusee_bayes.instrument.moon import mcmf_from_galactic
+from lusee_bayes.instrument.times import (
+    require_ephemeris,
+    unannounced_leap_seconds,
+    utc_from_text,
+)
+from lusee_bayes.instrument.windows import ROUNDING_S, Windows
 
 CYCLE_DAYS = 27.321661
 # period after which the sky repeats itself in luseepy's engine croissant
 LUSEEPY_MONTH_HOURS = 655.72
-EPHEMERIS_YEARS = (1900, 2050)
 
 
 @dataclass(frozen=True)
@@ -60,23 +62,25 @@ class Observation(Described):
     lon_deg, lat_deg : float
         Selenographic longitude and latitude of the site.
     times : (times,) Time
-        UTC of every sample, one run after the other.
+        UTC of every sample, one run after the other: the middles of their windows, or instants.
     run : (times,) array of int
         The run that each sample belongs to: 0, 1, ... without going back.
     turntable_deg : (runs,) tuple of float
         Turntable angle of each run.
     step_s : float
-        Integration time of a sample in seconds.
+        Time from sample to sample, in seconds; without windows the integration time, too.
     fixed_axis : bool
         Turn the sky once in 655.72 hours about the axis of the first sample, as
         luseepy's engine croissant does. Wrong by several times the radiometer noise, but so are
-        its data.
+        its data, which have no windows.
+    windows : Windows or None
+        What each sample is the mean of; None for instants.
 
     Raises
     ------
     InputError
-        For a latitude, step, time or run number that is impossible, and for times outside the
-        ephemeris.
+        For a latitude, step, time or run number that is impossible, for times outside the
+        ephemeris, and for windows that overlap or are longer than a step.
     """
 
     lon_deg: float
@@ -86,6 +90,7 @@ class Observation(Described):
     turntable_deg: tuple[float, ...]
     step_s: float
     fixed_axis: bool = False
+    windows: Windows | None = None
 
     def __post_init__(self):
         if not -90.0 <= self.lat_deg <= 90.0:
@@ -116,15 +121,48 @@ class Observation(Described):
                 "each turntable angle) without going back"
             )
         require_ephemeris(self.times.jd)
+        if self.windows is not None:
+            self._check_windows(self.windows)
+
+    def _check_windows(self, windows: Windows) -> None:
+        if self.fixed_axis:
+            raise InputError(
+                "a fixed axis of the Moon is for luseepy's croissant, whose samples are instants; "
+                "use observation.window=instant with it"
+            )
+        if windows.n_samples != self.n_times:
+            raise InputError(
+                f"there are windows of {windows.n_samples} samples for {self.n_times} times"
+            )
+        bounds = windows.bounds_s
+        length = bounds[:, 1] - bounds[:, 0]
+        if (length > self.step_s * (1.0 + 1e-9) + ROUNDING_S).any():
+            longest = int(np.argmax(length))
+            raise InputError(
+                f"the window of sample {longest} lasts {length[longest]:g} s, longer than the step "
+                f"of {self.step_s:g} s from sample to sample; check the bounds, or give the step"
+            )
+        gaps = np.diff(self._seconds()) + bounds[1:, 0] - bounds[:-1, 1]
+        if (gaps < -ROUNDING_S).any():
+            first = int(np.argmax(gaps < -ROUNDING_S))
+            raise InputError(
+                f"the windows of samples {first} and {first + 1} ({self.times[first].isot[:19]}) "
+                f"overlap by {-gaps[first]:g} s; give each stretch of time to one sample"
+            )
+
+    def _seconds(self) -> Float[np.ndarray, " times"]:
+        with unannounced_leap_seconds():
+            return (self.times - self.times[0]).to_value(u.s)
 
     def description(self) -> tuple[str, ...]:
         with unannounced_leap_seconds():
             first, last = self.times[0].isot[:19], self.times[-1].isot[:19]
         angles = listed(tuple(f"{angle:g}" for angle in self.turntable_deg))
+        instants = ", taken as instants" if self.windows is None else ""
         axis = ", with a fixed axis of the Moon" if self.fixed_axis else ""
         return (
             f"longitude {self.lon_deg:g}, latitude {self.lat_deg:g} degrees{axis}",
-            f"{first} to {last} UTC, {self.n_times} samples of {self.step_s:g} s",
+            f"{first} to {last} UTC, {self.n_times} samples of {self.step_s:g} s{instants}",
             f"{self.n_runs} run{'s' * (self.n_runs > 1)}, turntable at {angles} degrees",
         )
 
@@ -138,6 +176,7 @@ class Observation(Described):
         lon_deg: float = 182.258,
         lat_deg: float = -23.814,
         fixed_axis: bool = False,
+        window: Literal["instant", "mean"] = "instant",
     ) -> Observation:
         """Return an observation of runs that follow one another; defaults as in the paper.
 
@@ -154,6 +193,9 @@ class Observation(Described):
         lon_deg, lat_deg : float
         fixed_axis : bool
             See :class:`Observation`.
+        window : {"instant", "mean"}
+            Whether a sample is the sky at the beginning of its step, as in the paper, or the mean
+            over the step.
 
         Returns
         -------
@@ -183,6 +225,10 @@ class Observation(Described):
             elapsed += length
         seconds, run_of = np.concatenate(offsets), np.concatenate(numbers)
         require_ephemeris(np.array([t0.jd + seconds[-1] / 86400.0]))
+        windows = None
+        if window == "mean":
+            half = np.full(len(seconds), step_s / 2.0)
+            seconds, windows = seconds + half, Windows.whole(-half, half)
         with unannounced_leap_seconds():
             times = t0 + seconds * u.s
         observation = cls(
@@ -193,6 +239,7 @@ class Observation(Described):
             tuple(r.turntable_deg for r in runs),
             step_s,
             fixed_axis,
+            windows,
         )
         night_runs = np.array([r.night_only for r in runs])
         if not night_runs.any():
@@ -225,6 +272,7 @@ class Observation(Described):
             tuple(self.turntable_deg[run] for run in runs),
             self.step_s,
             self.fixed_axis,
+            None if self.windows is None else self.windows.select(keep),
         )
 
     @property
@@ -236,6 +284,40 @@ class Observation(Described):
     def n_runs(self) -> int:
         """Number of runs."""
         return len(self.turntable_deg)
+
+    @property
+    def live_s(self) -> Float[np.ndarray, " times"]:
+        """Integration time of every sample, in seconds."""
+        if self.windows is None:
+            return np.full(self.n_times, float(self.step_s))
+        return self.windows.live_per_sample_s
+
+    def at_nodes(
+        self, n: int
+    ) -> tuple[Observation, Int[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
+        """Return the observation at instants whose weighted means are those over the windows.
+
+        Parameters
+        ----------
+        n : int
+            Instants in each piece of a window, see :meth:`.Windows.nodes`.
+
+        Returns
+        -------
+        observation : Observation
+            Of the instants; itself if it has no windows.
+        sample : (nodes,) array of int
+            The sample of every instant, growing.
+        weight : (nodes,) array
+            One in total for each sample.
+        """
+        if self.windows is None:
+            return self, np.arange(self.n_times), np.ones(self.n_times)
+        sample, offset_s, weight = self.windows.nodes(n)
+        with unannounced_leap_seconds():
+            times = self.times[sample] + offset_s * u.s
+        instants = replace(self, times=times, run=self.run[sample], windows=None)
+        return instants, sample, weight
 
     @property
     def hours(self) -> Float[np.ndarray, " times"]:
@@ -281,65 +363,3 @@ class Observation(Described):
         vector = vector / np.linalg.norm(vector, axis=0)
         height = np.einsum("ti,it->t", self.zenith_galactic(), vector)
         return np.degrees(np.arcsin(height))
-
-
-@contextmanager
-def unannounced_leap_seconds() -> Iterator[None]:
-    """Silence ERFA's warning that UTC of coming years may get more leap seconds."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", erfa.ErfaWarning)
-        yield
-
-
-def utc_from_text(name: str, text: str) -> Time:
-    """Return the time of an ISO date in UTC.
-
-    Raises
-    ------
-    InputError
-        If it is none, or outside the ephemeris; the message begins with ``name``.
-    """
-    try:
-        with unannounced_leap_seconds():
-            time = Time(text, scale="utc")
-    except (ValueError, TypeError) as error:
-        raise InputError(
-            f"{name} '{text}' is not a date; write it as 2027-01-15T00:00:00"
-        ) from error
-    require_ephemeris(np.atleast_1d(time.jd))
-    return time
-
-
-def require_ephemeris(jd: Float[np.ndarray, " times"]) -> None:
-    """Check that Julian dates lie within lunarsky's kernel of the Moon's orientation.
-
-    Raises
-    ------
-    InputError
-        If one does not.
-    """
-    first, last = (Time(f"{year}-01-01", scale="tdb").jd for year in EPHEMERIS_YEARS)
-    outside = ~((jd >= first) & (jd <= last))
-    if not outside.any():
-        return
-    at = float(jd[outside][0])
-    date = f"Julian date {at:.6g}"
-    if 0.0 < at < 5373484.0:  # years of four digits
-        with unannounced_leap_seconds():
-            date = Time(at, format="jd").isot[:19]
-    raise InputError(
-        f"sample times run outside the ephemeris ({EPHEMERIS_YEARS[0]}-{EPHEMERIS_YEARS[1]}): "
-        f"{date}; give a start inside it"
-    )
-
-
-def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:
-    """Return the rotations that take Galactic unit vectors to MCMF ones.
-
-    The three Galactic axes go through lunarsky's ICRS -> MCMF transformation in one call.
-    """
-    axes = Galactic(CartesianRepresentation(np.eye(3)[:, :, None])).transform_to(ICRS())
-    icrs = ICRS(CartesianRepresentation(axes.cartesian.xyz.value))
-    with unannounced_leap_seconds():
-        turned = icrs.transform_to(MCMF(obstime=times))
-    return np.moveaxis(turned.cartesian.xyz.value, 2, 0)

@@ -2,20 +2,71 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Any
 
 import astropy.units as u
+import erfa
 import numpy as np
 from astropy.time import Time
 from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.observation import (
-    require_ephemeris,
-    unannounced_leap_seconds,
-    utc_from_text,
-)
+
+EPHEMERIS_YEARS = (1900, 2050)
+
+
+@contextmanager
+def unannounced_leap_seconds() -> Iterator[None]:
+    """Silence ERFA's warning that UTC of coming years may get more leap seconds."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
+        yield
+
+
+def utc_from_text(name: str, text: str) -> Time:
+    """Return the time of an ISO date in UTC.
+
+    Raises
+    ------
+    InputError
+        If it is none, or outside the ephemeris; the message begins with ``name``.
+    """
+    try:
+        with unannounced_leap_seconds():
+            time = Time(text, scale="utc")
+    except (ValueError, TypeError) as error:
+        raise InputError(
+            f"{name} '{text}' is not a date; write it as 2027-01-15T00:00:00"
+        ) from error
+    require_ephemeris(np.atleast_1d(time.jd))
+    return time
+
+
+def require_ephemeris(jd: Float[np.ndarray, " times"]) -> None:
+    """Check that Julian dates lie within lunarsky's kernel of the Moon's orientation.
+
+    Raises
+    ------
+    InputError
+        If one does not.
+    """
+    first, last = (Time(f"{year}-01-01", scale="tdb").jd for year in EPHEMERIS_YEARS)
+    outside = ~((jd >= first) & (jd <= last))
+    if not outside.any():
+        return
+    at = float(jd[outside][0])
+    date = f"Julian date {at:.6g}"
+    if 0.0 < at < 5373484.0:  # years of four digits
+        with unannounced_leap_seconds():
+            date = Time(at, format="jd").isot[:19]
+    raise InputError(
+        f"sample times run outside the ephemeris ({EPHEMERIS_YEARS[0]}-{EPHEMERIS_YEARS[1]}): "
+        f"{date}; give a start inside it"
+    )
 
 
 def utc_of(

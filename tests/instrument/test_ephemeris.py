@@ -13,7 +13,8 @@ from lusee_bayes.instrument.ephemeris import (
     body_direction,
     body_distance_au,
 )
-from lusee_bayes.instrument.observation import Observation, Run, unannounced_leap_seconds
+from lusee_bayes.instrument.observation import Observation, Run
+from lusee_bayes.instrument.times import unannounced_leap_seconds
 
 AU_KM = 149597870.7
 LIGHT = 299792.458

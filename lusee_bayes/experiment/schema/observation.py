@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Annotated
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lusee_bayes.experiment.schema.section import Angle, Positive, Section
 from lusee_bayes.instrument.observation import Observation, Run
@@ -39,22 +39,32 @@ class ObservationSection(Section):
     lat_deg : float
         Latitude of the site on the Moon (MCMF).
     start : str
-        First sample, UTC, as 2027-01-15T00:00:00.
+        Beginning of the first sample, UTC, as 2027-01-15T00:00:00.
     step_s : float
         Time between samples.
+    window : {"mean", "instant"}
+        What a sample is where no data say it: the mean over its step, or the sky at its beginning,
+        as in the paper and in luseepy's simulators.
     runs : tuple of RunSection
         Stretches of data, one after another.
     fixed_axis : bool
         The Moon turns about the axis of the first sample, as luseepy's engine ``croissant`` has
-        it; for data that it has made.
+        it; for data that it has made, with ``window: instant``.
     """
 
     lon_deg: Annotated[float, Field(ge=-360, le=360)] = 182.258
     lat_deg: Annotated[float, Field(ge=-90, le=90)] = -23.814
     start: str = "2027-01-15T00:00:00"
     step_s: Positive = 7200.0
+    window: Literal["mean", "instant"] = "mean"
     runs: Annotated[tuple[RunSection, ...], Field(min_length=1)] = (RunSection(),)
     fixed_axis: bool = False
+
+    @model_validator(mode="after")
+    def _a_fixed_axis_has_instants(self) -> ObservationSection:
+        if self.fixed_axis and self.window != "instant":
+            raise ValueError("fixed_axis is for samples that are instants; add window: instant")
+        return self
 
     def observation(self) -> Observation:
         """Site, times and turntable angles."""
@@ -71,4 +81,5 @@ def _observation(section: ObservationSection) -> Observation:
         lon_deg=section.lon_deg,
         lat_deg=section.lat_deg,
         fixed_axis=section.fixed_axis,
+        window=section.window,
     )

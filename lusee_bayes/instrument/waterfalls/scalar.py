@@ -19,12 +19,9 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import read_fits
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming
-from lusee_bayes.instrument.observation import (
-    Observation,
-    require_ephemeris,
-    unannounced_leap_seconds,
-)
+from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import N_ANTENNAS, Product, all_products
+from lusee_bayes.instrument.times import require_ephemeris, unannounced_leap_seconds
 from lusee_bayes.instrument.waterfalls.time_range import start_of
 from lusee_bayes.instrument.waterfalls.waterfall import SITE_AND_STEP, Waterfall
 

@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.ephemeris import body_direction
-from lusee_bayes.instrument.observation import Observation, utc_from_text
-from lusee_bayes.instrument.times import utc_of
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.times import utc_from_text, utc_of
 
 YEAR = re.compile(r"(CY|FY)([0-9]{2}|[0-9]{4})")
 LUNAR_DAY = re.compile(r"[0-9]{3,4}")

@@ -15,8 +15,9 @@ from jaxtyping import Complex, Float
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.version import __version__
-from lusee_bayes.instrument.observation import Observation, unannounced_leap_seconds
+from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import N_ANTENNAS, all_products
+from lusee_bayes.instrument.times import unannounced_leap_seconds
 from lusee_bayes.instrument.visibilities import Visibilities
 
 HINT = "write netCDF instead (a name that does not end in .fits)"
