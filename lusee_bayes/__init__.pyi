@@ -24,7 +24,7 @@ from .instrument.observation import Observation as Observation
 from .instrument.observation import Run as Run
 from .instrument.pointing import Pointing as Pointing
 from .instrument.visibilities import Visibilities as Visibilities
-from .instrument.visibilities import read_visibilities as read_visibilities
+from .instrument.visibilities_file import read_visibilities as read_visibilities
 from .instrument.waterfalls import read_waterfall as read_waterfall
 from .instrument.waterfalls import write_four_port as write_four_port
 from .instrument.waterfalls import write_waterfall as write_waterfall

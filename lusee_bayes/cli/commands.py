@@ -15,6 +15,15 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "lusee-bayes simulate fiducial --frequencies 10:30:5 -o waterfall.fits",
         ),
     ),
+    "average": (
+        "Average data over longer times, and say what that costs.",
+        "Data then need less memory and time to map. The cost is information about the map, in "
+        "bits, by the forecast that plan makes.",
+        (
+            "lusee-bayes average data.nc --to 2h -o averaged.nc",
+            "lusee-bayes average data.nc --to 30min --scenario gain_1e-2 --set lmax=31",
+        ),
+    ),
     "map": (
         "Make a posterior map of a scenario, or of given data.",
         "",

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from math import isclose
+from math import inf, isclose
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -44,6 +45,11 @@ Count = Annotated[int, Parameter(converter=_whole(1))]
 Flag = Annotated[bool, Parameter(negative="")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 Force = Annotated[bool, Parameter(name="--force", negative="")]
+
+
+# a number and its unit
+DURATION = re.compile(r"\s*([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?)\s*(s|min|h|d)\s*", re.ASCII)
+SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 # channels of one run: far more than 25 kHz apart over the band
@@ -99,6 +105,18 @@ def say(console: Console, *lines: object) -> None:
 def show(console: Console, table: Table) -> None:
     """Print a table within the width of the terminal: its cells are wrapped."""
     console.print(table, soft_wrap=False)
+
+
+def parse_duration(text: str) -> float:
+    """Seconds out of ``30s``, ``10min``, ``2h`` or ``1d``. InputError if it is none of these."""
+    found = DURATION.fullmatch(text)
+    seconds = float(found[1]) * SECONDS[found[2]] if found else 0.0
+    if not 0.0 < seconds < inf:
+        raise InputError(
+            f"'{text[:40]}' is not a length of time; give a positive number and its unit, s, min, "
+            "h or d, as in 30s, 10min, 2h or 1d"
+        )
+    return seconds
 
 
 def parse_frequencies(text: str) -> list[float]:

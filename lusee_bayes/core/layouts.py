@@ -17,7 +17,7 @@ import numpy as np
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.memory import gigabytes, memory_limit
 
-Kind = Literal["real", "complex", "integer", "boolean", "text", "word"]
+Kind = Literal["real", "complex", "integer", "boolean", "text", "word", "time"]
 # numpy's kinds of dtypes that each takes, and what it becomes
 KINDS: dict[str, tuple[str, type]] = {
     "real": ("fiu", np.float64),
@@ -26,6 +26,7 @@ KINDS: dict[str, tuple[str, type]] = {
     "boolean": ("biu", np.bool_),
     "text": ("UST", np.str_),
     "word": ("UST", np.str_),
+    "time": ("M", np.datetime64),
 }
 NAMES = {
     "real": "real numbers",
@@ -34,6 +35,7 @@ NAMES = {
     "boolean": "true or false",
     "text": "text",
     "word": "text or a whole number",
+    "time": "times (such as seconds since 2027-01-01)",
 }
 
 # no quantity of this field is larger in any unit, and fourth powers have room in 64 bits
@@ -56,8 +58,8 @@ class Variable:
     ----------
     dims : sequence of str or int
         Names of lengths, which all arrays of the file share, or lengths.
-    kind : {"real", "complex", "integer", "boolean", "text"}
-        What it holds; it is read as float64, complex128, int64, bool or str.
+    kind : {"real", "complex", "integer", "boolean", "text", "time"}
+        What it holds; it is read as float64, complex128, int64, bool, str or datetime64[ns].
     low, high : float
         The range of its numbers, ends included.
     finite : bool
@@ -233,6 +235,11 @@ def _checked_array(where: str, values: np.ndarray, declared: Variable) -> np.nda
         for text in texts.ravel():
             _require_choice(where, str(text), declared.choices)
         return texts
+    if declared.kind == "time":
+        if np.isnat(values).any():
+            first = tuple(int(i) for i in np.argwhere(np.isnat(values))[0])
+            raise InputError(f"{where} holds no time at {first}")
+        return values.astype("datetime64[ns]")
     if declared.kind == "boolean" and not np.isin(values, (0, 1)).all():
         raise InputError(f"{where} holds other numbers than 0 and 1, expected true or false")
     values = np.ascontiguousarray(values, dtype=KINDS[declared.kind][1])

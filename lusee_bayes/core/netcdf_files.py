@@ -13,6 +13,9 @@ from lusee_bayes.core.formats import format_of
 from lusee_bayes.core.layouts import Content, Layout
 from lusee_bayes.core.reading import reading, require_file
 
+# what the CF conventions call times, and what bounds may leave to the variable that they bound
+CF_TIME = ("units", "calendar")
+
 
 def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") -> Content:
     """Read one of the package's own files.
@@ -78,6 +81,18 @@ def _opened(path: str | Path, format_: str, layout: Layout, hint: str) -> Iterat
         yield dataset
 
 
+def _decoded(dataset: xr.Dataset, name: str, variable: xr.Variable) -> xr.Variable:
+    """Times by the CF conventions: bounds have the units of what they bound, if none of their own.
+
+    Without units they stay numbers.
+    """
+    bounding = (v.attrs for v in dataset.variables.values() if v.attrs.get("bounds") == name)
+    units = {key: v for attrs in bounding for key, v in attrs.items() if key in CF_TIME}
+    known = variable.copy(deep=False)
+    known.attrs = units | dict(variable.attrs)
+    return xr.conventions.decode_cf_variable(name, known)
+
+
 def _checked(path: str | Path, dataset: xr.Dataset, layout: Layout) -> Content:
     arrays = {str(name): variable for name, variable in dataset.variables.items()}
     for name, declared in layout.variables.items():
@@ -87,5 +102,6 @@ def _checked(path: str | Path, dataset: xr.Dataset, layout: Layout) -> Content:
         dims = [str(d) for d in declared.dims]
         if array.dims != tuple(dims) and sorted(map(str, array.dims)) == sorted(dims):
             array = array.transpose(*dims)
-        arrays[name] = array.variable
+        variable = array.variable
+        arrays[name] = _decoded(dataset, name, variable) if declared.kind == "time" else variable
     return layout.checked(path, arrays, dataset.attrs)

@@ -8,9 +8,12 @@ import numpy as np
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import is_fits
-from lusee_bayes.core.reading import require_file
+from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.instrument.visibilities import HINT, Visibilities, read_visibilities
+from lusee_bayes.instrument.averaging import averaged
+from lusee_bayes.instrument.timestamps import Timestamp
+from lusee_bayes.instrument.visibilities import HINT, Visibilities
+from lusee_bayes.instrument.visibilities_file import read_visibilities
 from lusee_bayes.instrument.waterfalls import Waterfall, read_waterfall
 from lusee_bayes.instrument.waterfalls.four_port import INTERPOLATIONS
 
@@ -27,16 +30,55 @@ def read_data(path: Path, scenario: Scenario) -> Visibilities:
     ----------
     path : Path
     scenario : Scenario
-        Of the frequency to read, and of the instrument that a waterfall has to fit.
+        Of the frequency to read, of the instrument that a waterfall has to fit, of what the times
+        of a file are that does not say so, and of the time to average over.
 
     Raises
     ------
     InputError
-        If the file cannot be used, or a waterfall does not fit the scenario's beams.
+        If the file cannot be used, it is not known or contradicted what its times are, they cannot
+        be averaged, or a waterfall does not fit the scenario's beams.
     """
     require_file(path, "data", HINT)
-    if not is_fits(path):
-        return read_visibilities(path)
+    timestamp, average_s = scenario.observation.timestamp, scenario.observation.average_s
+    if is_fits(path):
+        data = _channel(path, scenario)
+        # samples of luseepy's simulators are instants; its layout cannot say that others are not
+        if timestamp is not None:
+            with naming(path):
+                data = data.stamped(timestamp)
+    else:
+        data = _own(path, timestamp)
+    if average_s is None:
+        return data
+    with naming(path):
+        return averaged(data, average_s)
+
+
+def _own(path: Path, timestamp: Timestamp | None) -> Visibilities:
+    """Data of the package's own file; its times are what it says, or else what the scenario says."""
+    data = read_visibilities(path)
+    if not data.says_window:
+        if timestamp is None:
+            raise InputError(
+                f"{path} does not say what its times are: it has neither time_bounds nor the "
+                "attribute window = 'instant', and the start of a sample taken for its middle "
+                "shifts the data by tens to hundreds of standard deviations; use --set "
+                "observation.timestamp=start (or middle, end, instant)"
+            )
+        with naming(path):
+            return data.stamped(timestamp)
+    instants = data.observation.windows is None
+    if timestamp not in (None, "instant" if instants else "middle"):
+        said = "instants" if instants else "means over windows, with their start and end"
+        raise InputError(
+            f"{path} says that its samples are {said}, the scenario that their times are "
+            f"observation.timestamp={timestamp}; leave that out, or correct the file"
+        )
+    return data
+
+
+def _channel(path: Path, scenario: Scenario) -> Visibilities:
     waterfall = read_waterfall(path)
     data = waterfall.at(scenario.frequency_mhz, scenario.beam.n_ports)
     if waterfall.per_kelvin is not None:

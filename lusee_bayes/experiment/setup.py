@@ -141,7 +141,8 @@ def set_up(
     Raises
     ------
     InputError
-        If the data are of another frequency, another site or other ports.
+        If the data are of another frequency, another site or other ports, or do not say what
+        their times are.
     """
     stages = stages or Stages()
     if data is not None:
@@ -213,7 +214,12 @@ def _antennas(scenario: Scenario, source: BeamSource) -> Monopoles:
 
 
 def require_fitting(data: Visibilities, scenario: Scenario) -> None:
-    """InputError unless data are of the scenario's frequency and site."""
+    """InputError unless data are of the scenario's frequency and site, with known times."""
+    if not data.says_window:
+        raise InputError(
+            "the data do not say what their times are; use data.stamped('start') (or 'middle', "
+            "'end', 'instant'), or read_data with observation.timestamp"
+        )
     if abs(data.frequency_mhz - scenario.frequency_mhz) > SAME_FREQUENCY_MHZ:
         raise InputError(
             f"the data are at {data.frequency_mhz} MHz, the scenario at "

@@ -205,6 +205,19 @@ def site_of(site: Any) -> tuple[float, float]:
     return lon, lat
 
 
+def numbers_of_times(name: str, values: Any, n_times: int) -> Float[np.ndarray, " times"]:
+    """Return a finite number for each time. InputError, with the name, if there are others."""
+    try:
+        numbers = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is {values!r}; give a number for each time") from error
+    if numbers.shape != (n_times,) or not np.isfinite(numbers).all():
+        raise InputError(
+            f"{name} has shape {numbers.shape}; give a finite number for each of {n_times} times"
+        )
+    return numbers
+
+
 def runs_of(turntable_deg: Any, n_times: int) -> tuple[np.ndarray, tuple[float, ...]]:
     """Return the run of each sample, and the turntable angle of each run.
 

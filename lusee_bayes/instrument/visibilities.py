@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,46 +17,19 @@ from lusee_bayes.core.checks import require_finite, require_float64, require_pos
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.harmonics import lmax_of
-from lusee_bayes.core.layouts import Attribute, Layout, Variable
-from lusee_bayes.core.netcdf_files import read_netcdf
-from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.representation import Described, extent, listed
 from lusee_bayes.core.version import __version__
+from lusee_bayes.instrument import window_variables
 from lusee_bayes.instrument.beams.receiver import MeasuredReceiver
-from lusee_bayes.instrument.correlations import (
-    real_products,
-    runs_of,
-    site_of,
-)
+from lusee_bayes.instrument.correlations import numbers_of_times, real_products, runs_of, site_of
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import N_ANTENNAS, labels
-from lusee_bayes.instrument.times import step_of, utc_of, utc_times
+from lusee_bayes.instrument.times import step_of, utc_times
+from lusee_bayes.instrument.timestamps import Timestamp, bounded, stamped, utc_bounds
 
 LOADS = ("load_ohm_real", "load_ohm_imag")
-# what a file of visibilities holds
-LAYOUT = Layout(
-    "visibilities",
-    {
-        "product": Variable(("product",), "text"),
-        "visibility": Variable(("product", "time"), finite=False),
-        "flag": Variable(("product", "time"), "boolean"),
-        "jd1": Variable(("time",)),
-        "jd2": Variable(("time",)),
-        "run": Variable(("time",), "integer", low=0.0),
-        "turntable_deg": Variable(("run_number",)),
-        "truth": Variable(("mode",), optional=True),
-        # the receivers' loads ZL, where they are known
-        "load_frequency_mhz": Variable(("load_frequency",), low=0.0, grows=True, optional=True),
-        **{name: Variable(("load_frequency", "port", "port_2"), optional=True) for name in LOADS},
-    },
-    {
-        "frequency_mhz": Attribute(low=0.0),
-        "lon_deg": Attribute(low=-360.0, high=360.0),
-        "lat_deg": Attribute(low=-90.0, high=90.0),
-        "step_s": Attribute(low=0.0),
-    },
-)
+# what to do where there is no file of them
 HINT = "make some with: lusee-bayes simulate SCENARIO"
 
 
@@ -76,6 +49,9 @@ class Visibilities(Described):
         The sky of simulated data in K, Galactic; None for real data.
     receiver : MeasuredReceiver or None
         The loads through which they were taken, for data of luseepy's four ports.
+    says_window : bool
+        Whether it is known what the times are. False for data of a file that says neither windows
+        nor instants: they are of no use before :meth:`stamped`.
 
     Raises
     ------
@@ -89,6 +65,7 @@ class Visibilities(Described):
     frequency_mhz: float
     truth: Float[Array, " modes"] | None = None
     receiver: MeasuredReceiver | None = None
+    says_window: bool = True
 
     def __post_init__(self):
         require_float64("the data", self.data)
@@ -112,6 +89,9 @@ class Visibilities(Described):
         flags: Any = None,
         turntable_deg: Any = 0.0,
         convention: str = "s_i conj(s_j)",
+        timestamp: Timestamp = "middle",
+        bounds: Any = None,
+        live_s: Any = None,
         step_s: float | None = None,
         n_antennas: int = N_ANTENNAS,
     ) -> Visibilities:
@@ -123,7 +103,7 @@ class Visibilities(Described):
             In K. Complex correlations V_ij of pairs of ports, or their real and imaginary parts as
             real columns; NaN, or masked, where a sample is absent.
         times : (times,) sequence
-            Middles of the samples, growing: datetimes, ISO dates (UTC) or an astropy Time.
+            Of the samples, growing: datetimes, ISO dates (UTC) or an astropy Time.
         frequency_mhz : float
         products : sequence of str, optional
             The name of each column, in any order: "01" for complex data, "01R" and "01I" for real
@@ -138,8 +118,16 @@ class Visibilities(Described):
         convention : {"s_i conj(s_j)", "conj(s_i) s_j"}
             What "ij" is the mean of, with voltages that go as exp(+i w t). Software that has
             exp(-i w t) has the other sign of the imaginary part, too.
+        timestamp : {"middle", "start", "end", "instant"}
+            What the times are. Samples are means over windows of ``step_s``, unless they are
+            instants.
+        bounds : (times, 2) sequence, optional
+            Start and end of every sample, of any kind of times, where they are not those of
+            ``timestamp`` and ``step_s``. The times then may be anywhere between.
+        live_s : (times,) array, optional
+            How long each sample was integrated, in seconds; by default all of its window.
         step_s : float, optional
-            Integration time in seconds; by default the median step from sample to sample.
+            From sample to sample, in seconds; by default the median of the times.
         n_antennas : int
             Number of ports.
 
@@ -161,7 +149,15 @@ class Visibilities(Described):
         require_positive("frequency_mhz", frequency_mhz)
         lon_deg, lat_deg = site_of(site)
         run, angles = runs_of(turntable_deg, len(utc))
-        observation = Observation(lon_deg, lat_deg, utc, run, angles, step_of(utc, step_s))
+        live_s = None if live_s is None else numbers_of_times("live_s", live_s, len(utc))
+        if bounds is None:
+            step_s = step_of(utc, step_s)
+            middles, windows = stamped(utc, timestamp, step_s, live_s)
+        elif timestamp == "instant":
+            raise InputError("instants have no bounds; leave out bounds, or timestamp='instant'")
+        else:
+            middles, step_s, windows = bounded(utc, utc_bounds(bounds, len(utc)), step_s, live_s)
+        observation = Observation(lon_deg, lat_deg, middles, run, angles, step_s, windows=windows)
         layout = DataLayout.from_flags(missing)
         return cls(layout.gather(values), layout, observation, float(frequency_mhz))
 
@@ -187,10 +183,14 @@ class Visibilities(Described):
         return labels(round(np.sqrt(self.layout.n_products)))
 
     def digest(self) -> str:
-        """Return a hash of the data, their layout and their times, which tells data sets apart."""
+        """Return a hash of data, layout, times and windows, which tells data sets apart."""
         content = hashlib.sha256(np.ascontiguousarray(self.data).tobytes())
         content.update(self.layout.product.tobytes() + self.layout.time.tobytes())
         content.update(self.observation.times.jd.tobytes())
+        windows = self.observation.windows
+        if windows is not None:
+            for values in (windows.sample, windows.start_s, windows.end_s, windows.live_s):
+                content.update(np.ascontiguousarray(values).tobytes())
         return content.hexdigest()
 
     def grid(self) -> Float[np.ndarray, "products times"]:
@@ -198,14 +198,37 @@ class Visibilities(Described):
         present = np.asarray(self.layout.present)
         return np.where(present, np.asarray(self.layout.scatter(self.data)), np.nan)
 
+    def stamped(self, timestamp: Timestamp) -> Visibilities:
+        """Return the same data, their times being what is said; windows last for a step.
+
+        Parameters
+        ----------
+        timestamp : {"start", "middle", "end", "instant"}
+
+        Raises
+        ------
+        InputError
+            If the data have windows, and as :class:`Observation`.
+        """
+        observation = self.observation
+        if observation.windows is not None:
+            raise InputError("the data have windows, so that their times are the middles of these")
+        times, windows = stamped(observation.times, timestamp, observation.step_s)
+        seen = replace(observation, times=times, windows=windows)
+        return replace(self, observation=seen, says_window=True)
+
     def to_dataset(self) -> xr.Dataset:
-        """Return a Dataset with dims product, time and run_number, and mode if truth is known."""
+        """Return a Dataset with dims product, time and run_number.
+
+        With the dims piece and bounds for windows, and mode if the truth is known.
+        """
         observation = self.observation
         variables = {
             "visibility": (("product", "time"), self.grid(), {"units": "K"}),
             "flag": (("product", "time"), ~np.asarray(self.layout.present)),
             "run": (("time",), observation.run),
             "turntable_deg": (("run_number",), np.array(observation.turntable_deg)),
+            **window_variables.variables(observation),
         }
         if self.truth is not None:
             variables["truth"] = (("mode",), np.asarray(self.truth), {"units": "K"})
@@ -213,14 +236,14 @@ class Visibilities(Described):
             dims, ohm = ("load_frequency", "port", "port_2"), self.receiver.load_ohm
             variables["load_frequency_mhz"] = (dims[:1], self.receiver.frequencies_mhz)
             variables |= {n: (dims, x) for n, x in zip(LOADS, (ohm.real, ohm.imag), strict=True)}
-        # two parts keep the times exact; datetime64 is for the reader's eye
+        # two parts keep the times exact
         variables["jd1"] = (("time",), observation.times.jd1, {"scale": "utc"})
         variables["jd2"] = (("time",), observation.times.jd2, {"scale": "utc"})
         return xr.Dataset(
             variables,
             coords={
                 "product": list(self.labels),
-                "time": observation.times.isot.astype("datetime64[ms]"),
+                "time": window_variables.coordinate(observation),
             },
             attrs={
                 "format": formats.VISIBILITIES,
@@ -228,6 +251,7 @@ class Visibilities(Described):
                 "lon_deg": observation.lon_deg,
                 "lat_deg": observation.lat_deg,
                 "step_s": observation.step_s,
+                **(window_variables.attributes(observation) if self.says_window else {}),
                 "lusee_bayes_version": __version__,
             },
         )
@@ -248,64 +272,3 @@ class Visibilities(Described):
         with replacing(path) as partial:
             self.to_dataset().assign_attrs(attrs or {}).to_netcdf(partial, engine="h5netcdf")
         return Path(path)
-
-
-def read_visibilities(path: str | Path) -> Visibilities:
-    """Read a file that :meth:`Visibilities.write` has written.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    Visibilities
-
-    Raises
-    ------
-    InputError
-        If the file is missing or of another kind, holds NaN that is not flagged, or has nothing
-        but flagged samples.
-    """
-    require_file(path, "data", HINT)
-    found = read_netcdf(path, formats.VISIBILITIES, LAYOUT, HINT)
-    here = found.arrays
-    n, products = round(np.sqrt(found.sizes["product"])), tuple(map(str, here["product"]))
-    if products != labels(n):
-        raise InputError(
-            f"{path} has products {', '.join(products)}; expected {', '.join(labels(n))}"
-        )
-    flags = here["flag"]
-    values = np.where(flags, 0.0, here["visibility"])
-    require_finite(f"{path}: visibility (where not flagged)", values)
-    if here["run"].max() >= found.sizes["run_number"]:
-        raise InputError(
-            f"{path}: run numbers go up to {here['run'].max()}, and turntable_deg has "
-            f"{found.sizes['run_number']} runs"
-        )
-    with naming(path):
-        layout = DataLayout.from_flags(flags)
-        observation = Observation(
-            found.values["lon_deg"],
-            found.values["lat_deg"],
-            utc_of(here["jd1"], here["jd2"]),
-            here["run"],
-            tuple(here["turntable_deg"].tolist()),
-            found.values["step_s"],
-        )
-        return Visibilities(
-            layout.gather(values),
-            layout,
-            observation,
-            found.values["frequency_mhz"],
-            here.get("truth"),
-            _receiver(path, here),
-        )
-
-
-def _receiver(path: str | Path, here: dict[str, np.ndarray]) -> MeasuredReceiver | None:
-    names = ("load_frequency_mhz", *LOADS)
-    if not set(names) <= set(here):
-        return None
-    frequencies, real, imaginary = (here[name] for name in names)
-    return MeasuredReceiver(str(path), frequencies, real + 1j * imaginary)

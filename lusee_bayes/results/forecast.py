@@ -127,10 +127,18 @@ def without_ports(setup: Setup, lost: Sequence[int]) -> Setup:
     return replace(setup, instrument=instrument, coupling=coupling)
 
 
-def forecast(variation: Variation) -> Forecast:
-    """Build A, S and N of a variation and take the numbers from its posterior covariance.
+def expected_posterior(setup: Setup) -> Posterior:
+    """The posterior of a setup, of which all but the mean is known without data.
 
     N is the model's, with marginalised systematics and noise levels from the modelled sky.
+    """
+    model = full_model(setup)
+    # the covariance is that of any data; these are the shortest to write
+    return model.condition(np.zeros(model.n_data))
+
+
+def forecast(variation: Variation) -> Forecast:
+    """Build A, S and N of a variation and take the numbers from its posterior covariance.
 
     Raises
     ------
@@ -141,13 +149,11 @@ def forecast(variation: Variation) -> Forecast:
         setup = set_up(variation.scenario)
         if variation.lost:
             setup = without_ports(setup, variation.lost)
-        model = full_model(setup)
-        # the covariance is that of any data; these are the shortest to write
-        posterior = model.condition(np.zeros(model.n_data))
+        posterior = expected_posterior(setup)
         return Forecast(
             variation=variation,
             days=setup.observation.n_times * setup.observation.step_s / 86400.0,
-            n_data=model.n_data,
+            n_data=setup.layout.size,
             information_bits=float(posterior.information_bits()),
             modes=informed_modes(posterior),
             snr_squared=expected_snr_squared(posterior),

@@ -20,7 +20,7 @@ from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.beams import read_beam, sampled_beams, write_sampled_beams
-from lusee_bayes.instrument.visibilities import read_visibilities
+from lusee_bayes.instrument.visibilities_file import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.linear.compact import read_compact
 from lusee_bayes.report.describe import describe

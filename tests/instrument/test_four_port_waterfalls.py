@@ -15,7 +15,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.instrument.beams import CapacitorReceiver, read_beam
-from lusee_bayes.instrument.visibilities import read_visibilities
+from lusee_bayes.instrument.visibilities_file import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_four_port
 
 

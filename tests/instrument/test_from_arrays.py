@@ -11,7 +11,8 @@ from astropy.time import Time
 
 import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.instrument.visibilities_file import read_visibilities
 
 N = 5
 START = datetime(2027, 1, 15)

@@ -8,7 +8,8 @@ import xarray as xr
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation, Run
-from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.instrument.visibilities_file import read_visibilities
 
 
 @pytest.fixture

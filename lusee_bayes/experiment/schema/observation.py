@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from lusee_bayes.experiment.schema.section import Angle, Positive, Section
 from lusee_bayes.instrument.observation import Observation, Run
+from lusee_bayes.instrument.timestamps import Timestamp
 
 
 class RunSection(Section):
@@ -45,6 +46,11 @@ class ObservationSection(Section):
     window : {"mean", "instant"}
         What a sample is where no data say it: the mean over its step, or the sky at its beginning,
         as in the paper and in luseepy's simulators.
+    timestamp : {"start", "middle", "end", "instant"}
+        What the times of a file of data are, if it does not say so itself; windows then last for
+        the file's step.
+    average_s : float
+        Data of a file are averaged over this time when they are read.
     runs : tuple of RunSection
         Stretches of data, one after another.
     fixed_axis : bool
@@ -57,6 +63,8 @@ class ObservationSection(Section):
     start: str = "2027-01-15T00:00:00"
     step_s: Positive = 7200.0
     window: Literal["mean", "instant"] = "mean"
+    timestamp: Timestamp | None = None
+    average_s: Positive | None = None
     runs: Annotated[tuple[RunSection, ...], Field(min_length=1)] = (RunSection(),)
     fixed_axis: bool = False
 

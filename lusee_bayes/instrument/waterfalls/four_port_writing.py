@@ -59,8 +59,8 @@ def write_four_port(
     Raises
     ------
     InputError
-        For what the layout cannot hold: open ports, turntable angles other than 0, other than four
-        ports, channels of different observations.
+        For what the layout cannot hold: open ports, windows, turntable angles other than 0, other
+        than four ports, channels of different observations.
     """
     path, observation = Path(path), channels[0].observation
     receiver, loads = circuits[0].receiver, [circuit.load_ohm for circuit in circuits]

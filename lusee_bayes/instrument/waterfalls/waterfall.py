@@ -36,6 +36,8 @@ class Waterfall:
         In K, in the package's order of products; NaN where a sample is missing.
     frequencies_mhz : (frequencies,) array
     observation : Observation
+        Of instants: luseepy's simulators evaluate the sky at the times, and neither layout has
+        windows.
     per_kelvin : (frequencies, ports) array or None
         V^2/Hz that 1 K makes at each port; None unless the file is in V^2/Hz.
     moon_k, antenna_k : float

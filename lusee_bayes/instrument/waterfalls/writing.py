@@ -49,8 +49,9 @@ def write_waterfall(
     Raises
     ------
     InputError
-        For what the layout cannot hold: times other than start + k step, turntable angles other
-        than 0, other than four ports, channels of different observations, fewer than two channels.
+        For what the layout cannot hold: windows, times other than start + k step, turntable angles
+        other than 0, other than four ports, channels of different observations, fewer than two
+        channels.
     """
     path, first = Path(path), channels[0].observation
     if len(channels) < 2:
@@ -88,11 +89,18 @@ def grid_of(
     Raises
     ------
     InputError
-        For turntable angles other than 0, other than four ports, or channels of different times.
+        For samples with windows, turntable angles other than 0, other than four ports, or channels
+        of different times.
     """
     first = channels[0].observation
     for channel in channels:
         observation = channel.observation
+        if observation.windows is not None:
+            raise InputError(
+                f"{path}: luseepy's waterfalls have no room for windows, and the samples are means "
+                "over theirs; write netCDF (a name that does not end in .fits), or simulate with "
+                "--set observation.window=instant"
+            )
         if observation.turntable_deg != (0.0,):
             raise InputError(
                 f"{path}: luseepy's waterfalls have no turntable angles, the data have "

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from lusee_bayes.instrument.products import labels
-from lusee_bayes.instrument.visibilities import read_visibilities
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.instrument.visibilities_file import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall
 
 
@@ -23,6 +25,7 @@ def describe_visibilities(path: Path) -> str:
             f"  {data.layout.n_products} products ({data.labels[0]} ... {data.labels[-1]}), "
             f"{data.layout.n_times} times of {observation.step_s:g} s, {data.n_missing} samples "
             "missing",
+            f"  {_windows(data)}",
             f"  {observation.times[0].isot} to {observation.times[-1].isot} UTC, "
             f"{observation.n_runs} run(s) at turntable {observation.turntable_deg} degrees",
             f"  site: longitude {observation.lon_deg}, latitude {observation.lat_deg} degrees",
@@ -30,6 +33,28 @@ def describe_visibilities(path: Path) -> str:
             f"  true sky {'included' if data.truth is not None else 'not known'}",
         ]
     )
+
+
+def _windows(data: Visibilities) -> str:
+    """What its times are."""
+    windows = data.observation.windows
+    if not data.says_window:
+        return "the file does not say what its times are: --set observation.timestamp=..."
+    if windows is None:
+        return "times are instants"
+    bounds, live = windows.bounds_s, windows.live_per_sample_s
+    length = bounds[:, 1] - bounds[:, 0]
+    several = len(windows.sample) - windows.n_samples
+    in_pieces = f" in {len(windows.sample)} pieces" if several else ""
+    return (
+        f"times are middles of windows of {_range(length)} s{in_pieces}, live for "
+        f"{live.sum() / length.sum():.1%} of them"
+    )
+
+
+def _range(values: Float[np.ndarray, " samples"]) -> str:
+    low, high = (f"{x:.6g}" for x in (values.min(), values.max()))
+    return low if low == high else f"{low} to {high}"
 
 
 def describe_waterfall(path: Path) -> str:
@@ -53,6 +78,7 @@ def describe_waterfall(path: Path) -> str:
             f"  channels at {', '.join(f'{f:.9g}' for f in waterfall.frequencies_mhz)} MHz",
             f"  {len(names)} products ({' '.join(names)}), {observation.n_times} times of "
             f"{observation.step_s:g} s, {gaps} samples missing",
+            "  times are instants, unless observation.timestamp says otherwise",
             f"  {observation.times[0].isot} to {observation.times[-1].isot} UTC",
             f"  site: longitude {observation.lon_deg}, latitude {observation.lat_deg} degrees",
             *four_port_lines,

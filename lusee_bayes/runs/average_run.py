@@ -1,0 +1,127 @@
+"""Means of data over longer times, in a file, and what they cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lusee_bayes.core.destinations import require_target
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.setup import require_fitting, set_up
+from lusee_bayes.instrument.averaging import averaged, product_live_s
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.results.cost import require_resources
+from lusee_bayes.results.forecast import expected_posterior
+
+
+@dataclass(frozen=True)
+class AverageRun:
+    """Data and their averages.
+
+    Attributes
+    ----------
+    data, averaged : Visibilities
+        Before and after.
+    bits : tuple of float, or None
+        Information about the map in both, ``ln|1 + S^1/2 A^T N^-1 A S^1/2| / (2 ln 2)``; None if
+        it was not asked for.
+    """
+
+    data: Visibilities
+    averaged: Visibilities
+    bits: tuple[float, float] | None
+
+    @property
+    def lost_share(self) -> float:
+        """Share of the live time of all products that the rule for flags has left out."""
+        return 1.0 - product_live_s(self.averaged) / product_live_s(self.data)
+
+    @property
+    def lost_bits(self) -> float | None:
+        """Information about the map that the averages lack, in bits; None if it is not known."""
+        return None if self.bits is None else self.bits[0] - self.bits[1]
+
+    def lines(self) -> tuple[str, ...]:
+        """Return what there is to say about it."""
+        before, after = (d.observation for d in (self.data, self.averaged))
+        said = [
+            f"{before.n_times} samples of {before.step_s:g} s -> {after.n_times} of "
+            f"{after.step_s:g} s",
+            f"live time lost where products have different flags: {self.lost_share:.2%}",
+        ]
+        if self.bits is not None:
+            fine, coarse = self.bits
+            said.append(
+                f"information about the map: {fine:.2f} bits -> {coarse:.2f} bits, "
+                f"{self.lost_bits:.2g} lost"
+            )
+        return tuple(said)
+
+
+def run_average(
+    scenario: Scenario,
+    data: Path,
+    to_s: float,
+    path: str | Path,
+    *,
+    information: bool = True,
+    stages: Stages | None = None,
+) -> AverageRun:
+    """Average data, write them whole or not at all, and work out what is lost.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        How to read the data, and what the information is worked out with; ``average_s`` does not
+        count.
+    data : Path
+        Visibilities with windows.
+    to_s : float
+        Length of the averages, in seconds.
+    path : path
+        The netCDF file to write.
+    information : bool
+        Work out the information about the map, in the data and in their averages.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        As :func:`.read_data` and :func:`.averaged`, and for a scenario that the data do not fit or
+        that needs more memory than there is.
+    """
+    stages, path = stages or Stages(), Path(path)
+    require_target(path)
+    if path.suffix == ".fits":
+        raise InputError(
+            f"'{path}': averages have windows, for which luseepy's waterfalls have no room; give "
+            "-o a name that does not end in .fits"
+        )
+    if scenario.frequencies_mhz:
+        raise InputError(
+            "averages are of one frequency; give a scenario with frequency_mhz and without "
+            "frequencies_mhz"
+        )
+    section = scenario.observation.model_copy(update={"average_s": None})
+    scenario = scenario.model_copy(update={"observation": section})
+    with stages("data"):
+        fine = read_data(data, scenario)
+        coarse = averaged(fine, to_s)
+    if information:
+        require_fitting(fine, scenario)
+        require_resources(scenario, fine, stages)
+    coarse.write(path)
+    bits = None
+    if information:
+        bits = (_bits(scenario, fine, stages), _bits(scenario, coarse, stages))
+    return AverageRun(fine, coarse, bits)
+
+
+def _bits(scenario: Scenario, data: Visibilities, stages: Stages) -> float:
+    setup = set_up(scenario, data, stages)
+    with stages("information"):
+        return float(expected_posterior(setup).information_bits())
