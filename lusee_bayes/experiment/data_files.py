@@ -56,7 +56,7 @@ def read_data(path: Path, scenario: Scenario) -> Visibilities:
 
 
 def _own(path: Path, timestamp: Timestamp | None) -> Visibilities:
-    """Data of the package's own file; its times are what it says, or else what the scenario says."""
+    """Read a file of the package; its times are what it says, or else what the scenario says."""
     data = read_visibilities(path)
     if not data.says_window:
         if timestamp is None:

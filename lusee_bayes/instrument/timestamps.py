@@ -1,7 +1,8 @@
 """What the times of samples are: starts, middles or ends of their windows, or instants.
 
 Times and bounds that were rounded, such as single-precision seconds or Julian dates in one number,
-make windows overlap by as much. Such overlaps are halved between the two samples.
+make windows overlap by as much. Such overlaps are halved between the two samples, and a live time
+that is longer than its window by as little is that of the window.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ ROUNDED_S, ROUNDED_SHARE = 1e-3, 1e-4
 
 def stamped(
     times: Time,
-    timestamp: Timestamp,
+    timestamp: str,
     step_s: float,
     live_s: Float[np.ndarray, " times"] | None = None,
 ) -> tuple[Time, Windows | None]:
@@ -63,7 +64,7 @@ def stamped(
         return times, None
     if timestamp not in TO_MIDDLE:
         raise InputError(
-            f"unknown timestamp '{timestamp}'; {nearest(str(timestamp), [*TO_MIDDLE, 'instant'])}"
+            f"unknown timestamp '{timestamp}'; {nearest(timestamp, [*TO_MIDDLE, 'instant'])}"
         )
     with unannounced_leap_seconds():
         middles = times + TO_MIDDLE[timestamp] * step_s * u.s
@@ -163,9 +164,8 @@ def _windows(
     cut = np.where((overlap > 0.0) & (overlap <= _rounding(step_s)), overlap / 2.0, 0.0)
     start_s = start_s + np.append(0.0, cut)
     end_s = end_s - np.append(cut, 0.0)
-    if live_s is None:
-        return Windows.whole(start_s, end_s)
-    shortened = (np.append(0.0, cut) > 0.0) | (np.append(cut, 0.0) > 0.0)
-    return Windows.whole(
-        start_s, end_s, np.where(shortened, np.minimum(live_s, end_s - start_s), live_s)
-    )
+    if live_s is not None:
+        length = end_s - start_s
+        rounded = (live_s > length) & (live_s <= length + _rounding(step_s))
+        live_s = np.where(rounded, length, live_s)
+    return Windows.whole(start_s, end_s, live_s)

@@ -26,7 +26,7 @@ from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import N_ANTENNAS, labels
 from lusee_bayes.instrument.times import step_of, utc_times
-from lusee_bayes.instrument.timestamps import Timestamp, bounded, stamped, utc_bounds
+from lusee_bayes.instrument.timestamps import bounded, stamped, utc_bounds
 
 LOADS = ("load_ohm_real", "load_ohm_imag")
 # what to do where there is no file of them
@@ -89,7 +89,7 @@ class Visibilities(Described):
         flags: Any = None,
         turntable_deg: Any = 0.0,
         convention: str = "s_i conj(s_j)",
-        timestamp: Timestamp = "middle",
+        timestamp: str = "middle",
         bounds: Any = None,
         live_s: Any = None,
         step_s: float | None = None,
@@ -198,7 +198,7 @@ class Visibilities(Described):
         present = np.asarray(self.layout.present)
         return np.where(present, np.asarray(self.layout.scatter(self.data)), np.nan)
 
-    def stamped(self, timestamp: Timestamp) -> Visibilities:
+    def stamped(self, timestamp: str) -> Visibilities:
         """Return the same data, their times being what is said; windows last for a step.
 
         Parameters

@@ -115,6 +115,14 @@ def test_open_ports_have_no_loads_to_write(luseepy, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_there_is_no_room_for_windows(luseepy, tmp_path):
+    response, original = luseepy
+    channel = read_waterfall(original).at(5.0)
+    with pytest.raises(InputError, match="luseepy's waterfalls have no room for windows"):
+        write_four_port(tmp_path / "w.fits", [channel.stamped("start")], [response.circuit(5.0)])
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.essential
 def test_simulated_and_mapped_between_the_responses_frequencies(luseepy, tmp_path):
     """14.5 MHz / 3, a Moon of many digits, other receivers, which nothing but the data say."""
