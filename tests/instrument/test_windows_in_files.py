@@ -266,13 +266,16 @@ def test_rounded_times_make_no_overlaps():
     starts = Time(START, scale="utc") + 60.0 * np.arange(400) * u.s
     rounded = Time(starts.jd, format="jd", scale="utc")
     data = np.zeros((400, 16))
+    edges = np.random.default_rng(1).uniform(-2e-5, 2e-5, (400, 2))
+    edges = starts[:, None] + (edges + np.array([0.0, 60.0])) * u.s
     for options in (
         {},
-        {"bounds": Time(np.stack([starts.jd, starts.jd + 60.0 / 86400.0], 1), format="jd")},
-        {"live_s": np.full(400, 60.0)},
+        {"step_s": 60.0},
+        {"step_s": 60.0, "live_s": np.full(400, 60.0)},
+        {"bounds": edges},
     ):
         observation = Visibilities.from_arrays(
-            data, rounded, 25.0, timestamp="start", step_s=None, **options
+            data, rounded, 25.0, timestamp="start", **options
         ).observation
         found = bounds_of(observation)
         assert (found[1:, 0] >= found[:-1, 1] - 1e-6).all()
