@@ -43,24 +43,28 @@ class Pointing(eqx.Module):
         G_j(p, m), real and imaginary part: what the beams take up for each function.
     pole_from_galactic : Rotation
         From Galactic coordinates to the frame P.
-    mcmf_from_topocentric : Rotation
-        From the frame of the site, at turntable angle zero, to the Moon-fixed one.
+    mcmf_from_lander : Rotation
+        From the frame of the lander, at turntable angle zero, to the Moon-fixed one.
     turntable : (runs,) array
         In radians, positive from East towards North.
     run_starts : tuple of int
         First sample of each run, and the number of samples.
     order : int
         Of the expansion in the tilt.
+    turns : (4,) array or None
+        Further turns in radians, where offsets are not known: of the site in longitude and
+        latitude, and of the lander towards East and towards North. None for none.
     """
 
     azimuth: Float[Array, " times"]
     functions: Float[Array, "times functions"]
     factors: Float[Array, "functions powers orders 2"]
     pole_from_galactic: Rotation
-    mcmf_from_topocentric: Rotation
+    mcmf_from_lander: Rotation
     turntable: Float[Array, " runs"]
     run_starts: tuple[int, ...] = eqx.field(static=True)
     order: int = eqx.field(static=True)
+    turns: Float[Array, "4"] | None = None
 
     @classmethod
     def of(cls, observation: Observation, lmax: int, order: int | None = None) -> Pointing:
@@ -102,7 +106,7 @@ class Pointing(eqx.Module):
             functions=functions,
             factors=factors,
             pole_from_galactic=Rotation.from_matrix(pole_frame, lmax),
-            mcmf_from_topocentric=Rotation.from_matrix(observation.topocentric_from_mcmf().T, lmax),
+            mcmf_from_lander=Rotation.from_matrix(observation.lander_from_mcmf().T, lmax),
             turntable=np.radians(np.array(observation.turntable_deg, dtype=np.float64)),
             run_starts=tuple(int(s) for s in starts),
             order=order,

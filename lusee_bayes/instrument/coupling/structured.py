@@ -23,7 +23,7 @@ from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers
-from lusee_bayes.core.rotations import tilts, turn_about_z
+from lusee_bayes.core.rotations import tilts, turn_about_x, turn_about_y, turn_about_z
 from lusee_bayes.instrument.beams import ProductBeams
 from lusee_bayes.instrument.coupling.base import Coupling
 from lusee_bayes.instrument.coupling.dense import DenseCoupling
@@ -260,9 +260,18 @@ def _body_beams(
     """Beams in the Moon-fixed frame for every run's turntable angle and every function of time."""
     xp, runs = namespace(modes, pointing), []
     for run in range(len(pointing.run_starts) - 1):
-        body = pointing.mcmf_from_topocentric(turn_about_z(modes, pointing.turntable[run]))
+        body = _on_the_moon(turn_about_z(modes, pointing.turntable[run]), pointing)
         runs.append(_taken_up(xp.stack(tilts(body, pointing.order), axis=1), pointing.factors))
     return xp.stack(runs)
+
+
+def _on_the_moon(modes: Float[Array, "products modes"], pointing: Pointing) -> Array:
+    """Beams of the lander in the Moon-fixed frame, with the pointing's further turns."""
+    if pointing.turns is None:
+        return pointing.mcmf_from_lander(modes)
+    lon, lat, east, north = (pointing.turns[k] for k in range(4))
+    leaning = turn_about_x(turn_about_y(turn_about_x(modes, -north), east), -lat)
+    return turn_about_z(pointing.mcmf_from_lander(leaning), lon)
 
 
 def _taken_up(
