@@ -75,6 +75,8 @@ class Observation(Described):
         its data, which have no windows.
     windows : Windows or None
         What each sample is the mean of; None for instants.
+    tilt_deg : (float, float)
+        By how much the lander leans towards East and towards North.
 
     Raises
     ------
@@ -91,12 +93,14 @@ class Observation(Described):
     step_s: float
     fixed_axis: bool = False
     windows: Windows | None = None
+    tilt_deg: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self):
         if not -90.0 <= self.lat_deg <= 90.0:
             raise InputError(f"lat_deg must lie in -90..90, got {self.lat_deg}")
         require_positive("step_s", self.step_s)
         require_finite("lon_deg and turntable_deg", np.array([self.lon_deg, *self.turntable_deg]))
+        require_finite("tilt_deg", np.array(self.tilt_deg))
         if self.times.shape != self.run.shape or self.times.ndim != 1 or not self.times.size:
             raise InputError(
                 f"times {self.times.shape} and run {self.run.shape} must be two lists of the "
@@ -273,6 +277,7 @@ class Observation(Described):
             self.step_s,
             self.fixed_axis,
             None if self.windows is None else self.windows.select(keep),
+            self.tilt_deg,
         )
 
     @property
@@ -347,6 +352,16 @@ class Observation(Described):
         up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
         east = np.array([-np.sin(lon), np.cos(lon), 0.0])
         return np.array([east, np.cross(up, east), up])
+
+    def lander_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
+        """Return the rotation from MCMF to the lander's axes: East, North and up if it is level.
+
+        It leans first towards North, about East, then towards East, about North.
+        """
+        east, north = np.radians(self.tilt_deg)
+        lean = SpatialRotation.from_rotvec([0.0, east, 0.0])
+        lean *= SpatialRotation.from_rotvec([-north, 0.0, 0.0])
+        return lean.inv().as_matrix() @ self.topocentric_from_mcmf()
 
     def zenith_galactic(self) -> Float[np.ndarray, "times 3"]:
         """Return the Galactic unit vector of the zenith at every time."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -67,6 +68,14 @@ class ObservationSection(Section):
     average_s: Positive | None = None
     runs: Annotated[tuple[RunSection, ...], Field(min_length=1)] = (RunSection(),)
     fixed_axis: bool = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _before_there_were_windows(cls, tree: Any) -> Any:
+        """Scenarios that were written with all entries, but without this one, had instants."""
+        if isinstance(tree, Mapping) and "fixed_axis" in tree and "window" not in tree:
+            return {**tree, "window": "instant"}
+        return tree
 
     @model_validator(mode="after")
     def _a_fixed_axis_has_instants(self) -> ObservationSection:
