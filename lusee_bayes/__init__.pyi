@@ -6,6 +6,7 @@ from .experiment.inference import Inference as Inference
 from .experiment.inference import infer as infer
 from .experiment.scenario import Scenario as Scenario
 from .experiment.scenario import load_scenario as load_scenario
+from .instrument.averaging import averaged as averaged
 from .instrument.beams import BeamSource as BeamSource
 from .instrument.beams import Monopoles as Monopoles
 from .instrument.beams import ProductBeams as ProductBeams
@@ -49,6 +50,7 @@ from .noise.covariance import TimeBlockCovariance as TimeBlockCovariance
 from .results.channel import ChannelResult as ChannelResult
 from .results.cube import CubeResult as CubeResult
 from .results.map_result import MapResult as MapResult
+from .runs.average_run import run_average as run_average
 from .runs.compare_priors_run import run_compare_priors as run_compare_priors
 from .runs.compare_run import run_compare as run_compare
 from .runs.map_run import run_map as run_map

@@ -62,8 +62,8 @@ def _own(path: Path, timestamp: Timestamp | None) -> Visibilities:
         if timestamp is None:
             raise InputError(
                 f"{path} does not say what its times are: it has neither time_bounds nor the "
-                "attribute window = 'instant', and the start of a sample taken for its middle "
-                "shifts the data by tens to hundreds of standard deviations; use --set "
+                "attribute window = 'instant', and the start of a two-hour sample taken for its "
+                "middle shifts the data by tens to hundreds of standard deviations; use --set "
                 "observation.timestamp=start (or middle, end, instant)"
             )
         with naming(path):

@@ -1,0 +1,162 @@
+"""Averages of a file, and what they cost: as a user meets them, and against closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lusee_bayes.cli.main import main
+from lusee_bayes.cli.options import parse_duration
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.instrument.averaging import averaged
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.visibilities_file import read_visibilities
+from lusee_bayes.runs.average_run import run_average
+from lusee_bayes.testing import small_scenario
+
+LMAX = 5
+MEANS = ("observation.window=mean", "observation.step_s=1800")
+
+
+def scenario(*more):
+    return small_scenario(*MEANS, *more, lmax=LMAX, cycles=0.03)
+
+
+@pytest.fixture(scope="module")
+def data():
+    """39 samples of half an hour."""
+    return build(scenario()).data
+
+
+@pytest.fixture
+def path(data, tmp_path):
+    return data.write(tmp_path / "data.nc")
+
+
+def test_the_mean_of_a_signal_is_the_signal_of_the_mean(data):
+    """A of averages is that of their windows, with flags that leave some samples out."""
+    flags = np.random.default_rng(4).random((16, data.layout.n_times)) < 0.05
+    layout = DataLayout.from_flags(flags)
+    setup = set_up(scenario(), replace(data, data=np.zeros(layout.size), layout=layout))
+    signal = replace(data, data=layout.gather(np.asarray(setup.signal)), layout=layout)
+    coarse = averaged(signal, 4 * 1800.0)
+    assert 0 < coarse.layout.size < signal.layout.size
+    seen = set_up(scenario(), coarse)
+    expected = coarse.layout.gather(np.asarray(seen.signal))
+    # integrals over windows of both are exact to 1e-10
+    np.testing.assert_allclose(coarse.data, expected, rtol=0, atol=1e-9 * expected.max())
+
+
+def test_what_is_lost_is_small_and_grows_with_the_square_of_the_length(path, tmp_path):
+    """The signal within a window is lost: a twelfth of its length squared, times the slopes."""
+    lost = []
+    for hours in (2, 4):
+        run = run_average(scenario(), path, 3600.0 * hours, tmp_path / "averaged.nc")
+        fine, coarse = run.bits
+        assert 0.0 < run.lost_bits < 0.01 * fine
+        assert run.lost_bits == fine - coarse
+        lost.append(run.lost_bits / (hours**2 - 0.5**2))
+        assert run.lost_share == pytest.approx(0.0, abs=1e-12)
+    # higher orders are a few per cent over 4 h at this lmax
+    assert lost[1] == pytest.approx(lost[0], rel=0.1)
+
+
+def test_the_bits_are_those_of_the_determinant(path, data, tmp_path):
+    run = run_average(scenario(), path, 7200.0, tmp_path / "averaged.nc")
+    for seen, bits in zip((data, run.averaged), run.bits, strict=True):
+        setup = set_up(scenario(), seen)
+        a, root = np.asarray(setup.coupling.dense()), np.sqrt(np.asarray(setup.prior.variance()))
+        noise = np.asarray(full_model(setup).noise.diagonal())
+        white = a * root / np.sqrt(noise)[:, None]
+        expected = 0.5 * np.linalg.slogdet(np.eye(len(root)) + white.T @ white)[1] / np.log(2.0)
+        # singular values of 1e5 squared, in double precision
+        assert bits == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_command_writes_averages_and_says_what_they_cost(path, tmp_path, capsys):
+    out = tmp_path / "averaged.nc"
+    given = ["--set", f"lmax={LMAX}"]
+    assert main(["average", str(path), "--to", "2h", "-o", str(out), *given]) == 0
+    said = capsys.readouterr().out
+    assert "39 samples of 1800 s -> 10 of 7200 s" in said
+    assert "live time lost where products have different flags: 0.00%" in said
+    assert "information about the map: " in said and " lost" in said
+    assert f"160 visibilities -> {out}" in said
+    found = read_visibilities(out)
+    assert found.digest() == averaged(read_visibilities(path), 7200.0).digest()
+    again = tmp_path / "again.nc"
+    command = ["average", str(path), "--to", "120min", "-o", str(again), "--no-information"]
+    assert main(command) == 0
+    assert "information" not in capsys.readouterr().out
+    assert read_visibilities(again).digest() == found.digest()
+
+
+def test_what_flags_cost_is_said(data, tmp_path):
+    """A product that is there in one sample of four is lost; samples without any do not count."""
+    flags = np.zeros((16, data.layout.n_times), dtype=bool)
+    flags[3] = np.arange(data.layout.n_times) % 4 != 0
+    flags[:, -3:] = True
+    layout = DataLayout.from_flags(flags)
+    less = replace(data, data=layout.gather(data.grid()), layout=layout)
+    run = run_average(
+        scenario(), less.write(tmp_path / "d.nc"), 7200.0, tmp_path / "a.nc", information=False
+    )
+    assert run.bits is None and run.lost_bits is None
+    assert run.lost_share == pytest.approx(9 / (15 * 36 + 9))
+    assert run.lines()[1] == "live time lost where products have different flags: 1.64%"
+
+
+def test_average_s_of_the_scenario_does_not_count(path, data, tmp_path):
+    given = scenario("observation.average_s=3600")
+    run = run_average(given, path, 7200.0, tmp_path / "a.nc", information=False)
+    assert run.data.observation.n_times == data.observation.n_times
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--to", "2hours"], "'2hours' is not a length of time; give a positive number"),
+        (["--to", "2"], "'2' is not a length of time"),
+        (["--to", "0s"], "'0s' is not a length of time"),
+        (["--to", "10min"], "shorter than their samples of 1800 s"),
+        (["--to", "2h", "-o", "w.fits"], "give -o a name that does not end in .fits"),
+        (["--to", "2h", "--set", "frequency_mhz=10"], "the data are at 25.0 MHz"),
+        (["--to", "2h", "--set", "frequencies_mhz=[10,20]"], "averages are of one frequency"),
+        (["--to", "2h", "--set", "observation.timestamp=start"], "leave that out"),
+        ([], "--to"),
+    ],
+)
+def test_bad_input_is_a_sentence(path, tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert main(["average", str(path), *arguments]) == 2
+    error = capsys.readouterr().err.strip()
+    assert words in error and "\n" not in error
+    assert [p.name for p in tmp_path.iterdir()] == ["data.nc"]
+
+
+def test_instants_have_no_average(tmp_path):
+    instants = build(small_scenario(lmax=2, cycles=0.01)).data
+    assert instants.observation.windows is None
+    path = instants.write(tmp_path / "data.nc")
+    with pytest.raises(InputError, match="the samples are instants"):
+        run_average(scenario(), path, 14400.0, tmp_path / "a.nc")
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("30s", 30.0), ("10min", 600.0), ("2h", 7200.0), ("1d", 86400.0), (" 1.5 h", 5400.0),
+     (".5min", 30.0), ("1e3s", 1000.0)],
+)  # fmt: skip
+def test_lengths_of_time(text, seconds):
+    assert parse_duration(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "h", "-2h", "2 hours", "1e999d", "nan s", "٣s", "2h 30min"])
+def test_what_is_no_length_of_time(text):
+    with pytest.raises(InputError, match="is not a length of time; .* 30s, 10min, 2h or 1d"):
+        parse_duration(text)
