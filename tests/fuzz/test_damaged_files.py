@@ -52,6 +52,7 @@ def read_onto(path: Path) -> object:
 
 READERS = {
     "visibilities.nc": (describe, read_visibilities),
+    "windows.nc": (describe, read_visibilities),
     "waterfall.fits": (describe, read_waterfall, read_any_data),
     "four_port.fits": (describe, read_waterfall),
     "scalar_beam.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
@@ -84,6 +85,7 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
     folder = tmp_path_factory.mktemp("files")
     experiment = build(small_scenario(lmax=2))
     experiment.data.write(folder / "visibilities.nc")
+    experiment.data.stamped("start").write(folder / "windows.nc")
     channels = [replace(experiment.data, frequency_mhz=f) for f in (20.0, 25.0)]
     write_waterfall(folder / "waterfall.fits", channels, np.array([1 + 1j, 1 + 2j]), "")
     theta, phi = np.linspace(0.0, 90.0, 7), np.arange(0.0, 360.0, 45.0)
