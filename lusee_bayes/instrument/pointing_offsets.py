@@ -33,6 +33,8 @@ OFFSETS = {
     "tilt_east_deg": "lean of the lander towards East",
     "tilt_north_deg": "lean of the lander towards North",
 }
+CLOCK = ("clock_s", "clock_drift_s_per_day")
+TILTS = ("tilt_east_deg", "tilt_north_deg")
 # by which the Moon turns against the sky, as azimuths of the sky count it, in radians per hour
 TURN_PER_HOUR = -2.0 * np.pi / (CYCLE_DAYS * 24.0)
 
@@ -154,6 +156,3 @@ def turned_by_offsets(
         turntable=pointing.turntable + turntable,
         turns=xp.stack([lon, *rest]),
     )
-
-
-TILTS = ("tilt_east_deg", "tilt_north_deg")
