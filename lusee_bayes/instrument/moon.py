@@ -1,9 +1,10 @@
-"""The orientation of the Moon, from lunarsky's own coordinate transformation."""
+"""The orientation of the Moon, from lunarsky's own coordinate transformation, and its Sun."""
 
 from __future__ import annotations
 
+import astropy.units as u
 import numpy as np
-from astropy.coordinates import ICRS, CartesianRepresentation, Galactic
+from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_body_barycentric
 from astropy.time import Time
 from jaxtyping import Float
 from lunarsky import MCMF
@@ -21,3 +22,14 @@ def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:
     with unannounced_leap_seconds():
         turned = icrs.transform_to(MCMF(obstime=times))
     return np.moveaxis(turned.cartesian.xyz.value, 2, 0)
+
+
+def sun_direction(times: Time) -> Float[np.ndarray, "times 3"]:
+    """Return Galactic unit vectors from the Moon's centre to where the Sun's is at the time."""
+    with unannounced_leap_seconds():
+        sun = get_body_barycentric("sun", times, ephemeris="builtin")
+        moon = get_body_barycentric("moon", times, ephemeris="builtin")
+    direction = (sun - moon).xyz.to_value(u.km)
+    galactic = ICRS(CartesianRepresentation(direction)).transform_to(Galactic())
+    vector = galactic.cartesian.xyz.value
+    return (vector / np.linalg.norm(vector, axis=0)).T

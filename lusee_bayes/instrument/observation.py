@@ -7,13 +7,13 @@ nothing assumes that the Moon turns about a fixed axis, unless ``fixed_axis`` as
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_body_barycentric
 from astropy.time import Time
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation as SpatialRotation
@@ -21,36 +21,14 @@ from scipy.spatial.transform import Rotation as SpatialRotation
 from lusee_bayes.core.checks import require_finite, require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.representation import Described, listed
-from lusee_bayes.instrument.moon import mcmf_from_galactic
-from lusee_bayes.instrument.times import (
-    require_ephemeris,
-    unannounced_leap_seconds,
-    utc_from_text,
-)
-from lusee_bayes.instrument.windows import ROUNDING_S, Windows
+from lusee_bayes.instrument.moon import mcmf_from_galactic, sun_direction
+from lusee_bayes.instrument.schedule import Cuts, Interval, Run, cut_intervals, cut_runs
+from lusee_bayes.instrument.times import require_ephemeris, unannounced_leap_seconds
+from lusee_bayes.instrument.windows import Windows
 
-CYCLE_DAYS = 27.321661
+ONE_CYCLE = (Run(),)
 # period after which the sky repeats itself in luseepy's engine croissant
 LUSEEPY_MONTH_HOURS = 655.72
-
-
-@dataclass(frozen=True)
-class Run:
-    """A stretch of data taken at one turntable angle.
-
-    Attributes
-    ----------
-    cycles : float
-        Length in sidereal months of 27.321661 days.
-    turntable_deg : float
-        A positive angle turns the antennas from East towards North.
-    night_only : bool
-        Keep only the samples with the Sun below the horizon.
-    """
-
-    cycles: float = 1.0
-    turntable_deg: float = 0.0
-    night_only: bool = False
 
 
 @dataclass(frozen=True, repr=False)
@@ -121,55 +99,35 @@ class Observation(Described):
                 "each turntable angle) without going back"
             )
         require_ephemeris(self.times.jd)
-        if self.windows is not None:
-            self._check_windows(self.windows)
-
-    def _check_windows(self, windows: Windows) -> None:
+        if self.windows is None:
+            return
         if self.fixed_axis:
             raise InputError(
                 "a fixed axis of the Moon is for luseepy's croissant, whose samples are instants; "
                 "use observation.window=instant with it"
             )
-        if windows.n_samples != self.n_times:
-            raise InputError(
-                f"there are windows of {windows.n_samples} samples for {self.n_times} times"
-            )
-        bounds = windows.bounds_s
-        length = bounds[:, 1] - bounds[:, 0]
-        if (length > self.step_s * (1.0 + 1e-9) + ROUNDING_S).any():
-            longest = int(np.argmax(length))
-            raise InputError(
-                f"the window of sample {longest} lasts {length[longest]:g} s, longer than the step "
-                f"of {self.step_s:g} s from sample to sample; check the bounds, or give the step"
-            )
-        gaps = np.diff(self._seconds()) + bounds[1:, 0] - bounds[:-1, 1]
-        if (gaps < -ROUNDING_S).any():
-            first = int(np.argmax(gaps < -ROUNDING_S))
-            raise InputError(
-                f"the windows of samples {first} and {first + 1} ({self.times[first].isot[:19]}) "
-                f"overlap by {-gaps[first]:g} s; give each stretch of time to one sample"
-            )
-
-    def _seconds(self) -> Float[np.ndarray, " times"]:
-        with unannounced_leap_seconds():
-            return (self.times - self.times[0]).to_value(u.s)
+        self.windows.require_fitting(self.times, self.step_s)
 
     def description(self) -> tuple[str, ...]:
         with unannounced_leap_seconds():
             first, last = self.times[0].isot[:19], self.times[-1].isot[:19]
         angles = listed(tuple(f"{angle:g}" for angle in self.turntable_deg))
-        instants = ", taken as instants" if self.windows is None else ""
+        length = f"{self.step_s:g} s"
+        if self.windows is None:
+            length = f"{length}, taken as instants"
+        elif not np.allclose(self.live_s, self.step_s):
+            length = f"up to {length}, live for {self.live_s.sum() / 86400.0:.3g} days in all"
         axis = ", with a fixed axis of the Moon" if self.fixed_axis else ""
         return (
             f"longitude {self.lon_deg:g}, latitude {self.lat_deg:g} degrees{axis}",
-            f"{first} to {last} UTC, {self.n_times} samples of {self.step_s:g} s{instants}",
+            f"{first} to {last} UTC, {self.n_times} samples of {length}",
             f"{self.n_runs} run{'s' * (self.n_runs > 1)}, turntable at {angles} degrees",
         )
 
     @classmethod
     def from_runs(
         cls,
-        runs: list[Run] | tuple[Run, ...] = (Run(),),
+        runs: Sequence[Run] = ONE_CYCLE,
         *,
         start: str = "2027-01-15T00:00:00",
         step_s: float = 7200.0,
@@ -206,52 +164,82 @@ class Observation(Described):
         InputError
             For a bad date, step or length, and for a run without samples.
         """
-        require_positive("step_s", step_s)
-        if not runs:
-            raise InputError("an observation needs at least one run, got none")
-        t0 = utc_from_text("start", start)
-        elapsed, offsets, numbers = 0.0, [], []
-        for number, run in enumerate(runs):
-            require_positive(f"the length in cycles of run {number}", run.cycles)
-            length = run.cycles * CYCLE_DAYS * 86400.0
-            n = int(length // step_s)
-            if n < 1:
-                raise InputError(
-                    f"run {number} of {run.cycles} cycles holds no sample of {step_s} s; "
-                    "lengthen it or shorten step_s"
-                )
-            offsets.append(elapsed + step_s * np.arange(n))
-            numbers.append(np.full(n, number))
-            elapsed += length
-        seconds, run_of = np.concatenate(offsets), np.concatenate(numbers)
-        require_ephemeris(np.array([t0.jd + seconds[-1] / 86400.0]))
-        windows = None
-        if window == "mean":
-            half = np.full(len(seconds), step_s / 2.0)
-            seconds, windows = seconds + half, Windows.whole(-half, half)
-        with unannounced_leap_seconds():
-            times = t0 + seconds * u.s
-        observation = cls(
-            lon_deg,
-            lat_deg,
-            times,
-            run_of,
-            tuple(r.turntable_deg for r in runs),
-            step_s,
-            fixed_axis,
-            windows,
-        )
-        night_runs = np.array([r.night_only for r in runs])
-        if not night_runs.any():
-            return observation
-        keep = ~night_runs[run_of] | (observation.sun_altitude_deg() < 0.0)
-        empty = [i for i in range(len(runs)) if not keep[run_of == i].any()]
-        if empty:
+        cuts = cut_runs(runs, start, step_s)
+        site = {"lon_deg": lon_deg, "lat_deg": lat_deg, "fixed_axis": fixed_axis}
+        return cls._of_cuts(cuts, window, throughout=False, step_s=step_s, **site)
+
+    @classmethod
+    def from_schedule(
+        cls,
+        intervals: Sequence[Interval],
+        *,
+        step_s: float = 7200.0,
+        lon_deg: float = 182.258,
+        lat_deg: float = -23.814,
+        fixed_axis: bool = False,
+        window: Literal["instant", "mean"] = "mean",
+    ) -> Observation:
+        """Return an observation of the intervals of a schedule.
+
+        Each is cut into windows of ``step_s`` from its start, of which the last is shorter where it
+        does not end on a step. A run begins wherever the turntable has turned.
+
+        Parameters
+        ----------
+        intervals : sequence of Interval
+            In order, such as :func:`.read_schedule` gives them.
+        step_s : float
+            Time from sample to sample within an interval, in seconds.
+        lon_deg, lat_deg : float
+        fixed_axis : bool
+            See :class:`Observation`.
+        window : {"instant", "mean"}
+            Whether a sample is the sky at the beginning of its window or the mean over it.
+
+        Returns
+        -------
+        Observation
+
+        Raises
+        ------
+        InputError
+            For intervals that overlap or are not in order, for a duty cycle of instants, and where
+            an interval of nights holds none.
+        """
+        cuts = cut_intervals(intervals, step_s)
+        if window == "instant" and any(one.duty_cycle < 1.0 for one in intervals):
             raise InputError(
-                f"run {empty[0]} holds no lunar night; lengthen it, move its start or drop "
-                "night_only"
+                "samples that are instants have no duty cycle; take windows "
+                "(observation.window=mean), or leave out the schedule's duty_cycle"
             )
-        return observation.select(keep)
+        site = {"lon_deg": lon_deg, "lat_deg": lat_deg, "fixed_axis": fixed_axis}
+        return cls._of_cuts(cuts, window, throughout=True, step_s=step_s, **site)
+
+    @classmethod
+    def _of_cuts(
+        cls, cuts: Cuts, window: Literal["instant", "mean"], *, throughout: bool, **others: Any
+    ) -> Observation:
+        """Of samples by night alone where asked for, at their times or from end to end."""
+        times, windows = cuts.samples(window)
+        observation = cls(
+            times=times,
+            run=cuts.run,
+            turntable_deg=cuts.turntable_deg,
+            windows=windows,
+            **others,
+        )
+        if not any(cuts.night_only):
+            return observation
+        return observation.select(cuts.by_night(observation._is_dark(throughout)))
+
+    def _is_dark(self, throughout: bool) -> Bool[np.ndarray, " times"]:
+        dark = self.sun_altitude_deg() < 0.0
+        if throughout and self.windows is not None:
+            for offset_s in self.windows.bounds_s.T:
+                with unannounced_leap_seconds():
+                    times = self.times + offset_s * u.s
+                dark &= replace(self, times=times, windows=None).sun_altitude_deg() < 0.0
+        return dark
 
     def select(self, keep: Bool[np.ndarray, " times"]) -> Observation:
         """Return the observation with only the samples where ``keep`` is True.
@@ -354,12 +342,5 @@ class Observation(Described):
 
     def sun_altitude_deg(self) -> Float[np.ndarray, " times"]:
         """Return the geometric altitude of the Sun's centre above the horizon in degrees."""
-        with unannounced_leap_seconds():
-            sun = get_body_barycentric("sun", self.times, ephemeris="builtin")
-            moon = get_body_barycentric("moon", self.times, ephemeris="builtin")
-        direction = (sun - moon).xyz.to_value(u.km)
-        galactic = ICRS(CartesianRepresentation(direction)).transform_to(Galactic())
-        vector = galactic.cartesian.xyz.value
-        vector = vector / np.linalg.norm(vector, axis=0)
-        height = np.einsum("ti,it->t", self.zenith_galactic(), vector)
+        height = np.einsum("ti,ti->t", self.zenith_galactic(), sun_direction(self.times))
         return np.degrees(np.arcsin(height))
