@@ -24,7 +24,7 @@ from lusee_bayes.core.reading import naming, read_text, reading
 from lusee_bayes.instrument.schedule import Interval, require_sequence
 from lusee_bayes.instrument.times import require_ephemeris, unannounced_leap_seconds
 
-WHAT = "a schedule: a CSV table of intervals, or a command table of OpSim in YAML"
+WHAT = "a schedule, a table in CSV or OpSim's in YAML"
 REQUIRED = ("start", "end", "turntable_deg")
 OPTIONAL = ("duty_cycle", "night_only")
 # of OpSim, in which data are taken

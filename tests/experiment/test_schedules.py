@@ -94,5 +94,5 @@ def test_what_is_wrong_with_the_file_is_said(given, path):
     with pytest.raises(InputError, match=r"nights.csv, line 3: the interval from .* begins"):
         build(load_scenario("fiducial", given))
     path.unlink()
-    with pytest.raises(InputError, match="no schedule: a CSV table of intervals, or .* at '"):
+    with pytest.raises(InputError, match="no schedule, a table in CSV or .* at '"):
         posterior_cost(load_scenario("fiducial", given))
