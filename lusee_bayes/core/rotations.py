@@ -143,6 +143,31 @@ def turn_about_z(
     return modes * cosine.reshape(shape) + mirrored * sine.reshape(shape)
 
 
+def turn_about_x(
+    modes: Float[Array, "*batch modes"], angle: float | Float[Array, ""]
+) -> Float[Array, "*batch modes"]:
+    """Turn fields about x, from y towards z; else as :func:`turn_about_z`."""
+    return _turn_about(0, modes, angle)
+
+
+def turn_about_y(
+    modes: Float[Array, "*batch modes"], angle: float | Float[Array, ""]
+) -> Float[Array, "*batch modes"]:
+    """Turn fields about y, from z towards x; else as :func:`turn_about_z`."""
+    return _turn_about(1, modes, angle)
+
+
+def _turn_about(axis: int, modes: Array, angle: Array | float) -> Array:
+    from_axis = _z_from(axis, round(np.sqrt(modes.shape[-1])) - 1)
+    return from_axis.T(turn_about_z(from_axis(modes), angle))
+
+
+@lru_cache(maxsize=8)
+def _z_from(axis: int, lmax: int) -> Rotation:
+    """The rotation that takes the x axis (0) or the y axis (1) to z: a cyclic swap of the axes."""
+    return Rotation.from_matrix(np.roll(np.eye(3), -(axis + 1), axis=1).T, lmax)
+
+
 @lru_cache(maxsize=16)
 def _horizontal_generators(lmax: int) -> tuple[np.ndarray, np.ndarray]:
     """K_x and K_y over all packed modes, as two columns and their weights for every row.

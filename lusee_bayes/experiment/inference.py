@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array
@@ -11,13 +12,14 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.terms import Around
+from lusee_bayes.experiment.terms import Around, pointing_offsets
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.linear.templates import template_amplitudes
 
-# the gain term is rebuilt until the map moves by less than this (rms, in standard deviations)
+# N is rebuilt until the map moves by less than this (rms, in standard deviations)
 SETTLED, MAX_ROUNDS = 1e-2, 20
 
 
@@ -31,7 +33,7 @@ class Inference:
         With every systematic in N that the scenario does not ignore.
     posterior : Posterior
     rounds : int
-        How often the gain term was built.
+        How often N was built.
     around : Around
         What it was built around.
     """
@@ -45,8 +47,9 @@ class Inference:
 def infer(experiment: Experiment) -> Inference:
     """Condition the experiment's model on its data.
 
-    One round, unless the gain term is built around the posterior's own prediction: then N and the
-    map are repeated until the map moves by less than 0.01 standard deviations (rms).
+    One round, unless a term of N is built around what the data tell: the gains around the
+    posterior's own prediction, or clock and pointing around its sky and their own values. Then N
+    and the map are repeated until the map moves by less than 0.01 standard deviations (rms).
 
     Parameters
     ----------
@@ -61,18 +64,56 @@ def infer(experiment: Experiment) -> Inference:
     around = Around(data)
     model = full_model(setup, around)
     posterior = model.condition(data.data)
-    if not rebuilds_gains(setup):
+    if not rebuilds(setup):
         return Inference(model, posterior, 1, around)
     for rounds in range(2, MAX_ROUNDS + 1):
-        around = Around(data, prediction(setup, posterior))
+        around = _around(experiment, Inference(model, posterior, rounds, around))
         model = full_model(setup, around)
         previous, posterior = posterior, model.condition(data.data)
         if float(posterior.rms_shift_from(previous)) < SETTLED:
             return Inference(model, posterior, rounds, around)
     raise InputError(
-        f"the map still moves after {MAX_ROUNDS} rounds of rebuilding the gain term around it; "
-        "use noise.gain.visibilities=model"
+        f"the map still moves after {MAX_ROUNDS} rounds of rebuilding N around it; use "
+        "noise.gain.visibilities=model and noise.pointing.around=model"
     )
+
+
+def _around(experiment: Experiment, found: Inference) -> Around:
+    """What the terms of N are built around next, given a posterior."""
+    setup, visibilities, sky, values = experiment.setup, None, None, None
+    if rebuilds_gains(setup):
+        visibilities = prediction(setup, found.posterior)
+    if rebuilds_pointing(setup):
+        sky = np.asarray(found.posterior.mean)
+        values, _ = offset_posterior(experiment, found)
+    return Around(experiment.data, visibilities, sky, values)
+
+
+def offset_posterior(
+    experiment: Experiment, found: Inference
+) -> tuple[dict[str, float], Float[np.ndarray, "offsets offsets"]]:
+    """Mean of every offset of clock and pointing by name, and their covariance.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Whose scenario marginalises them, or samples them: then to first order.
+    found : Inference
+        Of these data alone.
+
+    Returns
+    -------
+    mean : dict of float
+        In the units that the names end with.
+    covariance : (offsets, offsets) array
+        In these units.
+    """
+    offsets = pointing_offsets(experiment.setup, found.around)
+    z, covariance = template_amplitudes(
+        found.model, found.posterior, experiment.data.data, offsets.templates
+    )
+    stds = np.asarray(offsets.stds)
+    return offsets.in_units(z), covariance * np.outer(stds, stds)
 
 
 def inform(
@@ -94,13 +135,24 @@ def inform(
         As :func:`infer`.
     """
     data, around, rounds = experiment.data, Around(experiment.data), 1
-    if rebuilds_gains(experiment.setup):
+    if rebuilds(experiment.setup):
         settled = infer(experiment)
         model, around, rounds = settled.model, settled.around, settled.rounds
     else:
         model = full_model(experiment.setup, around)
     information, posterior = model.inform(data.data, key, n_perturbations)
     return information, Inference(model, posterior, rounds, around)
+
+
+def rebuilds(setup: Setup) -> bool:
+    """Whether some term of N is built around what the data tell."""
+    return rebuilds_gains(setup) or rebuilds_pointing(setup)
+
+
+def rebuilds_pointing(setup: Setup) -> bool:
+    """Whether clock and pointing are to first order about the sky and the values of the data."""
+    section = setup.scenario.noise.pointing
+    return section is not None and section.treatment != "ignored" and section.around == "posterior"
 
 
 def rebuilds_gains(setup: Setup) -> bool:

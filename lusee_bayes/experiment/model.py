@@ -25,7 +25,7 @@ def radiometer(setup: Setup, data: Visibilities | None = None) -> Covariance:
         visibilities,
         setup.layout,
         bandwidth_hz=section.bandwidth_hz,
-        step_s=setup.observation.step_s,
+        step_s=setup.observation.live_s,
         form=section.form,
         duty_cycle=section.duty_cycle,
         factor=section.factor,

@@ -28,6 +28,9 @@ from lusee_bayes.sky import BRIGHT_SOURCES, Sky, galactic_unit_vector, kelvin_st
 from lusee_bayes.sky.prior_family import PriorFamily
 from lusee_bayes.sky.priors import Prior
 
+# instants in each piece of a window for the response to a source: antennas see nothing smaller
+# than some degrees, and nothing at the horizon, where a source appears within a window
+SOURCE_NODES = 8
 # two sites closer than that are one: 30 m
 SAME_SITE_DEG = 1e-3
 
@@ -232,17 +235,23 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
 def source_responses(
     scenario: Scenario, observation: Observation, antennas: Monopoles, frequency_mhz: float
 ) -> tuple[Float[Array, "products times"], ...]:
-    """Response to 1 K sr of each of the scenario's sources, with these antennas, in K."""
-    return tuple(
+    """Response to 1 K sr of each of the scenario's sources, with these antennas, in K.
+
+    Their means over the windows, by instants: a source may rise and set within one.
+    """
+    instants, sample, weight = observation.at_nodes(SOURCE_NODES)
+    first = np.searchsorted(sample, np.arange(observation.n_times))
+    responses = (
         source_response(
-            observation,
-            _direction(source, observation),
+            instants,
+            _direction(source, instants),
             frequency_mhz,
             antennas,
             stokes_v=source.stokes_v,
         )
         for source in scenario.sources.list
     )
+    return tuple(np.add.reduceat(np.asarray(r) * weight, first, axis=1) for r in responses)
 
 
 def _direction(source: SourceSection, observation: Observation) -> Float[np.ndarray, "..."]:

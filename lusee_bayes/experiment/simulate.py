@@ -8,7 +8,7 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.terms import TERMS, Truth, true_beams, true_instrument
+from lusee_bayes.experiment.terms import TERMS, Truth, true_beams, true_instrument, true_setup
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.visibilities import Visibilities
 
@@ -22,6 +22,7 @@ def true_values(setup: Setup) -> Truth:
 def true_signal(setup: Setup, truth: Truth) -> Float[Array, "products times"]:
     """Visibilities of sky, ground and systematics with the true instrument and values, in K."""
     key = jax.random.key(setup.scenario.seed)
+    setup = true_setup(setup, truth)
     true = CouplingMatrix.build(true_beams(setup), setup.pointing)
     visibilities = true.layout.scatter(true @ setup.sky.modes)
     visibilities = visibilities + true_instrument(setup).background()[:, None]

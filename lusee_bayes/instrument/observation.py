@@ -16,19 +16,22 @@ import astropy.units as u
 import numpy as np
 from astropy.time import Time
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.core.checks import require_finite, require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.representation import Described, listed
-from lusee_bayes.instrument.moon import mcmf_from_galactic, sun_direction
+from lusee_bayes.instrument.moon import (
+    about_fixed_axis,
+    lean,
+    mcmf_from_galactic,
+    sun_direction,
+    topocentric_from_mcmf,
+)
 from lusee_bayes.instrument.schedule import Cuts, Interval, Run, cut_intervals, cut_runs
 from lusee_bayes.instrument.times import require_ephemeris, unannounced_leap_seconds
 from lusee_bayes.instrument.windows import Windows
 
 ONE_CYCLE = (Run(),)
-# period after which the sky repeats itself in luseepy's engine croissant
-LUSEEPY_MONTH_HOURS = 655.72
 
 
 @dataclass(frozen=True, repr=False)
@@ -53,6 +56,8 @@ class Observation(Described):
         its data, which have no windows.
     windows : Windows or None
         What each sample is the mean of; None for instants.
+    tilt_deg : (float, float)
+        By how much the lander leans towards East and towards North.
 
     Raises
     ------
@@ -69,12 +74,14 @@ class Observation(Described):
     step_s: float
     fixed_axis: bool = False
     windows: Windows | None = None
+    tilt_deg: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self):
         if not -90.0 <= self.lat_deg <= 90.0:
             raise InputError(f"lat_deg must lie in -90..90, got {self.lat_deg}")
         require_positive("step_s", self.step_s)
         require_finite("lon_deg and turntable_deg", np.array([self.lon_deg, *self.turntable_deg]))
+        require_finite("tilt_deg", np.array(self.tilt_deg))
         if self.times.shape != self.run.shape or self.times.ndim != 1 or not self.times.size:
             raise InputError(
                 f"times {self.times.shape} and run {self.run.shape} must be two lists of the "
@@ -205,11 +212,6 @@ class Observation(Described):
             an interval of nights holds none.
         """
         cuts = cut_intervals(intervals, step_s)
-        if window == "instant" and any(one.duty_cycle < 1.0 for one in intervals):
-            raise InputError(
-                "samples that are instants have no duty cycle; take windows "
-                "(observation.window=mean), or leave out the schedule's duty_cycle"
-            )
         site = {"lon_deg": lon_deg, "lat_deg": lat_deg, "fixed_axis": fixed_axis}
         return cls._of_cuts(cuts, window, throughout=True, step_s=step_s, **site)
 
@@ -250,15 +252,12 @@ class Observation(Described):
             If no sample is kept.
         """
         runs, renumbered = np.unique(self.run[keep], return_inverse=True)
-        return Observation(
-            self.lon_deg,
-            self.lat_deg,
-            self.times[keep],
-            renumbered,
-            tuple(self.turntable_deg[run] for run in runs),
-            self.step_s,
-            self.fixed_axis,
-            None if self.windows is None else self.windows.select(keep),
+        return replace(
+            self,
+            times=self.times[keep],
+            run=renumbered,
+            turntable_deg=tuple(self.turntable_deg[run] for run in runs),
+            windows=None if self.windows is None else self.windows.select(keep),
         )
 
     @property
@@ -319,9 +318,7 @@ class Observation(Described):
     @cached_property
     def _mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
         if self.fixed_axis:
-            angle = 2.0 * np.pi * self.hours / LUSEEPY_MONTH_HOURS
-            about_z = SpatialRotation.from_rotvec(np.outer(-angle, [0.0, 0.0, 1.0])).as_matrix()
-            rotations = about_z @ mcmf_from_galactic(self.times[:1])[0]
+            rotations = about_fixed_axis(self.times, self.hours)
         else:
             rotations = mcmf_from_galactic(self.times)
         rotations.setflags(write=False)  # all channels share them
@@ -329,10 +326,11 @@ class Observation(Described):
 
     def topocentric_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from MCMF to the East, North and up of the site, its rows."""
-        lon, lat = np.radians(self.lon_deg), np.radians(self.lat_deg)
-        up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
-        east = np.array([-np.sin(lon), np.cos(lon), 0.0])
-        return np.array([east, np.cross(up, east), up])
+        return topocentric_from_mcmf(self.lon_deg, self.lat_deg)
+
+    def lander_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
+        """Return the rotation from MCMF to the lander's axes: East, North and up if it is level."""
+        return lean(self.tilt_deg) @ self.topocentric_from_mcmf()
 
     def zenith_galactic(self) -> Float[np.ndarray, "times 3"]:
         """Return the Galactic unit vector of the zenith at every time."""

@@ -7,26 +7,27 @@ Moon-fixed frame is a turn phi(t) about z followed by a small tilt, exactly::
 
 The pole wanders by 0.04 degrees over one cycle, so the tilt is expanded in powers of (ex, ey); the
 order is chosen such that the largest neglected term is below ``TILT_TOLERANCE`` of any mode.
+Means over windows, and what of all this depends on time, are left to :mod:`.window_average`.
 """
 
 from __future__ import annotations
-
-from math import factorial
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.rotations import Rotation, tilt_powers
+from lusee_bayes.core.rotations import Rotation
 from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.window_average import sufficient_nodes, windowed
 
-# bound on the relative error of a mode at lmax, and least order for any lmax: the bright low modes
-# then err by at most 4e-5 of the radiometer noise of a sample, over one cycle or three
-TILT_TOLERANCE = 1e-5
+# bound on the relative error of a mode at lmax, and least order for any lmax
+TILT_TOLERANCE = 1e-7
 LEAST_ORDER = 2
+# by which the Moon turns in a second, in radians, never less than in truth
+FASTEST_TURN = 2.0 * np.pi / (27.3 * 86400.0)
 
 
 class Pointing(eqx.Module):
@@ -35,28 +36,35 @@ class Pointing(eqx.Module):
     Attributes
     ----------
     azimuth : (times,) array
-        phi(t) in radians.
-    tilt : (times, 2) array
-        Rotation vector (ex, ey) in radians.
+        phi(t) in radians, its mean over the window of each sample.
+    functions : (times, functions) array
+        u_j(t), what else A knows of time.
+    factors : (functions, powers, orders, 2) array
+        G_j(p, m), real and imaginary part: what the beams take up for each function.
     pole_from_galactic : Rotation
         From Galactic coordinates to the frame P.
-    mcmf_from_topocentric : Rotation
-        From the frame of the site, at turntable angle zero, to the Moon-fixed one.
+    mcmf_from_lander : Rotation
+        From the frame of the lander, at turntable angle zero, to the Moon-fixed one.
     turntable : (runs,) array
         In radians, positive from East towards North.
     run_starts : tuple of int
         First sample of each run, and the number of samples.
     order : int
         Of the expansion in the tilt.
+    turns : (4,) array or None
+        Further turns in radians, where offsets are not known: of the site in longitude and
+        latitude, and of the lander towards East and towards North. None for none.
     """
 
     azimuth: Float[Array, " times"]
-    tilt: Float[Array, "times 2"]
+    functions: Float[Array, "times functions"]
+    factors: Float[Array, "functions powers orders 2"]
     pole_from_galactic: Rotation
-    mcmf_from_topocentric: Rotation
+    mcmf_from_lander: Rotation
     turntable: Float[Array, " runs"]
     run_starts: tuple[int, ...] = eqx.field(static=True)
     order: int = eqx.field(static=True)
+    turns: Float[Array, "4"] | None = None
 
     @classmethod
     def of(cls, observation: Observation, lmax: int, order: int | None = None) -> Pointing:
@@ -81,18 +89,27 @@ class Pointing(eqx.Module):
         """
         if order is not None and order < 0:
             raise InputError(f"the order of the tilt expansion must be 0, 1, ..., got {order}")
-        mcmf = observation.mcmf_from_galactic()
+        angle = 0.0
+        if observation.windows is not None:
+            longest = (observation.windows.end_s - observation.windows.start_s).max()
+            angle = lmax * FASTEST_TURN * float(longest) / 2.0
+        instants, sample, weight = observation.at_nodes(sufficient_nodes(angle))
+        mcmf = instants.mcmf_from_galactic()
         pole_frame = mean_pole_frame(mcmf)
         azimuth, tilt = split(mcmf @ pole_frame.T)
+        if order is None:
+            order = sufficient_order(tilt, lmax)
+        azimuth, functions, factors = windowed(sample, weight, azimuth, tilt, order, lmax)
         starts = np.searchsorted(observation.run, np.arange(observation.n_runs + 1))
         return cls(
             azimuth=azimuth,
-            tilt=tilt,
+            functions=functions,
+            factors=factors,
             pole_from_galactic=Rotation.from_matrix(pole_frame, lmax),
-            mcmf_from_topocentric=Rotation.from_matrix(observation.topocentric_from_mcmf().T, lmax),
+            mcmf_from_lander=Rotation.from_matrix(observation.lander_from_mcmf().T, lmax),
             turntable=np.radians(np.array(observation.turntable_deg, dtype=np.float64)),
             run_starts=tuple(int(s) for s in starts),
-            order=sufficient_order(tilt, lmax) if order is None else order,
+            order=order,
         )
 
     @property
@@ -104,16 +121,6 @@ class Pointing(eqx.Module):
         """Return the number of each run and the slice of its samples."""
         bounds = zip(self.run_starts[:-1], self.run_starts[1:], strict=True)
         return [(number, slice(first, end)) for number, (first, end) in enumerate(bounds)]
-
-    def tilt_factors(self) -> Float[Array, "times powers"]:
-        """Return (-ex)^a (-ey)^b / (a + b)! in the order of ``rotations.tilts``.
-
-        They multiply the tilted *beams*: a row of A is b^T exp(ex K_x + ey K_y) ..., and the
-        transpose of the exponential has the opposite sign.
-        """
-        ex, ey = -self.tilt[:, 0], -self.tilt[:, 1]
-        terms = [ex**a * ey**b / factorial(a + b) for a, b in tilt_powers(self.order)]
-        return namespace(self.tilt).stack(terms, axis=1)
 
 
 def mean_pole_frame(mcmf: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "3 3"]:

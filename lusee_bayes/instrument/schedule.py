@@ -18,14 +18,13 @@ from jaxtyping import Bool, Float, Int
 
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.instrument.moon import CYCLE_DAYS
 from lusee_bayes.instrument.times import (
     require_ephemeris,
     unannounced_leap_seconds,
     utc_from_text,
 )
 from lusee_bayes.instrument.windows import ROUNDING_S, Windows
-
-CYCLE_DAYS = 27.321661
 
 
 @dataclass(frozen=True)
@@ -168,13 +167,18 @@ class Cuts:
         Raises
         ------
         InputError
-            For times outside the ephemeris.
+            For times outside the ephemeris, and for a duty cycle of instants.
         """
         seconds, windows = self.start_s, None
         require_ephemeris(np.array([self.t0.jd + seconds[-1] / 86400.0]))
         if window == "mean":
             half = self.length_s / 2.0
             seconds, windows = seconds + half, Windows.whole(-half, half, self.live_s)
+        elif (self.live_s < self.length_s).any():
+            raise InputError(
+                "samples that are instants have no duty cycle; take windows "
+                "(observation.window=mean), or leave out the schedule's duty_cycle"
+            )
         with unannounced_leap_seconds():
             return self.t0 + seconds * u.s, windows
 

@@ -41,7 +41,8 @@ def antenna_directions(
     InputError
         Unless ``galactic`` is a finite float64 array of such a shape.
     """
-    east, north, up = _topocentric(observation, galactic).T
+    leaning = observation.lander_from_mcmf() @ observation.topocentric_from_mcmf().T
+    east, north, up = leaning @ _topocentric(observation, galactic).T
     turned = np.radians(np.asarray(observation.turntable_deg, dtype=np.float64))[observation.run]
     cos, sin = np.cos(turned), np.sin(turned)
     return np.stack([cos * east + sin * north, cos * north - sin * east, up], axis=1)

@@ -1,9 +1,9 @@
 """The windows over which samples were integrated: what a visibility is the mean of.
 
 A sample has one or more pieces, within each of which its live time is spread evenly: one piece
-where the spectrometer integrated without a gap, or with a duty cycle much faster than the sky
-turns; several where something was left out. The mean over a window is that over its pieces, each
-with the weight of its live time.
+where the spectrometer integrated without a gap, or with a duty cycle far faster than the sky turns;
+several where something was left out. The mean over a window is that over its pieces, each with the
+weight of its live time.
 """
 
 from __future__ import annotations

@@ -81,7 +81,6 @@ class StructuredLeftOut(LeftOut):
         self._coupling = model.coupling
         shape = self._coupling.layout.n_products, self._coupling.layout.n_times
         self._complete = replace(self._coupling, layout=DataLayout(*shape))
-        self._tilts = self._coupling.pointing.tilt_factors()
         self._prior = model.prior
         self._lower = posterior.lower
         scatter = self._coupling.layout.scatter
@@ -169,7 +168,7 @@ class StructuredLeftOut(LeftOut):
             return np.einsum("jt,jtm->mt", mixing, self._kept, optimize=True)
         rows = []
         for run, span in self._coupling.pointing.runs():
-            factors = self._tilts[span]
+            factors = self._coupling.pointing.functions[span]
             used = np.flatnonzero(mixing[:, span].any(1))
             beams = self._coupling.body_beams[run][used]
             each = mixing[used][:, span].T[:, :, None] * factors[:, None]
@@ -201,8 +200,8 @@ class StructuredLeftOut(LeftOut):
         return self._whitened(self._rows(run, here, functions))
 
     def _phases(self, here: Int[np.ndarray, " times"]) -> Float[np.ndarray, "times functions"]:
-        """cos and sin of m phi(t) times every power of the tilt: all that A knows of time."""
-        factors = self._tilts[here]
+        """cos and sin of m phi(t) times every function of time: all that A knows of time."""
+        factors = self._coupling.pointing.functions[here]
         angle = self._coupling.pointing.azimuth[here, None] * np.arange(self._coupling.lmax + 1.0)
         waves = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
         return (factors[:, :, None] * waves[:, None]).reshape(len(here), -1)
@@ -213,11 +212,11 @@ class StructuredLeftOut(LeftOut):
         """R: for every product U^T A, whose rows are combinations of those of A."""
         coupling, n = self._coupling, self._coupling.lmax + 1
         ell, m = mode_numbers(coupling.lmax)
-        n_products, n_powers = coupling.body_beams.shape[1:3]
-        phases = (functions.T @ self._phases(here)).reshape(-1, n_powers, 2, n)
-        cosine, sine = phases.transpose(2, 3, 1, 0)  # (orders, powers, functions)
+        n_products, n_functions = coupling.body_beams.shape[1:3]
+        phases = (functions.T @ self._phases(here)).reshape(-1, n_functions, 2, n)
+        cosine, sine = phases.transpose(2, 3, 1, 0)  # (orders, functions of A, functions)
         # by order: W_lm, and W_l,-m, of every product and degree
-        beams = coupling.by_order[run].reshape(n, n_products, n_powers, 2 * n).swapaxes(2, 3)
+        beams = coupling.by_order[run].reshape(n, n_products, n_functions, 2 * n).swapaxes(2, 3)
         plus, minus = beams[:, :, :n], beams[:, :, n:]
         cosine, sine = cosine[:, None], sine[:, None]
         even = plus @ cosine - minus @ sine

@@ -1,10 +1,10 @@
 """A^T N^-1 A without A: from the beams and Fourier sums over time.
 
-With c_lm(t) = sum_p e_p(t) beta_p,lm exp(i m phi(t)), beta_lm = W_lm + i W_l,-m (coupling.py), a
+With c_lm(t) = sum_j u_j(t) beta_j,lm exp(i m phi(t)), beta_lm = W_lm + i W_l,-m (coupling.py), a
 visibility is Re sum_m conj(c_lm) (a_lm + i a_l,-m), and for noise that does not couple times ::
 
-    sum_t w(t) c_lm conj(c'_l'm') = sum_pp' beta_p,lm conj(beta'_p',l'm') F_pp'(m - m') = P,
-    sum_t w(t) c_lm c'_l'm'       = sum_pp' beta_p,lm beta'_p',l'm' F_pp'(m + m')       = Q,
+    sum_t w(t) c_lm conj(c'_l'm') = sum_jk beta_j,lm conj(beta'_k,l'm') F_jk(m - m') = P,
+    sum_t w(t) c_lm c'_l'm'       = sum_jk beta_j,lm beta'_k,l'm' F_jk(m + m')       = Q,
 
 with F the sums of :mod:`time_sums`. The four parts of the matrix follow from P + Q and P - Q.
 Noise that couples different times is whitened in order of time, a few rows of A at once.
@@ -41,7 +41,7 @@ from lusee_bayes.noise.covariance.time_banded import TimeBandedFactor
 def normal_matrix(coupling: Coupling, noise: Covariance) -> Float[Array, "modes modes"]:
     """Compute A^T N^-1 A without forming A.
 
-    Exact for the coupling's own order of the tilt. For diagonal noise and blocks in time the cost
+    Exact for the coupling's own functions of time. For diagonal noise and blocks in time the cost
     hardly grows with the number of samples; for time-banded noise it grows in proportion, in
     bounded memory.
 
@@ -158,13 +158,11 @@ def summed(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> Float[Arra
         spans = [runs[run] for run in group]
         here = [
             xp.concatenate([x[..., span] for span in spans], axis=-1)
-            for x in (weights, pointing.azimuth, pointing.tilt.T)
+            for x in (weights, pointing.azimuth, pointing.functions.T)
         ]
         missing = -here[1].shape[0] % CHUNK
         padded = [xp.pad(x, ((0, 0),) * (x.ndim - 1) + ((0, missing),)) for x in here]
-        part = of_one_angle(
-            coupling.by_order[group[0]], *padded, coupling.body_beams.shape[1], pointing.order
-        )
+        part = of_one_angle(coupling.by_order[group[0]], *padded, coupling.body_beams.shape[1])
         total = total + part
     turn = pointing.pole_from_galactic
     return _to_galactic(turn, total, places(len(turn.blocks) - 1))
@@ -233,10 +231,9 @@ def _streamed(coupling: CouplingMatrix, factor: TimeBandedFactor) -> Float[Array
 
     def add(carry, block):
         before, total = carry
-        left, inverse, e, phi, run, present = block
-        beams = coupling.body_beams[run]
-        tilted = jnp.einsum("tp,tkpc->ktc", e, beams)
-        a = jnp.swapaxes(turned_about_pole(tilted, phi), 0, 1) * present[:, :, None]
+        left, inverse, u, phi, run, present = block
+        beams = jnp.einsum("tj,tkjc->ktc", u, coupling.body_beams[run])
+        a = jnp.swapaxes(turned_about_pole(beams, phi), 0, 1) * present[:, :, None]
         white = inverse @ (a.reshape(rows, n_modes) - left @ before)
         return (jnp.concatenate([before[rows:], white]), total + gram_matrix(white)), None
 
@@ -244,7 +241,7 @@ def _streamed(coupling: CouplingMatrix, factor: TimeBandedFactor) -> Float[Array
     parts = (
         factor.left,
         factor.inverse,
-        *map(blocked, (pointing.tilt_factors(), pointing.azimuth, run_of, present)),
+        *map(blocked, (pointing.functions, pointing.azimuth, run_of, present)),
     )
     start = (jnp.zeros((window, n_modes)), jnp.zeros((n_modes, n_modes)))
     (_, total), _ = jax.lax.scan(add, start, parts)

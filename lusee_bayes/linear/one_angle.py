@@ -13,6 +13,7 @@ from jaxtyping import Complex, Float, Int
 
 from lusee_bayes.core.arrays import Array, compiled, namespace, placed, scan
 from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.core.threads import in_threads
 from lusee_bayes.linear.time_sums import time_sums
 
 # strips of orders where they are compiled: more save products with zeros
@@ -24,19 +25,18 @@ def of_one_angle(
     by_order: Float[Array, "orders beams degrees"],
     weights: Float[Array, "..."],
     azimuth: Float[Array, " times"],
-    tilt: Float[Array, "2 times"],
+    functions: Float[Array, "functions times"],
     n_products: int,
-    order: int,
 ) -> Float[Array, "modes modes"]:
     """The lower triangle of their part in the mean-pole frame; modes as :func:`places` has them."""
     n = by_order.shape[0]
     beams = by_order.reshape(n, n_products, -1, 2, n).swapaxes(2, 3)
-    f = time_sums(weights.reshape(-1, azimuth.shape[0]), azimuth, tilt.T, order, n - 1)
+    f = time_sums(weights.reshape(-1, azimuth.shape[0]), azimuth, functions.T, n - 1)
     return _from_sums(beams, f.reshape(*weights.shape[:-1], *f.shape[1:]))
 
 
 def _from_sums(
-    beams: Float[Array, "orders products 2 powers degrees"], f: Complex[Array, "..."]
+    beams: Float[Array, "orders products 2 functions degrees"], f: Complex[Array, "..."]
 ) -> Float[Array, "modes modes"]:
     """The matrix of beams (W_lm, W_l,-m) and Fourier sums, one strip of orders after the other.
 
@@ -50,18 +50,26 @@ def _from_sums(
     m, s = np.abs(m), (m < 0).astype(int)
     whole = xp.zeros((len(m),) * 2)
     n_strips = n if xp is np else min(N_STRIPS, n)
-    for first, end in pairwise(np.linspace(0, n, n_strips + 1).astype(int).tolist()):
+    strips = list(pairwise(np.linspace(0, n, n_strips + 1).astype(int).tolist()))
 
-        def add(_, number, first=first, end=end):
+    def of(strip: tuple[int, int]) -> Array:
+        first, end = strip
+
+        def add(_, number):
             return None, _rows_of_order(number, beams, f, first, end)
 
-        _, strip = scan(xp, add, None, np.arange(first, end))
+        _, rows = scan(xp, add, None, np.arange(first, end))
         start, stop = np.searchsorted(m, (first, end))
-        rows, columns = slice(start, stop), slice(stop)
         row = ((m - first) * 2 + s) * (n - first) + ell - first
         column = (s * end + m) * n + ell
-        strip = strip.reshape(-1, strip.shape[-1])[row[rows][:, None], column[columns][None]]
-        whole = placed(whole, (rows, columns), strip)
+        here, there = row[start:stop][:, None], column[:stop][None]
+        return rows.reshape(-1, rows.shape[-1])[here, there]
+
+    # the many small products of matrices leave a processor idle that has no strip of its own
+    computed = in_threads(of, strips) if xp is np else [of(strip) for strip in strips]
+    for (first, end), rows in zip(strips, computed, strict=True):
+        start, stop = np.searchsorted(m, (first, end))
+        whole = placed(whole, (slice(start, stop), slice(stop)), rows)
     return whole
 
 
@@ -78,7 +86,7 @@ def _by_order(lmax: int) -> Int[np.ndarray, " modes"]:
 
 def _rows_of_order(
     m: Array,
-    beams: Float[Array, "orders products 2 powers degrees"],
+    beams: Float[Array, "orders products 2 functions degrees"],
     f: Complex[Array, "..."],
     first: int,
     end: int,
@@ -105,7 +113,7 @@ def _rows_of_order(
 def _weighted(
     even: Complex[Array, "..."],
     odd: Complex[Array, "..."],
-    beams: Float[Array, "orders products 2 powers degrees"],
+    beams: Float[Array, "orders products 2 functions degrees"],
 ) -> list[Float[Array, "orders parts degrees"]]:
     """(P + Q) / 2 and (P - Q) / 2 without the row's own beam, real and imaginary parts.
 
@@ -113,15 +121,15 @@ def _weighted(
 
         (P + Q) / 2 = even W + i odd W',    (P - Q) / 2 = -odd W - i even W'.
     """
-    xp, (n_orders, n_products, _, n_powers, n) = namespace(even, beams), beams.shape
+    xp, (n_orders, n_products, _, n_functions, n) = namespace(even, beams), beams.shape
     factors = [
         xp.stack([xp.stack([even.real, -odd.imag]), xp.stack([even.imag, odd.real])]),
         xp.stack([xp.stack([-odd.real, even.imag]), xp.stack([-odd.imag, -even.real])]),
     ]
     if even.ndim == 5:
-        # part, other part, product, other product, power, other power, order
+        # part, other part, product, other product, function, other function, order
         factors = [x.transpose(6, 2, 0, 4, 3, 1, 5) for x in factors]
-        factors = [x.reshape(n_orders, n_products * 2 * n_powers, -1) for x in factors]
+        factors = [x.reshape(n_orders, n_products * 2 * n_functions, -1) for x in factors]
         return [x @ beams.reshape(n_orders, -1, n) for x in factors]
     beams = beams.reshape(n_orders, n_products, -1, n)
     factors = [x.transpose(5, 2, 0, 3, 1, 4).reshape(*beams.shape[:3], -1) for x in factors]

@@ -39,7 +39,7 @@ def radiometer_noise(
     layout: DataLayout,
     *,
     bandwidth_hz: Scalar = 1.0e6,
-    step_s: Scalar = 7200.0,
+    step_s: Scalar | Float[np.ndarray, " times"] = 7200.0,
     form: str = "paper",
     duty_cycle: Scalar = 1.0,
     factor: Scalar = 1.0,
@@ -53,8 +53,8 @@ def radiometer_noise(
         layout may be 0 or NaN; :func:`.without_gaps` fills them where noise depends on them.
     layout : DataLayout
     bandwidth_hz : float
-    step_s : float
-        Time from sample to sample in seconds.
+    step_s : float or (times,) array
+        Integration time in seconds: of all samples, or the live time of each.
     form : {"paper", "exact"}
     duty_cycle : float
         Fraction of ``step_s`` spent integrating.
@@ -89,9 +89,13 @@ def radiometer_noise(
         "noise levels are taken from it; use a sky with a positive mean",
     )
     scale = factor / (bandwidth_hz * step_s * duty_cycle)
+    if np.ndim(scale):
+        require_shape("the radiometer's step_s", scale, (layout.n_times,))
+    else:
+        scale = namespace(scale, visibilities).full(layout.n_times, scale)
     if form == "paper":
-        return DiagonalCovariance(layout.gather(paper_variance(visibilities)) * scale)
-    return TimeBlockCovariance(exact_blocks(visibilities) * scale, layout)
+        return DiagonalCovariance(layout.gather(paper_variance(visibilities) * scale[None]))
+    return TimeBlockCovariance(exact_blocks(visibilities) * scale[:, None, None], layout)
 
 
 def paper_variance(

@@ -13,6 +13,7 @@ from lusee_bayes.systematics.chart import Chart
 from lusee_bayes.systematics.gain_drifts import SCALES, GainDrifts
 from lusee_bayes.systematics.noise_level import NoiseLevel
 from lusee_bayes.systematics.point_sources import PointSources, Source
+from lusee_bayes.systematics.pointing_offsets import PointingOffsets
 from lusee_bayes.systematics.prior_spectrum import PowerSpectrum, SpectrumBands
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "Marginalised",
     "NoiseLevel",
     "PointSources",
+    "PointingOffsets",
     "PowerSpectrum",
     "Source",
     "SpectrumBands",

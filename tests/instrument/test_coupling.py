@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -247,23 +245,23 @@ def test_a_uniform_sky_of_one_kelvin_gives_autos_of_one_kelvin():
 
 @pytest.mark.long
 @pytest.mark.parametrize(("cycles", "lmax"), [pytest.param(1, 47, marks=pytest.mark.long), (3, 12)])
-def test_the_moons_axis_is_not_fixed(cycles, lmax):
+def test_the_moons_axis_is_not_fixed(cycles, lmax, monkeypatch):
     """Orders of the tilt expansion in units of the fiducial radiometer noise (DESIGN 5)."""
     o = Observation.from_runs([Run(1.0)] * cycles, step_s=20000.0)
     beams, sky = monopole_beams(25.0, lmax), steep_sky(lmax)
 
-    pointing = Pointing.of(o, lmax)
+    def visibilities_at(order=None):
+        pointing = Pointing.of(o, lmax, order)
+        return np.asarray(CouplingMatrix.build(beams, pointing) @ sky)
 
-    def visibilities_at(order):
-        return np.asarray(CouplingMatrix.build(beams, replace(pointing, order=order)) @ sky)
-
-    exact = visibilities_at(3)  # itself good to 1e-7 sigma
+    monkeypatch.setattr("lusee_bayes.instrument.window_average.TOLERANCE", 1e-14)
+    exact = visibilities_at(5)  # itself good to 1e-9 sigma
     v = exact.reshape(16, -1)
     autos = v[auto_indices()]
     first, second = (np.array([int(x[i]) for x in labels()]) for i in (0, 1))
     sigma = np.sqrt((autos[first] * autos[second] + v**2) / (2 * 1e6 * 7200.0)).ravel()
 
-    def off(order):
+    def off(order=None):
         return np.abs((visibilities_at(order) - exact) / sigma)
 
     growth = (0.083 / 0.044) if cycles == 3 else 1.0  # the wander of the axis
@@ -271,8 +269,9 @@ def test_the_moons_axis_is_not_fixed(cycles, lmax):
     assert np.sqrt(np.mean(off(0) ** 2)) > 0.3
     assert off(1).max() < 0.02 * growth**2
     assert off(2).max() < 1e-5 * growth**3
-    assert pointing.order == 2
-    assert off(pointing.order).max() < 1e-4
+    monkeypatch.undo()
+    # by default, and with the fewest functions of time
+    assert off().max() < 1e-6
 
 
 def test_differentiable_in_the_beams():

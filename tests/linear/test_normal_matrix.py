@@ -16,6 +16,7 @@ from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation, Run
 from lusee_bayes.instrument.pointing import Pointing
+from lusee_bayes.instrument.window_average import windowed
 from lusee_bayes.linear import information
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.normal_matrix import normal_matrix
@@ -46,8 +47,11 @@ def setting(order=2, missing=True, step_s=40000.0):
     beams = ProductBeams(jnp.asarray(rng.standard_normal((N_PRODUCTS, (LMAX + 1) ** 2))), 25.0)
     # a pole that wanders a hundred times further than the Moon's: the tilt is not to be missed
     pointing = Pointing.of(o, LMAX, order)
-    wandering = jnp.asarray(0.05 * rng.standard_normal(pointing.tilt.shape))
-    pointing = replace(pointing, tilt=wandering)
+    times, once = np.arange(o.n_times), np.ones(o.n_times)
+    wandering = 0.05 * rng.standard_normal((o.n_times, 2))
+    azimuth, *rest = windowed(times, once, np.asarray(pointing.azimuth), wandering, order, LMAX)
+    functions, factors = map(jnp.asarray, rest)
+    pointing = replace(pointing, azimuth=azimuth, functions=functions, factors=factors)
     return CouplingMatrix.build(beams, pointing, layout)
 
 
@@ -109,9 +113,8 @@ def test_more_times_than_a_chunk():
     rng = np.random.default_rng(0)
     n = CHUNK + 37
     weights, phi = rng.standard_normal((2, n)), rng.uniform(0, 9, n)
-    tilt = 0.1 * rng.standard_normal((n, 2))
-    got = np.asarray(time_sums(jnp.asarray(weights), jnp.asarray(phi), jnp.asarray(tilt), 1, 2))
-    factors = np.stack([np.ones(n), -tilt[:, 0], -tilt[:, 1]])
+    factors = rng.standard_normal((3, n))
+    got = np.asarray(time_sums(jnp.asarray(weights), jnp.asarray(phi), jnp.asarray(factors.T), 2))
     for q in range(-4, 5):
         expected = np.einsum("ct,at,bt,t->cab", weights, factors, factors, np.exp(1j * q * phi))
         np.testing.assert_allclose(got[..., q + 4], expected, rtol=0, atol=1e-11)

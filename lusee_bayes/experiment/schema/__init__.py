@@ -18,6 +18,7 @@ from lusee_bayes.experiment.schema.noise import (
 )
 from lusee_bayes.experiment.schema.observation import ObservationSection, RunSection
 from lusee_bayes.experiment.schema.output import OutputSection
+from lusee_bayes.experiment.schema.pointing import PointingSection
 from lusee_bayes.experiment.schema.prior import (
     PRIOR_SECTIONS,
     IsotropicPriorSection,
@@ -53,6 +54,7 @@ __all__ = [
     "NoiseSection",
     "ObservationSection",
     "OutputSection",
+    "PointingSection",
     "PriorSection",
     "RadiometerSection",
     "ResponseSection",

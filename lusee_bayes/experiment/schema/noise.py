@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from lusee_bayes.experiment.schema.pointing import PointingSection
 from lusee_bayes.experiment.schema.section import Positive, Section, Treatment
 
 
@@ -118,8 +119,11 @@ class NoiseSection(Section):
         Gain drifts.
     beam : BeamErrorSection
         Beam errors.
+    pointing : PointingSection
+        Offsets of clock and pointing.
     """
 
     radiometer: RadiometerSection = RadiometerSection()
     gain: GainSection | None = None
     beam: BeamErrorSection | None = None
+    pointing: PointingSection | None = None

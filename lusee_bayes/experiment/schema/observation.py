@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from lusee_bayes.experiment.schema.section import Angle, Positive, Section
+from lusee_bayes.instrument.moon import CYCLE_DAYS
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.schedule import CYCLE_DAYS, Interval, Run
+from lusee_bayes.instrument.schedule import Interval, Run
 from lusee_bayes.instrument.schedule_file import read_schedule
 
 
@@ -65,6 +67,14 @@ class ObservationSection(Section):
     runs: Annotated[tuple[RunSection, ...], Field(min_length=1)] = (RunSection(),)
     schedule: str | None = None
     fixed_axis: bool = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _before_there_were_windows(cls, tree: Any) -> Any:
+        """Scenarios that were written with all entries, but without this one, had instants."""
+        if isinstance(tree, Mapping) and "fixed_axis" in tree and "window" not in tree:
+            return {**tree, "window": "instant"}
+        return tree
 
     @model_validator(mode="after")
     def _a_fixed_axis_has_instants(self) -> ObservationSection:

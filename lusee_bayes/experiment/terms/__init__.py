@@ -12,6 +12,13 @@ from lusee_bayes.experiment.terms.beam_error import (
 )
 from lusee_bayes.experiment.terms.gain_drift import GainTerm, gain_drifts, measured_visibilities
 from lusee_bayes.experiment.terms.noise_level import NoiseLevelTerm
+from lusee_bayes.experiment.terms.pointing import (
+    PointingTerm,
+    offsets_about,
+    pointing_offsets,
+    second_order,
+    true_setup,
+)
 from lusee_bayes.experiment.terms.prior_spectrum import PriorSpectrumTerm
 from lusee_bayes.experiment.terms.sources import SourcesTerm, point_sources
 from lusee_bayes.experiment.terms.term import AdditiveTerm, Around, Term, Truth
@@ -20,6 +27,7 @@ from lusee_bayes.experiment.terms.term import AdditiveTerm, Around, Term, Truth
 TERMS: tuple[Term, ...] = (
     NoiseLevelTerm(),
     PriorSpectrumTerm(),
+    PointingTerm(),
     BeamErrorTerm(),
     SourcesTerm(),
     GainTerm(),
@@ -35,7 +43,11 @@ __all__ = [
     "beam_rms_difference",
     "gain_drifts",
     "measured_visibilities",
+    "offsets_about",
     "point_sources",
+    "pointing_offsets",
+    "second_order",
     "true_beams",
     "true_instrument",
+    "true_setup",
 ]

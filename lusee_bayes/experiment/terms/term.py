@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, ClassVar
@@ -32,10 +32,16 @@ class Around:
         The measured data; None before there are any.
     visibilities : (products, times) array or None
         Visibilities for the gain term, in K; None for those that the scenario names.
+    sky : (modes,) array or None
+        For the templates of clock and pointing, in K; None for the scenario's.
+    offsets : mapping of float or None
+        Values of clock and pointing, by name; None for none.
     """
 
     data: Visibilities | None = None
     visibilities: Float[Array, "products times"] | None = None
+    sky: Float[Array, " modes"] | None = None
+    offsets: Mapping[str, float] | None = None
 
 
 class Term(ABC):

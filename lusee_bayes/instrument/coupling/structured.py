@@ -1,13 +1,14 @@
 """A of the beams of an observation: from sky coefficients to visibilities.
 
-With b_rk the coefficients of product k in run r, turned into the Moon-fixed frame, and W_p its
-tilted copies (``rotations.tilts``), a visibility is ::
+With b_rk the coefficients of product k in run r, turned into the Moon-fixed frame, and W_j what the
+pointing's function of time u_j has of its tilted copies (:mod:`.window_average`), a visibility, the
+mean over its window, is ::
 
-    V_k(t) = [ D_z(-phi(t)) sum_p e_p(t) W_p b_rk ] . a        (a: the sky in the mean-pole frame)
-           = sum_p e_p(t) sum_m ( cos m phi(t) X_pm + sin m phi(t) Y_pm ),
-    X_pm = sum_l (W_lm a_lm + W_l,-m a_l,-m),    Y_pm = sum_l (W_lm a_l,-m - W_l,-m a_lm).
+    V_k(t) = [ D_z(-phi(t)) sum_j u_j(t) W_j ] . a             (a: the sky in the mean-pole frame)
+           = sum_j u_j(t) sum_m ( cos m phi(t) X_jm + sin m phi(t) Y_jm ),
+    X_jm = sum_l (W_lm a_lm + W_l,-m a_l,-m),    Y_jm = sum_l (W_lm a_l,-m - W_l,-m a_lm).
 
-Time enters only through exp(i m phi) and the slow scalars e_p, beams only through b: a product of
+Time enters only through exp(i m phi) and the slow scalars u_j, beams only through b: a product of
 A with a vector never forms A, and nothing in it but the last sum grows with the number of times.
 """
 
@@ -22,7 +23,7 @@ from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers
-from lusee_bayes.core.rotations import tilts, turn_about_z
+from lusee_bayes.core.rotations import tilts, turn_about_x, turn_about_y, turn_about_z
 from lusee_bayes.instrument.beams import ProductBeams
 from lusee_bayes.instrument.coupling.base import Coupling
 from lusee_bayes.instrument.coupling.dense import DenseCoupling
@@ -40,8 +41,8 @@ class CouplingMatrix(Coupling):
 
     Attributes
     ----------
-    body_beams : (runs, products, powers, modes) array
-        Beams turned by the turntable into the Moon-fixed frame, and their tilted copies.
+    body_beams : (runs, products, functions, modes) array
+        Beams turned by the turntable into the Moon-fixed frame, as each function of time sees them.
     by_order : (runs, orders, beams, degrees) array
         The same coefficients order by order: the matrices behind X and Y of the module's equations.
     pointing : Pointing
@@ -50,7 +51,7 @@ class CouplingMatrix(Coupling):
         The product and the time of every row.
     """
 
-    body_beams: Float[Array, "runs products powers modes"]
+    body_beams: Float[Array, "runs products functions modes"]
     by_order: Float[Array, "runs orders beams degrees"]
     pointing: Pointing
     layout: DataLayout
@@ -220,10 +221,9 @@ class CouplingMatrix(Coupling):
 
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:
         """Rows of all products for some samples of one run; times: a slice or numbers."""
-        factors = self.pointing.tilt_factors()[times]
-        tilted = factors @ self.body_beams[run]
+        beams = self.pointing.functions[times] @ self.body_beams[run]
         return self.pointing.pole_from_galactic.T(
-            turned_about_pole(tilted, self.pointing.azimuth[times])
+            turned_about_pole(beams, self.pointing.azimuth[times])
         )
 
 
@@ -256,13 +256,36 @@ def turned_about_pole(
 @compiled
 def _body_beams(
     modes: Float[Array, "products modes"], pointing: Pointing
-) -> Float[Array, "runs products powers modes"]:
-    """Tilted copies of the beams in the Moon-fixed frame, for every run's turntable angle."""
+) -> Float[Array, "runs products functions modes"]:
+    """Beams in the Moon-fixed frame for every run's turntable angle and every function of time."""
     xp, runs = namespace(modes, pointing), []
     for run in range(len(pointing.run_starts) - 1):
-        body = pointing.mcmf_from_topocentric(turn_about_z(modes, pointing.turntable[run]))
-        runs.append(xp.stack(tilts(body, pointing.order), axis=1))
+        body = _on_the_moon(turn_about_z(modes, pointing.turntable[run]), pointing)
+        runs.append(_taken_up(xp.stack(tilts(body, pointing.order), axis=1), pointing.factors))
     return xp.stack(runs)
+
+
+def _on_the_moon(modes: Float[Array, "products modes"], pointing: Pointing) -> Array:
+    """Beams of the lander in the Moon-fixed frame, with the pointing's further turns."""
+    if pointing.turns is None:
+        return pointing.mcmf_from_lander(modes)
+    lon, lat, east, north = (pointing.turns[k] for k in range(4))
+    leaning = turn_about_x(turn_about_y(turn_about_x(modes, -north), east), -lat)
+    return turn_about_z(pointing.mcmf_from_lander(leaning), lon)
+
+
+def _taken_up(
+    tilted: Float[Array, "products powers modes"],
+    factors: Float[Array, "functions powers orders 2"],
+) -> Float[Array, "products functions modes"]:
+    """sum_p G_j(p, m) W_p, a complex factor for each pair c_m + i c_-m."""
+    _, m = mode_numbers(lmax_of(tilted.shape[-1]))
+    mirrored = tilted[..., np.arange(len(m)) - 2 * m]
+    xp = namespace(tilted, factors)
+    real = factors[..., 0][..., np.abs(m)]
+    imaginary = factors[..., 1][..., np.abs(m)] * np.sign(m).astype(np.float64)[None, None]
+    straight = xp.einsum("kpm,jpm->kjm", tilted, real)
+    return straight - xp.einsum("kpm,jpm->kjm", mirrored, imaginary)
 
 
 @compiled
@@ -281,7 +304,7 @@ def _phases(pointing: Pointing, lmax: int) -> tuple[Array, Array]:
 
 @compiled
 def _by_order(
-    body_beams: Float[Array, "runs products powers modes"], lmax: int
+    body_beams: Float[Array, "runs products functions modes"], lmax: int
 ) -> Float[Array, "runs orders beams degrees"]:
     """W_lm and W_l,-m side by side for every order: the matrices behind X and Y.
 
@@ -305,7 +328,7 @@ def _pairs(modes: Float[Array, "*batch modes"], lmax: int) -> Float[Array, "*bat
 
 @compiled
 def _forward(coupling: CouplingMatrix, sky: Float[Array, " modes"]) -> Float[Array, " data"]:
-    n_products, n_powers = coupling.body_beams.shape[1:3]
+    n_products, n_functions = coupling.body_beams.shape[1:3]
     pairs = _pairs(coupling.pointing.pole_from_galactic(sky), coupling.lmax)
     plus, minus = pairs[: coupling.lmax + 1], pairs[coupling.lmax + 1 :]
     xp = namespace(coupling, sky)
@@ -313,13 +336,13 @@ def _forward(coupling: CouplingMatrix, sky: Float[Array, " modes"]) -> Float[Arr
     crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
     both = xp.stack([pairs.T, crossed.T], axis=-1)
     cosine, sine = _phases(coupling.pointing, coupling.lmax)
-    factors = coupling.pointing.tilt_factors()
+    functions = coupling.pointing.functions
     grids = []
     for run, span in coupling.pointing.runs():
         x_and_y = coupling.by_order[run] @ both
         over_time = cosine[span] @ x_and_y[..., 0] + sine[span] @ x_and_y[..., 1]
-        over_time = over_time.reshape(-1, n_products, n_powers)
-        grids.append((over_time * factors[span][:, None]).sum(-1).T)
+        over_time = over_time.reshape(-1, n_products, n_functions)
+        grids.append((over_time * functions[span][:, None]).sum(-1).T)
     data = coupling.layout.gather(xp.concatenate(grids, axis=1))
     return data if coupling.response is None else data * coupling.response
 
@@ -331,10 +354,10 @@ def _backward(coupling: CouplingMatrix, data: Float[Array, " data"]) -> Float[Ar
     data = data if coupling.response is None else data * coupling.response
     grid = coupling.layout.scatter(data)
     cosine, sine = _phases(coupling.pointing, coupling.lmax)
-    factors = coupling.pointing.tilt_factors()
+    functions = coupling.pointing.functions
     both = 0.0
     for run, span in coupling.pointing.runs():
-        weighted = grid[:, span].T[:, :, None] * factors[span][:, None]
+        weighted = grid[:, span].T[:, :, None] * functions[span][:, None]
         weighted = weighted.reshape(weighted.shape[0], -1)
         x_and_y = namespace(weighted).stack(
             [cosine[span].T @ weighted, sine[span].T @ weighted], axis=-1
