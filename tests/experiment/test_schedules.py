@@ -74,6 +74,21 @@ def test_a_plan_keeps_the_dates_of_a_schedule(given):
     assert forecast(variations[0]).days == pytest.approx(live, abs=1e-9)
 
 
+def test_half_duty_in_the_schedule_is_half_duty_of_the_receivers(given, path):
+    """Live time is what noise goes by, whoever says that it is half of the time."""
+    header, *rows = TABLE.splitlines()
+    said = {}
+    for duty, of_receivers in (("0.5", 1.0), ("1", 0.5)):
+        lines = [f"{row.rpartition(',')[0]},{duty}" for row in rows]
+        path.write_text("\n".join([header, *lines]))
+        overrides = [*given, f"noise.radiometer.duty_cycle={of_receivers}"]
+        scenario = load_scenario("fiducial", overrides)
+        said[duty] = forecast(default_variations("fiducial", scenario)[0])
+    # the same numbers but for products of 0.5, which are exact
+    assert said["0.5"].information_bits == pytest.approx(said["1"].information_bits, rel=1e-9)
+    assert said["1"].days == pytest.approx(2.0 * said["0.5"].days, rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
