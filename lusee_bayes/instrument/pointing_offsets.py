@@ -18,7 +18,8 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.instrument.observation import CYCLE_DAYS, Observation
+from lusee_bayes.instrument.moon import CYCLE_DAYS
+from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.times import unannounced_leap_seconds
 from lusee_bayes.instrument.windows import Windows

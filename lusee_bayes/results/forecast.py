@@ -146,7 +146,7 @@ def forecast(variation: Variation) -> Forecast:
         posterior = model.condition(np.zeros(model.n_data))
         return Forecast(
             variation=variation,
-            days=setup.observation.n_times * setup.observation.step_s / 86400.0,
+            days=float(setup.observation.live_s.sum()) / 86400.0,
             n_data=model.n_data,
             information_bits=float(posterior.information_bits()),
             modes=informed_modes(posterior),
