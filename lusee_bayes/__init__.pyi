@@ -22,8 +22,10 @@ from .instrument.coupling import CouplingMatrix as CouplingMatrix
 from .instrument.coupling import DenseCoupling as DenseCoupling
 from .instrument.instrument import Instrument as Instrument
 from .instrument.observation import Observation as Observation
-from .instrument.observation import Run as Run
 from .instrument.pointing import Pointing as Pointing
+from .instrument.schedule import Interval as Interval
+from .instrument.schedule import Run as Run
+from .instrument.schedule_file import read_schedule as read_schedule
 from .instrument.visibilities import Visibilities as Visibilities
 from .instrument.visibilities_file import read_visibilities as read_visibilities
 from .instrument.waterfalls import read_waterfall as read_waterfall

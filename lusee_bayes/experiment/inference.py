@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
@@ -10,14 +10,15 @@ from jaxtyping import Float, PRNGKeyArray
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.model import base_model, marginalised, systematics
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.terms import Around, pointing_offsets
+from lusee_bayes.experiment.terms import Around
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.linear.templates import template_amplitudes
+from lusee_bayes.systematics import PointingOffsets
 
 # N is rebuilt until the map moves by less than this (rms, in standard deviations)
 SETTLED, MAX_ROUNDS = 1e-2, 20
@@ -36,12 +37,15 @@ class Inference:
         How often N was built.
     around : Around
         What it was built around.
+    offsets : PointingOffsets or None
+        Of clock and pointing, as they are in N.
     """
 
     model: LinearGaussian
-    posterior: Posterior
+    posterior: Posterior | None
     rounds: int
     around: Around
+    offsets: PointingOffsets | None = None
 
 
 def infer(experiment: Experiment) -> Inference:
@@ -61,21 +65,57 @@ def infer(experiment: Experiment) -> Inference:
         If N is not positive definite, or the map does not settle in 20 rounds.
     """
     setup, data = experiment.setup, experiment.data
-    around = Around(data)
-    model = full_model(setup, around)
-    posterior = model.condition(data.data)
+
+    def conditioned(around: Around, rounds: int) -> Inference:
+        model, offsets = _model(setup, around)
+        return Inference(model, model.condition(data.data), rounds, around, offsets)
+
+    found = conditioned(Around(data), 1)
     if not rebuilds(setup):
-        return Inference(model, posterior, 1, around)
+        return found
     for rounds in range(2, MAX_ROUNDS + 1):
-        around = _around(experiment, Inference(model, posterior, rounds, around))
-        model = full_model(setup, around)
-        previous, posterior = posterior, model.condition(data.data)
-        if float(posterior.rms_shift_from(previous)) < SETTLED:
-            return Inference(model, posterior, rounds, around)
+        before, found = found, conditioned(_around(experiment, found), rounds)
+        if float(found.posterior.rms_shift_from(before.posterior)) < SETTLED:
+            return found
     raise InputError(
         f"the map still moves after {MAX_ROUNDS} rounds of rebuilding N around it; use "
         "noise.gain.visibilities=model and noise.pointing.around=model"
     )
+
+
+def inform(
+    experiment: Experiment, key: PRNGKeyArray, n_perturbations: int = 0
+) -> tuple[Information, Inference]:
+    """What the data say of the sky as a quadratic form, and the posterior that it gives.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    key : PRNG key
+        For the perturbations.
+    n_perturbations : int
+        See :meth:`LinearGaussian.inform`.
+
+    Raises
+    ------
+    InputError
+        As :func:`infer`.
+    """
+    if rebuilds(experiment.setup):
+        found = infer(experiment)
+    else:
+        around = Around(experiment.data)
+        model, offsets = _model(experiment.setup, around)
+        found = Inference(model, None, 1, around, offsets)
+    information, posterior = found.model.inform(experiment.data.data, key, n_perturbations)
+    return information, replace(found, posterior=posterior)
+
+
+def _model(setup: Setup, around: Around) -> tuple[LinearGaussian, PointingOffsets | None]:
+    """The full model, and the offsets of clock and pointing in its N."""
+    found = systematics(setup, around)
+    offsets = [s for _, s in found if isinstance(s, PointingOffsets)]
+    return marginalised(base_model(setup, around.data), found), next(iter(offsets), None)
 
 
 def _around(experiment: Experiment, found: Inference) -> Around:
@@ -97,9 +137,8 @@ def offset_posterior(
     Parameters
     ----------
     experiment : Experiment
-        Whose scenario marginalises them, or samples them: then to first order.
     found : Inference
-        Of these data alone.
+        Of these data alone, with offsets.
 
     Returns
     -------
@@ -108,40 +147,12 @@ def offset_posterior(
     covariance : (offsets, offsets) array
         In these units.
     """
-    offsets = pointing_offsets(experiment.setup, found.around)
+    offsets = found.offsets
     z, covariance = template_amplitudes(
         found.model, found.posterior, experiment.data.data, offsets.templates
     )
     stds = np.asarray(offsets.stds)
     return offsets.in_units(z), covariance * np.outer(stds, stds)
-
-
-def inform(
-    experiment: Experiment, key: PRNGKeyArray, n_perturbations: int = 0
-) -> tuple[Information, Inference]:
-    """What the data say of the sky as a quadratic form, and the posterior that it gives.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    key : PRNG key
-        For the perturbations.
-    n_perturbations : int
-        See :meth:`LinearGaussian.inform`.
-
-    Raises
-    ------
-    InputError
-        As :func:`infer`.
-    """
-    data, around, rounds = experiment.data, Around(experiment.data), 1
-    if rebuilds(experiment.setup):
-        settled = infer(experiment)
-        model, around, rounds = settled.model, settled.around, settled.rounds
-    else:
-        model = full_model(experiment.setup, around)
-    information, posterior = model.inform(data.data, key, n_perturbations)
-    return information, Inference(model, posterior, rounds, around)
 
 
 def rebuilds(setup: Setup) -> bool:

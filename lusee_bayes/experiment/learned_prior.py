@@ -79,6 +79,13 @@ def learned_prior(
                 "a log-normal sky is found under one N, and noise.gain.visibilities=posterior "
                 "builds several; use noise.gain.visibilities=measured"
             )
+        pointing = scenario.noise.pointing
+        rebuilt = pointing is not None and pointing.treatment != "ignored"
+        if rebuilt and pointing.around == "posterior":
+            raise InputError(
+                "a log-normal sky is found under one N, and noise.pointing.around=posterior "
+                "builds several; use noise.pointing.around=model"
+            )
         return learn_log_normal(family, information, seed)
     if scenario.lmax <= COARSE_LMAX:
         return learn(family, information, seed=seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 from lusee_bayes.core.arrays import on_device
@@ -50,8 +51,12 @@ def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     Those that are to be sampled, too, to first order: what a Gaussian can say about them.
     """
     around = around or Around()
-    model = base_model(setup, around.data)
-    for _, systematic in systematics(setup, around):
+    return marginalised(base_model(setup, around.data), systematics(setup, around))
+
+
+def marginalised(model: LinearGaussian, found: Iterable[tuple[str, Systematic]]) -> LinearGaussian:
+    """The model with these systematics (:func:`systematics`) in N."""
+    for _, systematic in found:
         model = systematic.marginalised(model)
     return model
 

@@ -7,50 +7,31 @@ nothing assumes that the Moon turns about a fixed axis, unless ``fixed_axis`` as
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_body_barycentric
 from astropy.time import Time
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.core.checks import require_finite, require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.representation import Described, listed
-from lusee_bayes.instrument.moon import mcmf_from_galactic
-from lusee_bayes.instrument.times import (
-    require_ephemeris,
-    unannounced_leap_seconds,
-    utc_from_text,
+from lusee_bayes.instrument.moon import (
+    about_fixed_axis,
+    lean,
+    mcmf_from_galactic,
+    sun_direction,
+    topocentric_from_mcmf,
 )
-from lusee_bayes.instrument.windows import ROUNDING_S, Windows
+from lusee_bayes.instrument.schedule import Cuts, Interval, Run, cut_intervals, cut_runs
+from lusee_bayes.instrument.times import require_ephemeris, unannounced_leap_seconds
+from lusee_bayes.instrument.windows import Windows
 
-CYCLE_DAYS = 27.321661
-# period after which the sky repeats itself in luseepy's engine croissant
-LUSEEPY_MONTH_HOURS = 655.72
-
-
-@dataclass(frozen=True)
-class Run:
-    """A stretch of data taken at one turntable angle.
-
-    Attributes
-    ----------
-    cycles : float
-        Length in sidereal months of 27.321661 days.
-    turntable_deg : float
-        A positive angle turns the antennas from East towards North.
-    night_only : bool
-        Keep only the samples with the Sun below the horizon.
-    """
-
-    cycles: float = 1.0
-    turntable_deg: float = 0.0
-    night_only: bool = False
+ONE_CYCLE = (Run(),)
 
 
 @dataclass(frozen=True, repr=False)
@@ -125,55 +106,33 @@ class Observation(Described):
                 "each turntable angle) without going back"
             )
         require_ephemeris(self.times.jd)
-        if self.windows is not None:
-            self._check_windows(self.windows)
-
-    def _check_windows(self, windows: Windows) -> None:
+        if self.windows is None:
+            return
         if self.fixed_axis:
             raise InputError(
                 "a fixed axis of the Moon is for luseepy's croissant, whose samples are instants; "
                 "use observation.window=instant with it"
             )
-        if windows.n_samples != self.n_times:
-            raise InputError(
-                f"there are windows of {windows.n_samples} samples for {self.n_times} times"
-            )
-        bounds = windows.bounds_s
-        length = bounds[:, 1] - bounds[:, 0]
-        if (length > self.step_s * (1.0 + 1e-9) + ROUNDING_S).any():
-            longest = int(np.argmax(length))
-            raise InputError(
-                f"the window of sample {longest} lasts {length[longest]:g} s, longer than the step "
-                f"of {self.step_s:g} s from sample to sample; check the bounds, or give the step"
-            )
-        gaps = np.diff(self._seconds()) + bounds[1:, 0] - bounds[:-1, 1]
-        if (gaps < -ROUNDING_S).any():
-            first = int(np.argmax(gaps < -ROUNDING_S))
-            raise InputError(
-                f"the windows of samples {first} and {first + 1} ({self.times[first].isot[:19]}) "
-                f"overlap by {-gaps[first]:g} s; give each stretch of time to one sample"
-            )
-
-    def _seconds(self) -> Float[np.ndarray, " times"]:
-        with unannounced_leap_seconds():
-            return (self.times - self.times[0]).to_value(u.s)
+        self.windows.require_fitting(self.times, self.step_s)
 
     def description(self) -> tuple[str, ...]:
         with unannounced_leap_seconds():
             first, last = self.times[0].isot[:19], self.times[-1].isot[:19]
         angles = listed(tuple(f"{angle:g}" for angle in self.turntable_deg))
-        instants = ", taken as instants" if self.windows is None else ""
+        kind = ", samples taken as instants"
+        if self.windows is not None:
+            kind = f", live for {self.live_s.sum() / 86400.0:.3g} days"
         axis = ", with a fixed axis of the Moon" if self.fixed_axis else ""
         return (
             f"longitude {self.lon_deg:g}, latitude {self.lat_deg:g} degrees{axis}",
-            f"{first} to {last} UTC, {self.n_times} samples of {self.step_s:g} s{instants}",
-            f"{self.n_runs} run{'s' * (self.n_runs > 1)}, turntable at {angles} degrees",
+            f"{first} to {last} UTC, {self.n_times} samples of {self.step_s:g} s",
+            f"{self.n_runs} run{'s' * (self.n_runs > 1)}, turntable at {angles} degrees{kind}",
         )
 
     @classmethod
     def from_runs(
         cls,
-        runs: list[Run] | tuple[Run, ...] = (Run(),),
+        runs: Sequence[Run] = ONE_CYCLE,
         *,
         start: str = "2027-01-15T00:00:00",
         step_s: float = 7200.0,
@@ -210,52 +169,77 @@ class Observation(Described):
         InputError
             For a bad date, step or length, and for a run without samples.
         """
-        require_positive("step_s", step_s)
-        if not runs:
-            raise InputError("an observation needs at least one run, got none")
-        t0 = utc_from_text("start", start)
-        elapsed, offsets, numbers = 0.0, [], []
-        for number, run in enumerate(runs):
-            require_positive(f"the length in cycles of run {number}", run.cycles)
-            length = run.cycles * CYCLE_DAYS * 86400.0
-            n = int(length // step_s)
-            if n < 1:
-                raise InputError(
-                    f"run {number} of {run.cycles} cycles holds no sample of {step_s} s; "
-                    "lengthen it or shorten step_s"
-                )
-            offsets.append(elapsed + step_s * np.arange(n))
-            numbers.append(np.full(n, number))
-            elapsed += length
-        seconds, run_of = np.concatenate(offsets), np.concatenate(numbers)
-        require_ephemeris(np.array([t0.jd + seconds[-1] / 86400.0]))
-        windows = None
-        if window == "mean":
-            half = np.full(len(seconds), step_s / 2.0)
-            seconds, windows = seconds + half, Windows.whole(-half, half)
-        with unannounced_leap_seconds():
-            times = t0 + seconds * u.s
+        cuts = cut_runs(runs, start, step_s)
+        site = {"lon_deg": lon_deg, "lat_deg": lat_deg, "fixed_axis": fixed_axis}
+        return cls._of_cuts(cuts, window, throughout=False, step_s=step_s, **site)
+
+    @classmethod
+    def from_schedule(
+        cls,
+        intervals: Sequence[Interval],
+        *,
+        step_s: float = 7200.0,
+        lon_deg: float = 182.258,
+        lat_deg: float = -23.814,
+        fixed_axis: bool = False,
+        window: Literal["instant", "mean"] = "mean",
+    ) -> Observation:
+        """Return an observation of the intervals of a schedule.
+
+        Each is cut into windows of ``step_s`` from its start, of which the last is shorter where it
+        does not end on a step. A run begins wherever the turntable has turned.
+
+        Parameters
+        ----------
+        intervals : sequence of Interval
+            In order, such as :func:`.read_schedule` gives them.
+        step_s : float
+            Time from sample to sample within an interval, in seconds.
+        lon_deg, lat_deg : float
+        fixed_axis : bool
+            See :class:`Observation`.
+        window : {"instant", "mean"}
+            Whether a sample is the sky at the beginning of its window or the mean over it.
+
+        Returns
+        -------
+        Observation
+
+        Raises
+        ------
+        InputError
+            For intervals that overlap or are not in order, for a duty cycle of instants, and where
+            an interval of nights holds none.
+        """
+        cuts = cut_intervals(intervals, step_s)
+        site = {"lon_deg": lon_deg, "lat_deg": lat_deg, "fixed_axis": fixed_axis}
+        return cls._of_cuts(cuts, window, throughout=True, step_s=step_s, **site)
+
+    @classmethod
+    def _of_cuts(
+        cls, cuts: Cuts, window: Literal["instant", "mean"], *, throughout: bool, **others: Any
+    ) -> Observation:
+        """Of samples by night alone where asked for, at their times or from end to end."""
+        times, windows = cuts.samples(window)
         observation = cls(
-            lon_deg,
-            lat_deg,
-            times,
-            run_of,
-            tuple(r.turntable_deg for r in runs),
-            step_s,
-            fixed_axis,
-            windows,
+            times=times,
+            run=cuts.run,
+            turntable_deg=cuts.turntable_deg,
+            windows=windows,
+            **others,
         )
-        night_runs = np.array([r.night_only for r in runs])
-        if not night_runs.any():
+        if not any(cuts.night_only):
             return observation
-        keep = ~night_runs[run_of] | (observation.sun_altitude_deg() < 0.0)
-        empty = [i for i in range(len(runs)) if not keep[run_of == i].any()]
-        if empty:
-            raise InputError(
-                f"run {empty[0]} holds no lunar night; lengthen it, move its start or drop "
-                "night_only"
-            )
-        return observation.select(keep)
+        return observation.select(cuts.by_night(observation._is_dark(throughout)))
+
+    def _is_dark(self, throughout: bool) -> Bool[np.ndarray, " times"]:
+        dark = self.sun_altitude_deg() < 0.0
+        if throughout and self.windows is not None:
+            for offset_s in self.windows.bounds_s.T:
+                with unannounced_leap_seconds():
+                    times = self.times + offset_s * u.s
+                dark &= replace(self, times=times, windows=None).sun_altitude_deg() < 0.0
+        return dark
 
     def select(self, keep: Bool[np.ndarray, " times"]) -> Observation:
         """Return the observation with only the samples where ``keep`` is True.
@@ -268,16 +252,12 @@ class Observation(Described):
             If no sample is kept.
         """
         runs, renumbered = np.unique(self.run[keep], return_inverse=True)
-        return Observation(
-            self.lon_deg,
-            self.lat_deg,
-            self.times[keep],
-            renumbered,
-            tuple(self.turntable_deg[run] for run in runs),
-            self.step_s,
-            self.fixed_axis,
-            None if self.windows is None else self.windows.select(keep),
-            self.tilt_deg,
+        return replace(
+            self,
+            times=self.times[keep],
+            run=renumbered,
+            turntable_deg=tuple(self.turntable_deg[run] for run in runs),
+            windows=None if self.windows is None else self.windows.select(keep),
         )
 
     @property
@@ -338,9 +318,7 @@ class Observation(Described):
     @cached_property
     def _mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
         if self.fixed_axis:
-            angle = 2.0 * np.pi * self.hours / LUSEEPY_MONTH_HOURS
-            about_z = SpatialRotation.from_rotvec(np.outer(-angle, [0.0, 0.0, 1.0])).as_matrix()
-            rotations = about_z @ mcmf_from_galactic(self.times[:1])[0]
+            rotations = about_fixed_axis(self.times, self.hours)
         else:
             rotations = mcmf_from_galactic(self.times)
         rotations.setflags(write=False)  # all channels share them
@@ -348,20 +326,11 @@ class Observation(Described):
 
     def topocentric_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from MCMF to the East, North and up of the site, its rows."""
-        lon, lat = np.radians(self.lon_deg), np.radians(self.lat_deg)
-        up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
-        east = np.array([-np.sin(lon), np.cos(lon), 0.0])
-        return np.array([east, np.cross(up, east), up])
+        return topocentric_from_mcmf(self.lon_deg, self.lat_deg)
 
     def lander_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
-        """Return the rotation from MCMF to the lander's axes: East, North and up if it is level.
-
-        It leans first towards North, about East, then towards East, about North.
-        """
-        east, north = np.radians(self.tilt_deg)
-        lean = SpatialRotation.from_rotvec([0.0, east, 0.0])
-        lean *= SpatialRotation.from_rotvec([-north, 0.0, 0.0])
-        return lean.inv().as_matrix() @ self.topocentric_from_mcmf()
+        """Return the rotation from MCMF to the lander's axes: East, North and up if it is level."""
+        return lean(self.tilt_deg) @ self.topocentric_from_mcmf()
 
     def zenith_galactic(self) -> Float[np.ndarray, "times 3"]:
         """Return the Galactic unit vector of the zenith at every time."""
@@ -369,12 +338,5 @@ class Observation(Described):
 
     def sun_altitude_deg(self) -> Float[np.ndarray, " times"]:
         """Return the geometric altitude of the Sun's centre above the horizon in degrees."""
-        with unannounced_leap_seconds():
-            sun = get_body_barycentric("sun", self.times, ephemeris="builtin")
-            moon = get_body_barycentric("moon", self.times, ephemeris="builtin")
-        direction = (sun - moon).xyz.to_value(u.km)
-        galactic = ICRS(CartesianRepresentation(direction)).transform_to(Galactic())
-        vector = galactic.cartesian.xyz.value
-        vector = vector / np.linalg.norm(vector, axis=0)
-        height = np.einsum("ti,it->t", self.zenith_galactic(), vector)
+        height = np.einsum("ti,ti->t", self.zenith_galactic(), sun_direction(self.times))
         return np.degrees(np.arcsin(height))

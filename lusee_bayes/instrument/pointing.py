@@ -12,6 +12,8 @@ Means over windows, and what of all this depends on time, are left to :mod:`.win
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -110,6 +112,21 @@ class Pointing(eqx.Module):
             turntable=np.radians(np.array(observation.turntable_deg, dtype=np.float64)),
             run_starts=tuple(int(s) for s in starts),
             order=order,
+        )
+
+    def placed(self, observation: Observation) -> Pointing:
+        """Return the pointing of an observation at the same times and windows, but elsewhere.
+
+        Parameters
+        ----------
+        observation : Observation
+            With its own site, lean and turntable angles.
+        """
+        lmax = len(self.mcmf_from_lander.blocks) - 1
+        return replace(
+            self,
+            mcmf_from_lander=Rotation.from_matrix(observation.lander_from_mcmf().T, lmax),
+            turntable=np.radians(np.array(observation.turntable_deg, dtype=np.float64)),
         )
 
     @property

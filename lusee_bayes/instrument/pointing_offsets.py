@@ -18,7 +18,8 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.instrument.observation import CYCLE_DAYS, Observation
+from lusee_bayes.instrument.moon import CYCLE_DAYS
+from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.times import unannounced_leap_seconds
 from lusee_bayes.instrument.windows import Windows
@@ -33,6 +34,8 @@ OFFSETS = {
     "tilt_east_deg": "lean of the lander towards East",
     "tilt_north_deg": "lean of the lander towards North",
 }
+CLOCK = ("clock_s", "clock_drift_s_per_day")
+TILTS = ("tilt_east_deg", "tilt_north_deg")
 # by which the Moon turns against the sky, as azimuths of the sky count it, in radians per hour
 TURN_PER_HOUR = -2.0 * np.pi / (CYCLE_DAYS * 24.0)
 
@@ -154,6 +157,3 @@ def turned_by_offsets(
         turntable=pointing.turntable + turntable,
         turns=xp.stack([lon, *rest]),
     )
-
-
-TILTS = ("tilt_east_deg", "tilt_north_deg")

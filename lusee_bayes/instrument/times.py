@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import Any
 
 import astropy.units as u
@@ -54,7 +55,7 @@ def require_ephemeris(jd: Float[np.ndarray, " times"]) -> None:
     InputError
         If one does not.
     """
-    first, last = (Time(f"{year}-01-01", scale="tdb").jd for year in EPHEMERIS_YEARS)
+    first, last = _ephemeris_jd()
     outside = ~((jd >= first) & (jd <= last))
     if not outside.any():
         return
@@ -67,6 +68,11 @@ def require_ephemeris(jd: Float[np.ndarray, " times"]) -> None:
         f"sample times run outside the ephemeris ({EPHEMERIS_YEARS[0]}-{EPHEMERIS_YEARS[1]}): "
         f"{date}; give a start inside it"
     )
+
+
+@lru_cache(maxsize=1)
+def _ephemeris_jd() -> tuple[float, ...]:
+    return tuple(float(Time(f"{year}-01-01", scale="tdb").jd) for year in EPHEMERIS_YEARS)
 
 
 def utc_of(

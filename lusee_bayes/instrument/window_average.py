@@ -166,10 +166,13 @@ def _fewest(
 ) -> tuple[Float[np.ndarray, "times functions"], Float[np.ndarray, "functions columns"]]:
     """Functions u and factors G with u G = moments x series at every time, to ``TOLERANCE``."""
     q, r = np.linalg.qr(moments)
-    u, s, vt = np.linalg.svd(r @ series, full_matrices=False)
+    across, left = np.linalg.qr(series.T)
+    u, s, vt = np.linalg.svd(r @ left.T)
+    n = min(u.shape[0], vt.shape[0])
+    u, vt = u[:, :n], vt[:n] @ across.T
     contributions = (q @ u) * s
     size = np.sqrt((contributions**2).sum(1).max())
     # what is left of each sample without the last functions
-    left = np.sqrt(np.cumsum((contributions**2)[:, ::-1], axis=1)[:, ::-1].max(0))
-    keep = max(1, int((left > TOLERANCE * size).sum()))
+    missing = np.sqrt(np.cumsum((contributions**2)[:, ::-1], axis=1)[:, ::-1].max(0))
+    keep = max(1, int((missing > TOLERANCE * size).sum()))
     return contributions[:, :keep], vt[:keep]

@@ -10,12 +10,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import astropy.units as u
 import numpy as np
+from astropy.time import Time
 from jaxtyping import Bool, Float, Int
 
 from lusee_bayes.core.checks import require_finite
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.representation import Described
+from lusee_bayes.instrument.times import unannounced_leap_seconds
 
 # times of a Julian date in two parts are exact to less than a nanosecond, others to a few of them
 ROUNDING_S = 1e-6
@@ -134,6 +137,37 @@ class Windows(Described):
     @property
     def _first(self) -> Int[np.ndarray, " samples"]:
         return np.searchsorted(self.sample, np.arange(self.n_samples))
+
+    def require_fitting(self, times: Time, step_s: float) -> None:
+        """Check that windows are those of samples at these times, a step apart.
+
+        Raises
+        ------
+        InputError
+            If there are more or fewer of them, and if one is longer than a step or overlaps the
+            next.
+        """
+        if self.n_samples != len(times):
+            raise InputError(
+                f"there are windows of {self.n_samples} samples for {len(times)} times"
+            )
+        bounds = self.bounds_s
+        length = bounds[:, 1] - bounds[:, 0]
+        if (length > step_s * (1.0 + 1e-9) + ROUNDING_S).any():
+            longest = int(np.argmax(length))
+            raise InputError(
+                f"the window of sample {longest} lasts {length[longest]:g} s, longer than the step "
+                f"of {step_s:g} s from sample to sample; check the bounds, or give the step"
+            )
+        with unannounced_leap_seconds():
+            seconds = (times - times[0]).to_value(u.s)
+        gaps = np.diff(seconds) + bounds[1:, 0] - bounds[:-1, 1]
+        if (gaps < -ROUNDING_S).any():
+            first = int(np.argmax(gaps < -ROUNDING_S))
+            raise InputError(
+                f"the windows of samples {first} and {first + 1} ({times[first].isot[:19]}) "
+                f"overlap by {-gaps[first]:g} s; give each stretch of time to one sample"
+            )
 
     def select(self, keep: Bool[np.ndarray, " samples"]) -> Windows:
         """Return the windows of the samples where ``keep`` is True."""

@@ -19,7 +19,6 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.memory import gigabytes, memory_limit
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.instrument.observation import CYCLE_DAYS
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.results.joint_components import is_iterative
 from lusee_bayes.results.positive_components import lmax_of_fields
@@ -95,15 +94,9 @@ def _operations_a_second() -> float:
     return 2.0 * 1024.0**3 / (time.perf_counter() - start)
 
 
-def n_times(scenario: Scenario) -> int:
-    """Count the samples of an observation, those by day among them."""
-    section = scenario.observation
-    return sum(int(run.cycles * CYCLE_DAYS * 86400.0 // section.step_s) for run in section.runs)
-
-
 def simulation_cost(scenario: Scenario, n_channels: int = 1) -> Cost:
     """Work out what the visibilities of a scenario take."""
-    n_data = 16 * n_times(scenario)
+    n_data = 16 * scenario.observation.n_samples()
     n_modes = (scenario.lmax + 1) ** 2
     memory = BASE_BYTES + n_channels * n_data * BYTES_A_DATUM + 64.0 * n_modes
     return Cost(n_data, n_modes, n_channels, memory, 100.0 * n_channels * (n_data + n_modes))
@@ -122,7 +115,7 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
         Of given data; without them, those of the scenario's observation.
     """
     n_channels = max(1, len(scenario.frequencies_mhz))
-    n_data = 16 * n_times(scenario) if n_data is None else n_data
+    n_data = 16 * scenario.observation.n_samples() if n_data is None else n_data
     n_modes = (scenario.lmax + 1) ** 2
     direct = scenario.joint and not is_iterative(scenario)
     n, rounds = n_modes, 1

@@ -152,7 +152,7 @@ def forecast(variation: Variation) -> Forecast:
         posterior = expected_posterior(setup)
         return Forecast(
             variation=variation,
-            days=setup.observation.n_times * setup.observation.step_s / 86400.0,
+            days=float(setup.observation.live_s.sum()) / 86400.0,
             n_data=setup.layout.size,
             information_bits=float(posterior.information_bits()),
             modes=informed_modes(posterior),

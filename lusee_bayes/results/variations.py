@@ -22,10 +22,32 @@ DUTY_CYCLES = (0.25, 0.5, 1.0)
 
 
 def default_variations(source: str, scenario: Scenario) -> list[Variation]:
-    """The scenario as it is, then turntable, duration, nights, duty cycle and lost antennas."""
+    """The scenario as it is, then turntable, duration, nights, duty cycle and lost antennas.
+
+    A schedule keeps its dates and angles.
+    """
+    families = {AS_GIVEN: {AS_GIVEN: scenario}}
+    if scenario.observation.schedule is None:
+        families |= families_of_runs(scenario)
+    families["duty cycle"] = {f"{duty:g}": with_duty_cycle(scenario, duty) for duty in DUTY_CYCLES}
+    found = [
+        Variation(source, family, name, varied)
+        for family, members in families.items()
+        for name, varied in members.items()
+    ]
+    n_ports = scenario.beam.n_ports
+    if n_ports > 1:
+        found += [
+            Variation(source, "antenna lost", f"port {port}", scenario, (port,))
+            for port in range(n_ports)
+        ]
+    return found
+
+
+def families_of_runs(scenario: Scenario) -> dict[str, dict[str, Scenario]]:
+    """The scenario with its runs turned, longer or shorter, or by night."""
     runs = scenario.observation.runs
-    families = {
-        AS_GIVEN: {AS_GIVEN: scenario},
+    return {
         "turned, same time": {
             angles(turned): with_runs(scenario, turned)
             for turned in (parted(runs, n) for n in PARTS)
@@ -42,20 +64,7 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
             length(longer): with_runs(scenario, at_night(longer))
             for longer in (repeated(runs, n, 0.0) for n in PARTS[:2])
         },
-        "duty cycle": {f"{duty:g}": with_duty_cycle(scenario, duty) for duty in DUTY_CYCLES},
     }
-    found = [
-        Variation(source, family, name, varied)
-        for family, members in families.items()
-        for name, varied in members.items()
-    ]
-    n_ports = scenario.beam.n_ports
-    if n_ports > 1:
-        found += [
-            Variation(source, "antenna lost", f"port {port}", scenario, (port,))
-            for port in range(n_ports)
-        ]
-    return found
 
 
 Runs = tuple[RunSection, ...]

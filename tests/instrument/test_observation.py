@@ -14,7 +14,8 @@ from lunarsky import MCMF, LunarTopo, MoonLocation
 from reference import galactic_directions
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.observation import CYCLE_DAYS, Observation, Run
+from lusee_bayes.instrument.moon import CYCLE_DAYS
+from lusee_bayes.instrument.observation import Observation, Run
 
 # the leap seconds of years far ahead are unknown; astropy says so whenever it converts them
 

@@ -9,7 +9,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from lusee_bayes.experiment.schema.section import Angle, Positive, Section
-from lusee_bayes.instrument.observation import Observation, Run
+from lusee_bayes.instrument.moon import CYCLE_DAYS
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.schedule import Interval, Run
+from lusee_bayes.instrument.schedule_file import read_schedule
 from lusee_bayes.instrument.timestamps import Timestamp
 
 
@@ -32,7 +35,7 @@ class RunSection(Section):
 
 
 class ObservationSection(Section):
-    """Where and when; ``runs`` follow one another from ``start``.
+    """Where and when; ``runs`` follow one another from ``start``, or a ``schedule`` has dates.
 
     Attributes
     ----------
@@ -54,6 +57,9 @@ class ObservationSection(Section):
         Data of a file are averaged over this time when they are read.
     runs : tuple of RunSection
         Stretches of data, one after another.
+    schedule : str, optional
+        File of the intervals in which data are taken, instead of ``start`` and ``runs``: CSV, or a
+        command table of OpSim.
     fixed_axis : bool
         The Moon turns about the axis of the first sample, as luseepy's engine ``croissant`` has
         it; for data that it has made, with ``window: instant``.
@@ -67,6 +73,7 @@ class ObservationSection(Section):
     timestamp: Timestamp | None = None
     average_s: Positive | None = None
     runs: Annotated[tuple[RunSection, ...], Field(min_length=1)] = (RunSection(),)
+    schedule: str | None = None
     fixed_axis: bool = False
 
     @model_validator(mode="before")
@@ -83,14 +90,44 @@ class ObservationSection(Section):
             raise ValueError("fixed_axis is for samples that are instants; add window: instant")
         return self
 
+    @model_validator(mode="after")
+    def _a_schedule_has_all_dates(self) -> ObservationSection:
+        if self.schedule is None:
+            return self
+        for name in ("start", "runs"):
+            if getattr(self, name) != type(self).model_fields[name].default:
+                raise ValueError(
+                    f"schedule {self.schedule} says when data are taken, and so does {name}; leave "
+                    "out one of them"
+                )
+        return self
+
     def observation(self) -> Observation:
         """Site, times and turntable angles."""
-        return _observation(self)
+        return _observation(self, self._intervals())
+
+    def n_samples(self) -> int:
+        """Count the samples, those by day among them."""
+        if self.schedule is None:
+            return sum(int(run.cycles * CYCLE_DAYS * 86400.0 // self.step_s) for run in self.runs)
+        return sum(interval.n_samples(self.step_s) for interval in self._intervals())
+
+    def _intervals(self) -> tuple[Interval, ...]:
+        return () if self.schedule is None else read_schedule(self.schedule)
 
 
 @lru_cache(maxsize=2)
-def _observation(section: ObservationSection) -> Observation:
+def _observation(section: ObservationSection, intervals: tuple[Interval, ...]) -> Observation:
     """One for all channels, with their times' orientations."""
+    if intervals:
+        return Observation.from_schedule(
+            intervals,
+            step_s=section.step_s,
+            lon_deg=section.lon_deg,
+            lat_deg=section.lat_deg,
+            fixed_axis=section.fixed_axis,
+            window=section.window,
+        )
     return Observation.from_runs(
         tuple(Run(r.cycles, r.turntable_deg, r.night_only) for r in section.runs),
         start=section.start,

@@ -14,7 +14,7 @@ from lusee_bayes.experiment.setup import Setup, mean_flux, source_responses
 from lusee_bayes.experiment.terms.term import Around, Term, Truth
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing import Pointing
-from lusee_bayes.instrument.pointing_offsets import kind_of, offset_names, with_offsets
+from lusee_bayes.instrument.pointing_offsets import CLOCK, kind_of, offset_names, with_offsets
 from lusee_bayes.systematics import PointingOffsets, Systematic
 
 # what the scenario's seed is folded with
@@ -31,12 +31,12 @@ class PointingTerm(Term):
         if section is None or section.treatment == "ignored":
             return []
         beam = setup.scenario.noise.beam
-        if section.treatment == "sampled" and beam is not None and beam.parameters:
-            if beam.treatment == "sampled":
-                raise InputError(
-                    "noise.pointing and the parameters of noise.beam cannot both be sampled: each "
-                    "of them makes A anew; set the treatment of one to marginalised"
-                )
+        makes_a = beam is not None and bool(beam.parameters) and beam.treatment == "sampled"
+        if section.treatment == "sampled" and makes_a:
+            raise InputError(
+                "noise.pointing and the parameters of noise.beam cannot both be sampled: each of "
+                "them makes A anew; set the treatment of one to marginalised"
+            )
         return [(section.treatment, pointing_offsets(setup, around))]
 
     def truth(self, setup: Setup, key: PRNGKeyArray) -> Truth:
@@ -66,7 +66,10 @@ def true_setup(setup: Setup, truth: Truth) -> Setup:
 def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
     """The setup with another observation, coupling and responses to sources; else as it is."""
     observation = with_offsets(setup.observation, values)
-    pointing = Pointing.of(observation, setup.scenario.lmax)
+    if any(values.get(name) for name in CLOCK):
+        pointing = Pointing.of(observation, setup.scenario.lmax)
+    else:  # the sky turns as before
+        pointing = setup.pointing.placed(observation)
     coupling = CouplingMatrix.build(setup.beams, pointing, setup.layout)
     responses = setup.responses
     if responses:

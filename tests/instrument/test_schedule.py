@@ -1,0 +1,355 @@
+from datetime import datetime, timedelta
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import ICRS, CartesianRepresentation, get_body_barycentric
+from astropy.time import Time
+from lunarsky import MCMF, MoonLocation
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.instrument.moon import CYCLE_DAYS
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.schedule import Interval, Run
+from lusee_bayes.instrument.schedule_file import read_schedule
+
+# three lunar nights at half duty, the table turned in the middle of the first and of the last
+NIGHTS = """\
+# the Sun sets at the site on 14 January, 13 February and 15 March 2027
+start, end, turntable_deg, duty_cycle, night_only
+2027-01-14T00:00:00Z, 2027-01-22T12:00:00Z, 0, 0.5, true
+2027-01-22T12:30:00, 2027-01-31T00:00:00, 30, 0.5, true   # turned within half an hour
+
+2027-02-13T00:00:00, 2027-03-01T00:00:00, 30, , TRUE
+2027-03-14T00:00:00, 2027-03-22T12:00:00, 30, 0.25, true
+2027-03-22T13:00:00, 2027-03-23, -60.5, 1, false
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(text, name="schedule.csv"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def schedule(seed, n=5, **options):
+    """Intervals of whole seconds, with and without time between them, of several angles."""
+    rng = np.random.default_rng(seed)
+    at, intervals = datetime(2027, 1, 15), []
+    for _ in range(n):
+        at += timedelta(seconds=int(rng.choice([0, 1, 4000])))
+        end = at + timedelta(seconds=int(rng.integers(2, 50000)))
+        angle, duty = float(rng.choice([0.0, 30.0])), float(rng.choice([1.0, 0.5, 0.1]))
+        intervals.append(Interval(at.isoformat(), end.isoformat(), angle, duty, **options))
+        at = end
+    return intervals
+
+
+def naive(intervals, step_s):
+    """Start, end, live time and run of every window, one by one."""
+    windows, run = [], -1
+    for number, one in enumerate(intervals):
+        if number == 0 or one.turntable_deg != intervals[number - 1].turntable_deg:
+            run += 1
+        at, last = datetime.fromisoformat(one.start), datetime.fromisoformat(one.end)
+        while at < last:
+            end = min(at + timedelta(seconds=step_s), last)
+            windows.append((at, end, one.duty_cycle * (end - at).total_seconds(), run))
+            at = end
+    return windows
+
+
+def seconds(observation, origin):
+    return (observation.times - Time(origin)).to_value(u.s)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("step_s", [600.0, 7200.0, 1234.5])
+def test_intervals_are_cut_as_by_a_loop(seed, step_s):
+    intervals = schedule(seed)
+    o = Observation.from_schedule(intervals, step_s=step_s)
+    expected = naive(intervals, step_s)
+    origin = expected[0][0]
+    start = np.array([(w[0] - origin).total_seconds() for w in expected])
+    end = np.array([(w[1] - origin).total_seconds() for w in expected])
+    at = seconds(o, origin)
+    # dates in two doubles, and sums of days in seconds: a nanosecond
+    np.testing.assert_allclose(at, (start + end) / 2.0, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(at[:, None] + o.windows.bounds_s, np.stack([start, end], 1),
+                               rtol=0, atol=1e-8)  # fmt: skip
+    np.testing.assert_allclose(o.live_s, [w[2] for w in expected], rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(o.run, [w[3] for w in expected])
+    assert [o.turntable_deg[w[3]] for w in expected] == [
+        one.turntable_deg
+        for one in intervals
+        for _ in range(one.n_samples(step_s))
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_time_is_lost_or_found(seed):
+    intervals = schedule(seed, n=8)
+    o = Observation.from_schedule(intervals, step_s=777.0)
+    total = sum(one.duty_cycle * one.length_s for one in intervals)
+    # rounding of a few hundred numbers of 1e3 seconds
+    assert o.live_s.sum() == pytest.approx(total, abs=1e-8)
+
+
+def test_instants_begin_before_the_end():
+    intervals = [
+        Interval("2027-01-15T00:00:00", "2027-01-15T04:00:00"),  # two steps: the end is no sample
+        Interval("2027-01-15T05:00:00", "2027-01-15T09:00:01"),  # a second more: it is
+    ]
+    o = Observation.from_schedule(intervals, window="instant")
+    hours = np.array([0.0, 2.0, 5.0, 7.0, 9.0])
+    np.testing.assert_allclose(seconds(o, "2027-01-15"), 3600.0 * hours, rtol=0, atol=1e-8)
+    assert o.windows is None
+    assert (o.live_s == 7200.0).all()
+    half = [Interval("2027-01-15", "2027-01-16", duty_cycle=0.5)]
+    with pytest.raises(
+        InputError, match=r"no duty cycle; take windows \(observation.window=mean\)"
+    ):
+        Observation.from_schedule(half, window="instant")
+
+
+def test_runs_are_where_the_table_turns():
+    days = [("15", 0.0), ("16", 0.0), ("17", 30.0), ("18", 0.0), ("21", 0.0)]
+    intervals = [Interval(f"2027-01-{d}", f"2027-01-{int(d) + 1}", angle) for d, angle in days]
+    o = Observation.from_schedule(intervals, step_s=43200.0)
+    assert o.turntable_deg == (0.0, 30.0, 0.0)
+    np.testing.assert_array_equal(o.run, [0, 0, 0, 0, 1, 1, 2, 2, 2, 2])
+
+
+@pytest.mark.parametrize("window", ["instant", "mean"])
+@pytest.mark.parametrize("step_s", [7200.0, 5400.0])
+def test_runs_are_a_schedule(window, step_s):
+    """Runs of so many steps and a half: their samples fill the steps, the next begins later."""
+    counts, angles = (10, 7, 12), (0.0, 30.0, -15.0)
+    month = CYCLE_DAYS * 86400.0
+    runs = [Run((n + 0.5) * step_s / month, a) for n, a in zip(counts, angles, strict=True)]
+    site = {"lon_deg": 10.0, "lat_deg": 20.0}
+    expected = Observation.from_runs(
+        runs, start="2027-02-01T00:00:00", step_s=step_s, window=window, **site
+    )
+    at, intervals = datetime(2027, 2, 1), []
+    for n, angle in zip(counts, angles, strict=True):
+        end = at + timedelta(seconds=n * step_s)
+        intervals.append(Interval(at.isoformat(), end.isoformat(), angle))
+        at = end + timedelta(seconds=0.5 * step_s)
+    got = Observation.from_schedule(intervals, step_s=step_s, window=window, **site)
+    # lengths in cycles are rounded, to 1e-16 of 1e5 seconds, and so are differences of dates
+    apart = (got.times - expected.times).to_value(u.s)
+    np.testing.assert_allclose(apart, 0.0, rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(got.run, expected.run)
+    assert got.turntable_deg == expected.turntable_deg
+    assert (got.lon_deg, got.lat_deg) == (expected.lon_deg, expected.lat_deg)
+    np.testing.assert_allclose(got.live_s, expected.live_s, rtol=0, atol=1e-8)
+    if window == "mean":
+        np.testing.assert_allclose(got.windows.bounds_s, expected.windows.bounds_s,
+                                   rtol=0, atol=1e-8)  # fmt: skip
+
+
+def is_dark(times, lon_deg, lat_deg):
+    """As lunarsky has the site and the Moon."""
+    site = MoonLocation.from_selenodetic(lon=lon_deg, lat=lat_deg)
+    sun, moon = (get_body_barycentric(body, times, ephemeris="builtin") for body in ("sun", "moon"))
+    vector = (sun - moon).xyz.to_value(u.km)
+    icrs = ICRS(CartesianRepresentation(vector / np.linalg.norm(vector, axis=0)))
+    mcmf = icrs.transform_to(MCMF(obstime=times)).cartesian.xyz.value
+    return np.array([x.to_value(u.m) for x in (site.x, site.y, site.z)]) @ mcmf < 0
+
+
+def test_windows_at_night_are_dark_from_end_to_end():
+    step_s, lon, lat = 40000.0, 182.258, -23.814
+    dates = [("2027-01-14T00:00:00", "2027-01-31T00:00:00"), ("2027-02-01", "2027-02-16")]
+    intervals = [Interval(*pair, night_only=True) for pair in dates]
+    o = Observation.from_schedule(intervals, step_s=step_s, lon_deg=lon, lat_deg=lat)
+    windows = naive(intervals, step_s)
+    start, end = (Time([w[k] for w in windows]) for k in (0, 1))
+    middle = start + (end - start) / 2.0
+    dark = np.array([is_dark(times, lon, lat) for times in (start, middle, end)])
+    expected = dark.all(axis=0)
+    # each of the two sunsets and the sunrise lies within a window
+    assert (dark.any(axis=0) & ~expected).sum() == 3
+    apart = (o.times - middle[expected]).to_value(u.s)
+    np.testing.assert_allclose(apart, 0.0, rtol=0, atol=1e-8)
+    by_day = [Interval(*dates[0], night_only=True), Interval(*dates[1])]
+    mixed = Observation.from_schedule(by_day, step_s=step_s, lon_deg=lon, lat_deg=lat)
+    second = start >= Time("2027-02-01")
+    assert mixed.n_times == (expected | second).sum()
+    instants = Observation.from_schedule(
+        intervals, step_s=step_s, lon_deg=lon, lat_deg=lat, window="instant"
+    )
+    assert instants.n_times == dark[0].sum()
+
+
+def test_a_table_in_csv(write):
+    intervals = read_schedule(write(NIGHTS))
+    assert intervals == (
+        Interval("2027-01-14T00:00:00Z", "2027-01-22T12:00:00Z", 0.0, 0.5, True),
+        Interval("2027-01-22T12:30:00", "2027-01-31T00:00:00", 30.0, 0.5, True),
+        Interval("2027-02-13T00:00:00", "2027-03-01T00:00:00", 30.0, 1.0, True),
+        Interval("2027-03-14T00:00:00", "2027-03-22T12:00:00", 30.0, 0.25, True),
+        Interval("2027-03-22T13:00:00", "2027-03-23", -60.5, 1.0, False),
+    )
+    assert intervals[2].where.endswith("schedule.csv, line 6")
+    o = Observation.from_schedule(intervals, step_s=7200.0)
+    assert o.turntable_deg == (0.0, 30.0, -60.5)
+    assert o.times[0].isot[:16] == "2027-01-15T03:00"  # sunset is late on the 14th
+    columns = "turntable_deg,end,start\n7,2027-01-02,2027-01-01\n"
+    assert read_schedule(write(columns)) == (Interval("2027-01-01", "2027-01-02", 7.0),)
+
+
+HEADER = "start,end,turntable_deg,duty_cycle,night_only\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "schedule.csv is empty; give a table with the header start,end,turntable_deg"),
+        (f"# nights\n{HEADER}", "schedule.csv holds no interval below its header; give at least"),
+        ("start,end\n", "line 1: there is no column 'turntable_deg' in the header start,end; a"),
+        ("start,end,turntable_deg,duty\n", "line 1: a schedule has no column 'duty'"),
+        ("start,end,end,turntable_deg\n", "line 1: the column 'end' comes twice"),
+        (f"{HEADER}2027-01-01,2027-01-02\n", "line 2: there are 2 entries for the 5 columns"),
+        (f"{HEADER}\nsoon,2027-01-02,0,1,false\n", "line 3: start 'soon' is not a date; write it"),
+        (f"{HEADER}2027-01-01,61050.8,0,1,false\n", "line 2: end '61050.8' is not a date; write"),
+        (
+            f"{HEADER}1827-01-01,2027-01-02,0,1,false\n",
+            r"outside the ephemeris \(1900-2050\): 1827",
+        ),
+        (
+            f"{HEADER}2027-01-02,2027-01-01,0,1,false\n",
+            "line 2: end 2027-01-01 does not come after start 2027-01-02; give the dates between",
+        ),
+        (f"{HEADER}2027-01-01,2027-01-01,0,1,false\n", "line 2: end 2027-01-01 does not come aft"),
+        (
+            f"{HEADER}2027-01-01,2027-01-02,0,1,false\n2027-01-01T23:00:00,2027-01-03,0,1,false\n",
+            "line 3: the interval from 2027-01-01T23:00:00 begins 3600 s before the one that "
+            "precedes it ends, 2027-01-02; give each stretch of time once",
+        ),
+        (
+            f"{HEADER}2027-01-05,2027-01-06,0,1,false\n2027-01-01,2027-01-02,0,1,false\n",
+            "line 3: the interval from 2027-01-01 begins before the one that precedes it, from "
+            "2027-01-05; sort the intervals by their start",
+        ),
+        (f"{HEADER}2027-01-01,2027-01-02,0,1.5,false\n", "line 2: duty_cycle is 1.5; give the fra"),
+        (
+            f"{HEADER}2027-01-01,2027-01-02,0,0,false\n",
+            "line 2: duty_cycle is 0; give the fraction",
+        ),
+        (f"{HEADER}2027-01-01,2027-01-02,0,nan,false\n", "line 2: duty_cycle is nan; give the fra"),
+        (f"{HEADER}2027-01-01,2027-01-02,0,half,\n", "line 2: duty_cycle is 'half', not a number"),
+        (
+            f"{HEADER}2027-01-01,2027-01-02,north,1,\n",
+            "line 2: turntable_deg is 'north', not a num",
+        ),
+        (f"{HEADER}2027-01-01,2027-01-02,,1,\n", "line 2: turntable_deg is '', not a number"),
+        (f"{HEADER}2027-01-01,2027-01-02,inf,1,\n", "line 2: turntable_deg is inf; give an angle"),
+        (
+            f"{HEADER}2027-01-01,2027-01-02,0,1,1\n",
+            "line 2: night_only is '1'; write true or false",
+        ),
+    ],
+)
+def test_bad_tables_are_refused(write, text, message):
+    with pytest.raises(InputError, match=message):
+        read_schedule(write(text))
+
+
+def test_an_interval_without_a_night_is_refused(write):
+    # the Sun is up for two weeks from 1 February 2027 at this site
+    text = f"{HEADER}2027-01-16,2027-01-17,0,1,true\n2027-02-05,2027-02-07,0,1,true\n"
+    with pytest.raises(InputError, match=r"schedule.csv, line 3 holds no lunar night; lengthen it"):
+        Observation.from_schedule(read_schedule(write(text)))
+    unnamed = [Interval("2027-02-05", "2027-02-07", night_only=True)]
+    with pytest.raises(InputError, match="interval 0 holds no lunar night"):
+        Observation.from_schedule(unnamed)
+
+
+@pytest.mark.parametrize(
+    ("intervals", "options", "message"),
+    [
+        ([], {}, "a schedule needs at least one interval, got none"),
+        ([("2027-01-02", "2027-01-03"), ("2027-01-01", "2027-01-02")], {}, "interval 1: the inter"),
+        ([("2027-01-02", "2027-01-03")], {"step_s": 0.0}, "step_s must be positive, got 0.0"),
+        ([("2027-01-02", "2027-01-03")], {"lat_deg": 95.0}, "lat_deg must lie in -90..90"),
+        ([("2027-01-02", "2027-01-03")], {"fixed_axis": True}, "use observation.window=instant"),
+    ],
+)
+def test_bad_schedules_are_refused(intervals, options, message):
+    with pytest.raises(InputError, match=message):
+        Observation.from_schedule([Interval(*pair) for pair in intervals], **options)
+
+
+# a table as those of OpSim, with the states that its simulator adds
+COMMANDS = """\
+1:
+  start:  61050.8 # first full day
+  mode:   maint
+
+2:
+  start:  61065.7 # sunset
+  mode:   science
+  battery_expected_fill: 0.75
+3:
+  start:  61080.5
+  mode:   powersave
+4: {mode: science, start: 61095.25}
+5: {mode: science, start: 61095.75}
+6: {mode: powersave, start: 61096}
+"""
+
+
+def test_a_command_table_of_opsim(write):
+    intervals = read_schedule(write(COMMANDS, "comtable.yml"))
+    mjd = [(61065.7, 61080.5), (61095.25, 61095.75), (61095.75, 61096.0)]
+    assert len(intervals) == 3
+    for one, (start, end) in zip(intervals, mjd, strict=True):
+        for text, days in ((one.start, start), (one.end, end)):
+            expected = datetime(1858, 11, 17) + timedelta(days=days)
+            # both to a microsecond; the day of an MJD is a double of 0.6
+            apart = datetime.fromisoformat(text) - expected
+            assert abs(apart.total_seconds()) < 3e-6
+        assert (one.turntable_deg, one.duty_cycle, one.night_only) == (0.0, 1.0, False)
+    assert intervals[0].where.endswith("comtable.yml, line 5")
+    assert Observation.from_schedule(intervals).n_runs == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "comtable.yml is no command table of OpSim: expected numbered entries"),
+        ("- 1\n", "comtable.yml is no command table of OpSim"),
+        ("1: [\n", "comtable.yml cannot be read as a schedule"),
+        ("1: {start: 61050.8}\n", "line 1: the entry has no mode; a command table of OpSim has a"),
+        ("1: science\n", "line 1: the entry has no start"),
+        ("1: {start: [1], mode: science}\n", "line 1: the entry has no start"),
+        ("1:\n  start: noon\n  mode: science\n", "line 1: start is 'noon', not a number; give a"),
+        ("1: {start: nan, mode: science}\n", "line 1: sample times run outside the ephemeris"),
+        ("1: {start: 2461050.8, mode: science}\n", "line 1: sample times run outside the ephemer"),
+        (
+            "1: {start: 61050.8, mode: science}\n2: {start: 61050.7, mode: maint}\n",
+            "line 2: start 61050.7 does not come after that of the entry before, 61050.8; sort",
+        ),
+        ("1: {start: 61050.8, mode: maint}\n", "holds no entry in the mode science, the one in w"),
+        (
+            "1: {start: 61050.8, mode: maint}\n2: {start: 61051, mode: science}\n",
+            "line 2: the last entry is in the mode science, and nothing says when it ends; add an",
+        ),
+    ],
+)
+def test_bad_command_tables_are_refused(write, text, message):
+    with pytest.raises(InputError, match=message):
+        read_schedule(write(text, "comtable.yml"))
+
+
+def test_a_file_that_has_changed_is_read_again(write):
+    path = write("start,end,turntable_deg\n2027-01-01,2027-01-02,0\n")
+    assert read_schedule(path)[0].turntable_deg == 0.0
+    write("start,end,turntable_deg\n2027-01-01,2027-01-02,30\n")
+    assert read_schedule(path)[0].turntable_deg == 30.0
