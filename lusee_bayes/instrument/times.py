@@ -13,11 +13,12 @@ import astropy.units as u
 import erfa
 import numpy as np
 from astropy.time import Time
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from lusee_bayes.core.errors import InputError
 
 EPHEMERIS_YEARS = (1900, 2050)
+EPOCH, CENTURIES = np.datetime64("2000-01-01"), np.timedelta64(100_000, "D")
 
 
 @contextmanager
@@ -90,6 +91,20 @@ def utc_of(
         return Time(jd1, jd2, format="jd", scale=scale).utc
 
 
+def utc_of_datetimes(times: Shaped[np.ndarray, "*shape"]) -> Time:
+    """Return times of an array of datetime64 in UTC, all at once.
+
+    Raises
+    ------
+    InputError
+        If one is outside the ephemeris.
+    """
+    with unannounced_leap_seconds():
+        found = Time(times, format="datetime64", scale="utc")
+    require_ephemeris(np.ravel(found.jd))
+    return found
+
+
 def utc_times(times: Any) -> Time:
     """Return times of any kind in UTC.
 
@@ -105,8 +120,12 @@ def utc_times(times: Any) -> Time:
     """
     if not isinstance(times, Time):
         given = np.atleast_1d(np.asarray(times)).ravel()
-        # numpy makes whole numbers of nanoseconds
-        listed = (np.datetime_as_string(given) if given.dtype.kind == "M" else given).tolist()
+        if given.dtype.kind == "M":
+            if (np.abs(given - EPOCH) < CENTURIES).all():
+                return utc_of_datetimes(given)
+            # what is no date, or so far away that astropy cannot read it, is named by what follows
+            given = np.datetime_as_string(given)
+        listed = given.tolist()
         return Time([_utc(number, one) for number, one in enumerate(listed)])
     times = times.reshape(-1)
     require_ephemeris(np.asarray(times.jd))

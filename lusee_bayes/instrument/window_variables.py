@@ -16,7 +16,7 @@ from astropy.time import Time
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Attribute, Content, Variable
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.times import unannounced_leap_seconds, utc_times
+from lusee_bayes.instrument.times import unannounced_leap_seconds, utc_of_datetimes
 from lusee_bayes.instrument.timestamps import bounded
 from lusee_bayes.instrument.windows import Windows
 
@@ -109,7 +109,7 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, boo
             _require_same(windows, times, here["time_bounds"])
         return times, windows, True
     if "time_bounds" in here:
-        bounds = utc_times(here["time_bounds"]).reshape(len(times), 2)
+        bounds = utc_of_datetimes(here["time_bounds"])
         live_s = here.get("live_time")
         middles, _, windows = bounded(times, bounds, found.values["step_s"], live_s)
         return middles, windows, True
@@ -122,7 +122,7 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, boo
 
 
 def _require_same(windows: Windows, times: Time, there: np.ndarray) -> None:
-    bounds = utc_times(there).reshape(len(times), 2)
+    bounds = utc_of_datetimes(there)
     with unannounced_leap_seconds():
         seconds = (bounds - times[:, None]).to_value(u.s)
     if windows.n_samples != len(times):
