@@ -223,6 +223,11 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
             "the data do not say what their times are; use data.stamped('start') (or 'middle', "
             "'end', 'instant'), or read_data with observation.timestamp"
         )
+    if scenario.observation.fixed_axis and data.observation.windows is not None:
+        raise InputError(
+            "the data are means over windows, and a fixed axis of the Moon is for data of "
+            "luseepy's croissant, which are instants; leave out observation.fixed_axis"
+        )
     if abs(data.frequency_mhz - scenario.frequency_mhz) > SAME_FREQUENCY_MHZ:
         raise InputError(
             f"the data are at {data.frequency_mhz} MHz, the scenario at "

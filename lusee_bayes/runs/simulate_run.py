@@ -14,6 +14,7 @@ from lusee_bayes.experiment.experiment import Experiment, simulated
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import write_four_port, write_waterfall
+from lusee_bayes.instrument.waterfalls.writing import NO_ROOM
 from lusee_bayes.results.cost import require_fits, simulation_cost
 
 
@@ -50,6 +51,8 @@ def run_simulate(
     path, channels = Path(path), (scenario,)
     stages = stages or Stages()
     require_target(path)
+    if path.suffix == ".fits" and scenario.observation.window != "instant":
+        raise InputError(f"{path}: {NO_ROOM}")
     require_fits(simulation_cost(scenario, max(1, len(frequencies_mhz))), scenario)
     if frequencies_mhz:
         if path.suffix != ".fits":

@@ -93,6 +93,12 @@ def test_no_experiment_of_data_with_unclear_times(tmp_path):
         set_up(scenario(), data)
 
 
+def test_no_fixed_axis_of_data_with_windows(tmp_path):
+    data = read_visibilities(file_of(tmp_path, "mean")[0])
+    with pytest.raises(InputError, match="means over windows.*leave out observation.fixed_axis"):
+        set_up(scenario("observation.fixed_axis=true"), data)
+
+
 def test_data_are_averaged_on_reading(tmp_path):
     path, _ = file_of(tmp_path, "mean")
     found = read_data(path, scenario(f"observation.average_s={2 * STEP}"))

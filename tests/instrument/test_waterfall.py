@@ -303,6 +303,7 @@ def test_simulate_writes_it_and_map_reads_it(tmp_path):
     ("arguments", "message"),
     [
         (["-o", "w.fits"], "at least two channels"),
+        (["-o", "w.fits", "--set", "observation.window=mean"], "no room for windows"),
         (["-o", "data.nc", "--frequencies", "10,20"], "netCDF files hold one frequency"),
         (["-o", "w.fits", "--frequencies", "20,10"], "expected growing MHz"),
         (["-o", "w.fits", "--frequencies", "5:50:7"], "expected growing MHz"),

@@ -136,6 +136,8 @@ def test_instants_and_silent_files(data, tmp_path):
     assert "does not say what its times are" in describe(path)
     # what does not say it does not learn it by being written
     assert not read_visibilities(again.write(tmp_path / "again.nc")).says_window
+    assert "it is not known what the times are" in repr(again)
+    assert "not known" not in repr(instants)
     started = again.stamped("start")
     np.testing.assert_allclose(bounds_of(started.observation)[:, 0], STEP * np.arange(4), atol=1e-6)
     with pytest.raises(InputError, match="the data have windows"):

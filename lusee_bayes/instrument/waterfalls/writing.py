@@ -21,6 +21,10 @@ from lusee_bayes.instrument.times import unannounced_leap_seconds
 from lusee_bayes.instrument.visibilities import Visibilities
 
 HINT = "write netCDF instead (a name that does not end in .fits)"
+NO_ROOM = (
+    "luseepy's waterfalls have no room for windows, and the samples are means over theirs; write "
+    "netCDF (a name that does not end in .fits), or simulate with --set observation.window=instant"
+)
 
 
 def write_waterfall(
@@ -96,11 +100,7 @@ def grid_of(
     for channel in channels:
         observation = channel.observation
         if observation.windows is not None:
-            raise InputError(
-                f"{path}: luseepy's waterfalls have no room for windows, and the samples are means "
-                "over theirs; write netCDF (a name that does not end in .fits), or simulate with "
-                "--set observation.window=instant"
-            )
+            raise InputError(f"{path}: {NO_ROOM}")
         if observation.turntable_deg != (0.0,):
             raise InputError(
                 f"{path}: luseepy's waterfalls have no turntable angles, the data have "
