@@ -114,20 +114,21 @@ class Pointing(eqx.Module):
             order=order,
         )
 
-    def placed(self, observation: Observation) -> Pointing:
+    def placed(self, before: Observation, observation: Observation) -> Pointing:
         """Return the pointing of an observation at the same times and windows, but elsewhere.
 
         Parameters
         ----------
+        before : Observation
+            That of this pointing.
         observation : Observation
             With its own site, lean and turntable angles.
         """
-        lmax = len(self.mcmf_from_lander.blocks) - 1
-        return replace(
-            self,
-            mcmf_from_lander=Rotation.from_matrix(observation.lander_from_mcmf().T, lmax),
-            turntable=np.radians(np.array(observation.turntable_deg, dtype=np.float64)),
-        )
+        lander, turn = self.mcmf_from_lander, observation.lander_from_mcmf()
+        if not np.array_equal(turn, before.lander_from_mcmf()):
+            lander = Rotation.from_matrix(turn.T, len(lander.blocks) - 1)
+        angles = np.radians(np.array(observation.turntable_deg, dtype=np.float64))
+        return replace(self, mcmf_from_lander=lander, turntable=angles)
 
     @property
     def n_times(self) -> int:

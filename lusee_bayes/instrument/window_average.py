@@ -22,6 +22,7 @@ from math import factorial, lgamma
 
 import numpy as np
 from jaxtyping import Float, Int
+from threadpoolctl import threadpool_limits
 
 from lusee_bayes.core.rotations import tilt_powers
 
@@ -119,7 +120,9 @@ def windowed(
         axis=2,
     ).reshape(len(first), -1)
     series = _series(powers, n_moments, largest, lmax)
-    functions, factors = _fewest(moments, series)
+    # small matrices: several threads would wait for one another
+    with threadpool_limits(1, "blas"):
+        functions, factors = _fewest(moments, series)
     weights = _importance(powers, lmax)
     factors = factors.reshape(len(factors), len(powers), lmax + 1, 2) / weights[..., None]
     return azimuth[first] + mean, functions, factors

@@ -29,6 +29,8 @@ FILES = {
     "samples.nc": "draws of all chains, ArviZ DataTree",
     "spectra.csv": "fidelity and power, a row for each multipole",
     "sources.csv": "fluxes of point sources",
+    "pointing.csv": "offsets of clock and pointing",
+    "pointing_by_day.csv": "offsets that all days, and each day, would prefer",
     "summary.csv": "ArviZ's summary of the draws",
     "coverage.json": "coverage of every sky, and the verdicts",
     "coverage.csv": "coverage, a row for each sky and part of it",

@@ -15,7 +15,7 @@ from lusee_bayes.report.coverage_table import COVERAGE_HEADER, coverage_cells
 from lusee_bayes.report.explorer import explorer
 from lusee_bayes.report.run_details import details
 from lusee_bayes.results.finished_runs import FinishedRun
-from lusee_bayes.results.saved import COVERAGE, SOURCES
+from lusee_bayes.results.saved import COVERAGE, POINTING, SOURCES
 
 NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "diagnostics.nc", "mean.fits", "std.fits")
 FIGURES = ("maps", "draws", "fidelity", "spectra", "data_vector", "residuals", "beams")
@@ -210,6 +210,7 @@ def _data(folder: Path, found: xr.Dataset) -> list[str]:
         cells = [_group_row(found, int(row)) for row in rows]
         bad = [f"{name} {cell[0]}" in marked for cell in cells]
         parts += [html.paragraph(f"{title}{note}"), html.table(header, cells, bad)]
+    parts += _pointing(folder)
     parts.append(
         _figure(
             folder,
@@ -219,6 +220,32 @@ def _data(folder: Path, found: xr.Dataset) -> list[str]:
         )
     )
     return parts
+
+
+def _pointing(folder: Path) -> list[str]:
+    """Offsets of clock and pointing, and those that each day prefers, where the run has them."""
+    parts = []
+    if (folder / "pointing.csv").is_file():
+        table = read_table(folder / "pointing.csv", POINTING)
+        rows = zip(*(table[name] for name in POINTING.variables), strict=True)
+        cells = [
+            (name, f"{value:.4g}", f"{std:.2g}", f"{prior:.2g}", f"{left:.1g}")
+            for name, value, std, prior, left in rows
+        ]
+        header = ("offset", "found", "+-", "+- before the data", "beyond first order [noise]")
+        parts = [html.table(header, cells)]
+    if (folder / "figures" / "pointing.png").is_file():
+        parts.append(
+            _figure(
+                folder,
+                "pointing",
+                "Preferred offsets of clock, turntable and lean, day by day",
+                "The offset that each day would prefer if all others had none, and that of all "
+                "days alike, in terms of which chi² falls most. Days that scatter about zero "
+                "within their errors ask for none.",
+            )
+        )
+    return [html.subsection("Clock and pointing"), *parts] if parts else []
 
 
 def _group_row(found: xr.Dataset, row: int) -> tuple[str, ...]:

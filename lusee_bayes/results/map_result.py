@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from textwrap import wrap
 
@@ -19,15 +19,18 @@ from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import Inference, infer
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.terms import beam_rms_difference
-from lusee_bayes.linear.fit import RULE
+from lusee_bayes.linear.fit import LEVELS, RULE
 from lusee_bayes.linear.metrics import effective_resolution_deg
 from lusee_bayes.linear.updating import composed, deviation_model
 from lusee_bayes.results.channel import ChannelResult, channel_of_posterior
 from lusee_bayes.results.diagnostics import diagnostics
 from lusee_bayes.results.fluxes import flux_lines, flux_table
+from lusee_bayes.results.pointing import PointingReport, pointing_report
 from lusee_bayes.results.prior_words import prior_sentence, prior_summary
 from lusee_bayes.results.saved import JUDGED
 from lusee_bayes.results.updatable import Updatable, read_updatable
+
+DOES_NOT_FIT = LEVELS[-1]
 
 
 @dataclass(frozen=True, repr=False)
@@ -46,6 +49,8 @@ class MapResult(Described):
         What a report shows beyond the map (:func:`.diagnostics`).
     fluxes : DataFrame or None
         Of the point sources beside the map, a row each, if there are any.
+    pointing : PointingReport or None
+        Of clock and pointing, where the scenario has them or the data do not fit.
     digests : tuple of str
         Of all data behind the posterior.
     seconds : dict
@@ -58,6 +63,7 @@ class MapResult(Described):
     channel: ChannelResult
     diagnostics: xr.Dataset
     fluxes: pd.DataFrame | None
+    pointing: PointingReport | None
     digests: tuple[str, ...]
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -99,6 +105,7 @@ class MapResult(Described):
             "n_modes": len(channel.mean),
             "rounds": channel.rounds,
             **prior_summary(self.experiment),
+            "pointing": self._pointing_rows(),
             "beam_rms_difference": beam_rms_difference(self.experiment.setup),
             "mean_refinement_sigma": channel.refinement,
             "never_observed_fraction": channel.never_observed,
@@ -107,6 +114,11 @@ class MapResult(Described):
             "peak_memory_gb": round(peak_memory_gb(), 3),
             "versions": versions(),
         }
+
+    def _pointing_rows(self) -> list[dict[str, object]] | None:
+        if self.pointing is None or self.pointing.offsets is None:
+            return None
+        return self.pointing.offsets.to_dict("records")
 
     def verdict(self) -> str:
         """What the residuals say, in sentences."""
@@ -132,8 +144,9 @@ class MapResult(Described):
     def lines(self) -> list[str]:
         """What a terminal shows: headline, fluxes, verdict with its rule."""
         fluxes = [] if self.fluxes is None else flux_lines(self.fluxes)
-        prior = prior_sentence(self.experiment)
-        return [self.headline(), prior, *fluxes, self.verdict(), RULE, *self.channel.doubts]
+        offsets = [] if self.pointing is None else self.pointing.lines()
+        told = [prior_sentence(self.experiment), *fluxes, *offsets]
+        return [self.headline(), *told, self.verdict(), RULE, *self.channel.doubts]
 
 
 def map_result(
@@ -170,7 +183,7 @@ def map_result(
             digests = (*earlier.digests, *digests)
         elif scenario.output.updatable:
             posterior = found.model.condition(data.data, form="root")
-            found = judged = Inference(found.model, posterior, found.rounds, found.around)
+            found = judged = replace(found, posterior=posterior)
         jax.block_until_ready(found.posterior.white_mean)
     with stages("standard deviations"):
         covariance = on_host(found.posterior).covariance()
@@ -183,7 +196,15 @@ def map_result(
             fluxes = flux_table(experiment, alone)
     with stages("diagnostics"):
         page = diagnostics(experiment, found, judged, channel, covariance)
-    return MapResult(experiment, found, judged, channel, page, fluxes, digests, stages.seconds)
+    pointing = None
+    if scenario.noise.pointing is not None or page.attrs["level"] == DOES_NOT_FIT:
+        with stages("clock and pointing"):
+            own = covariance if earlier is None else on_host(alone.posterior).covariance()
+            pointing = pointing_report(experiment, alone, own)
+        page.attrs["verdict"] = f"{page.attrs['verdict']} {pointing.sentence()}".strip()
+    return MapResult(
+        experiment, found, judged, channel, page, fluxes, pointing, digests, stages.seconds
+    )
 
 
 def _updated(
@@ -200,6 +221,6 @@ def _updated(
     deviation = deviations.condition(data.data, form="root")
     posterior = composed(earlier.posterior, deviation)
     return (
-        Inference(alone.model, posterior, alone.rounds, alone.around),
+        replace(alone, posterior=posterior),
         Inference(deviations, deviation, alone.rounds, alone.around),
     )

@@ -265,6 +265,16 @@ SOURCES = Layout(
         "std_jy": Variable(("source",), low=0.0),
     },
 )
+POINTING = Layout(
+    "offsets of clock and pointing",
+    {
+        "offset": Variable(("offset",), "text"),
+        "value": Variable(("offset",)),
+        "std": Variable(("offset",), low=0.0),
+        "prior_std": Variable(("offset",), low=0.0),
+        "beyond_first_order": Variable(("offset",), low=0.0),
+    },
+)
 SPECTRA = Layout(
     "spectra of a map",
     {

@@ -53,7 +53,7 @@ class RunKind:
         Kept in ``manifest.json``; a page of this name in ``PAGES`` becomes ``report.html``.
     outputs : sequence of Output
     figures : mapping
-        ``draw(result)`` by the name of its PNG in ``figures/``.
+        ``draw(result)`` by the name of its PNG in ``figures/``; None where there is none.
     unfinished : str
         The folder that holds unfinished work, removed when the results are there.
     dpi : int
@@ -64,7 +64,7 @@ class RunKind:
 
     name: str
     outputs: Sequence[Output]
-    figures: Mapping[str, Callable[[Any], Figure]]
+    figures: Mapping[str, Callable[[Any], Figure | None]]
     unfinished: str = ""
     dpi: int = 110
     after: Sequence[str] = ()
@@ -192,7 +192,8 @@ def write_run(
             (stage / FIGURES).mkdir()
             with stages("figures"):
                 for name, draw in kind.figures.items():
-                    save(draw(result), stage / FIGURES / f"{name}.png", kind.dpi)
+                    if (figure := draw(result)) is not None:
+                        save(figure, stage / FIGURES / f"{name}.png", kind.dpi)
         with stages("files"):
             for output in kind.outputs:
                 if output.wanted(result):

@@ -16,6 +16,7 @@ from lusee_bayes.linear.compact import CompactPosterior
 from lusee_bayes.report.figures import channel as channel_figures
 from lusee_bayes.report.figures import cube as cube_figures
 from lusee_bayes.report.figures import diagnostics as diagnostic_figures
+from lusee_bayes.report.figures.pointing import pointing_by_day
 from lusee_bayes.results.channel_files import CHANNELS
 from lusee_bayes.results.cost import posterior_cost, require_fits, require_resources
 from lusee_bayes.results.cube import CubeResult
@@ -163,6 +164,14 @@ def _write_compact(result: MapResult, folder: Path) -> None:
     compact.write(folder / "posterior_compact.npz", about(result.scenario))
 
 
+def _write_offsets(result: MapResult, folder: Path) -> None:
+    result.pointing.offsets.to_csv(folder / "pointing.csv", index=False)
+
+
+def _write_preferred(result: MapResult, folder: Path) -> None:
+    result.pointing.preferred.to_csv(folder / "pointing_by_day.csv", index=False)
+
+
 def _write_cubes(result: CubeResult, folder: Path) -> None:
     for name, pixels in result.maps().items():
         write_cube(folder / f"{name}.fits", name, pixels, result.scenario)
@@ -193,6 +202,8 @@ MAP = RunKind(
             lambda result, folder: result.fluxes.to_csv(folder / "sources.csv", index=False),
             wanted=lambda result: result.fluxes is not None,
         ),
+        Output(_write_offsets, wanted=lambda r: r.pointing and r.pointing.offsets is not None),
+        Output(_write_preferred, wanted=lambda result: result.pointing is not None),
         Output(
             lambda result, folder: write_diagnostics(result.diagnostics, folder / "diagnostics.nc")
         ),
@@ -207,6 +218,7 @@ MAP = RunKind(
         "spectra": lambda result: channel_figures.spectra(result.channel),
         "draws": lambda result: diagnostic_figures.draws(result.diagnostics),
         "residuals": lambda result: diagnostic_figures.residuals(result.diagnostics),
+        "pointing": lambda result: result.pointing and pointing_by_day(result.pointing.preferred),
     },
 )
 

@@ -69,7 +69,7 @@ def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
     if any(values.get(name) for name in CLOCK):
         pointing = Pointing.of(observation, setup.scenario.lmax)
     else:  # the sky turns as before
-        pointing = setup.pointing.placed(observation)
+        pointing = setup.pointing.placed(setup.observation, observation)
     coupling = CouplingMatrix.build(setup.beams, pointing, setup.layout)
     responses = setup.responses
     if responses:

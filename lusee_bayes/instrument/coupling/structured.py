@@ -23,9 +23,9 @@ from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers
-from lusee_bayes.core.rotations import tilts, turn_about_x, turn_about_y, turn_about_z
 from lusee_bayes.instrument.beams import ProductBeams
 from lusee_bayes.instrument.coupling.base import Coupling
+from lusee_bayes.instrument.coupling.body_beams import body_beams
 from lusee_bayes.instrument.coupling.dense import DenseCoupling
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation
@@ -118,7 +118,7 @@ class CouplingMatrix(Coupling):
         CouplingMatrix
             A of these beams.
         """
-        body = _body_beams(modes, pointing)
+        body = body_beams(modes, pointing)
         lmax = len(pointing.pole_from_galactic.blocks) - 1
         return cls(body, _by_order(body, lmax), pointing, layout)
 
@@ -251,41 +251,6 @@ def turned_about_pole(
     cosine, sine = xp.cos(angle), xp.sin(angle)
     signed = sine[:, np.abs(m)] * np.sign(m).astype(np.float64)[None]
     return beams * cosine[None, :, np.abs(m)] - mirrored * signed[None]
-
-
-@compiled
-def _body_beams(
-    modes: Float[Array, "products modes"], pointing: Pointing
-) -> Float[Array, "runs products functions modes"]:
-    """Beams in the Moon-fixed frame for every run's turntable angle and every function of time."""
-    xp, runs = namespace(modes, pointing), []
-    for run in range(len(pointing.run_starts) - 1):
-        body = _on_the_moon(turn_about_z(modes, pointing.turntable[run]), pointing)
-        runs.append(_taken_up(xp.stack(tilts(body, pointing.order), axis=1), pointing.factors))
-    return xp.stack(runs)
-
-
-def _on_the_moon(modes: Float[Array, "products modes"], pointing: Pointing) -> Array:
-    """Beams of the lander in the Moon-fixed frame, with the pointing's further turns."""
-    if pointing.turns is None:
-        return pointing.mcmf_from_lander(modes)
-    lon, lat, east, north = (pointing.turns[k] for k in range(4))
-    leaning = turn_about_x(turn_about_y(turn_about_x(modes, -north), east), -lat)
-    return turn_about_z(pointing.mcmf_from_lander(leaning), lon)
-
-
-def _taken_up(
-    tilted: Float[Array, "products powers modes"],
-    factors: Float[Array, "functions powers orders 2"],
-) -> Float[Array, "products functions modes"]:
-    """sum_p G_j(p, m) W_p, a complex factor for each pair c_m + i c_-m."""
-    _, m = mode_numbers(lmax_of(tilted.shape[-1]))
-    mirrored = tilted[..., np.arange(len(m)) - 2 * m]
-    xp = namespace(tilted, factors)
-    real = factors[..., 0][..., np.abs(m)]
-    imaginary = factors[..., 1][..., np.abs(m)] * np.sign(m).astype(np.float64)[None, None]
-    straight = xp.einsum("kpm,jpm->kjm", tilted, real)
-    return straight - xp.einsum("kpm,jpm->kjm", mirrored, imaginary)
 
 
 @compiled
