@@ -1,0 +1,230 @@
+"""Clock and pointing that are off: found within their errors, pointed at where they are ignored."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpyro import handlers
+from scipy import stats
+
+from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.experiment.experiment import Experiment, build
+from lusee_bayes.experiment.inference import infer, offset_posterior
+from lusee_bayes.experiment.model import base_model
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.experiment.setup import Setup, set_up
+from lusee_bayes.experiment.simulate import simulate, true_values
+from lusee_bayes.experiment.terms import Around, pointing_offsets, second_order
+from lusee_bayes.experiment.terms.pointing import shifted
+from lusee_bayes.results.pointing import pointing_report
+from lusee_bayes.sky.priors import HarmonicPrior
+
+TWO_RUNS = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
+OFF = "clock_s: 60, turntable_0_deg: 0.3, turntable_1_deg: 0.0, clock_drift_s_per_day: 0.0"
+PRIORS = "clock_s: 60, turntable_deg: 0.3, clock_drift_s_per_day: 1"
+
+
+def scenario_of(*overrides, lmax=10, step_s=21600.0):
+    plain = [f"lmax={lmax}", f"observation.step_s={step_s}", "observation.window=mean"]
+    return load_scenario("fiducial", overrides=[*plain, *overrides])
+
+
+def about_a_mean(setup: Setup, scale: float, seed: int) -> Setup:
+    """A sky that is known to a part of its C_ell: the truth is a draw of the prior."""
+    spectrum = scale * np.asarray(setup.prior.spectrum)
+    prior = HarmonicPrior(spectrum)
+    z = np.random.default_rng(seed).standard_normal(prior.size)
+    return replace(setup, prior=HarmonicPrior(spectrum, mean=setup.sky.modes - prior.colour(z)))
+
+
+def chi2_of(found, data):
+    q = found.posterior
+    return float(found.model.chi2(q.mean, data.data)) + float(q.prior_chi2())
+
+
+@pytest.fixture(scope="module")
+def known_sky():
+    """The sky to 0.1 %, so that the data tell the clock, too."""
+    pointing = f"noise.pointing={{{PRIORS}, true_values: {{{OFF}}}}}"
+    setup = about_a_mean(set_up(scenario_of(TWO_RUNS, pointing)), 1e-6, 3)
+    return Experiment(setup, simulate(setup))
+
+
+def test_a_clock_and_a_turntable_that_are_off_are_found(known_sky):
+    found = infer(known_sky)
+    mean, covariance = offset_posterior(known_sky, found)
+    truth = true_values(known_sky.setup)
+    assert truth == pytest.approx(
+        {
+            "clock_s": 60.0,
+            "clock_drift_s_per_day": 0.0,
+            "turntable_0_deg": 0.3,
+            "turntable_1_deg": 0.0,
+        }
+    )
+    off = np.array([mean[name] - truth[name] for name in mean])
+    std = np.sqrt(np.diagonal(covariance))
+    assert (np.abs(off) < 3.5 * std).all()
+    # they are told apart from none
+    assert mean["clock_s"] > 4 * std[0]
+    assert mean["turntable_0_deg"] > 50 * std[2]
+    # chi^2 of the data and the errors of the map are those of data that nothing is wrong with
+    n = found.model.n_data
+    assert abs(chi2_of(found, known_sky.data) - n) < 4 * np.sqrt(2 * n)
+    pull = (found.posterior.mean - known_sky.setup.sky.modes) / found.posterior.std()
+    straight = known_sky.setup.scenario.model_copy(
+        update={"noise": known_sky.setup.scenario.noise.model_copy(update={"pointing": None})}
+    )
+    setup = replace(known_sky.setup, scenario=straight)
+    plain = Experiment(setup, simulate(setup))
+    known = infer(plain)
+    expected = (known.posterior.mean - setup.sky.modes) / known.posterior.std()
+    assert np.mean(pull**2) == pytest.approx(np.mean(expected**2), abs=0.2)
+    assert np.median(found.posterior.std() / known.posterior.std()) < 1.2
+
+
+def test_ignored_the_report_points_at_it(known_sky):
+    section = known_sky.setup.scenario.noise.pointing.model_copy(update={"treatment": "ignored"})
+    noise = known_sky.setup.scenario.noise.model_copy(update={"pointing": section})
+    scenario = known_sky.setup.scenario.model_copy(update={"noise": noise})
+    experiment = Experiment(replace(known_sky.setup, scenario=scenario), known_sky.data)
+    found = infer(experiment)
+    assert chi2_of(found, known_sky.data) > 2 * found.model.n_data
+    report = pointing_report(experiment, found, on_host(found.posterior).covariance())
+    assert report.offsets is None
+    assert "turntable_0_deg off by" in report.sentence()
+    assert "give noise.pointing" in report.sentence()
+    whole = report.preferred[report.preferred["first_day"] < 0].set_index("offset")
+    assert whole["value"]["turntable_0_deg"] == pytest.approx(0.3, rel=0.03)
+    days = report.preferred[report.preferred["offset"] == "turntable_0_deg"]
+    # no more than MOST_STRETCHES groups of days, and those of the other run say nothing of it
+    assert 10 < len(days) < 32
+    assert days["last_day"].max() <= 28
+
+
+def test_where_nothing_is_off_the_report_is_silent():
+    none = "true_values: {clock_s: 0, turntable_0_deg: 0, turntable_1_deg: 0}"
+    nothing = f"noise.pointing={{clock_s: 60, turntable_deg: 0.3, {none}, treatment: ignored}}"
+    setup = about_a_mean(set_up(scenario_of(TWO_RUNS, nothing)), 1e-2, 5)
+    experiment = Experiment(setup, simulate(setup))
+    found = infer(experiment)
+    report = pointing_report(experiment, found, on_host(found.posterior).covariance())
+    assert report.sentence() == ""
+
+
+def test_preferences_are_those_of_matrices(known_sky):
+    """a = t^T K^-1 r / t^T K^-1 t with K = A S A^T + N as a matrix."""
+    experiment = known_sky
+    found = infer(experiment)
+    report = pointing_report(experiment, found, on_host(found.posterior).covariance())
+    model = found.model
+    a = np.asarray(model.coupling.dense())
+    k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
+    mean = np.asarray(model.predict(model.prior.colour(model.prior.white_mean)))
+    u = np.linalg.solve(k, experiment.data.data - mean)
+    names = {"clock_s": 60.0, "turntable_1_deg": 0.3}
+    setup = shifted(experiment.setup, {})
+    for name, step in names.items():
+        centre = dict(offset_posterior(experiment, found)[0])
+        up, down = (
+            np.asarray(
+                shifted(setup, {**centre, name: centre[name] + sign * 1e-2 * step}).coupling
+                @ np.asarray(found.posterior.mean)
+            )
+            for sign in (1.0, -1.0)
+        )
+        t = (up - down) / (2e-2 * step)
+        row = report.preferred[
+            (report.preferred["offset"] == name) & (report.preferred["first_day"] < 0)
+        ].iloc[0]
+        information = t @ np.linalg.solve(k, t)
+        assert row["std"] == pytest.approx(information**-0.5, rel=1e-3)
+        assert row["value"] == pytest.approx(t @ u / information, abs=3e-3 * row["std"])
+
+
+@pytest.mark.parametrize("name", ["clock_s", "turntable_1_deg", "lat_deg", "tilt_east_deg"])
+def test_sampled_sites_move_a_as_the_exact_shift_does(name):
+    pointing = (
+        "noise.pointing={clock_s: 60, turntable_deg: 0.3, lat_deg: 0.1, tilt_east_deg: 0.2, "
+        "treatment: sampled}"
+    )
+    runs = "observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]"
+    # about a mean: a sky of which nothing is known may as well have turned
+    setup = about_a_mean(set_up(scenario_of(runs, pointing, lmax=5)), 1e-4, 1)
+    data = simulate(setup)
+    offsets = pointing_offsets(setup, Around(data))
+    values = dict.fromkeys(offsets.names, 0.0) | {
+        name: 1.5 * dict(zip(offsets.names, offsets.stds.tolist(), strict=True))[name]
+    }
+    with (
+        handlers.seed(rng_seed=0),
+        handlers.substitute(data={site: jnp.asarray(value) for site, value in values.items()}),
+    ):
+        moved = offsets.sampled(base_model(setup))
+    exact = base_model(setup).condition(data.data)
+    expected = replace(base_model(setup), coupling=shifted(setup, values).coupling)
+    got, wanted = (float(m.condition(data.data).log_evidence) for m in (moved, expected))
+    unmoved = float(exact.log_evidence)
+    assert abs(wanted - unmoved) > 1.0
+    assert got == pytest.approx(wanted, abs=2e-3 * abs(wanted - unmoved) + 1e-4)
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_simulation_based_calibration():
+    """100 data sets with clock, turntable, lean and sky drawn from their priors."""
+    pointing = "noise.pointing={clock_s: 60, turntable_deg: 0.1, tilt_east_deg: 0.1, %s}"
+    first = set_up(scenario_of(pointing % "tilt_north_deg: 0.1", lmax=6, step_s=43200.0))
+    # known to 1 %, where the clock is told to some 40 s
+    prior = HarmonicPrior(1e-4 * np.asarray(first.prior.spectrum), mean=first.sky.modes)
+    z, ranks = [], []
+    for seed in range(100):
+        draw = np.asarray(prior.colour(np.random.default_rng(seed).standard_normal(prior.size)))
+        sky = replace(first.sky, modes=first.sky.modes + draw)
+        scenario = first.scenario.model_copy(update={"seed": seed})
+        setup = replace(first.under(sky), scenario=scenario, prior=prior)
+        experiment = Experiment(setup, simulate(setup))
+        found = infer(experiment)
+        mean, covariance = offset_posterior(experiment, found)
+        truth = true_values(setup)
+        std = np.sqrt(np.diagonal(covariance))
+        z.append([(mean[name] - truth[name]) / s for name, s in zip(mean, std, strict=True)])
+        pull = (found.posterior.mean - sky.modes) / found.posterior.std()
+        ranks.append(np.asarray(pull)[[0, 2, 6, 20]])
+    pulls = np.concatenate([z, ranks], axis=1)
+    assert pulls.shape == (100, 8)
+    for column in pulls.T:
+        assert stats.kstest(column, "norm").pvalue > 1e-3 / 8
+    # and all of their squares: 99.9 % of chi^2
+    low, high = stats.chi2(100).interval(1 - 1e-3 / 8)
+    assert ((pulls**2).sum(0) > low).all()
+    assert ((pulls**2).sum(0) < high).all()
+
+
+def test_the_second_order_is_a_quadratic():
+    setup = set_up(scenario_of("noise.pointing={turntable_deg: 0.3}", lmax=6))
+    one, two = (second_order(setup, {"turntable_deg": s}, setup.sky.modes) for s in (0.5, 1.0))
+    # but for the fourth order, (4 x 0.017)^2 / 12 of the second
+    np.testing.assert_allclose(
+        two["turntable_deg"],
+        4 * one["turntable_deg"],
+        rtol=0,
+        atol=1e-3 * np.abs(two["turntable_deg"]).max(),
+    )
+
+
+def test_what_cannot_be():
+    with pytest.raises(InputError, match="give a standard deviation of at least one of clock_s"):
+        scenario_of("noise.pointing={treatment: sampled}")
+    setup = set_up(scenario_of("noise.pointing={clock_s: 1, true_values: {lat_deg: 1}}", lmax=4))
+    with pytest.raises(InputError, match="true_values has 'lat_deg', which is not among the off"):
+        simulate(setup)
+    both = [
+        "noise.pointing={clock_s: 60, treatment: sampled}",
+        "noise.beam={parameters: {height_m: 0.1}, treatment: sampled}",
+    ]
+    experiment = build(scenario_of(*both, lmax=4))
+    with pytest.raises(InputError, match="cannot both be sampled"):
+        infer(experiment)
