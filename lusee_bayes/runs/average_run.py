@@ -8,6 +8,7 @@ from pathlib import Path
 from lusee_bayes.core.destinations import require_target
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.reading import naming
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import require_fitting, set_up
@@ -110,7 +111,8 @@ def run_average(
     scenario = scenario.model_copy(update={"observation": section})
     with stages("data"):
         fine = read_data(data, scenario)
-        coarse = averaged(fine, to_s)
+        with naming(data):
+            coarse = averaged(fine, to_s)
     if information:
         require_fitting(fine, scenario)
         require_resources(scenario, fine, stages)

@@ -143,7 +143,7 @@ def test_instants_have_no_average(tmp_path):
     instants = build(small_scenario(lmax=2, cycles=0.01)).data
     assert instants.observation.windows is None
     path = instants.write(tmp_path / "data.nc")
-    with pytest.raises(InputError, match="the samples are instants"):
+    with pytest.raises(InputError, match=r"data\.nc: the samples are instants"):
         run_average(scenario(), path, 14400.0, tmp_path / "a.nc")
 
 
