@@ -163,12 +163,19 @@ def test_sampled_sites_move_a_as_the_exact_shift_does(name):
         handlers.substitute(data={site: jnp.asarray(value) for site, value in values.items()}),
     ):
         moved = offsets.sampled(base_model(setup))
-    exact = base_model(setup).condition(data.data)
     expected = replace(base_model(setup), coupling=shifted(setup, values).coupling)
-    got, wanted = (float(m.condition(data.data).log_evidence) for m in (moved, expected))
-    unmoved = float(exact.log_evidence)
+    got, wanted, unmoved = (
+        float(m.condition(data.data).log_evidence) for m in (moved, expected, base_model(setup))
+    )
     assert abs(wanted - unmoved) > 1.0
-    assert got == pytest.approx(wanted, abs=2e-3 * abs(wanted - unmoved) + 1e-4)
+    # what the offset does to the data, in radiometer noise; of a clock's, 1e-3 are left out, and
+    # the evidence tells them by their product with unit normals
+    std = np.sqrt(np.asarray(expected.noise.diagonal()))
+    done = np.linalg.norm(
+        (expected.coupling @ setup.sky.modes - setup.coupling @ setup.sky.modes) / std
+    )
+    left = 4 * 1e-3 * done if name == "clock_s" else 1e-6 * done
+    assert got == pytest.approx(wanted, abs=left + 1e-4)
 
 
 @pytest.mark.long
