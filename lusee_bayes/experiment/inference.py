@@ -12,7 +12,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, marginalised, systematics
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.terms import Around
+from lusee_bayes.experiment.terms import Around, pointed
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.model import LinearGaussian
@@ -21,7 +21,12 @@ from lusee_bayes.linear.templates import template_amplitudes
 from lusee_bayes.systematics import PointingOffsets
 
 # N is rebuilt until the map moves by less than this (rms, in standard deviations)
-SETTLED, MAX_ROUNDS = 1e-2, 20
+SETTLED, MAX_ROUNDS = 1e-2, 30
+# no offset moves further in a round, in prior standard deviations: beyond, the first order that
+# the move comes from says little
+FARTHEST = 2.0
+# steps that swing about where they lead to are halved, down to this part of the whole
+SHORTEST = 0.125
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,8 @@ def infer(experiment: Experiment) -> Inference:
     One round, unless a term of N is built around what the data tell: the gains around the
     posterior's own prediction, or clock and pointing around its sky and their own values. Then N
     and the map are repeated until the map moves by less than 0.01 standard deviations (rms).
+    Clock and pointing go part of the way where they would go far, or swing: what is second order
+    in them may outweigh what tells two offsets apart.
 
     Parameters
     ----------
@@ -62,7 +69,7 @@ def infer(experiment: Experiment) -> Inference:
     Raises
     ------
     InputError
-        If N is not positive definite, or the map does not settle in 20 rounds.
+        If N is not positive definite, or the map does not settle in 30 rounds.
     """
     setup, data = experiment.setup, experiment.data
 
@@ -73,13 +80,20 @@ def infer(experiment: Experiment) -> Inference:
     found = conditioned(Around(data), 1)
     if not rebuilds(setup):
         return found
+    step = _Step()
     for rounds in range(2, MAX_ROUNDS + 1):
-        before, found = found, conditioned(_around(experiment, found), rounds)
-        if float(found.posterior.rms_shift_from(before.posterior)) < SETTLED:
+        around, step = _around(experiment, found, step)
+        before, found = found, conditioned(around, rounds)
+        if float(found.posterior.rms_shift_from(before.posterior)) < SETTLED * step.size:
             return found
+    remedies = []
+    if rebuilds_gains(setup):
+        remedies.append("noise.gain.visibilities=model")
+    if rebuilds_pointing(setup):
+        remedies.append("smaller standard deviations in noise.pointing, or its treatment=sampled")
     raise InputError(
         f"the map still moves after {MAX_ROUNDS} rounds of rebuilding N around it; use "
-        "noise.gain.visibilities=model and noise.pointing.around=model"
+        + ", and ".join(remedies)
     )
 
 
@@ -118,15 +132,44 @@ def _model(setup: Setup, around: Around) -> tuple[LinearGaussian, PointingOffset
     return marginalised(base_model(setup, around.data), found), next(iter(offsets), None)
 
 
-def _around(experiment: Experiment, found: Inference) -> Around:
-    """What the terms of N are built around next, given a posterior."""
+@dataclass(frozen=True)
+class _Step:
+    """Of clock and pointing, from what N is built around to what the data then tell.
+
+    whole : (offsets,) array, the way there in prior standard deviations, None before the first;
+    swing : how much of it is gone unless it is far; size : how much of it is gone
+    """
+
+    whole: Float[np.ndarray, " offsets"] | None = None
+    swing: float = 1.0
+    size: float = 1.0
+
+    def after(self, whole: Float[np.ndarray, " offsets"]) -> _Step:
+        """The next step: a smaller part if it turns back without becoming short."""
+        back = (
+            self.whole is not None
+            and whole @ self.whole < 0.0
+            and np.linalg.norm(whole) > np.linalg.norm(self.whole) / 2.0
+        )
+        swing = max(self.swing / 2.0, SHORTEST) if back else min(2.0 * self.swing, 1.0)
+        size = min(swing, FARTHEST / max(float(np.abs(whole).max()), FARTHEST))
+        return _Step(whole, swing, size)
+
+
+def _around(experiment: Experiment, found: Inference, step: _Step) -> tuple[Around, _Step]:
+    """What the terms of N are built around next, given a posterior, and the step there."""
     setup, visibilities, sky, values = experiment.setup, None, None, None
-    if rebuilds_gains(setup):
-        visibilities = prediction(setup, found.posterior)
     if rebuilds_pointing(setup):
-        sky = np.asarray(found.posterior.mean)
-        values, _ = offset_posterior(experiment, found)
-    return Around(experiment.data, visibilities, sky, values)
+        offsets = found.offsets
+        here = np.asarray(setup.sky.modes if found.around.sky is None else found.around.sky)
+        told, _ = offset_posterior(experiment, found)
+        whole = np.array(list(told.values())) / np.asarray(offsets.stds) - offsets.centre
+        step = step.after(whole)
+        sky = here + step.size * (np.asarray(found.posterior.mean) - here)
+        values = offsets.in_units(offsets.centre + step.size * whole)
+    if rebuilds_gains(setup):
+        visibilities = prediction(pointed(setup, values), found.posterior)
+    return Around(experiment.data, visibilities, sky, values), step
 
 
 def offset_posterior(
