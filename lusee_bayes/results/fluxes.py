@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import Inference
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.simulate import true_values
 from lusee_bayes.experiment.terms import point_sources, pointed
 from lusee_bayes.linear.templates import template_amplitudes
