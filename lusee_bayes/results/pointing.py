@@ -58,7 +58,7 @@ class PointingReport:
         remedy = f"give noise.pointing.{kind_of(name)}"
         if self.offsets is not None and name in set(self.offsets["offset"]):
             remedy = (
-                "noise.pointing has it to first order; set its around=posterior, or "
+                "noise.pointing has it; widen its prior, or set around=posterior or "
                 "treatment=sampled"
             )
         return (

@@ -152,7 +152,7 @@ def test_about_no_offsets_large_ones_are_not_described():
     found = infer(experiment)
     report = pointing_report(experiment, found, on_host(found.posterior).covariance())
     assert "too much: set noise.pointing.treatment=sampled" in report.lines()[0]
-    assert "has it to first order; set its around=posterior" in report.sentence()
+    assert "noise.pointing has it; widen its prior, or set around=posterior" in report.sentence()
 
 
 @pytest.mark.parametrize("name", ["clock_s", "turntable_1_deg", "lat_deg", "tilt_east_deg"])
@@ -293,6 +293,11 @@ def test_the_second_order_is_a_quadratic():
 def test_what_cannot_be():
     with pytest.raises(InputError, match="give a standard deviation of at least one of clock_s"):
         scenario_of("noise.pointing={treatment: sampled}")
+    with pytest.raises(InputError, match="lat_deg is 90, but input should be less than or equal"):
+        scenario_of("noise.pointing={lat_deg: 90}")
+    far = "noise.pointing={lat_deg: 1, true_values: {lat_deg: 200}}"
+    with pytest.raises(InputError, match=r"noise.pointing, with lat_deg = 200: lat_deg must lie"):
+        simulate(set_up(scenario_of(far, lmax=4)))
     setup = set_up(scenario_of("noise.pointing={clock_s: 1, true_values: {lat_deg: 1}}", lmax=4))
     with pytest.raises(InputError, match="true_values has 'lat_deg', which is not among the off"):
         simulate(setup)

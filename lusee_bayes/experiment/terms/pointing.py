@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.reading import naming
 from lusee_bayes.experiment.setup import Setup, expected_signal, mean_flux, source_responses
 from lusee_bayes.experiment.terms.term import Around, Term, Truth
 from lusee_bayes.instrument.coupling import CouplingMatrix
@@ -65,7 +66,9 @@ def true_setup(setup: Setup, truth: Truth) -> Setup:
 
 def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
     """The setup with another observation, coupling and responses to sources; else as it is."""
-    observation = with_offsets(setup.observation, values)
+    given = ", ".join(f"{name} = {value:g}" for name, value in values.items() if value)
+    with naming(f"noise.pointing, with {given or 'no offsets'}"):
+        observation = with_offsets(setup.observation, values)
     if any(values.get(name) for name in CLOCK):
         pointing = Pointing.of(observation, setup.scenario.lmax)
     else:  # the sky turns as before
