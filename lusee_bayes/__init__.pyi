@@ -2,8 +2,8 @@ from .core.errors import InputError as InputError
 from .core.version import __version__ as __version__
 from .experiment.experiment import Experiment as Experiment
 from .experiment.experiment import build as build
-from .experiment.inference import Inference as Inference
 from .experiment.inference import infer as infer
+from .experiment.rounds import Inference as Inference
 from .experiment.scenario import Scenario as Scenario
 from .experiment.scenario import load_scenario as load_scenario
 from .instrument.averaging import averaged as averaged

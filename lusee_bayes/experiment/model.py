@@ -77,15 +77,17 @@ def marginalised(model: LinearGaussian, found: Iterable[tuple[str, Systematic]])
 
 
 def model_to_sample(
-    setup: Setup, data: Visibilities
+    setup: Setup, data: Visibilities, around: Around | None = None
 ) -> tuple[LinearGaussian, tuple[Systematic, ...]]:
     """The model before anything is sampled, and what is then to be applied to it.
+
+    Terms are built around the data, unless ``around`` says more.
 
     Systematics that are marginalised come in their place in the order, as sampled ones without a
     site.
     """
     model, later = base_model(setup, data), []
-    for treatment, systematic in systematics(setup, Around(data)):
+    for treatment, systematic in systematics(setup, around or Around(data)):
         if treatment == "sampled":
             later.append(systematic)
         elif later:

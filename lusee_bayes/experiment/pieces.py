@@ -10,6 +10,7 @@ from lusee_bayes.core.arrays import on_device
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import model_to_sample
+from lusee_bayes.experiment.rounds import rebuilds_pointing, settled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import TERMS, Around, gain_drifts, point_sources
 from lusee_bayes.instrument.instrument import Instrument
@@ -36,7 +37,11 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
 
         return make
 
-    to_sample = cache(lambda: model_to_sample(setup, data))
+    def around() -> Around:
+        # about none, large offsets are not described, and gains are those of other antennas
+        return settled(setup, data).around if rebuilds_pointing(setup) else Around(data)
+
+    to_sample = cache(lambda: model_to_sample(setup, data, around()))
     return {
         "gaussian": lambda: to_sample()[0],
         "systematics": lambda: to_sample()[1],

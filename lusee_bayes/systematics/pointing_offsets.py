@@ -70,7 +70,7 @@ class PointingOffsets(Systematic):
         )
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
-        """Sample one site for each offset, of its name; sources move to first order."""
+        """Sample one site for each offset, of its name; sources move to first order about z_0."""
         values = {
             name: numpyro.sample(name, dist.Normal(0.0, std))
             for name, std in zip(self.names, self.stds, strict=True)
@@ -78,7 +78,7 @@ class PointingOffsets(Systematic):
         pointing = turned_by_offsets(self.nominal.pointing, self.hours, values)
         coupling = CouplingMatrix.of_modes(self.modes, pointing, self.nominal.layout)
         z = jnp.stack([jnp.asarray(value) for value in values.values()]) / self.stds
-        return with_added(replace(model, coupling=coupling), self.sources @ z)
+        return with_added(replace(model, coupling=coupling), self.sources @ (z - self.centre))
 
     def in_units(self, z: Float[np.ndarray, " offsets"]) -> dict[str, float]:
         """Values by name, of numbers in prior standard deviations."""

@@ -13,6 +13,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.model import base_model, full_model, radiometer
+from lusee_bayes.experiment.pieces import program_pieces
 from lusee_bayes.experiment.rounds import offset_posterior
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import Setup, set_up
@@ -268,6 +269,16 @@ def test_sources_and_gains_are_those_of_the_offsets():
     wanted = np.asarray(expected.noise.dense())
     wanted = wanted - np.diag(np.asarray(radiometer(there).diagonal()))
     np.testing.assert_allclose(systematic, wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
+
+
+def test_what_is_left_to_sample_is_about_the_offsets():
+    """Gains are sampled, a turntable is marginalised: what is left of the model fits."""
+    far = "noise.pointing={turntable_deg: 1, true_values: {turntable_deg: 2.0}}"
+    experiment = build(scenario_of(far, "noise.gain={sigma: 1e-9, treatment: sampled}", lmax=6))
+    model = program_pieces(experiment)["gaussian"]()
+    n = model.n_data
+    mean = model.condition(experiment.data.data).mean
+    assert float(model.chi2(mean, experiment.data.data)) < n + 4 * np.sqrt(2 * n)
 
 
 def test_a_prior_is_learned_about_the_offsets():
