@@ -26,9 +26,9 @@ from threadpoolctl import threadpool_limits
 
 from lusee_bayes.core.rotations import tilt_powers
 
-# of what is left out of any sample, relative to the visibility of a sky whose harmonics fall as
-# 1 / ell^2: less than 1e-6 of the radiometer noise in the fiducial case
-TOLERANCE = 1e-9
+# of what is left out of any sample, relative to its visibility if what a beam sees of the sky falls
+# with ell to this power: less than 1e-6 of the radiometer noise in the fiducial case
+TOLERANCE, FALLING = 5e-11, -3.5
 # of the quadrature over a piece, and of the series in moments
 ROUNDING = 1e-14
 
@@ -138,11 +138,11 @@ def _sufficient_moments(angle: float) -> int:
 
 
 def _importance(powers: list[tuple[int, int]], lmax: int) -> Float[np.ndarray, "powers orders"]:
-    """What each power of the tilt makes of the harmonics of one order, falling as 1 / ell^2."""
+    """What each power of the tilt makes of the harmonics of one order."""
     ell = np.arange(1.0, max(lmax, 1) + 1.0)
     return np.array(
         [
-            [(ell[ell >= max(m, 1)] ** (a + b - 2.0)).sum() for m in range(lmax + 1)]
+            [(ell[ell >= max(m, 1)] ** (a + b + FALLING)).sum() for m in range(lmax + 1)]
             for a, b in powers
         ]
     )

@@ -39,7 +39,7 @@ def radiometer_noise(
     layout: DataLayout,
     *,
     bandwidth_hz: Scalar = 1.0e6,
-    step_s: Scalar | Float[np.ndarray, " times"] = 7200.0,
+    step_s: Scalar | Float[Array, " samples"] = 7200.0,
     form: str = "paper",
     duty_cycle: Scalar = 1.0,
     factor: Scalar = 1.0,

@@ -126,7 +126,7 @@ class AdditiveNoise(Systematic):
         covariance = self.covariance()
         normal = dist.Normal(jnp.zeros(covariance.rank), 1.0).to_event(1)
         noise = covariance.colour(numpyro.sample(f"{self.name}_noise", normal))
-        return replace(model, offset=noise if model.offset is None else model.offset + noise)
+        return with_added(model, noise)
 
     def distort(
         self, visibilities: Float[Array, "products times"], key: PRNGKeyArray
@@ -176,6 +176,11 @@ class Scale(Systematic):
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Return the model as it is."""
         return model
+
+
+def with_added(model: LinearGaussian, signal: Float[Array, " data"]) -> LinearGaussian:
+    """Add a signal in K to the mean of a model's data."""
+    return replace(model, offset=signal if model.offset is None else model.offset + signal)
 
 
 def scalar(value: float | Float[Array, ""]) -> Float[Array, ""]:

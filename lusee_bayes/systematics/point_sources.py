@@ -14,7 +14,7 @@ from lusee_bayes.core.checks import require_finite, require_positive, require_sh
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankCovariance
-from lusee_bayes.systematics.base import Systematic, scalar
+from lusee_bayes.systematics.base import Systematic, scalar, with_added
 
 
 class Source(eqx.Module):
@@ -100,7 +100,7 @@ class PointSources(Systematic):
         """Add T P T^T to N, and the mean fluxes to the offset."""
         columns = self.columns()
         noise = model.noise + LowRankCovariance(self.templates(), "the sources")
-        return _with_added(replace(model, noise=noise), columns @ self.mean())
+        return with_added(replace(model, noise=noise), columns @ self.mean())
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """Sample one site for each source: ``flux_NAME`` in K sr, (blocks,) or a number."""
@@ -112,8 +112,4 @@ class PointSources(Systematic):
                 signal = signal + source.columns[:, 0] * flux
             else:
                 signal = signal + source.columns @ numpyro.sample(source.site, prior.to_event(1))
-        return _with_added(model, signal)
-
-
-def _with_added(model: LinearGaussian, signal: Float[Array, " data"]) -> LinearGaussian:
-    return replace(model, offset=signal if model.offset is None else model.offset + signal)
+        return with_added(model, signal)

@@ -24,7 +24,7 @@ from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing_offsets import turned_by_offsets
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankCovariance
-from lusee_bayes.systematics.base import Systematic
+from lusee_bayes.systematics.base import Systematic, with_added
 
 
 class PointingOffsets(Systematic):
@@ -65,7 +65,7 @@ class PointingOffsets(Systematic):
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Take A(z_0), add T T^T to N and -T z_0 to the mean."""
         noise = model.noise + LowRankCovariance(self.templates, "clock and pointing")
-        return _with_added(
+        return with_added(
             replace(model, coupling=self.coupling, noise=noise), -self.templates @ self.centre
         )
 
@@ -78,12 +78,8 @@ class PointingOffsets(Systematic):
         pointing = turned_by_offsets(self.nominal.pointing, self.hours, values)
         coupling = CouplingMatrix.of_modes(self.modes, pointing, self.nominal.layout)
         z = jnp.stack([jnp.asarray(value) for value in values.values()]) / self.stds
-        return _with_added(replace(model, coupling=coupling), self.sources @ z)
+        return with_added(replace(model, coupling=coupling), self.sources @ z)
 
     def in_units(self, z: Float[np.ndarray, " offsets"]) -> dict[str, float]:
         """Values by name, of numbers in prior standard deviations."""
         return dict(zip(self.names, (np.asarray(self.stds) * z).tolist(), strict=True))
-
-
-def _with_added(model: LinearGaussian, signal: Float[Array, " data"]) -> LinearGaussian:
-    return replace(model, offset=signal if model.offset is None else model.offset + signal)

@@ -18,6 +18,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "keys.md"
 WITHIN = {
     "noise.gain": "noise.gain={}",
     "noise.beam": "noise.beam={shift_mhz: 4}",
+    "noise.pointing": "noise.pointing={clock_s: 60}",
     "sources.list.0": "sources.list=[{name: Cas A}]",
 }
 

@@ -18,7 +18,9 @@ from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.simulate import simulate, true_values
 from lusee_bayes.experiment.terms import Around, pointing_offsets, second_order
 from lusee_bayes.experiment.terms.pointing import shifted
+from lusee_bayes.instrument.source_response import source_response
 from lusee_bayes.results.pointing import pointing_report
+from lusee_bayes.sky import galactic_unit_vector
 from lusee_bayes.sky.priors import HarmonicPrior
 
 TWO_RUNS = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
@@ -235,3 +237,23 @@ def test_what_cannot_be():
     experiment = build(scenario_of(*both, lmax=4))
     with pytest.raises(InputError, match="cannot both be sampled"):
         infer(experiment)
+
+
+def test_sources_are_seen_as_means_over_windows():
+    """Cas A rises, sets and turns within windows of a day: against 400 instants in each."""
+    source = "sources.list=[{name: Cas A}]"
+    scenario = scenario_of(source, lmax=4, step_s=86400.0)
+    setup = set_up(scenario)
+    instants, sample, weight = setup.observation.at_nodes(400)
+    antennas = setup.beam_source.monopoles
+    direction = galactic_unit_vector(350.85, 58.815)
+    fine = np.asarray(source_response(instants, direction, 25.0, antennas)) * weight
+    expected = np.stack([np.bincount(sample, row) for row in fine])
+    got = np.asarray(setup.responses[0])
+    # a window of a day is 13 degrees of the sky; where Cas A sets within one, 8 instants tell its
+    # mean to some percent of what it is when high
+    np.testing.assert_allclose(got, expected, rtol=0, atol=0.02 * np.abs(expected).max())
+    whole = np.abs(fine.reshape(16, -1, 400)).min(2).max(0) > 0
+    assert 5 < whole.sum() < whole.size - 2
+    peak = np.abs(expected).max()
+    np.testing.assert_allclose(got[:, whole], expected[:, whole], rtol=0, atol=1e-9 * peak)

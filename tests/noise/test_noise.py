@@ -260,3 +260,22 @@ def test_an_auto_that_was_never_measured_is_refused():
     seen = np.where(flags, 0.0, np.asarray(VISIBILITIES))
     with pytest.raises(InputError, match="the auto 11R is absent at all times"):
         radiometer_noise(seen, DataLayout.from_flags(flags))
+
+
+@pytest.mark.parametrize("form", ["paper", "exact"])
+def test_every_sample_has_its_own_live_time(form):
+    """The mean of samples, weighted by live time, has the noise of all of their live time."""
+    rng = np.random.default_rng(4)
+    live = rng.uniform(10.0, 300.0, 5)
+    v = jnp.repeat(VISIBILITIES[:, :1], 5, axis=1)
+    layout = DataLayout(N_PRODUCTS, 5)
+    fine = np.asarray(radiometer_noise(v, layout, step_s=live, form=form).dense())
+    weight = np.kron(np.eye(16), live / live.sum())
+    expected = weight @ fine @ weight.T
+    one = DataLayout(16, 1)
+    got = radiometer_noise(v[:, :1], one, step_s=np.array([live.sum()]), form=form).dense()
+    np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12 * expected.max())
+    same = radiometer_noise(v[:, :1], one, step_s=live.sum(), form=form).dense()
+    np.testing.assert_allclose(got, same, rtol=1e-15)
+    with pytest.raises(InputError, match=r"step_s has shape \(4,\), expected \(5,\)"):
+        radiometer_noise(v, layout, step_s=live[:4], form=form)

@@ -20,7 +20,8 @@ class RadiometerSection(Section):
     bandwidth_hz : float
         Width of a channel.
     duty_cycle : float
-        Share of the time in which the spectrometer integrates.
+        Share of the live time in which the spectrometer integrates: 1 where data or a schedule say
+        their live time as it was.
     factor : float
         Factor of the noise variance.
     log_factor_std : float
