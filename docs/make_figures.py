@@ -8,15 +8,19 @@ The figure of the regolith needs the draws of
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import astropy.units as u
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
+from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.experiment.inference import Inference
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.simulate import true_values
 from lusee_bayes.linear.metrics import ell_cross, signal_to_noise
@@ -32,6 +36,7 @@ from lusee_bayes.sky import BRIGHT_SOURCES
 from lusee_bayes.sky.galaxy import galaxy_map
 
 HERE = Path(__file__).parent / "figures"
+GREEN = "#009E73"  # of the same palette as BLUE and ORANGE
 
 
 def first_map() -> None:
@@ -74,6 +79,99 @@ def fixed_axis() -> None:
     axes.set_title("The same data, two assumptions about the Moon's axis")
     axes.legend(frameon=False)
     figure.savefig(HERE / "fixed_axis.png", dpi=90)
+
+
+def instants() -> None:
+    """Draw and print what becomes of the map if averages are taken for instants."""
+    styles = {
+        "windows": ("windows", {"color": BLUE, "marker": "s"}),
+        "instants": ("instants in the middle", {"color": ORANGE, "marker": "o"}),
+        "starts": ("starts taken for middles", {"color": GREEN, "marker": "^"}),
+    }
+    figure = Figure(figsize=(10, 4.4), layout="constrained")
+    per_direction, per_length = figure.subplots(1, 2)
+    # groups of combinations of coefficients, narrow where they are measured best
+    edges = np.append(0, np.geomspace(4, 48**2, 20).astype(int))
+    for name, (experiment, found) in taken_for(2.0, lmax=47).items():
+        label, style = styles[name]
+        posterior, data = found.posterior, experiment.data.data
+        scale = np.sqrt(posterior.prior.variance())
+        # eigenvectors of the covariance in units of the prior: what is known best comes first
+        variances, directions = np.linalg.eigh(posterior.covariance() / np.outer(scale, scale))
+        error = directions.T @ ((posterior.mean - experiment.setup.sky.modes) / scale)
+        rms = np.sqrt(np.add.reduceat(error**2 / variances, edges[:-1]) / np.diff(edges))
+        chi2 = _chi2(found.model, data)
+        print(name, f"chi2 {chi2:.0f} of {len(data)}", np.round(rms, 1))
+        label = f"{label}: $\\chi^2$ {chi2:,.0f} of {len(data):,} data"
+        per_direction.loglog((edges[:-1] + edges[1:]) / 2, rms, ms=4, label=label, **style)
+    per_direction.set(
+        xlabel="combination of coefficients, best measured first",
+        ylabel="map - truth [standard deviations, rms]",
+        title="Maps of means over 2 h",
+        xlim=(2, 48**2),
+        ylim=(0.1, 1e5),
+    )
+    print("| length [h] | taken for | data, rms | largest | map | chi^2 |\n|" + " --- |" * 6)
+    lengths_h, rows = (1 / 6, 0.5, 1.0, 2.0, 4.0, 8.0, 12.0, 24.0), {"starts": [], "instants": []}
+    for length_h in lengths_h:
+        taken = taken_for(length_h, lmax=31)
+        truth = taken["windows"][0].setup
+        for name, row in rows.items():
+            coupling, model = taken[name][0].setup.coupling, taken[name][1].model
+            change = np.asarray(truth.coupling @ truth.sky.modes - coupling @ truth.sky.modes)
+            squares = change**2 / np.asarray(model.noise.diagonal())
+            chi2 = _chi2(model, change)  # the rest is in the map
+            row.append((np.sqrt(squares.sum() - chi2), chi2 / np.sqrt(2 * len(change))))
+            of_data = np.sqrt([squares.mean(), squares.max()])
+            numbers = " | ".join(f"{x:.3g}" for x in (*of_data, *row[-1]))
+            print(f"| {length_h:.3g} | {name} | {numbers} |")
+    for name, row in rows.items():
+        label, style = styles[name]
+        for values, ls, what in zip(np.transpose(row), "-:", ("map", r"$\chi^2$"), strict=True):
+            per_length.loglog(lengths_h, values, ls, ms=4, label=f"{label}: {what}", **style)
+    per_length.set(
+        xlabel="length of the samples",
+        ylabel="shift [standard deviations]",
+        title=r"The map is far off, and $\chi^2$ does not show it",
+        ylim=(1e-9, 1e6),
+    )
+    per_length.minorticks_off()
+    per_length.set_xticks(lengths_h, ["10 min", "", "1 h", "2 h", "4 h", "8 h", "", "24 h"])
+    for axes in (per_direction, per_length):
+        axes.axhline(1.0, color="grey", lw=0.8)
+        axes.legend(frameon=False, fontsize=8)
+    figure.savefig(HERE / "instants.png", dpi=90)
+
+
+def _chi2(model: lb.LinearGaussian, data: np.ndarray) -> float:
+    """Of data under a model without a mean, any sky of the prior being possible."""
+    found = model.condition(data)
+    return float(model.chi2(found.mean, data)) + float(found.prior_chi2())
+
+
+def taken_for(length_h: float, lmax: int) -> dict[str, tuple[Experiment, Inference]]:
+    """Map means over windows as such, as instants in their middles, and shifted by a half.
+
+    Parameters
+    ----------
+    length_h : float
+        Of the windows, in hours.
+    lmax : int
+    """
+    plain = [f"lmax={lmax}", f"observation.step_s={3600 * length_h}", "observation.window=mean"]
+    scenario = lb.load_scenario("fiducial", plain)
+    data = lb.build(scenario).data
+    there = data.observation
+    observations = {
+        "windows": there,
+        "instants": replace(there, windows=None),
+        "starts": replace(there, times=there.times - length_h / 2 * u.hour),
+    }
+    taken = {}
+    for name, observation in observations.items():
+        experiment = lb.build(scenario, replace(data, observation=observation))
+        taken[name] = experiment, lb.infer(experiment)
+    return taken
 
 
 def embedded_sky(ulsa: Path | None) -> None:
@@ -249,3 +347,4 @@ if __name__ == "__main__":
     embedded_sky(ulsa)
     given_skies(ulsa)
     fixed_axis()
+    instants()

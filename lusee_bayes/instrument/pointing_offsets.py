@@ -122,7 +122,7 @@ def with_offsets(observation: Observation, values: Values) -> Observation:
 
 
 def turned_by_offsets(
-    pointing: Pointing, hours: Float[np.ndarray, " times"], values: Values
+    pointing: Pointing, hours: Float[Array, " times"], values: Values
 ) -> Pointing:
     """Return the pointing that offsets make of another, differentiable in them.
 

@@ -33,6 +33,9 @@ def run_command(line: str) -> None:
     assert program == "lusee-bayes"
     if arguments[0] in ("simulate", "map", "sample", "plan"):
         arguments += SMALL
+    if arguments[0] == "average":
+        arguments[arguments.index("--to") + 1] = "3d"
+        arguments += SMALL[:2]
     if arguments[0] == "sample":
         for name, value in (("--draws", "50"), ("--warmup", "60"), ("--chains", "2")):
             if name in arguments:
