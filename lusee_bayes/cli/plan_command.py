@@ -47,6 +47,7 @@ def plan_command(
     """
     from lusee_bayes.cli.plan_variations import headline, variations_of
     from lusee_bayes.cli.tables import forecast_table
+    from lusee_bayes.results.forecast import baseline
     from lusee_bayes.runs.plan_run import run_plan
 
     console = Console(quiet=quiet, soft_wrap=True)
@@ -59,5 +60,8 @@ def plan_command(
     for source in sources:
         show(console, forecast_table([f for f in run.forecasts if f.variation.source == source]))
     say(console, *(f"  {path}" for path in run.files))
-    say(console, *(headline(run.forecasts, source) for source in sources))
+    for source in sources:
+        say(console, headline(run.forecasts, source))
+        if offsets := baseline(run.forecasts, source).offsets_line():
+            say(console, f"{source}: {offsets}")
     say(console, f"look at {run.folder}/figures/plan.png")

@@ -2,58 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import base_model, marginalised, systematics
-from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.experiment.rounds import Inference, model_about, rebuilds, settled
 from lusee_bayes.experiment.terms import Around
-from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.templates import template_amplitudes
-from lusee_bayes.systematics import PointingOffsets
-
-# N is rebuilt until the map moves by less than this (rms, in standard deviations)
-SETTLED, MAX_ROUNDS = 1e-2, 20
-
-
-@dataclass(frozen=True)
-class Inference:
-    """A model, the posterior given the data, and how it was found.
-
-    Attributes
-    ----------
-    model : LinearGaussian
-        With every systematic in N that the scenario does not ignore.
-    posterior : Posterior
-    rounds : int
-        How often N was built.
-    around : Around
-        What it was built around.
-    offsets : PointingOffsets or None
-        Of clock and pointing, as they are in N.
-    """
-
-    model: LinearGaussian
-    posterior: Posterior | None
-    rounds: int
-    around: Around
-    offsets: PointingOffsets | None = None
 
 
 def infer(experiment: Experiment) -> Inference:
-    """Condition the experiment's model on its data.
-
-    One round, unless a term of N is built around what the data tell: the gains around the
-    posterior's own prediction, or clock and pointing around its sky and their own values. Then N
-    and the map are repeated until the map moves by less than 0.01 standard deviations (rms).
+    """Condition the experiment's model on its data (:func:`.settled`).
 
     Parameters
     ----------
@@ -62,25 +22,9 @@ def infer(experiment: Experiment) -> Inference:
     Raises
     ------
     InputError
-        If N is not positive definite, or the map does not settle in 20 rounds.
+        As :func:`.settled`.
     """
-    setup, data = experiment.setup, experiment.data
-
-    def conditioned(around: Around, rounds: int) -> Inference:
-        model, offsets = _model(setup, around)
-        return Inference(model, model.condition(data.data), rounds, around, offsets)
-
-    found = conditioned(Around(data), 1)
-    if not rebuilds(setup):
-        return found
-    for rounds in range(2, MAX_ROUNDS + 1):
-        before, found = found, conditioned(_around(experiment, found), rounds)
-        if float(found.posterior.rms_shift_from(before.posterior)) < SETTLED:
-            return found
-    raise InputError(
-        f"the map still moves after {MAX_ROUNDS} rounds of rebuilding N around it; use "
-        "noise.gain.visibilities=model and noise.pointing.around=model"
-    )
+    return settled(experiment.setup, experiment.data)
 
 
 def inform(
@@ -105,75 +49,7 @@ def inform(
         found = infer(experiment)
     else:
         around = Around(experiment.data)
-        model, offsets = _model(experiment.setup, around)
+        model, offsets = model_about(experiment.setup, around)
         found = Inference(model, None, 1, around, offsets)
     information, posterior = found.model.inform(experiment.data.data, key, n_perturbations)
     return information, replace(found, posterior=posterior)
-
-
-def _model(setup: Setup, around: Around) -> tuple[LinearGaussian, PointingOffsets | None]:
-    """The full model, and the offsets of clock and pointing in its N."""
-    found = systematics(setup, around)
-    offsets = [s for _, s in found if isinstance(s, PointingOffsets)]
-    return marginalised(base_model(setup, around.data), found), next(iter(offsets), None)
-
-
-def _around(experiment: Experiment, found: Inference) -> Around:
-    """What the terms of N are built around next, given a posterior."""
-    setup, visibilities, sky, values = experiment.setup, None, None, None
-    if rebuilds_gains(setup):
-        visibilities = prediction(setup, found.posterior)
-    if rebuilds_pointing(setup):
-        sky = np.asarray(found.posterior.mean)
-        values, _ = offset_posterior(experiment, found)
-    return Around(experiment.data, visibilities, sky, values)
-
-
-def offset_posterior(
-    experiment: Experiment, found: Inference
-) -> tuple[dict[str, float], Float[np.ndarray, "offsets offsets"]]:
-    """Mean of every offset of clock and pointing by name, and their covariance.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    found : Inference
-        Of these data alone, with offsets.
-
-    Returns
-    -------
-    mean : dict of float
-        In the units that the names end with.
-    covariance : (offsets, offsets) array
-        In these units.
-    """
-    offsets = found.offsets
-    z, covariance = template_amplitudes(
-        found.model, found.posterior, experiment.data.data, offsets.templates
-    )
-    stds = np.asarray(offsets.stds)
-    return offsets.in_units(z), covariance * np.outer(stds, stds)
-
-
-def rebuilds(setup: Setup) -> bool:
-    """Whether some term of N is built around what the data tell."""
-    return rebuilds_gains(setup) or rebuilds_pointing(setup)
-
-
-def rebuilds_pointing(setup: Setup) -> bool:
-    """Whether clock and pointing are to first order about the sky and the values of the data."""
-    section = setup.scenario.noise.pointing
-    return section is not None and section.treatment != "ignored" and section.around == "posterior"
-
-
-def rebuilds_gains(setup: Setup) -> bool:
-    """Whether the gain term is built around the posterior's own prediction."""
-    gain = setup.scenario.noise.gain
-    return gain is not None and gain.treatment != "ignored" and gain.visibilities == "posterior"
-
-
-def prediction(setup: Setup, posterior: Posterior) -> Float[Array, "products times"]:
-    """Visibilities of the mean map, with the sources' mean fluxes, at every time; in K."""
-    complete = CouplingMatrix.build(setup.beams, setup.pointing)
-    difference_of_skies = posterior.mean - setup.sky.modes
-    return setup.signal + complete.layout.scatter(complete @ difference_of_skies)

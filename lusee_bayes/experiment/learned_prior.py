@@ -9,6 +9,7 @@ import numpy as np
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.rounds import rebuilds_gains, rebuilds_pointing, settled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import Around
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -46,8 +47,13 @@ def with_learned_prior(setup: Setup, data: Visibilities) -> tuple[Setup, Learned
 
 
 def about_sky(setup: Setup, data: Visibilities) -> Information:
-    """What data say of the sky; only its reference sky depends on the setup's prior."""
-    return full_model(setup, Around(data)).inform(data.data)[0]
+    """What data say of the sky; only its reference sky depends on the setup's prior.
+
+    Clock and pointing are in N about what data and the prior before them tell. To first order
+    about none, what is left of large ones would be taken for the sky's.
+    """
+    around = settled(setup, data).around if rebuilds_pointing(setup) else Around(data)
+    return full_model(setup, around).inform(data.data)[0]
 
 
 def learned_prior(
@@ -73,15 +79,12 @@ def learned_prior(
     """
     scenario, seed = setup.scenario, setup.scenario.seed
     if isinstance(family, LogNormalPrior):
-        gain = scenario.noise.gain
-        if gain is not None and gain.visibilities == "posterior":
+        if rebuilds_gains(setup):
             raise InputError(
                 "a log-normal sky is found under one N, and noise.gain.visibilities=posterior "
                 "builds several; use noise.gain.visibilities=measured"
             )
-        pointing = scenario.noise.pointing
-        rebuilt = pointing is not None and pointing.treatment != "ignored"
-        if rebuilt and pointing.around == "posterior":
+        if rebuilds_pointing(setup):
             raise InputError(
                 "a log-normal sky is found under one N, and noise.pointing.around=posterior "
                 "builds several; use noise.pointing.around=model"

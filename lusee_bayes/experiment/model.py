@@ -7,7 +7,13 @@ from dataclasses import replace
 
 from lusee_bayes.core.arrays import on_device
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.terms import TERMS, Around, measured_visibilities
+from lusee_bayes.experiment.terms import (
+    TERMS,
+    Around,
+    PointingTerm,
+    measured_visibilities,
+    pointed,
+)
 from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
@@ -34,9 +40,18 @@ def radiometer(setup: Setup, data: Visibilities | None = None) -> Covariance:
 
 
 def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, Systematic]]:
-    """Treatment and systematic, for all that the scenario does not ignore, in their order."""
+    """Treatment and systematic, for all that the scenario does not ignore, in their order.
+
+    Where clock and pointing are built around offsets, the others are, too: gains multiply, and
+    sources are seen, where the antennas then pointed.
+    """
     around = around or Around()
-    return [found for term in TERMS for found in term.build(setup, around)]
+    there = pointed(setup, around.offsets)
+    return [
+        found
+        for term in TERMS
+        for found in term.build(setup if isinstance(term, PointingTerm) else there, around)
+    ]
 
 
 def base_model(setup: Setup, data: Visibilities | None = None) -> LinearGaussian:

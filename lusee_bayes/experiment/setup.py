@@ -179,9 +179,7 @@ def set_up(
     with stages("coupling"):
         complete = CouplingMatrix.build(beams, pointing)
         layout = complete.layout if data is None else data.layout
-        signal = complete.layout.scatter(complete @ sky.modes) + background[:, None]
-        for section, response in zip(scenario.sources.list, responses, strict=True):
-            signal = signal + mean_flux(section, scenario.frequency_mhz) * response
+        signal = expected_signal(scenario, complete, sky, background, responses)
         instrument = Instrument(
             _antennas(scenario, source), pointing, layout, scenario.frequency_mhz, scenario.lmax
         )
@@ -278,6 +276,32 @@ def _direction(source: SourceSection, observation: Observation) -> Float[np.ndar
             "(or give ra_deg and dec_deg of your own)"
         )
     return galactic_unit_vector(known[source.name].ra_deg, known[source.name].dec_deg)
+
+
+def expected_signal(
+    scenario: Scenario,
+    complete: CouplingMatrix,
+    sky: Sky,
+    background: Float[Array, " products"],
+    responses: tuple[Float[Array, "products times"], ...],
+) -> Float[Array, "products times"]:
+    """Visibilities of sky, background and sources with their mean fluxes, in K.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    complete : CouplingMatrix
+        A, for all products at all times.
+    sky : Sky
+    background : (products,) array
+        In K.
+    responses : tuple of (products, times) arrays
+        As in :class:`Setup`.
+    """
+    signal = complete.layout.scatter(complete @ sky.modes) + background[:, None]
+    for section, response in zip(scenario.sources.list, responses, strict=True):
+        signal = signal + mean_flux(section, scenario.frequency_mhz) * response
+    return signal
 
 
 def mean_flux(source: SourceSection, frequency_mhz: float) -> float:

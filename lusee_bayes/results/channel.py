@@ -17,8 +17,8 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, power_spectrum
 from lusee_bayes.core.representation import Described, extent
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import Inference
 from lusee_bayes.experiment.plausibility import about_information
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.metrics import (
     correlation,

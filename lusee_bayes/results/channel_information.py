@@ -10,7 +10,7 @@ import xarray as xr
 from jaxtyping import Float
 
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import Inference
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.linear.fit import ChiSquare
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.split import Split

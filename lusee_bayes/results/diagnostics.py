@@ -21,7 +21,7 @@ from lusee_bayes.core.harmonics import (
 )
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import Inference
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.linear.pixel_variance import prior_pixel_std
 from lusee_bayes.linear.residuals import residuals
 from lusee_bayes.results.channel import ChannelResult

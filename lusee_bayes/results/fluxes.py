@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import Inference
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.simulate import true_values
-from lusee_bayes.experiment.terms import point_sources
+from lusee_bayes.experiment.terms import point_sources, pointed
 from lusee_bayes.linear.templates import template_amplitudes
 from lusee_bayes.sky import kelvin_steradian
 
@@ -30,7 +30,7 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
         its flux is known from the prior only.
     """
     setup, data = experiment.setup, experiment.data
-    sources = point_sources(setup)
+    sources = point_sources(pointed(setup, inference.around.offsets))
     amplitudes, covariance = template_amplitudes(
         inference.model, inference.posterior, data.data, sources.templates()
     )

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -29,10 +29,13 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
+from lusee_bayes.experiment.terms import Around, pointing_offsets
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.linear.metrics import effective_resolution_deg, ell_cross, prior_fraction_per_ell
+from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.linear.templates import template_amplitudes
 from lusee_bayes.results.cost import duration
 
 AS_GIVEN = "as given"
@@ -67,7 +70,9 @@ class Forecast:
 
     days : of observing; n_data : samples of all products; information_bits : about the whole sky;
     modes : how many have SNR > 1; snr_squared : (ells,) expected SNR_ell^2 for ell = 0..lmax;
-    resolution_deg : as in a map's summary, 180 degrees / ell_cross, None if there is none
+    resolution_deg : as in a map's summary, 180 degrees / ell_cross, None if there is none;
+    offsets : expected standard deviation of every offset of clock and pointing that the model has,
+    by name
     """
 
     variation: Variation
@@ -77,6 +82,11 @@ class Forecast:
     modes: int
     snr_squared: Float[np.ndarray, " ells"]
     resolution_deg: float | None
+    offsets: dict[str, float] = field(default_factory=dict)
+
+    def offsets_line(self) -> str:
+        """How well clock and pointing will be known; empty where the model has no such offsets."""
+        return ", ".join(f"{name} +- {std:.2g}" for name, std in self.offsets.items())
 
     @property
     def ell_cross(self) -> int | None:
@@ -132,9 +142,27 @@ def expected_posterior(setup: Setup) -> Posterior:
 
     N is the model's, with marginalised systematics and noise levels from the modelled sky.
     """
+    return _expected(setup)[1]
+
+
+def _expected(setup: Setup) -> tuple[LinearGaussian, Posterior]:
     model = full_model(setup)
     # the covariance is that of any data; these are the shortest to write
-    return model.condition(np.zeros(model.n_data))
+    return model, model.condition(np.zeros(model.n_data))
+
+
+def expected_offsets(setup: Setup, model: LinearGaussian, posterior: Posterior) -> dict[str, float]:
+    """Expected standard deviations of clock and pointing, in the units that their names end with.
+
+    To first order about the scenario's sky and no offsets; empty where the model has none.
+    """
+    section = setup.scenario.noise.pointing
+    if section is None or section.treatment == "ignored":
+        return {}
+    offsets = pointing_offsets(setup, Around())
+    no_data = np.zeros(model.n_data)
+    _, covariance = template_amplitudes(model, posterior, no_data, offsets.templates)
+    return offsets.in_units(np.sqrt(np.diagonal(covariance)))
 
 
 def forecast(variation: Variation) -> Forecast:
@@ -149,7 +177,7 @@ def forecast(variation: Variation) -> Forecast:
         setup = set_up(variation.scenario)
         if variation.lost:
             setup = without_ports(setup, variation.lost)
-        posterior = expected_posterior(setup)
+        model, posterior = _expected(setup)
         return Forecast(
             variation=variation,
             days=float(setup.observation.live_s.sum()) / 86400.0,
@@ -158,6 +186,7 @@ def forecast(variation: Variation) -> Forecast:
             modes=informed_modes(posterior),
             snr_squared=expected_snr_squared(posterior),
             resolution_deg=effective_resolution_deg(prior_fraction_per_ell(posterior)),
+            offsets=expected_offsets(setup, model, posterior),
         )
     except InputError as error:
         raise InputError(f"{variation.source}, {variation.name}: {error}") from error
@@ -215,6 +244,7 @@ def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
                 "resolution_deg": "none"
                 if row.resolution_deg is None
                 else f"{row.resolution_deg:.2f}",
+                "clock_and_pointing": row.offsets_line().replace(",", ";"),
             }
         )
     return rows

@@ -16,7 +16,8 @@ from lusee_bayes.core.progress import Stages, peak_memory_gb
 from lusee_bayes.core.representation import Described
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import Inference, infer
+from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.terms import beam_rms_difference
 from lusee_bayes.linear.fit import LEVELS, RULE

@@ -10,11 +10,11 @@ from jaxtyping import Float
 
 from lusee_bayes.core.lazy import special
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import Inference, offset_posterior
 from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.experiment.rounds import Inference, offset_posterior
 from lusee_bayes.experiment.simulate import true_values
 from lusee_bayes.experiment.terms import offsets_about, second_order
-from lusee_bayes.instrument.pointing_offsets import offset_names
+from lusee_bayes.instrument.pointing_offsets import kind_of, offset_names
 from lusee_bayes.linear.fit import FALSE_ALARM, probability
 from lusee_bayes.linear.offset_tests import preferences
 from lusee_bayes.linear.residuals import HOURS_A_DAY
@@ -54,10 +54,17 @@ class PointingReport:
         p = float(special.chdtrc(1, best["chi2_gain"]))
         if len(whole) * p >= FALSE_ALARM:
             return ""
+        name = best["offset"]
+        remedy = f"give noise.pointing.{kind_of(name)}"
+        if self.offsets is not None and name in set(self.offsets["offset"]):
+            remedy = (
+                "noise.pointing has it; widen its prior, or set around=posterior or "
+                "treatment=sampled"
+            )
         return (
-            f"Look at clock and pointing: {best['offset']} off by {best['value']:.3g} +- "
+            f"Look at clock and pointing: {name} off by {best['value']:.3g} +- "
             f"{best['std']:.2g} would lower chi^2 by {best['chi2_gain']:.0f} (p "
-            f"{probability(p)}); give noise.pointing."
+            f"{probability(p)}); {remedy}."
         )
 
     def lines(self) -> list[str]:
@@ -99,7 +106,7 @@ def pointing_report(
 def _table(
     experiment: Experiment, found: Inference, sky: Float[np.ndarray, " modes"]
 ) -> pd.DataFrame:
-    mean, covariance = offset_posterior(experiment, found)
+    mean, covariance = offset_posterior(found)
     std = dict(zip(mean, np.sqrt(np.diagonal(covariance)).tolist(), strict=True))
     prior = found.offsets.in_units(np.ones(len(mean)))
     # where values and sky are those that the data tell, only what is left of the offsets counts

@@ -19,8 +19,9 @@ from lusee_bayes.core.progress import Stages, peak_memory_gb
 from lusee_bayes.core.reading import reading
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import Inference, infer
+from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.pieces import program_pieces
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.simulate import true_values
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling.chains import Chains

@@ -102,6 +102,11 @@ def run_average(
             f"'{path}': averages have windows, for which luseepy's waterfalls have no room; give "
             "-o a name that does not end in .fits"
         )
+    if path.resolve() == Path(data).resolve():
+        raise InputError(
+            f"'{path}': the averages would replace the data that they are made of; give -o "
+            "another name"
+        )
     if scenario.frequencies_mhz:
         raise InputError(
             "averages are of one frequency; give a scenario with frequency_mhz and without "

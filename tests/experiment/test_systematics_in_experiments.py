@@ -15,8 +15,9 @@ from scipy.stats import chi2, kstest
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import Experiment, build
-from lusee_bayes.experiment.inference import SETTLED, Inference, infer, prediction
+from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.model import full_model, radiometer
+from lusee_bayes.experiment.rounds import SETTLED, Inference, prediction
 from lusee_bayes.experiment.scenario import load_scenario, scenario_names
 from lusee_bayes.experiment.terms import (
     Around,

@@ -255,6 +255,29 @@ def test_what_is_there_twice_is_computed_once(monkeypatch):
     assert rows[1]["difference_bits"] == "0.00"
 
 
+def test_what_will_be_known_of_clock_and_turntable():
+    """Against K = A S A^T + N as a matrix, and the derivative to an angle that is given."""
+    offsets = "noise.pointing={turntable_deg: 1.0, clock_s: 60}"
+    found = forecast(varied(offsets)).offsets
+    assert list(found) == ["clock_s", "turntable_deg"]
+    # the sky may as well have turned
+    assert found["clock_s"] == pytest.approx(60.0, rel=0.02)
+    setup = set_up(varied(offsets).scenario)
+    model = full_model(setup)
+    a = np.asarray(model.coupling.dense())
+    up, down = (
+        set_up(varied(f"observation.runs.0.turntable_deg={x}").scenario).coupling @ setup.sky.modes
+        for x in (1.0, -1.0)
+    )
+    k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
+    t = (up - down) / 2.0
+    expected = np.sqrt(1.0 - t @ np.linalg.solve(k, t))
+    assert found["turntable_deg"] == pytest.approx(expected, rel=1e-4)
+    rows = forecast_rows([forecast(varied(offsets)), forecast(varied())])
+    assert "turntable_deg +- " in rows[0]["clock_and_pointing"]
+    assert rows[1]["clock_and_pointing"] == ""
+
+
 def test_ports_that_do_not_exist_and_none_left():
     with pytest.raises(InputError, match="no port 4 to lose; ports are 0 to 3"):
         forecast(varied(lost=(4,)))

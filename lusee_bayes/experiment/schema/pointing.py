@@ -9,6 +9,9 @@ from pydantic import Field, model_validator
 from lusee_bayes.experiment.schema.section import Positive, Section, Treatment
 from lusee_bayes.instrument.pointing_offsets import OFFSETS
 
+# wider priors are none: the sky looks nothing like it did
+Offset = Annotated[Positive, Field(le=45)]
+
 
 class PointingSection(Section):
     """Offsets of clock and pointing: prior standard deviations of what has to be added.
@@ -40,13 +43,13 @@ class PointingSection(Section):
         the others are drawn from their priors.
     """
 
-    clock_s: Positive | None = None
-    clock_drift_s_per_day: Positive | None = None
-    turntable_deg: Positive | None = None
-    lon_deg: Positive | None = None
-    lat_deg: Positive | None = None
-    tilt_east_deg: Positive | None = None
-    tilt_north_deg: Positive | None = None
+    clock_s: Annotated[Positive, Field(le=1e6)] | None = None
+    clock_drift_s_per_day: Annotated[Positive, Field(le=1e4)] | None = None
+    turntable_deg: Offset | None = None
+    lon_deg: Offset | None = None
+    lat_deg: Offset | None = None
+    tilt_east_deg: Offset | None = None
+    tilt_north_deg: Offset | None = None
     treatment: Treatment = "marginalised"
     around: Literal["posterior", "model"] = "posterior"
     true_values: dict[str, Annotated[float, Field(ge=-1e6, le=1e6)]] = Field(default_factory=dict)

@@ -15,6 +15,7 @@ from lusee_bayes.experiment.terms.noise_level import NoiseLevelTerm
 from lusee_bayes.experiment.terms.pointing import (
     PointingTerm,
     offsets_about,
+    pointed,
     pointing_offsets,
     second_order,
     true_setup,
@@ -37,6 +38,7 @@ __all__ = [
     "TERMS",
     "AdditiveTerm",
     "Around",
+    "PointingTerm",
     "Term",
     "Truth",
     "beam_directions",
@@ -45,6 +47,7 @@ __all__ = [
     "measured_visibilities",
     "offsets_about",
     "point_sources",
+    "pointed",
     "pointing_offsets",
     "second_order",
     "true_beams",

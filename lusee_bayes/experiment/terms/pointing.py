@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.experiment.setup import Setup, mean_flux, source_responses
+from lusee_bayes.core.reading import naming
+from lusee_bayes.experiment.setup import Setup, expected_signal, mean_flux, source_responses
 from lusee_bayes.experiment.terms.term import Around, Term, Truth
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing import Pointing
@@ -65,7 +66,9 @@ def true_setup(setup: Setup, truth: Truth) -> Setup:
 
 def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
     """The setup with another observation, coupling and responses to sources; else as it is."""
-    observation = with_offsets(setup.observation, values)
+    given = ", ".join(f"{name} = {value:g}" for name, value in values.items() if value)
+    with naming(f"noise.pointing, with {given or 'no offsets'}"):
+        observation = with_offsets(setup.observation, values)
     if any(values.get(name) for name in CLOCK):
         pointing = Pointing.of(observation, setup.scenario.lmax)
     else:  # the sky turns as before
@@ -84,6 +87,16 @@ def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
         coupling=coupling,
         responses=responses,
     )
+
+
+def pointed(setup: Setup, values: Mapping[str, float] | None) -> Setup:
+    """The setup as the other terms are built about: shifted, its signal with it."""
+    if not values:
+        return setup
+    there = shifted(setup, values)
+    complete = CouplingMatrix.build(there.beams, there.pointing)
+    signal = expected_signal(there.scenario, complete, there.sky, there.background, there.responses)
+    return replace(there, signal=signal)
 
 
 def pointing_offsets(setup: Setup, around: Around) -> PointingOffsets:
