@@ -148,7 +148,8 @@ def test_as_much_is_lost_as_the_planner_says(maps):
     samples = noise.observation.live_s[noise.layout.time] / maps.samples.observation.step_s
     too_small = 1.0 - np.asarray(maps.windows.model.noise.diagonal()) / (noise.data / samples)
     assert 0.0 < too_small.max() < 2e-3
-    assert ratios.min() > 1.0 - too_small.max() - 1e-6
+    # and of the finest structure A leaves out up to 1e-5 of what little it adds
+    assert ratios.min() > 1.0 - too_small.max() - 2e-5
     lost = 0.5 * np.log2(ratios).sum()
     assert maps.fine.bits - maps.windows.bits == pytest.approx(lost, abs=1e-3)
     assert 0.1 < lost < 0.02 * maps.fine.bits
