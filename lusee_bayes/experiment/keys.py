@@ -26,6 +26,7 @@ UNITS = {
     "deg": "degrees",
     "m": "m",
     "s": "s",
+    "day": "s/day",
     "h": "h",
     "k": "K",
     "jy": "Jy",

@@ -124,11 +124,12 @@ def run_average(
     coarse.write(path)
     bits = None
     if information:
-        bits = (_bits(scenario, fine, stages), _bits(scenario, coarse, stages))
+        with stages("information of the data"):
+            before = _bits(scenario, fine)
+        with stages("and of the averages"):
+            bits = (before, _bits(scenario, coarse))
     return AverageRun(fine, coarse, bits)
 
 
-def _bits(scenario: Scenario, data: Visibilities, stages: Stages) -> float:
-    setup = set_up(scenario, data, stages)
-    with stages("information"):
-        return float(expected_posterior(setup).information_bits())
+def _bits(scenario: Scenario, data: Visibilities) -> float:
+    return float(expected_posterior(set_up(scenario, data)).information_bits())

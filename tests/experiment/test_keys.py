@@ -83,6 +83,7 @@ def test_units_are_those_of_the_names():
     units = {key.path.rsplit("_", 1)[-1]: key.unit for key in KEYS if key.unit}
     assert units == {
         "mhz": "MHz", "hz": "Hz", "deg": "degrees", "m": "m", "s": "s", "h": "h", "k": "K",
+        "day": "s/day",
         "jy": "Jy", "pf": "pF", "nh": "nH", "ohm": "Ohm",
     }  # fmt: skip
 

@@ -21,7 +21,7 @@ class PointingSection(Section):
     clock_s : float
         Samples were taken later than their times say by so many seconds.
     clock_drift_s_per_day : float
-        And later by so much more every day from the first sample on, in s/day.
+        And later by so much more every day from the first sample on.
     turntable_deg : float
         Angle of the turntable, of every run on its own.
     lon_deg : float
