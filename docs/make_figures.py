@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import Inference
 from lusee_bayes.experiment.model import base_model
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.simulate import true_values
 from lusee_bayes.linear.metrics import ell_cross, signal_to_noise
 from lusee_bayes.report.figures import coverage
