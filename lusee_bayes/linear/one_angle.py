@@ -13,7 +13,6 @@ from jaxtyping import Complex, Float, Int
 
 from lusee_bayes.core.arrays import Array, compiled, namespace, placed, scan
 from lusee_bayes.core.harmonics import mode_numbers
-from lusee_bayes.core.threads import in_threads
 from lusee_bayes.linear.time_sums import time_sums
 
 # strips of orders where they are compiled: more save products with zeros
@@ -52,7 +51,7 @@ def _from_sums(
     n_strips = n if xp is np else min(N_STRIPS, n)
     strips = list(pairwise(np.linspace(0, n, n_strips + 1).astype(int).tolist()))
 
-    def of(strip: tuple[int, int]) -> Array:
+    def put(strip: tuple[int, int], whole: Array) -> Array:
         first, end = strip
 
         def add(_, number):
@@ -62,14 +61,11 @@ def _from_sums(
         start, stop = np.searchsorted(m, (first, end))
         row = ((m - first) * 2 + s) * (n - first) + ell - first
         column = (s * end + m) * n + ell
-        here, there = row[start:stop][:, None], column[:stop][None]
-        return rows.reshape(-1, rows.shape[-1])[here, there]
+        rows = rows.reshape(-1, rows.shape[-1])[row[start:stop][:, None], column[:stop][None]]
+        return placed(whole, (slice(start, stop), slice(stop)), rows)
 
-    # the many small products of matrices leave a processor idle that has no strip of its own
-    computed = in_threads(of, strips) if xp is np else [of(strip) for strip in strips]
-    for (first, end), rows in zip(strips, computed, strict=True):
-        start, stop = np.searchsorted(m, (first, end))
-        whole = placed(whole, (slice(start, stop), slice(stop)), rows)
+    for strip in strips:
+        whole = put(strip, whole)
     return whole
 
 

@@ -70,4 +70,4 @@ def time_sums(
     full = xp.concatenate([positive[..., :0:-1].conj(), positive], axis=-1)
     place = np.zeros((n, n), dtype=int)
     place[left, right] = place[right, left] = np.arange(len(left))
-    return full[:, place]
+    return xp.take(full, place, axis=1)
