@@ -23,17 +23,22 @@ from scipy.linalg.lapack import dpotrf
 N_DATA, N_MODES = 5232, 2304
 YEAR = ["--set", "observation.step_s=600", "--set", "observation.runs=[{{cycles: 13.3683}}]"]
 CHANNELS = ["--frequencies", "5:50:1", "--draws", "20"]
+MEANS = ["--set", "observation.window=mean"]
+POINTING = ["--set", "noise.pointing={{turntable_deg: 0.3, tilt_east_deg: 0.2, clock_s: 60}}"]
 COMMANDS = {
     "--help": ["--help"],
     "info posterior.nc": ["info", "{map}/posterior.nc"],
     "info diagnostics.nc": ["info", "{map}/diagnostics.nc"],
     "info mean.fits": ["info", "{map}/mean.fits"],
     "map fiducial": ["map", "fiducial", "-o", "{map}"],
+    "map, means over windows": ["map", "fiducial", *MEANS, "-o", "{means}"],
+    "map, clock and pointing": ["map", "fiducial", *MEANS, *POINTING, "-o", "{pointing}"],
     "46 channels, each by itself": ["map", "fiducial", *CHANNELS, "-o", "{cube}"],
     "46 channels, joint": ["map", "fiducial", *CHANNELS, "--joint", "-o", "{joint}"],
     "a year every ten minutes": ["map", "fiducial", *YEAR, "-o", "{year}"],
 }
 COLD = ("map fiducial",)
+FOLDERS = ("map", "means", "pointing", "cube", "joint", "year")
 
 
 def unit() -> float:
@@ -75,7 +80,7 @@ def main() -> None:
     line = "{:28} {:>9} {:>8} {:>9} {:>8} {:>10}"
     console.print(line.format("command", "cold [s]", "[units]", "warm [s]", "[units]", "peak [GB]"))
     with tempfile.TemporaryDirectory() as place:
-        folders = {name: f"{place}/{name}" for name in ("map", "cube", "joint", "year")}
+        folders = {name: f"{place}/{name}" for name in FOLDERS}
         cache = Path(place) / "cache"
         run(["map", "fiducial", "-q", "-o", folders["map"]], cache)
         for name, words in COMMANDS.items():
