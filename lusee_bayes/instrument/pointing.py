@@ -13,6 +13,7 @@ Means over windows, and what of all this depends on time, are left to :mod:`.win
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import equinox as eqx
 import numpy as np
@@ -43,8 +44,10 @@ class Pointing(eqx.Module):
         u_j(t), what else A knows of time.
     factors : (functions, powers, orders, 2) array
         G_j(p, m), real and imaginary part: what the beams take up for each function.
+    pole_frame : (3, 3) array
+        The rotation of vectors from Galactic coordinates to the frame P.
     pole_from_galactic : Rotation
-        From Galactic coordinates to the frame P.
+        The same of harmonics.
     mcmf_from_lander : Rotation
         From the frame of the lander, at turntable angle zero, to the Moon-fixed one.
     turntable : (runs,) array
@@ -61,6 +64,7 @@ class Pointing(eqx.Module):
     azimuth: Float[Array, " times"]
     functions: Float[Array, "times functions"]
     factors: Float[Array, "functions powers orders 2"]
+    pole_frame: Float[Array, "3 3"]
     pole_from_galactic: Rotation
     mcmf_from_lander: Rotation
     turntable: Float[Array, " runs"]
@@ -69,7 +73,13 @@ class Pointing(eqx.Module):
     turns: Float[Array, "4"] | None = None
 
     @classmethod
-    def of(cls, observation: Observation, lmax: int, order: int | None = None) -> Pointing:
+    def of(
+        cls,
+        observation: Observation,
+        lmax: int,
+        order: int | None = None,
+        pole_frame: Float[np.ndarray, "3 3"] | None = None,
+    ) -> Pointing:
         """Return the pointing of every sample of an observation.
 
         Parameters
@@ -79,6 +89,9 @@ class Pointing(eqx.Module):
         order : int, optional
             Of the expansion in the tilt: 0 fixes the axis at its mean; by default the lowest one
             whose error is negligible, see :func:`sufficient_order`.
+        pole_frame : (3, 3) array, optional
+            That of another observation about the same time; by default of the mean pole over this
+            one.
 
         Returns
         -------
@@ -97,7 +110,8 @@ class Pointing(eqx.Module):
             angle = lmax * FASTEST_TURN * float(longest) / 2.0
         instants, sample, weight = observation.at_nodes(sufficient_nodes(angle))
         mcmf = instants.mcmf_from_galactic()
-        pole_frame = mean_pole_frame(mcmf)
+        if pole_frame is None:
+            pole_frame = mean_pole_frame(mcmf)
         azimuth, tilt = split(mcmf @ pole_frame.T)
         if order is None:
             order = sufficient_order(tilt, lmax)
@@ -107,26 +121,24 @@ class Pointing(eqx.Module):
             azimuth=azimuth,
             functions=functions,
             factors=factors,
-            pole_from_galactic=Rotation.from_matrix(pole_frame, lmax),
-            mcmf_from_lander=Rotation.from_matrix(observation.lander_from_mcmf().T, lmax),
+            pole_frame=pole_frame,
+            pole_from_galactic=_rotation(pole_frame, lmax),
+            mcmf_from_lander=_rotation(observation.lander_from_mcmf().T, lmax),
             turntable=np.radians(np.array(observation.turntable_deg, dtype=np.float64)),
             run_starts=tuple(int(s) for s in starts),
             order=order,
         )
 
-    def placed(self, before: Observation, observation: Observation) -> Pointing:
+    def placed(self, observation: Observation) -> Pointing:
         """Return the pointing of an observation at the same times and windows, but elsewhere.
 
         Parameters
         ----------
-        before : Observation
-            That of this pointing.
         observation : Observation
             With its own site, lean and turntable angles.
         """
-        lander, turn = self.mcmf_from_lander, observation.lander_from_mcmf()
-        if not np.array_equal(turn, before.lander_from_mcmf()):
-            lander = Rotation.from_matrix(turn.T, len(lander.blocks) - 1)
+        lmax = len(self.mcmf_from_lander.blocks) - 1
+        lander = _rotation(observation.lander_from_mcmf().T, lmax)
         angles = np.radians(np.array(observation.turntable_deg, dtype=np.float64))
         return replace(self, mcmf_from_lander=lander, turntable=angles)
 
@@ -139,6 +151,16 @@ class Pointing(eqx.Module):
         """Return the number of each run and the slice of its samples."""
         bounds = zip(self.run_starts[:-1], self.run_starts[1:], strict=True)
         return [(number, slice(first, end)) for number, (first, end) in enumerate(bounds)]
+
+
+def _rotation(matrix: Float[np.ndarray, "3 3"], lmax: int) -> Rotation:
+    """Of harmonics; what was asked for before, as all channels of a site do, is there."""
+    return _rotation_of(np.ascontiguousarray(matrix).tobytes(), lmax)
+
+
+@lru_cache(maxsize=8)
+def _rotation_of(matrix: bytes, lmax: int) -> Rotation:
+    return Rotation.from_matrix(np.frombuffer(matrix).reshape(3, 3), lmax)
 
 
 def mean_pole_frame(mcmf: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "3 3"]:

@@ -70,9 +70,10 @@ def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
     with naming(f"noise.pointing, with {given or 'no offsets'}"):
         observation = with_offsets(setup.observation, values)
     if any(values.get(name) for name in CLOCK):
-        pointing = Pointing.of(observation, setup.scenario.lmax)
+        frame = np.asarray(setup.pointing.pole_frame)
+        pointing = Pointing.of(observation, setup.scenario.lmax, pole_frame=frame)
     else:  # the sky turns as before
-        pointing = setup.pointing.placed(setup.observation, observation)
+        pointing = setup.pointing.placed(observation)
     coupling = CouplingMatrix.build(setup.beams, pointing, setup.layout)
     responses = setup.responses
     if responses:
