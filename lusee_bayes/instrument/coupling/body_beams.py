@@ -49,10 +49,14 @@ def _taken_up(
     factors: Float[Array, "functions powers orders 2"],
 ) -> Float[Array, "products functions modes"]:
     """sum_p G_j(p, m) W_p, a complex factor for each pair c_m + i c_-m."""
-    _, m = mode_numbers(lmax_of(tilted.shape[-1]))
-    mirrored = tilted[..., np.arange(len(m)) - 2 * m]
+    ell, m = mode_numbers(lmax_of(tilted.shape[-1]))
     xp = namespace(tilted, factors)
-    real = factors[..., 0][..., np.abs(m)]
-    imaginary = factors[..., 1][..., np.abs(m)] * np.sign(m).astype(np.float64)[None, None]
-    straight = xp.einsum("kpm,jpm->kjm", tilted, real)
-    return straight - xp.einsum("kpm,jpm->kjm", mirrored, imaginary)
+    # modes side by side in memory, as products of matrices want them
+    mirrored = xp.take(tilted, ell * (ell + 1) - m, axis=-1)
+    real = xp.take(factors[..., 0], np.abs(m), axis=-1)
+    sign = np.sign(m).astype(np.float64)[None, None]
+    imaginary = xp.take(factors[..., 1], np.abs(m), axis=-1) * sign
+    return sum(
+        tilted[:, None, p] * real[None, :, p] - mirrored[:, None, p] * imaginary[None, :, p]
+        for p in range(tilted.shape[1])
+    )
