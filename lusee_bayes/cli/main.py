@@ -1,6 +1,6 @@
 """The command line: parsing, error messages and exit codes. The work is in ``runs``.
 
-Exit codes: 0 success, 1 a validation that failed or a process that was lost, 2 bad input (one
+Exit codes: 0 success, 1 a validation that failed or workers that were lost, 2 bad input (one
 sentence on standard error), 130 interrupted.
 """
 
@@ -16,7 +16,7 @@ from rich.console import Console
 
 from lusee_bayes.cli.commands import COMMANDS, help_of
 from lusee_bayes.core.command_line import COMMAND
-from lusee_bayes.core.errors import InputError, ProcessLost
+from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.version import __version__
 
 app = App(
@@ -25,7 +25,7 @@ app = App(
     suppress_keyboard_interrupt=False,
     help=(
         "Bayesian maps of the low-frequency sky from LuSEE-Night's visibilities.\n\n"
-        "Exit codes: 0 success, 1 a validation that failed or a process that was lost, 2 bad input "
+        "Exit codes: 0 success, 1 a validation that failed or workers that were lost, 2 bad input "
         "(one sentence on standard error), 130 interrupted. lusee-bayes COMMAND --help shows "
         "examples."
     ),
@@ -63,7 +63,7 @@ def main(arguments: list[str] | None = None) -> int:
         at = f" ('{error.filename}')" if error.filename else ""
         errors.print(f"lusee-bayes: {error.strerror}{at}; results are whole or as they were")
         return 1
-    except ProcessLost as error:
+    except WorkersLost as error:
         errors.print(f"lusee-bayes: {error}", markup=False)
         return 1
     except KeyboardInterrupt as interrupt:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from rich.console import Console
 
 from lusee_bayes.cli.options import (
-    Count,
+    Cluster,
     Flag,
     Force,
     Frequencies,
@@ -17,6 +16,7 @@ from lusee_bayes.cli.options import (
     Overrides,
     Quiet,
     Verbose,
+    Workers,
     default_folder,
     load,
     say,
@@ -38,13 +38,13 @@ def map_command(
     onto: Path | None = None,
     frequencies: Frequencies = None,
     joint: Flag = False,
-    processes: Count = 1,
-    devices: Count | None = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
     set_: Overrides | None = None,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
-) -> int | None:
+) -> None:
     """Make a posterior map of a scenario, or of given data.
 
     Parameters
@@ -73,10 +73,12 @@ def map_command(
         command continues an interrupted run.
     joint
         One posterior for the skies of all channels, with the scenario's spectral prior.
-    processes
-        Number of processes on this machine that share the channels. Under Slurm, srun sets it.
-    devices
-        Number of devices to make of the CPU, which share the channels.
+    workers
+        Processes of this machine that share out the channels; by default as many as pay. With
+        several GPUs, each has one.
+    cluster
+        Address of a Dask scheduler, as tcp://host:8786, whose workers share out the channels; by
+        default DASK_SCHEDULER_ADDRESS.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
     force
@@ -86,10 +88,9 @@ def map_command(
     verbose
         Print the memory in use after every stage.
     """
-    from lusee_bayes.core.launcher import run_processes
-    from lusee_bayes.core.process_group import use_cpu_devices
-    from lusee_bayes.core.rendezvous import is_launched, join
+    from lusee_bayes.core.workers import open_engine
     from lusee_bayes.report.pages import REPORT
+    from lusee_bayes.results.cost import demand_of_channels
     from lusee_bayes.runs.map_run import run_map
 
     console = Console(quiet=quiet, soft_wrap=True)
@@ -103,26 +104,16 @@ def map_command(
         output__compact=compact,
         output__updatable=updatable,
     )
-    if not resolved.frequencies_mhz and (processes != 1 or devices is not None):
-        raise InputError("--processes and --devices share out channels; give --frequencies")
-    if processes != 1 and not is_launched():
-        return run_processes(processes, sys.argv[1:])
-    if devices is not None:
-        use_cpu_devices(devices)
     folder = output or default_folder(scenario)
-    with join() as group:
-        stages = Stages(console if group.is_first else None, verbose=verbose)
-        run = run_map(
-            resolved,
-            folder,
-            data=data,
-            truth=truth,
-            onto=onto,
-            group=group,
-            replace=force,
-            stages=stages,
-        )
-        if group.is_first:
-            say(console, *(f"  {path}" for path in run.files), *run.result.lines())
-            say(console, f"look at {run.folder / REPORT}")
-    return None
+    stages = Stages(console, verbose=verbose)
+    given = {"data": data, "truth": truth, "onto": onto, "replace": force, "stages": stages}
+    if resolved.frequencies_mhz:
+        demand = demand_of_channels(resolved)
+        with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+            run = run_map(resolved, folder, engine=engine, **given)
+    elif workers is None and cluster is None:
+        run = run_map(resolved, folder, **given)
+    else:
+        raise InputError("--workers and --cluster share out channels; give --frequencies")
+    say(console, *(f"  {path}" for path in run.files), *run.result.lines())
+    say(console, f"look at {run.folder / REPORT}")

@@ -42,6 +42,9 @@ def _whole(least: int) -> Callable[[object, Sequence[Token]], int]:
 # so many of something: none of them is possible, or at least one
 Number = Annotated[int, Parameter(converter=_whole(0))]
 Count = Annotated[int, Parameter(converter=_whole(1))]
+# what carries out the tasks of a run
+Workers = Annotated[int | None, Parameter(name="--workers", converter=_whole(1))]
+Cluster = Annotated[str | None, Parameter(name="--cluster")]
 Flag = Annotated[bool, Parameter(negative="")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 Force = Annotated[bool, Parameter(name="--force", negative="")]

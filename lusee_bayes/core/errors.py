@@ -24,8 +24,8 @@ class InputError(ValueError):
         super().__init__(text)
 
 
-class ProcessLost(RuntimeError):
-    """Raised when another process of the run has ended, so that this one cannot go on."""
+class WorkersLost(RuntimeError):
+    """Raised when workers fail again and again, or are gone; the message is one sentence."""
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

@@ -23,6 +23,13 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
+def processors() -> int:
+    """How many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def in_threads(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
     """Call a function with every item; what it gives, in their order.
 
@@ -37,7 +44,7 @@ def in_threads(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
     -------
     list
     """
-    n_threads = min(len(items), os.cpu_count() or 1, MOST)
+    n_threads = min(len(items), processors(), MOST)
     if n_threads < 2:
         return [function(item) for item in items]
     with threads(n_threads) as pool:
@@ -47,7 +54,7 @@ def in_threads(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
 @contextmanager
 def threads(n: int) -> Iterator[ThreadPoolExecutor]:
     """Start so many threads, each with its share of the processors for products of matrices."""
-    share = max(1, (os.cpu_count() or 1) // n)
+    share = max(1, processors() // n)
     with threadpool_limits(share, "blas"), ThreadPoolExecutor(n) as pool:
         yield pool
 

@@ -144,6 +144,12 @@ class ComponentSums(eqx.Module):
         matrices = np.zeros((k * (k + 1) // 2, n, n))
         return cls(matrices, np.zeros((k, n)), maps, zero, zero, zero)
 
+    def plus(self, others: ComponentSums) -> ComponentSums:
+        """Add the sums of other channels, about the same reference maps; neither is changed."""
+        names = ("matrices", "vectors", "misfit", "log_det", "n_data")
+        both = {name: getattr(self, name) + getattr(others, name) for name in names}
+        return replace(self, **both)
+
     def information(self) -> Information:
         """Information about all component maps in one vector, the first map first."""
         return _assembled(self)

@@ -8,13 +8,14 @@ Factorisations of them take nearly all of the time.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import ceil
 
 import numpy as np
 
+from lusee_bayes.core.engine import Demand
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.memory import gigabytes, memory_limit
 from lusee_bayes.core.progress import Stages
@@ -74,6 +75,29 @@ class Cost:
             f"  {channels}{self.n_data:,} data, {self.n_unknowns:,} unknowns: about "
             f"{gigabytes(self.memory)} of memory"
         )
+
+
+def demand_of(costs: Sequence[Cost]) -> Demand:
+    """What independent posteriors take, one or more."""
+    memory = max(cost.memory for cost in costs) - BASE_BYTES
+    seconds = sum(cost.operations for cost in costs) / _operations_a_second()
+    return Demand(len(costs), BASE_BYTES, memory, seconds)
+
+
+def demand_of_channels(scenario: Scenario) -> Demand:
+    """What the channels of a scenario take, of several frequencies."""
+    channels = scenario.channels()
+    demand = demand_of([posterior_cost(channels[0])] * len(channels))
+    if not scenario.joint:
+        return demand
+    # sums over channels, of every pair of components, and another one that is added
+    count = len(
+        scenario.spectral.fields
+        if scenario.spectral.model == "positive"
+        else scenario.spectral.components
+    )
+    sums = 16.0 * (count * (count + 1) / 2) * (scenario.lmax + 1) ** 4
+    return replace(demand, task_bytes=demand.task_bytes + sums)
 
 
 def duration(seconds: float) -> str:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.process_group import ProcessGroup
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build, with_truth
@@ -19,7 +19,6 @@ from lusee_bayes.linear.positive_channel import positive_sky
 from lusee_bayes.results.channel import ChannelResult, channel_of_information
 from lusee_bayes.results.channel_files import ChannelFiles, identity_of
 from lusee_bayes.results.channel_information import ChannelInformation
-from lusee_bayes.results.channel_threads import each_channel
 from lusee_bayes.results.coverage import N_DRAWS
 from lusee_bayes.results.cube import CubeResult
 from lusee_bayes.results.draws import (
@@ -29,6 +28,7 @@ from lusee_bayes.results.draws import (
     posterior_draws,
     widths,
 )
+from lusee_bayes.results.joint_channels import names_of
 from lusee_bayes.results.joint_components import (
     LEAST_DRAWS,
     Components,
@@ -43,12 +43,10 @@ def cube_result(
     *,
     data: Path | None = None,
     truth: bool = False,
-    group: ProcessGroup | None = None,
+    engine: Engine | None = None,
     stages: Stages | None = None,
 ) -> CubeResult:
     """Work out all channels, going on from what an interrupted run has left in ``folder``.
-
-    Every process of ``group`` has to call it; all of them return the whole cube.
 
     Parameters
     ----------
@@ -60,8 +58,8 @@ def cube_result(
         File of measured data; without it the scenario's own are simulated.
     truth : bool
         The data are of the scenario's own sky.
-    group : ProcessGroup, optional
-        The processes that share the channels.
+    engine : Engine, optional
+        What carries out the channels; by default this process.
     stages : Stages, optional
         Told what is being done.
 
@@ -70,13 +68,16 @@ def cube_result(
     InputError
         For a scenario without frequencies, and as :func:`infer` for a channel.
     """
-    group, stages = group or ProcessGroup(), stages or Stages()
+    engine, stages = engine or ThisProcess(), stages or Stages()
+    engine.work_in(folder)
     if not scenario.frequencies_mhz:
         raise InputError("the scenario names no frequencies_mhz; give --frequencies")
     iterative = scenario.joint and is_iterative(scenario)
     n_draws = max(scenario.output.draws, LEAST_DRAWS if iterative else 0)
-    files = ChannelFiles(folder, identity_of(scenario, data, truth, n_draws))
+    # workers may have other folders of their own
+    files = ChannelFiles(folder.resolve(), identity_of(scenario, data, truth, n_draws))
     channels = scenario.channels()
+    names = [names_of((channel,)) for channel in channels]
     wanted = "information" if scenario.joint else "result"
 
     def observe(channel: Scenario) -> None:
@@ -109,40 +110,36 @@ def cube_result(
         )
         files.write(channel, wanted, found.to_dataset())
 
-    each_channel(observe, channels, group, stages, "channels")
-    group.barrier("channels")
+    engine.each(Tasks(observe, channels, names), stages, "channels")
     components = None
     if scenario.joint:
         # coverage is compared with draws; after conjugate gradients with those that there are
         known = (data is None or truth) and not iterative
         n_solved = max(n_draws, N_DRAWS) if known else n_draws
-        components = solve_components(scenario, files, n_solved, group, stages)
-        each_channel(
-            lambda channel: _write_joint_sky(
-                channel, channels, components, scenario, files, n_draws
-            ),
-            channels,
-            group,
-            stages,
-            "joint skies",
-        )
-        group.barrier("joint")
+        components = solve_components(scenario, files, n_solved, engine, stages)
+        # for workers of other processes
+        shared = on_host(components)
+
+        def write_sky(number: int) -> None:
+            _write_joint_sky(number, channels, shared, scenario, files, n_draws)
+
+        engine.each(Tasks(write_sky, range(len(channels)), names), stages, "joint skies")
     found = tuple(ChannelResult.from_dataset(files.read(c, "result")) for c in channels)
     return CubeResult(scenario, found, components, stages.seconds)
 
 
 def _write_joint_sky(
-    channel: Scenario,
+    number: int,
     channels: tuple[Scenario, ...],
     components: Components,
     scenario: Scenario,
     files: ChannelFiles,
     n_draws: int,
 ) -> None:
+    channel, key = channels[number], draw_key(scenario)
     if files.has(channel, "result"):
         return
     known = ChannelInformation.from_dataset(files.read(channel, "information"))
-    number, key = channels.index(channel), draw_key(scenario)
     if components.mode is not None:
         sky = positive_sky(
             components.mode,

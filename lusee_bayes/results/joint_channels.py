@@ -1,29 +1,30 @@
-"""The channels of a joint posterior, in the files of a run that several processes may share."""
+"""The channels of a joint posterior, in the files of a run, and sums over them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from threading import get_ident
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.process_group import ProcessGroup
+from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.engine import Engine, Tasks
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.joint import ComponentSums, summed
 from lusee_bayes.results.channel_files import ChannelFiles
 from lusee_bayes.results.channel_information import ChannelInformation
-from lusee_bayes.results.channel_threads import each_channel
 from lusee_bayes.sky.spectral_prior import SpectralPrior
+
+# channels that one task adds up, one after the other
+BLOCK = 4
 
 
 @dataclass(frozen=True)
 class ChannelsInFiles:
-    """Channels whose information is read from files, each by the process that it belongs to.
+    """Channels whose information is read from files, by whatever carries out the tasks.
 
     Attributes
     ----------
@@ -31,20 +32,19 @@ class ChannelsInFiles:
         Of the whole run.
     files : ChannelFiles
         With the information of every channel.
-    group : ProcessGroup
+    engine : Engine
     stages : Stages
         Told what is being done.
     """
 
     channels: tuple[Scenario, ...]
     files: ChannelFiles
-    group: ProcessGroup
+    engine: Engine
     stages: Stages
 
     def read(self, channel: int) -> Information:
         """What the data of a channel say."""
-        dataset = self.files.read(self.channels[channel], "information")
-        return ChannelInformation.from_dataset(dataset).information
+        return _information(self.files, self.channels[channel])
 
     def each(
         self,
@@ -52,14 +52,15 @@ class ChannelsInFiles:
         shapes: dict[str, tuple[int, ...]],
     ) -> dict[str, np.ndarray]:
         """Call a function with number and information of every channel; its arrays, stacked."""
-        found = {name: np.zeros((len(self.channels), *shape)) for name, shape in shapes.items()}
+        files, channels = self.files, self.channels
 
-        def call(number: int) -> None:
-            for name, value in function(number, self.read(number)).items():
-                found[name][number] = value
+        def call(number: int) -> dict[str, np.ndarray]:
+            return function(number, _information(files, channels[number]))
 
-        self._each(call)
-        return {name: self.group.total(array) for name, array in found.items()}
+        numbers = range(len(channels))
+        tasks = Tasks(call, numbers, [names_of(channels[k : k + 1]) for k in numbers])
+        found = self.engine.each(tasks, self.stages, "joint sums")
+        return {name: np.stack([np.asarray(one[name]) for one in found]) for name in shapes}
 
     def summed(
         self,
@@ -68,38 +69,32 @@ class ChannelsInFiles:
         function: Callable[[int, Information], Information],
     ) -> Information:
         """What a function of every channel's information says of the component maps."""
-        start = ComponentSums.empty(prior, reference)
-        by_thread: dict[int, ComponentSums] = {}
+        files, channels = self.files, self.channels
 
-        def add(number: int) -> None:
-            information = function(number, self.read(number))
-            # every thread has sums of its own, on its device
-            before = by_thread.get(get_ident())
-            if before is None:
-                before = ComponentSums.empty(prior, reference)
-            by_thread[get_ident()] = jax.block_until_ready(
-                summed(before, prior, number, information)
-            )
+        def add(numbers: range) -> ComponentSums:
+            sums = ComponentSums.empty(prior, reference)
+            for number in numbers:
+                information = function(number, _information(files, channels[number]))
+                sums = summed(sums, prior, number, information)
+            return on_host(sums)
 
-        self._each(add)
-        leaves, shape = jax.tree.flatten(start)
-        # with the empty ones: a process may have no channels
-        parts = [jax.tree.leaves(sums) for sums in (start, *by_thread.values())]
-        # everything but the maps that all is written about is a sum
-        whole = [
-            leaf
-            if leaf is start.reference
-            else self.group.total(np.asarray(sum(np.asarray(part[k]) for part in parts)))
-            for k, leaf in enumerate(leaves)
+        # the same blocks, and the same tree of them, whatever carries out the tasks
+        blocks = [
+            range(first, min(first + BLOCK, len(channels)))
+            for first in range(0, len(channels), BLOCK)
         ]
-        return jax.tree.unflatten(shape, whole).information()
+        names = [names_of(channels[block.start : block.stop]) for block in blocks]
+        tasks = Tasks(add, blocks, names)
+        return self.engine.reduced(
+            tasks, ComponentSums.plus, self.stages, "joint sums"
+        ).information()
 
-    def _each(self, function: Callable[[int], None]) -> None:
-        number = {channel.frequency_mhz: k for k, channel in enumerate(self.channels)}
-        each_channel(
-            lambda channel: function(number[channel.frequency_mhz]),
-            self.channels,
-            self.group,
-            self.stages,
-            "joint sums",
-        )
+
+def names_of(channels: tuple[Scenario, ...]) -> str:
+    """What one channel, or neighbouring ones, are called: 25 MHz, or 25 to 28 MHz."""
+    first, last = (f"{c.frequency_mhz:g}" for c in (channels[0], channels[-1]))
+    return f"{first} MHz" if len(channels) == 1 else f"{first} to {last} MHz"
+
+
+def _information(files: ChannelFiles, channel: Scenario) -> Information:
+    return ChannelInformation.from_dataset(files.read(channel, "information")).information

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.process_group import ProcessGroup
+from lusee_bayes.core.engine import Engine
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.iterative_joint import DIRECT_UNKNOWNS, solve_iteratively
@@ -83,7 +83,7 @@ def is_iterative(scenario: Scenario) -> bool:
 
 
 def solve_components(
-    scenario: Scenario, files: ChannelFiles, n_draws: int, group: ProcessGroup, stages: Stages
+    scenario: Scenario, files: ChannelFiles, n_draws: int, engine: Engine, stages: Stages
 ) -> Components:
     """Work out the joint posterior from the files of all channels.
 
@@ -95,7 +95,8 @@ def solve_components(
         With the information of every channel.
     n_draws : int
         Draws of the component maps.
-    group : ProcessGroup
+    engine : Engine
+        What carries out the channels.
     stages : Stages
         Told what is being done.
 
@@ -105,7 +106,7 @@ def solve_components(
         If conjugate gradients do not converge, or data are too precise to be solved for.
     """
     channels = scenario.channels()
-    at_hand = ChannelsInFiles(channels, files, group, stages)
+    at_hand = ChannelsInFiles(channels, files, engine, stages)
     if scenario.spectral.model == "positive":
         return _positive(scenario, at_hand, n_draws, stages)
     small = [files.read(channel, "information", ["reference", "sky"]) for channel in channels]

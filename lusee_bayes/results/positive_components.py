@@ -101,7 +101,5 @@ def positive_mode(scenario: Scenario, channels: ChannelsInFiles, stages: Stages)
     coarse = lmax_of_fields(scenario, min(scenario.lmax, COARSE_LMAX))
     with stages.progress("laws of the fields", MAX_ROUNDS) as report:
         laws = learn_laws(skies, silent, lmax_fields=coarse, report=report)
-    # all processes go on from the same ones, to the last bit
-    shared = channels.group.total(laws.parameters) / channels.group.processes
     with stages.progress("positive skies", MAX_ROUNDS) as report:
-        return find_joint_mode(skies, laws.with_parameters(shared), silent, report=report)
+        return find_joint_mode(skies, laws, silent, report=report)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from lusee_bayes.core.compilation_cache import publish, use_compilation_cache
 from lusee_bayes.core.destinations import locked, require_folder
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.files import MANIFEST, recover, transaction
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.report.figures.drawing import save
@@ -78,7 +78,6 @@ def run_folder(
     resume: str = "",
     *,
     replace: bool = False,
-    alone: bool = True,
 ) -> Iterator[Path]:
     """Open a folder for a run, and say what it holds if the run is interrupted.
 
@@ -92,8 +91,6 @@ def run_folder(
         How the run is gone on with.
     replace : bool
         Replace results of another run.
-    alone : bool
-        Keep other runs out. Of several processes of one run, the first does.
 
     Yields
     ------
@@ -107,13 +104,14 @@ def run_folder(
         its results there.
     RunInterrupted
         Instead of KeyboardInterrupt.
+    WorkersLost
+        With what the folder holds added to its message.
     """
     folder = Path(folder)
     require_folder(folder)
     made = _made(folder)
-    lock = locked(folder) if alone else nullcontext()
     try:
-        with lock:
+        with locked(folder):
             recover(folder)
             if not replace:
                 require_own(folder, (kind.name, *kind.after), origin)
@@ -126,6 +124,9 @@ def run_folder(
                 raise
             except KeyboardInterrupt as interrupt:
                 raise RunInterrupted(_state(folder, before, kind.unfinished, resume)) from interrupt
+            except WorkersLost as error:
+                state = _state(folder, before, kind.unfinished, resume)
+                raise WorkersLost(f"{error}; {state}") from error
             finally:
                 publish()
     finally:

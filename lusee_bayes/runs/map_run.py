@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from lusee_bayes.core.process_group import ProcessGroup
+from lusee_bayes.core.engine import Engine
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.tables import rows_of, write_csv
 from lusee_bayes.experiment.data_files import read_data
@@ -63,7 +63,7 @@ def run_map(
     data: Path | None = None,
     truth: bool = False,
     onto: Path | None = None,
-    group: ProcessGroup | None = None,
+    engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
 ) -> MapRun:
@@ -84,8 +84,8 @@ def run_map(
         The given data are of the scenario's own sky: compare the map with it.
     onto : Path, optional
         Folder of an updatable run, to whose data these are added.
-    group : ProcessGroup, optional
-        The processes that share the channels; only the first one writes.
+    engine : Engine, optional
+        What carries out the channels; by default this process.
     replace : bool
         Replace results of another run in the folder.
     stages : Stages, optional
@@ -96,7 +96,7 @@ def run_map(
     InputError
         If the scenario samples something, or for whatever is wrong with scenario, data or folder.
     """
-    group, stages = group or ProcessGroup(), stages or Stages()
+    stages = stages or Stages()
     require_marginal("a map", "use: lusee-bayes sample", scenario.samples)
     if not scenario.frequencies_mhz:
         return _run_single(scenario, folder, data, truth, onto, replace, stages)
@@ -109,11 +109,9 @@ def run_map(
     origin = origin_of(scenario, data, truth=truth or None)
     cost = posterior_cost(scenario)
     require_fits(cost, scenario)
-    with run_folder(folder, CUBE, origin, resume, replace=replace, alone=group.is_first) as place:
+    with run_folder(folder, CUBE, origin, resume, replace=replace) as place:
         stages.say(cost.line())
-        cube = cube_result(scenario, place, data=data, truth=truth, group=group, stages=stages)
-        if not group.is_first:
-            return MapRun(cube, place, [])
+        cube = cube_result(scenario, place, data=data, truth=truth, engine=engine, stages=stages)
         provenance = _provenance_of_channels(scenario, data, cube)
         return MapRun(cube, place, write_run(place, cube, CUBE, origin, stages, provenance))
 

@@ -1,0 +1,171 @@
+"""Which engine carries out the tasks of a run: this process, workers of its own, or a cluster."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from importlib.util import find_spec
+
+import jax
+
+from lusee_bayes.core.engine import SIDE_BY_SIDE, Demand, Engine, ThisProcess
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.memory import gigabytes, memory_limit
+from lusee_bayes.core.threads import processors
+
+# the variable by which Dask's own programs are told of a cluster
+SCHEDULER = "DASK_SCHEDULER_ADDRESS"
+# workers pay where each has two processors for each of its tasks, and the run takes long enough
+# for them to start: on two processors a second process gains nothing (docs/cubes.md)
+PROCESSORS_OF_WORKER, LONG_S = 2 * SIDE_BY_SIDE, 60.0
+# how long a scheduler has to answer
+ANSWER = "10s"
+
+
+@contextmanager
+def open_engine(
+    demand: Demand,
+    workers: int | None = None,
+    cluster: str | None = None,
+    *,
+    verbose: bool = False,
+    say: Callable[[str], None] = lambda line: None,
+) -> Iterator[Engine]:
+    """Start what is to carry out the tasks of a run, and end it after the block.
+
+    Parameters
+    ----------
+    demand : Demand
+        What the tasks take.
+    workers : int, optional
+        Processes of this machine; one is this process, without any server. By default as many as
+        pay.
+    cluster : str, optional
+        Address of the scheduler of a Dask cluster, as tcp://host:8786; by default that of the
+        environment variable ``DASK_SCHEDULER_ADDRESS``, if it is set.
+    verbose : bool
+        Say where Dask's dashboard is.
+    say : callable
+        Prints a line.
+
+    Yields
+    ------
+    Engine
+
+    Raises
+    ------
+    InputError
+        If Dask is not installed, the workers do not fit into the memory, no scheduler answers, or
+        as :class:`.DaskEngine`.
+    """
+    if workers is not None and cluster is not None:
+        raise InputError("--workers starts workers of its own, --cluster uses others; give one")
+    if workers is None and cluster is None:
+        cluster = os.environ.get(SCHEDULER) or None
+    with ExitStack() as stack:
+        if cluster is not None:
+            _require_dask("--cluster")
+            place: object = cluster
+        else:
+            wanted = workers_that_pay(demand) if workers is None else workers
+            if wanted == 1:
+                yield ThisProcess()
+                return
+            _require_dask("--workers")
+            place = stack.enter_context(_own_workers(wanted, demand, verbose))
+        yield stack.enter_context(_connected(place, demand, verbose, say))
+
+
+def workers_that_pay(demand: Demand) -> int:
+    """How many workers are worth starting on this machine; 1 is this process."""
+    if not _dask_is_there():
+        return 1
+    devices = _gpus()
+    if devices > 1:
+        return min(devices, demand.n_tasks)
+    if demand.seconds < LONG_S:
+        return 1
+    by_memory = int(memory_limit() // demand.process_bytes(SIDE_BY_SIDE))
+    by_tasks = demand.n_tasks // SIDE_BY_SIDE
+    return max(1, min(processors() // PROCESSORS_OF_WORKER, by_memory, by_tasks))
+
+
+def _gpus() -> int:
+    return len(jax.local_devices()) if jax.default_backend() == "gpu" else 0
+
+
+def _dask_is_there() -> bool:
+    return find_spec("distributed") is not None
+
+
+def _require_dask(option: str) -> None:
+    if not _dask_is_there():
+        raise InputError(f"{option} needs Dask; install it: pip install 'lusee_bayes[cluster]'")
+
+
+@contextmanager
+def _own_workers(n: int, demand: Demand, verbose: bool) -> Iterator[object]:
+    """A cluster of this machine alone, whose processors and memory its workers share."""
+    import distributed
+
+    side_by_side = min(SIDE_BY_SIDE, max(1, processors() // n))
+    needed, share = demand.process_bytes(side_by_side), memory_limit() / n
+    if needed > share:
+        fit = int(memory_limit() // demand.process_bytes(1))
+        raise InputError(
+            f"{n} workers need about {gigabytes(n * needed)} of memory; this machine has "
+            f"{gigabytes(memory_limit())}: " + (f"use --workers {fit}" if fit > 0 else "use none")
+        )
+    devices = _gpus()
+    local = {"host": "127.0.0.1"}
+    server = {**local, "port": 0, "dashboard": verbose, "dashboard_address": "127.0.0.1:0"}
+    options = {**local, "nthreads": side_by_side, "memory_limit": int(share)}
+    kinds = {"cls": distributed.Nanny}
+
+    def options_of(worker: int) -> dict[str, object]:
+        if devices == 0:
+            return options
+        # a GPU each; none takes all of its memory at once
+        seen = {"CUDA_VISIBLE_DEVICES": _gpu(worker % devices)}
+        return {**options, "env": {**seen, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}}
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    with distributed.SpecCluster(
+        scheduler={"cls": distributed.Scheduler, "options": server},
+        workers={worker: {**kinds, "options": options_of(worker)} for worker in range(n)},
+        silence_logs=logging.CRITICAL,
+        name="lusee_bayes",
+    ) as own:
+        yield own
+
+
+def _gpu(number: int) -> str:
+    """What CUDA calls the device: one of those that this process may see."""
+    seen = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return seen.split(",")[number] if seen else str(number)
+
+
+@contextmanager
+def _connected(
+    place: object, demand: Demand, verbose: bool, say: Callable[[str], None]
+) -> Iterator[Engine]:
+    import distributed
+
+    from lusee_bayes.core.dask_engine import DaskEngine
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    try:
+        client = distributed.Client(place, timeout=ANSWER, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(
+            f"no Dask scheduler answers at '{place}' ({' '.join(str(error).split())[:200]}); start "
+            "one with: dask scheduler"
+        ) from error
+    try:
+        if verbose:
+            say(f"  Dask's dashboard: {client.dashboard_link or 'none; pip install bokeh'}")
+        yield DaskEngine(client, demand)
+    finally:
+        client.close()
