@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from lusee_bayes.cli.options import (
+    Cluster,
     Flag,
     Force,
     Number,
@@ -14,6 +15,7 @@ from lusee_bayes.cli.options import (
     Overrides,
     Quiet,
     Verbose,
+    Workers,
     default_folder,
     load,
     say,
@@ -31,6 +33,8 @@ def compare_priors_command(
     draws: Number = 100,
     output: Output = None,
     set_: Overrides | None = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -55,6 +59,12 @@ def compare_priors_command(
         Folder for the results; by default output/NAME-priors.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
+    workers
+        Processes of this machine that share out the priors; by default as many
+        as pay.
+    cluster
+        Address of a Dask scheduler, as tcp://host:8786, whose workers share out the priors;
+        by default DASK_SCHEDULER_ADDRESS.
     force
         Replace results of another run in the folder.
     quiet
@@ -63,21 +73,29 @@ def compare_priors_command(
         Print the memory in use after every stage.
     """
     from lusee_bayes.cli.tables import priors_table
+    from lusee_bayes.core.workers import open_engine
+    from lusee_bayes.experiment.named_priors import NAMED
     from lusee_bayes.report.pages import REPORT
+    from lusee_bayes.results.cost import demand_of, posterior_cost
     from lusee_bayes.runs.compare_priors_run import run_compare_priors
 
     console = Console(quiet=quiet, soft_wrap=True)
-    run = run_compare_priors(
-        load(scenario, set_),
-        output or default_folder(scenario, "-priors"),
-        None if priors is None else [name.strip() for name in priors.split(",") if name.strip()],
-        data=data,
-        truth=truth,
-        draws=draws,
-        name=Path(scenario).stem,
-        replace=force,
-        stages=Stages(console, verbose=verbose),
-    )
+    resolved, stages = load(scenario, set_), Stages(console, verbose=verbose)
+    names = None if priors is None else [n.strip() for n in priors.split(",") if n.strip()]
+    demand = demand_of([posterior_cost(resolved)] * len(names or NAMED))
+    with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+        run = run_compare_priors(
+            resolved,
+            output or default_folder(scenario, "-priors"),
+            names,
+            data=data,
+            truth=truth,
+            draws=draws,
+            name=Path(scenario).stem,
+            engine=engine,
+            replace=force,
+            stages=stages,
+        )
     say(console, *(f"  {path}" for path in run.files))
     show(console, priors_table(run.result))
     say(console, *run.result.lines(), f"look at {run.folder / REPORT}")

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes.cli.options import Force, Quiet, say
+from lusee_bayes.cli.options import Cluster, Force, Quiet, Workers, say
 from lusee_bayes.core.progress import Stages
 
 
@@ -16,6 +16,8 @@ def paper_command(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("output/paper"),
     sky: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative="")] = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
@@ -32,15 +34,25 @@ def paper_command(
         ULSA HDF5 files with the frequency in their names, as exp10.0MHz_sky.hdf5; each case scales
         the one nearest in log frequency.
         Without them the embedded sky is used.
+    workers
+        Processes of this machine that share out the cases; by default as many as pay.
+    cluster
+        Address of a Dask scheduler, as tcp://host:8786, whose workers share out the cases; by
+        default DASK_SCHEDULER_ADDRESS.
     force
         Replace results of another run in the folder.
     quiet
         Print nothing but errors.
     """
+    from lusee_bayes.core.workers import open_engine
+    from lusee_bayes.paper.cases import paper_scenarios
+    from lusee_bayes.results.cost import demand_of, posterior_cost
     from lusee_bayes.runs.paper_run import run_paper
 
-    console = Console(quiet=quiet, soft_wrap=True)
-    run = run_paper(output, skies=sky or [], replace=force, stages=Stages(console))
+    console, skies = Console(quiet=quiet, soft_wrap=True), sky or []
+    demand = demand_of([posterior_cost(s) for s in paper_scenarios(skies=skies).values()])
+    with open_engine(demand, workers, cluster) as engine:
+        run = run_paper(output, skies=skies, engine=engine, replace=force, stages=Stages(console))
     say(console, *(f"  {path}" for path in run.files if path.suffix != ".nc"))
     say(console, (run.folder / "claims.md").read_text().splitlines()[0])
     say(console, f"look at {run.folder}/claims.md")

@@ -8,7 +8,16 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes.cli.options import Force, Overrides, Quiet, Verbose, say, show
+from lusee_bayes.cli.options import (
+    Cluster,
+    Force,
+    Overrides,
+    Quiet,
+    Verbose,
+    Workers,
+    say,
+    show,
+)
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 
@@ -19,6 +28,8 @@ def plan_command(
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("output/plan"),
     vary: Annotated[list[str] | None, Parameter(negative="")] = None,
     set_: Overrides | None = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -38,6 +49,11 @@ def plan_command(
         needed, instead of turntable, duration, nights, duty cycle and lost antennas.
     set_
         key.path=value; overrides an entry of every scenario, as often as needed.
+    workers
+        Processes of this machine that share out the variations; by default as many as pay.
+    cluster
+        Address of a Dask scheduler, as tcp://host:8786, whose workers share out the variations; by
+        default DASK_SCHEDULER_ADDRESS.
     force
         Replace results of another run in the folder.
     quiet
@@ -47,6 +63,8 @@ def plan_command(
     """
     from lusee_bayes.cli.plan_variations import headline, variations_of
     from lusee_bayes.cli.tables import forecast_table
+    from lusee_bayes.core.workers import open_engine
+    from lusee_bayes.results.cost import demand_of, posterior_cost
     from lusee_bayes.results.forecast import baseline
     from lusee_bayes.runs.plan_run import run_plan
 
@@ -56,7 +74,10 @@ def plan_command(
         twice = next(s for s in sources if sources.count(s) > 1)
         raise InputError(f"the scenario '{twice}' is given twice; give each once")
     variations = [v for s in sources for v in variations_of(s, vary, set_ or [], console)]
-    run = run_plan(variations, output, replace=force, stages=Stages(console, verbose=verbose))
+    stages = Stages(console, verbose=verbose)
+    demand = demand_of([posterior_cost(v.scenario) for v in variations])
+    with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+        run = run_plan(variations, output, engine=engine, replace=force, stages=stages)
     for source in sources:
         show(console, forecast_table([f for f in run.forecasts if f.variation.source == source]))
     say(console, *(f"  {path}" for path in run.files))

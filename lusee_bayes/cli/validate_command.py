@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 from rich.console import Console
 
 from lusee_bayes.cli.options import (
+    Cluster,
     Count,
     Flag,
     Force,
@@ -17,6 +18,7 @@ from lusee_bayes.cli.options import (
     Overrides,
     Quiet,
     Verbose,
+    Workers,
     default_folder,
     load,
     say,
@@ -24,6 +26,9 @@ from lusee_bayes.cli.options import (
 )
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
+
+if TYPE_CHECKING:
+    from lusee_bayes.experiment.scenario import Scenario
 
 
 def validate_command(
@@ -38,6 +43,8 @@ def validate_command(
     warmup: Number = 150,
     simulations: Count = 500,
     set_: Overrides | None = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -69,6 +76,12 @@ def validate_command(
         Data sets for simulation-based calibration.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
+    workers
+        Processes of this machine that share out the simulated data sets, or the skies; by default
+        as many as pay.
+    cluster
+        Address of a Dask scheduler, as tcp://host:8786, whose workers share them out; by default
+        DASK_SCHEDULER_ADDRESS.
     force
         Replace results of another run in the folder.
     quiet
@@ -76,30 +89,42 @@ def validate_command(
     verbose
         Print the memory in use after every stage.
     """
+    if skies is not None and (data is not None or resume):
+        raise InputError("--skies simulates its data, all at once; leave out --data and --resume")
+    from lusee_bayes.core.workers import open_engine
+    from lusee_bayes.results.cost import demand_of, posterior_cost
+
+    console = Console(quiet=quiet, soft_wrap=True)
+    resolved, stages = load(scenario, set_), Stages(console, verbose=verbose)
     if skies is not None:
-        return _on_skies(scenario, skies, data, output, resume, set_, force, quiet, verbose)
+        demand = demand_of([posterior_cost(resolved)] * max(1, len(skies)))
+        with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+            given = {"engine": engine, "replace": force, "stages": stages}
+            return _on_skies(resolved, scenario, skies, output, console, given)
     from lusee_bayes.sampling.least import require_draws, require_simulations
 
     require_simulations(simulations)
     require_draws(draws)
     from lusee_bayes.cli.tables import checks_table
     from lusee_bayes.report.pages import REPORT
+    from lusee_bayes.results.validation_result import demand_of_calibration
     from lusee_bayes.runs.validate_run import run_validate
     from lusee_bayes.sampling.hmc import Sampler
 
-    console = Console(quiet=quiet, soft_wrap=True)
-    resolved = load(scenario, set_)
-    run = run_validate(
-        resolved,
-        output or default_folder(scenario, "-validation"),
-        name=Path(scenario).stem,
-        sampler=Sampler(chains=chains, warmup=warmup, draws=draws, seed=resolved.seed),
-        simulations=simulations,
-        data=data,
-        resume=resume,
-        replace=force,
-        stages=Stages(console, verbose=verbose),
-    )
+    demand = demand_of_calibration(resolved, simulations)
+    with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+        run = run_validate(
+            resolved,
+            output or default_folder(scenario, "-validation"),
+            name=Path(scenario).stem,
+            sampler=Sampler(chains=chains, warmup=warmup, draws=draws, seed=resolved.seed),
+            simulations=simulations,
+            data=data,
+            resume=resume,
+            engine=engine,
+            replace=force,
+            stages=stages,
+        )
     say(console, *(f"  {path}" for path in run.files))
     show(console, checks_table(run.result.checks))
     say(console, f"{run.result.headline()}; look at {run.folder / REPORT}")
@@ -107,31 +132,19 @@ def validate_command(
 
 
 def _on_skies(
+    resolved: Scenario,
     scenario: str,
     skies: list[str],
-    data: Path | None,
     output: Path | None,
-    resume: bool,
-    set_: list[str] | None,
-    force: bool,
-    quiet: bool,
-    verbose: bool,
+    console: Console,
+    given: dict[str, Any],
 ) -> int:
-    if data is not None or resume:
-        raise InputError("--skies simulates its data, all at once; leave out --data and --resume")
     from lusee_bayes.cli.tables import coverage_table
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.skies_run import run_skies
 
-    console = Console(quiet=quiet, soft_wrap=True)
-    run = run_skies(
-        load(scenario, set_),
-        output or default_folder(scenario, "-skies"),
-        skies,
-        name=Path(scenario).stem,
-        replace=force,
-        stages=Stages(console, verbose=verbose),
-    )
+    folder = output or default_folder(scenario, "-skies")
+    run = run_skies(resolved, folder, skies, name=Path(scenario).stem, **given)
     say(console, *(f"  {path}" for path in run.files))
     show(console, coverage_table(run.result))
     say(console, run.result.thresholds())

@@ -64,16 +64,20 @@ class Demand:
         What every task adds that is carried out at a time.
     seconds : float
         Of all tasks in one process of this machine.
+    side_by_side : int
+        How many a process carries out at a time; one where a task uses all processors.
     """
 
     n_tasks: int
     base_bytes: float
     task_bytes: float
     seconds: float
+    side_by_side: int = SIDE_BY_SIDE
 
-    def process_bytes(self, side_by_side: int) -> float:
+    def process_bytes(self, side_by_side: int | None = None) -> float:
         """Memory of a process that carries out so many tasks at a time."""
-        return self.base_bytes + side_by_side * self.task_bytes
+        at_once = self.side_by_side if side_by_side is None else side_by_side
+        return self.base_bytes + at_once * self.task_bytes
 
 
 class Engine(ABC):

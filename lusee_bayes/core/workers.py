@@ -71,7 +71,8 @@ def open_engine(
         else:
             wanted = workers_that_pay(demand) if workers is None else workers
             if wanted == 1:
-                yield ThisProcess()
+                fits = demand.process_bytes() <= memory_limit()
+                yield ThisProcess(demand.side_by_side if fits else 1)
                 return
             _require_dask("--workers")
             place = stack.enter_context(_own_workers(wanted, demand, verbose))
@@ -87,8 +88,8 @@ def workers_that_pay(demand: Demand) -> int:
         return min(devices, demand.n_tasks)
     if demand.seconds < LONG_S:
         return 1
-    by_memory = int(memory_limit() // demand.process_bytes(SIDE_BY_SIDE))
-    by_tasks = demand.n_tasks // SIDE_BY_SIDE
+    by_memory = int(memory_limit() // demand.process_bytes())
+    by_tasks = demand.n_tasks // demand.side_by_side
     return max(1, min(processors() // PROCESSORS_OF_WORKER, by_memory, by_tasks))
 
 
@@ -110,7 +111,7 @@ def _own_workers(n: int, demand: Demand, verbose: bool) -> Iterator[object]:
     """A cluster of this machine alone, whose processors and memory its workers share."""
     import distributed
 
-    side_by_side = min(SIDE_BY_SIDE, max(1, processors() // n))
+    side_by_side = min(demand.side_by_side, max(1, processors() // n))
     needed, share = demand.process_bytes(side_by_side), memory_limit() / n
     if needed > share:
         fit = int(memory_limit() // demand.process_bytes(1))
@@ -122,6 +123,7 @@ def _own_workers(n: int, demand: Demand, verbose: bool) -> Iterator[object]:
     local = {"host": "127.0.0.1"}
     server = {**local, "port": 0, "dashboard": verbose, "dashboard_address": "127.0.0.1:0"}
     options = {**local, "nthreads": side_by_side, "memory_limit": int(share)}
+    options["silence_logs"] = logging.CRITICAL
     kinds = {"cls": distributed.Nanny}
 
     def options_of(worker: int) -> dict[str, object]:

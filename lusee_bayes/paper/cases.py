@@ -97,10 +97,15 @@ def with_sky(scenario: Scenario, files: Mapping[float, Path]) -> Scenario:
     return scenario.model_copy(update={"sky": sky})
 
 
-def read_case(path: Path, scenario: Scenario) -> xr.Dataset | None:
-    """A case computed before with the same scenario and version of the package, or None."""
+def is_case(path: Path, scenario: Scenario) -> bool:
+    """Whether a file holds the case of a scenario, computed by this version of the package."""
     wanted = {"format": formats.PAPER_CASE, "scenario": scenario.to_yaml(), "version": __version__}
-    return xr.load_dataset(path, engine="h5netcdf") if says(path, wanted) else None
+    return says(path, wanted)
+
+
+def read_case(path: Path) -> xr.Dataset:
+    """A case that was computed before."""
+    return xr.load_dataset(path, engine="h5netcdf")
 
 
 def compute_case(scenario: Scenario) -> xr.Dataset:

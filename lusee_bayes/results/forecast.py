@@ -14,8 +14,7 @@ C = Lambda^-1 does not depend on d. Three numbers are taken from it:
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,7 +24,6 @@ from lusee_bayes.core.arrays import namespace
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import sum_over_m
 from lusee_bayes.core.linalg import solve_lower
-from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
@@ -36,7 +34,6 @@ from lusee_bayes.linear.metrics import effective_resolution_deg, ell_cross, prio
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.linear.templates import template_amplitudes
-from lusee_bayes.results.cost import duration
 
 AS_GIVEN = "as given"
 
@@ -190,33 +187,6 @@ def forecast(variation: Variation) -> Forecast:
         )
     except InputError as error:
         raise InputError(f"{variation.source}, {variation.name}: {error}") from error
-
-
-def forecasts_of(variations: Iterable[Variation], stages: Stages | None = None) -> list[Forecast]:
-    """A forecast of every variation, in their order; what is there twice is computed once.
-
-    ``stages`` is told how many there are, and after the first about how long the others take.
-    """
-    variations, stages = list(variations), stages or Stages()
-    keys = [(variation.scenario.to_yaml(), variation.lost) for variation in variations]
-    different = len(set(keys))
-    stages.say(f"  {len(variations)} variations, {different} of them different")
-    known: dict[tuple[str, tuple[int, ...]], Forecast] = {}
-    start = time.perf_counter()
-    with stages.progress("planning", different) as report:
-        for variation, key in zip(variations, keys, strict=True):
-            if key in known:
-                continue
-            report(len(known), f"{variation.source}, {variation.name}")
-            known[key] = forecast(variation)
-            if len(known) == 1 and different > 1:
-                longest = (different - 1) * (time.perf_counter() - start)
-                stages.say(f"  the other {different - 1} take about {duration(longest)}, or less")
-        report(len(known), "")
-    return [
-        replace(known[key], variation=variation)
-        for variation, key in zip(variations, keys, strict=True)
-    ]
 
 
 def baseline(forecasts: Sequence[Forecast], source: str) -> Forecast:

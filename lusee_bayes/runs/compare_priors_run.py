@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.tables import write_csv
 from lusee_bayes.experiment.data_files import read_data
@@ -53,6 +54,7 @@ def run_compare_priors(
     truth: bool = False,
     draws: int = DRAWS,
     name: str = "the scenario",
+    engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
 ) -> ComparePriorsRun:
@@ -77,6 +79,8 @@ def run_compare_priors(
         Of learned parameters, for importance sampling; 0 for none.
     name : str
         Of the scenario, for the title.
+    engine : Engine, optional
+        What maps the data under each prior; by default this process, one after the other.
     replace : bool
         Replace results of another run in the folder.
     stages : Stages, optional
@@ -88,7 +92,7 @@ def run_compare_priors(
         As :func:`.named_priors`, for a scenario of several frequencies or one that samples
         something, and as :func:`run_map`.
     """
-    stages = stages or Stages()
+    engine, stages = engine or ThisProcess(side_by_side=1), stages or Stages()
     require_single_frequency("compare-priors", bool(scenario.frequencies_mhz))
     require_marginal("compare-priors", "set treatment=marginalised", scenario.samples)
     if draws:
@@ -104,11 +108,13 @@ def run_compare_priors(
             experiment = with_truth(experiment)
         with stages("data"):
             information = about_sky(experiment.setup, experiment.data)
-        found = []
-        for prior, section in sections.items():
-            with stages(prior):
-                setup = experiment.setup.with_prior(section)
-                found.append(_under(prior, setup, experiment, information, draws))
+
+        def under(prior: str) -> UnderPrior:
+            setup = experiment.setup.with_prior(sections[prior])
+            return _under(prior, setup, experiment, information, draws)
+
+        engine.work_in(place)
+        found = engine.each(Tasks(under, list(sections), list(sections)), stages, "priors")
         result = PriorComparison(name, scenario, tuple(found), stages.seconds)
         provenance = Provenance.of_experiment(experiment, data)
         files = write_run(place, result, COMPARE_PRIORS, origin, stages, provenance)

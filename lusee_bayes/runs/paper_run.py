@@ -8,12 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.tables import write_csv
-from lusee_bayes.paper.cases import case_table, compute_case, paper_scenarios, read_case
+from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios, read_case
 from lusee_bayes.paper.claim_table import claim_table, claims_as_markdown
-from lusee_bayes.paper.claims import Cases, cross
+from lusee_bayes.paper.claims import Cases
 from lusee_bayes.paper.figures import FIGURES
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
 from lusee_bayes.runs.origins import origin_of
@@ -55,6 +56,7 @@ def run_paper(
     folder: str | Path,
     overrides: Sequence[str] = (),
     skies: Sequence[str | Path] = (),
+    engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
 ) -> PaperRun:
@@ -71,6 +73,8 @@ def run_paper(
         ``key.path=value``, applied to every case.
     skies : sequence of paths
         ULSA HDF5 files with the frequency in their names; each case scales the nearest one.
+    engine : Engine, optional
+        What computes the cases; by default this process.
     replace : bool
         Replace results of another run in the folder.
     stages : Stages, optional
@@ -81,25 +85,30 @@ def run_paper(
     InputError
         For skies without a frequency in their names, and for overrides that do not fit.
     """
-    stages = stages or Stages()
+    engine, stages = engine or ThisProcess(), stages or Stages()
     scenarios = paper_scenarios(overrides, skies)
     origin = origin_of()
     with run_folder(folder, PAPER, origin, RESUME, replace=replace) as place:
-        cases, paths = {}, {}
-        with stages.progress("cases", len(scenarios)) as report:
-            for number, (name, scenario) in enumerate(scenarios.items()):
-                report(number, name)
-                paths[name] = place / UNFINISHED / f"{name}.nc"
-                case = read_case(paths[name], scenario)
-                if case is None:
-                    case = read_case(place / CASES / f"{name}.nc", scenario)
-                    paths[name] = paths[name] if case is None else place / CASES / f"{name}.nc"
-                if case is None:
-                    case = compute_case(scenario)
-                    with replacing(paths[name]) as partial:
-                        case.to_netcdf(partial, engine="h5netcdf")
-                cases[name] = case
-                report(number + 1, f"{name}: first SNR < 1 at ell {cross(case)}")
+        engine.work_in(place)
+        # workers may have other folders of their own
+        home = place.resolve()
+
+        def path_of(name: str) -> Path:
+            """Where a case is, if it has been computed, or else will be."""
+            earlier, kept = home / UNFINISHED / f"{name}.nc", home / CASES / f"{name}.nc"
+            there = not is_case(earlier, scenarios[name]) and is_case(kept, scenarios[name])
+            return kept if there else earlier
+
+        def compute(name: str) -> None:
+            if is_case(path := path_of(name), scenarios[name]):
+                return
+            with replacing(path) as partial:
+                compute_case(scenarios[name]).to_netcdf(partial, engine="h5netcdf")
+
+        names = list(scenarios)
+        engine.each(Tasks(compute, names, names), stages, "cases")
+        paths = {name: path_of(name) for name in names}
+        cases = {name: read_case(path) for name, path in paths.items()}
         files = write_run(place, _Computed(cases, paths), PAPER, origin, stages)
         return PaperRun(cases, claim_table(cases), place, files)
 

@@ -7,12 +7,17 @@ from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
+from lusee_bayes.core.engine import Engine, ThisProcess
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.tables import write_csv
 from lusee_bayes.report.figures import plan as plan_figures
-from lusee_bayes.results.forecast import Forecast, Variation, forecast_rows, forecasts_of
+from lusee_bayes.results.forecast import Forecast, Variation, forecast_rows
+from lusee_bayes.results.forecasts import ForecastFiles, forecasts_of
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
 from lusee_bayes.runs.origins import origin_of
+
+UNFINISHED = "unfinished-forecasts"
+RESUME = "the same command continues from the finished forecasts"
 
 
 @dataclass(frozen=True)
@@ -28,10 +33,13 @@ def run_plan(
     variations: Sequence[Variation],
     folder: str | Path,
     *,
+    engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
 ) -> PlanRun:
     """Forecast the information in every variation, and write table and figure in one transaction.
+
+    A plan that was stopped goes on with the same call.
 
     Parameters
     ----------
@@ -39,6 +47,8 @@ def run_plan(
         Such as those of :func:`.default_variations`.
     folder : path
         Of the results.
+    engine : Engine, optional
+        What makes the forecasts; by default this process.
     replace : bool
         Replace results of another run in the folder.
     stages : Stages, optional
@@ -49,12 +59,14 @@ def run_plan(
     InputError
         With the variation's name, for whatever is wrong with its scenario.
     """
-    stages = stages or Stages()
+    engine, stages = engine or ThisProcess(), stages or Stages()
     told = {f"{v.source}, {v.family}, {v.name}": v.scenario for v in variations}
     digests = {name: sha256(s.to_yaml().encode()).hexdigest()[:12] for name, s in told.items()}
     origin = origin_of(**digests)
-    with run_folder(folder, PLAN, origin, replace=replace) as place:
-        forecasts = forecasts_of(variations, stages)
+    with run_folder(folder, PLAN, origin, RESUME, replace=replace) as place:
+        engine.work_in(place)
+        files = ForecastFiles((place / UNFINISHED).resolve())
+        forecasts = forecasts_of(variations, files, engine, stages)
         return PlanRun(forecasts, place, write_run(place, forecasts, PLAN, origin, stages))
 
 
@@ -65,4 +77,5 @@ PLAN = RunKind(
         Output(lambda forecasts, folder: write_csv(folder / "plan.csv", forecast_rows(forecasts))),
     ),
     figures={"plan": plan_figures.forecasts},
+    unfinished=UNFINISHED,
 )

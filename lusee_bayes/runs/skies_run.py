@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.tables import write_csv
@@ -27,7 +28,7 @@ from lusee_bayes.runs.folder import (
     run_folder,
     write_run,
 )
-from lusee_bayes.runs.given_skies import given_skies
+from lusee_bayes.runs.given_skies import GivenSky, given_skies
 from lusee_bayes.runs.origins import origin_of
 
 
@@ -46,6 +47,7 @@ def run_skies(
     skies: Sequence[str | Path],
     *,
     name: str = "the scenario",
+    engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
 ) -> SkiesRun:
@@ -64,6 +66,8 @@ def run_skies(
         Names or files (:func:`.given_skies`), one or more.
     name : str
         Of the scenario, for the title.
+    engine : Engine, optional
+        What maps the skies; by default this process, one after the other.
     replace : bool
         Replace results of another run in the folder.
     stages : Stages, optional
@@ -75,7 +79,7 @@ def run_skies(
         For no sky, one that there is not, a scenario of several frequencies or one that samples
         something, and as :func:`run_map`.
     """
-    stages = stages or Stages()
+    engine, stages = engine or ThisProcess(side_by_side=1), stages or Stages()
     require_single_frequency("--skies", bool(scenario.frequencies_mhz))
     require_marginal("--skies", "set treatment=marginalised", scenario.samples)
     given = given_skies(skies)
@@ -86,14 +90,17 @@ def run_skies(
     with run_folder(folder, SKIES, origin, replace=replace) as place:
         n_draws = draws_needed(len(given))
         require_resources(scenario, None, stages, n_draws)
-        setup, found = set_up(scenario, None, stages), []
-        with stages.progress("skies", len(given)) as update:
-            for number, sky in enumerate(given):
-                update(number, sky.name)
-                # noise of its own for each sky, whatever the others are
-                seed = scenario.seed + zlib.crc32(sky.name.encode())
-                experiment = under_sky(setup, sky.source, seed)
-                found.append(SkyCoverage.of(sky.name, map_result(experiment), n_draws))
+        setup = set_up(scenario, None, stages)
+
+        def cover(sky: GivenSky) -> SkyCoverage:
+            # noise of its own for each sky, whatever the others are
+            seed = scenario.seed + zlib.crc32(sky.name.encode())
+            result = map_result(under_sky(setup, sky.source, seed))
+            return SkyCoverage.of(sky.name, result, n_draws)
+
+        engine.work_in(place)
+        tasks = Tasks(cover, given, [sky.name for sky in given])
+        found = engine.each(tasks, stages, "skies")
         result = SkiesResult(name, scenario, tuple(found), n_draws, stages.seconds)
         provenance = Provenance.of(scenario, setup.observation, None, known_sky=True)
         return SkiesRun(result, place, write_run(place, result, SKIES, origin, stages, provenance))

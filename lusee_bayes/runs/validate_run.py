@@ -6,6 +6,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from lusee_bayes.core.engine import Engine
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
@@ -42,6 +43,7 @@ def run_validate(
     simulations: int = 500,
     data: Path | None = None,
     resume: bool = False,
+    engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
 ) -> ValidationRun:
@@ -64,6 +66,8 @@ def run_validate(
         Visibilities to use; without them the scenario's own are simulated.
     resume : bool
         Go on with the unfinished run in the folder, or judge the finished one again.
+    engine : Engine, optional
+        What works on the simulated data sets; by default this process.
     replace : bool
         Replace results of another run in the folder.
     stages : Stages, optional
@@ -91,10 +95,16 @@ def run_validate(
             found = validate_draws(
                 sampled.skies, posterior, stats["diverging"].values, stats["energy"].values
             )
-        with stages.progress("calibration", simulations) as update:
-            ranks = calibrate_sky(
-                model, model, n_simulations=simulations, seed=scenario.seed, report=update
-            )
+        if engine is not None:
+            engine.work_in(place)
+        ranks = calibrate_sky(
+            model,
+            model,
+            n_simulations=simulations,
+            seed=scenario.seed,
+            engine=engine,
+            stages=stages,
+        )
         result = ValidationResult(name, sampled, found, ranks)
         provenance = Provenance.of_experiment(experiment, data)
         files = write_run(place, result, VALIDATION, origin, stages, provenance)

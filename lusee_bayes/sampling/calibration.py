@@ -20,6 +20,8 @@ from jaxtyping import Float, Int, Key, PRNGKeyArray
 from scipy import stats
 
 from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
+from lusee_bayes.core.progress import Stages
 from lusee_bayes.linear.levels import LEVELS
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.solver import Solver
@@ -117,7 +119,8 @@ def calibrate(
     batch: int = BATCH,
     one_by_one: bool = False,
     regions: Sequence[str] = (),
-    report: Callable[[int], None] = lambda done: None,
+    engine: Engine | None = None,
+    stages: Stages | None = None,
 ) -> Ranks:
     """Rank the truth among draws of the posterior, for many data sets.
 
@@ -142,8 +145,10 @@ def calibrate(
         would all wait for the slowest.
     regions : sequence of str
         See :class:`Ranks`.
-    report : callable
-        Called with the number of data sets done, after each batch.
+    engine : Engine, optional
+        What works on the batches; by default this process, on one after the other.
+    stages : Stages, optional
+        Told how many batches are done.
 
     Raises
     ------
@@ -151,12 +156,17 @@ def calibrate(
         For fewer than 100 data sets.
     """
     require_simulations(n_simulations)
-    keys = jax.random.split(jax.random.key(seed), n_simulations)
-    parts = []
-    for start in range(0, n_simulations, batch):
-        ranks = _rank_batch(simulate, draw, quantities, keys[start : start + batch], one_by_one)
-        parts.append(jax.tree.map(np.asarray, ranks))
-        report(min(start + batch, n_simulations))
+
+    def rank(start: int) -> dict[str, np.ndarray]:
+        keys = jax.random.split(jax.random.key(seed), n_simulations)[start : start + batch]
+        ranks = _rank_batch(simulate, draw, quantities, keys, one_by_one)
+        return jax.tree.map(np.asarray, ranks)
+
+    starts = range(0, n_simulations, batch)
+    names = [f"data sets from {start} on" for start in starts]
+    # a compiled batch uses all processors
+    engine = engine or ThisProcess(side_by_side=1)
+    parts = engine.each(Tasks(rank, starts, names), stages or Stages(), "calibration")
     names, columns = [], []
     for name in parts[0]:
         ranks = np.concatenate([p[name] for p in parts])
@@ -189,7 +199,8 @@ def calibrate_sky(
     n_modes: int = 10,
     n_projections: int = 10,
     seed: int = 0,
-    report: Callable[[int], None] = lambda done: None,
+    engine: Engine | None = None,
+    stages: Stages | None = None,
 ) -> Ranks:
     """Calibrate the analytic posterior of the sky.
 
@@ -208,8 +219,8 @@ def calibrate_sky(
         Number of single modes and of random directions.
     seed : int
         Of everything.
-    report : callable
-        Called with the number of data sets done, after each batch.
+    engine, stages : optional
+        As for :func:`calibrate`.
 
     Raises
     ------
@@ -227,7 +238,8 @@ def calibrate_sky(
             seed=seed,
             batch=int(np.clip(MEMORY // (N_DRAWS * posterior.n_data), 1, BATCH)),
             regions=("distance",),
-            report=report,
+            engine=engine,
+            stages=stages,
         )
     )
 
