@@ -133,13 +133,15 @@ def _own_workers(n: int, demand: Demand, verbose: bool) -> Iterator[object]:
         seen = {"CUDA_VISIBLE_DEVICES": _gpu(worker % devices)}
         return {**options, "env": {**seen, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}}
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    with distributed.SpecCluster(
-        scheduler={"cls": distributed.Scheduler, "options": server},
-        workers={worker: {**kinds, "options": options_of(worker)} for worker in range(n)},
-        silence_logs=logging.CRITICAL,
-        name="lusee_bayes",
-    ) as own:
+    with (
+        _quiet(),
+        distributed.SpecCluster(
+            scheduler={"cls": distributed.Scheduler, "options": server},
+            workers={worker: {**kinds, "options": options_of(worker)} for worker in range(n)},
+            silence_logs=logging.CRITICAL,
+            name="lusee_bayes",
+        ) as own,
+    ):
         yield own
 
 
@@ -157,17 +159,32 @@ def _connected(
 
     from lusee_bayes.core.dask_engine import DaskEngine
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    with _quiet():
+        try:
+            client = distributed.Client(place, timeout=ANSWER, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(
+                f"no Dask scheduler answers at '{place}' ({' '.join(str(error).split())[:200]}); "
+                "start one with: dask scheduler"
+            ) from error
+        try:
+            if verbose:
+                there = "dashboard" in client.scheduler_info()["services"]
+                say(f"  Dask's dashboard: {client.dashboard_link if there else 'none'}")
+            yield DaskEngine(client, demand)
+        finally:
+            client.close()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Dask from writing into the terminal what the engine says in one sentence."""
+    loggers = [logging.getLogger(n) for n in logging.root.manager.loggerDict if "distributed" in n]
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
     try:
-        client = distributed.Client(place, timeout=ANSWER, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(
-            f"no Dask scheduler answers at '{place}' ({' '.join(str(error).split())[:200]}); start "
-            "one with: dask scheduler"
-        ) from error
-    try:
-        if verbose:
-            say(f"  Dask's dashboard: {client.dashboard_link or 'none; pip install bokeh'}")
-        yield DaskEngine(client, demand)
+        yield
     finally:
-        client.close()
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
