@@ -123,8 +123,10 @@ class DaskEngine(Engine):
                     for first in range(0, len(level), 2)
                 ]
             root = level.pop()
+            if root not in futures:
+                futures.append(root)
             # what the tasks give is left with the workers
-            for _ in self._finished([*futures, root], tasks, stages, stage):
+            for _ in self._finished(futures, tasks, stages, stage):
                 pass
             return self._value(root)
 

@@ -147,7 +147,8 @@ class ComponentSums(eqx.Module):
     def plus(self, others: ComponentSums) -> ComponentSums:
         """Add the sums of other channels, about the same reference maps; neither is changed."""
         names = ("matrices", "vectors", "misfit", "log_det", "n_data")
-        both = {name: getattr(self, name) + getattr(others, name) for name in names}
+        xp = namespace(self, others)
+        both = {name: xp.asarray(getattr(self, name) + getattr(others, name)) for name in names}
         return replace(self, **both)
 
     def information(self) -> Information:

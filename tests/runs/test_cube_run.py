@@ -2,11 +2,6 @@
 
 import csv
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import healpy
@@ -15,6 +10,8 @@ import pytest
 import xarray as xr
 
 from lusee_bayes.cli.main import main
+from lusee_bayes.core import workers
+from lusee_bayes.core.engine import ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import build
@@ -22,7 +19,7 @@ from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.terms import Around
 from lusee_bayes.linear.metrics import signal_to_noise
-from lusee_bayes.results import channel_threads, cube_channels, joint_channels
+from lusee_bayes.results import cube_channels
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
 from lusee_bayes.runs.map_run import run_map
@@ -161,18 +158,10 @@ def made(monkeypatch):
         done.append(experiment.scenario.frequency_mhz)
         return inform(experiment, *arguments)
 
-    monkeypatch.setattr(channel_threads, "THREADS_PER_DEVICE", 1)
+    for module in (workers, cube_channels):
+        monkeypatch.setattr(module, "ThisProcess", lambda *_: ThisProcess(1))
     monkeypatch.setattr(cube_channels, "inform", counting)
     return done
-
-
-def test_a_process_without_channels_adds_nothing(tmp_path, monkeypatch, numbers_alone):
-    """Of more processes than channels: alone, its sums leave the component maps to their prior."""
-    monkeypatch.setattr(joint_channels, "each_channel", lambda *_: None)
-    scenario = three("joint=true", "spectral.components=[power_law, curvature]")
-    components = run_map(scenario, tmp_path).result.components
-    np.testing.assert_array_equal(components.mean, 0.0)
-    assert components.information_bits == 0.0
 
 
 @pytest.mark.long
@@ -239,8 +228,9 @@ def test_measured_data_of_several_channels(tmp_path, capsys, numbers_alone):
         (["--frequencies", "20,60"], "less than or equal to 50"),
         (["--frequencies", "20,10"], "expected growing MHz"),
         (["--joint"], "joint needs frequencies_mhz"),
-        (["--processes", "2"], "give --frequencies"),
-        (["--devices", "2"], "give --frequencies"),
+        (["--workers", "2"], "give --frequencies"),
+        (["--cluster", "tcp://127.0.0.1:1"], "give --frequencies"),
+        (["--workers", "0", "--frequencies", "20,25"], "expected a whole number from 1"),
         (["--frequencies", "20,25", "--compact"], "--compact is for a single frequency"),
         (["--frequencies", "20,25", "--onto", "x"], "--onto is for a single frequency"),
         (["--frequencies", "20,25", "--joint"], "need at least as many channels, got 2"),
@@ -268,61 +258,3 @@ def test_sampling_several_channels(tmp_path, capsys):
     joint = ("--set", "joint=true", "--set", "spectral.components=[power_law]")
     assert run(*command, *joint) == 2
     assert "channels are sampled one by one" in capsys.readouterr().err
-
-
-def started(folder, *arguments):
-    """The joint run in a process of its own, with more processes or devices."""
-    command = [
-        "-m",
-        "lusee_bayes.cli",
-        "map",
-        "fiducial",
-        *JOINT,
-        "-o",
-        str(folder),
-        "--draws=3",
-    ]
-    return subprocess.Popen(
-        [sys.executable, *command, *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"MPLBACKEND": "agg"},
-    )
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("how", ["--processes=2", "--devices=3"])
-def test_processes_and_devices_give_the_same_numbers(how, joint, tmp_path):
-    with started(tmp_path, how) as process:
-        said, errors = process.communicate()
-    assert process.returncode == 0, errors
-    assert said.count("one posterior") == 1
-    assert_equal(posterior_of(tmp_path), posterior_of(joint), 1e-6)
-
-
-def children_of(pid: int) -> list[int]:
-    text = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True)
-    return [int(line) for line in text.stdout.split()]
-
-
-@pytest.mark.long
-def test_a_killed_process_ends_the_run_which_can_be_resumed(joint, tmp_path):
-    with started(tmp_path, "--processes=2", "-q") as process:
-        deadline = time.monotonic() + 120
-        while not list(tmp_path.glob("channels/*.information.nc")):
-            assert time.monotonic() < deadline and process.poll() is None
-            time.sleep(0.05)
-        victim = children_of(process.pid)[1]
-        os.kill(victim, signal.SIGKILL)
-        _, errors = process.communicate(timeout=60)
-    assert process.returncode == 1
-    assert "process 1 of 0..1 was ended by SIGKILL" in errors
-    assert "continues from what is finished" in errors
-    assert not (tmp_path / "posterior.nc").exists()
-    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("channels/*.nc")}
-    assert kept
-    with started(tmp_path, "--processes=2", "-q") as process:
-        _, errors = process.communicate()
-    assert process.returncode == 0, errors
-    assert_equal(posterior_of(tmp_path), posterior_of(joint), 1e-6)

@@ -1,0 +1,211 @@
+"""Tasks on workers of Dask: the same numbers, and workers that die, hang or lack memory."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from core.test_engine import joined, tasks_of, tree
+
+from lusee_bayes.core.dask_engine import DaskEngine
+from lusee_bayes.core.dask_worker import Preparation
+from lusee_bayes.core.engine import Demand
+from lusee_bayes.core.errors import InputError, WorkersLost
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.threads import processors
+from lusee_bayes.core.workers import open_engine
+
+distributed = pytest.importorskip("distributed")
+
+SMALL = Demand(n_tasks=4, base_bytes=1e6, task_bytes=1e6, seconds=1.0)
+
+
+@pytest.fixture(scope="module")
+def engine(tmp_path_factory):
+    """Of workers that are processes of their own."""
+    with open_engine(SMALL, workers=2) as found:
+        found.work_in(tmp_path_factory.mktemp("run"))
+        yield found
+
+
+class Said(Stages):
+    """Keeps the lines."""
+
+    def __init__(self):
+        super().__init__()
+        self.lines = []
+
+    def say(self, text):
+        self.lines.append(text)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 7, 12])
+def test_results_come_in_order_and_merge_as_a_tree(engine, n):
+    assert engine.each(tasks_of(lambda k: k * k, n), Stages(), "s") == [k * k for k in range(n)]
+    assert engine.reduced(tasks_of(str, n), joined, Stages(), "s") == tree([*map(str, range(n))])
+    assert engine.each(tasks_of(abs, 0), Stages(), "s") == []
+
+
+def test_tasks_share_what_is_large_and_work_in_this_folder(engine):
+    large = np.arange(1e6)
+    found = engine.each(tasks_of(lambda k: (large[k], os.getcwd(), os.getpid()), 6), Stages(), "s")
+    assert [f[0] for f in found] == list(range(6))
+    assert {f[1] for f in found} == {os.getcwd()}
+    assert os.getpid() not in {f[2] for f in found}
+
+
+def test_processors_are_divided_among_workers(engine, monkeypatch):
+    assert set(engine._threads().values()) == {max(1, processors() // 2)}
+
+    def threads(_):
+        import numpy as np
+        from threadpoolctl import threadpool_info
+
+        np.ones((2, 2)) @ np.ones((2, 2))
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    monkeypatch.setattr(engine, "_threads", lambda: {os.uname().nodename: 1})
+    assert engine.each(tasks_of(threads, 2), Stages(), "s") == [{1}, {1}]
+
+
+def test_a_failure_of_ours_ends_the_stage_as_it_is(engine):
+    def fail(k):
+        raise InputError(f"of number {k}")
+
+    with pytest.raises(InputError, match="^of number 0$"):
+        engine.each(tasks_of(fail, 1), Stages(), "s")
+    with pytest.raises(InputError, match="^of number "):
+        engine.reduced(tasks_of(fail, 3), joined, Stages(), "s")
+
+    def wrong(k):
+        return 1 // (k - k)
+
+    with pytest.raises(ZeroDivisionError) as caught:
+        engine.each(tasks_of(wrong, 1), Stages(), "s")
+    assert "in wrong" in caught.value.__notes__[0]
+
+
+def attempts(folder: Path, k: int) -> int:
+    """How often a task has been begun, this time included."""
+    (folder / f"{k}-{time.monotonic_ns()}").touch()
+    return len(list(folder.glob(f"{k}-*")))
+
+
+def test_lack_of_memory_or_disk_is_tried_again(engine, tmp_path):
+    def short(k):
+        if attempts(tmp_path, k) < 3:
+            raise MemoryError("none left")
+        return k
+
+    assert engine.each(tasks_of(short, 3), Stages(), "s") == [0, 1, 2]
+
+    def full(k):
+        attempts(tmp_path, 10 + k)
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(WorkersLost, match="^maps, number 0: failed 4 times, at last with OSError"):
+        engine.each(tasks_of(full, 1), Stages(), "maps")
+    assert len(list(tmp_path.glob("10-*"))) == 4
+
+
+@pytest.mark.essential
+def test_a_task_whose_worker_dies_is_done_again_elsewhere(engine, tmp_path):
+    def die(k):
+        if k == 2 and attempts(tmp_path, k) < 3:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return k
+
+    said = Said()
+    assert engine.each(tasks_of(die, 5), said, "s") == list(range(5))
+    assert len(list(tmp_path.glob("2-*"))) == 3
+    assert said.lines and all("done again elsewhere: " in line for line in said.lines)
+    assert any("number 2" in line for line in said.lines)
+
+    def always(k):
+        if k == 1:
+            attempts(tmp_path, 10)
+            os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(0.1)
+        return k
+
+    with pytest.raises(WorkersLost) as caught:
+        engine.reduced(tasks_of(always, 3), joined, Stages(), "sums")
+    assert str(caught.value).startswith(
+        "sums, number 1: 4 workers ended while they worked on it, one after the other, the last of "
+    )
+    assert len(list(tmp_path.glob("10-*"))) == 4
+    # and what comes next is not affected
+    assert engine.each(tasks_of(abs, 4), Stages(), "s") == [0, 1, 2, 3]
+
+
+@pytest.mark.essential
+def test_a_task_that_hangs_costs_its_worker(engine, tmp_path, monkeypatch):
+    monkeypatch.setattr(engine, "_limit_s", 1.0)
+
+    def hang(k):
+        if k == 1 and attempts(tmp_path, k) < 2:
+            time.sleep(1000)
+        return k
+
+    said = Said()
+    assert engine.each(tasks_of(hang, 3), said, "s") == [0, 1, 2]
+    assert "its task took longer than 1 s" in said.lines[0]
+
+
+@pytest.mark.essential
+def test_a_task_that_takes_too_much_memory_is_named(tmp_path):
+    def hold(k):
+        if k == 1:
+            held = np.ones(int(4e8 / 8))  # 0.4 GB, and the process's own
+            time.sleep(60)
+            del held
+        return k
+
+    with (
+        distributed.SpecCluster(
+            scheduler={"cls": distributed.Scheduler, "options": {"host": "127.0.0.1", "port": 0}},
+            workers={
+                k: {
+                    "cls": distributed.Nanny,
+                    "options": {"host": "127.0.0.1", "nthreads": 1, "memory_limit": 500_000_000},
+                }
+                for k in range(2)
+            },
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        engine = DaskEngine(client)
+        engine.work_in(tmp_path)
+        with pytest.raises(WorkersLost, match=r"maps, number 1: 4 workers .* GB of memory, too mu"):
+            engine.each(tasks_of(hold, 2), Stages(), "maps")
+
+
+def test_workers_that_cannot_do_it_are_refused(engine, tmp_path, monkeypatch):
+    gone = Preparation(str(tmp_path / "gone"), None)
+    with pytest.raises(InputError, match=r"does not see '.*gone' \(No such file"):
+        engine.client.register_plugin(gone)
+    other = Preparation(os.getcwd(), None)
+    other.version = "0.0"
+    with pytest.raises(InputError, match=r"has lusee_bayes .*, the command 0.0; install the same"):
+        engine.client.register_plugin(other)
+    large = Demand(n_tasks=4, base_bytes=1e9, task_bytes=1e15, seconds=1.0)
+    with pytest.raises(InputError, match=r"may take .* of memory, and 1 task\(s\) at a time need"):
+        DaskEngine(engine.client, large)
+    with pytest.raises(RuntimeError, match="call work_in first"):
+        DaskEngine(engine.client).each(tasks_of(abs, 1), Stages(), "s")
+    DaskEngine(engine.client, SMALL)
+
+
+def test_a_scheduler_without_workers_is_not_waited_for_for_ever(tmp_path):
+    with (
+        pytest.importorskip("dask").config.set({"lusee-bayes.patience": "1s"}),
+        distributed.SpecCluster(
+            scheduler={"cls": distributed.Scheduler, "options": {"host": "127.0.0.1", "port": 0}}
+        ) as cluster,
+        open_engine(SMALL, cluster=cluster.scheduler_address) as engine,
+    ):
+        engine.work_in(tmp_path)
+        with pytest.raises(WorkersLost, match="has had no workers for 1 s; start some, with: dask"):
+            engine.each(tasks_of(abs, 2), Stages(), "s")

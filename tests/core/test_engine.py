@@ -1,0 +1,150 @@
+"""Tasks in threads of this process: order, progress, failures, and the tree of a sum."""
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lusee_bayes.core import workers
+from lusee_bayes.core.engine import Demand, Tasks, ThisProcess
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.workers import open_engine, workers_that_pay
+
+
+def tasks_of(function, n):
+    return Tasks(function, range(n), [f"number {k}" for k in range(n)])
+
+
+def tree(parts):
+    """Neighbours first, then their neighbours; one that has none waits for the next level."""
+    while len(parts) > 1:
+        pairs = [parts[k : k + 2] for k in range(0, len(parts), 2)]
+        parts = [pair[0] if len(pair) == 1 else f"({pair[0]}+{pair[1]})" for pair in pairs]
+    return parts[0]
+
+
+def joined(a, b):
+    return f"({a}+{b})"
+
+
+@pytest.mark.parametrize("side_by_side", [1, 2, 5])
+@pytest.mark.parametrize("n", [1, 2, 3, 7, 12])
+def test_results_come_in_order_and_merge_as_a_tree(n, side_by_side):
+    engine = ThisProcess(side_by_side)
+    assert engine.each(tasks_of(lambda k: k * k, n), Stages(), "s") == [k * k for k in range(n)]
+    assert engine.reduced(tasks_of(str, n), joined, Stages(), "s") == tree([*map(str, range(n))])
+
+
+def test_so_many_are_carried_out_at_a_time():
+    """Each waits until another one has begun: with one thread nobody would come."""
+    together = threading.Barrier(2, timeout=20)
+
+    def meet(k):
+        together.wait()
+        return k
+
+    assert ThisProcess(2).each(tasks_of(meet, 6), Stages(), "s") == list(range(6))
+    now, most = [0], [0]
+
+    def count(k):
+        now[0] += 1
+        most[0] = max(most[0], now[0])
+        now[0] -= 1
+
+    ThisProcess(1).each(tasks_of(count, 5), Stages(), "s")
+    assert most == [1]
+
+
+def test_a_failure_ends_the_stage():
+    begun = []
+
+    def fail(k):
+        begun.append(k)
+        if k == 1:
+            raise InputError("of number 1")
+
+    with pytest.raises(InputError, match="of number 1"):
+        ThisProcess(1).each(tasks_of(fail, 5), Stages(), "s")
+    assert begun == [0, 1]
+    assert ThisProcess().each(tasks_of(abs, 0), Stages(), "s") == []
+    with pytest.raises(ValueError, match="2 items have 1 names"):
+        Tasks(abs, [1, 2], ["one"])
+
+
+@pytest.fixture
+def large(monkeypatch):
+    """A machine of 16 processors and 64 GB, without GPUs."""
+    monkeypatch.setattr(workers, "processors", lambda: 16)
+    monkeypatch.setattr(workers, "memory_limit", lambda: 64 * 10**9)
+    monkeypatch.setattr(workers, "_gpus", lambda: 0)
+
+
+@pytest.mark.usefixtures("large")
+def test_as_many_workers_as_pay():
+    demand = Demand(n_tasks=46, base_bytes=1e9, task_bytes=1e9, seconds=1000.0)
+    assert workers_that_pay(demand) == 4
+    assert workers_that_pay(replace(demand, seconds=30.0)) == 1
+    assert workers_that_pay(replace(demand, task_bytes=12e9)) == 2  # 25 GB each
+    assert workers_that_pay(replace(demand, n_tasks=5)) == 2
+    assert workers_that_pay(replace(demand, n_tasks=1)) == 1
+
+
+def test_every_gpu_has_a_worker(large, monkeypatch):
+    monkeypatch.setattr(workers, "_gpus", lambda: 3)
+    demand = Demand(n_tasks=46, base_bytes=1e9, task_bytes=1e9, seconds=1.0)
+    assert workers_that_pay(demand) == 3
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,5,7")
+    assert [workers._gpu(k) for k in range(3)] == ["4", "5", "7"]
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    assert workers._gpu(2) == "2"
+
+
+@pytest.mark.usefixtures("large")
+def test_one_worker_is_this_process_which_needs_no_dask(monkeypatch):
+    demand = Demand(n_tasks=4, base_bytes=1e9, task_bytes=1e9, seconds=1.0)
+    monkeypatch.delenv(workers.SCHEDULER, raising=False)
+    monkeypatch.setattr(workers, "_dask_is_there", lambda: False)
+    for n in (None, 1):
+        with open_engine(demand, n) as engine:
+            assert engine == ThisProcess(2)
+    # two at a time would not fit
+    with open_engine(replace(demand, task_bytes=40e9)) as engine:
+        assert engine == ThisProcess(1)
+    for given in ({"workers": 2}, {"cluster": "tcp://127.0.0.1:1"}):
+        with (
+            pytest.raises(InputError, match=r"needs Dask; install it: pip install 'lusee_bayes\["),
+            open_engine(demand, **given),
+        ):
+            pass
+
+
+@pytest.mark.usefixtures("large")
+def test_what_cannot_be_started_is_refused():
+    demand = Demand(n_tasks=46, base_bytes=1e9, task_bytes=5e9, seconds=1000.0)
+    for given, message in (
+        ({"workers": 2, "cluster": "tcp://x:1"}, "give one"),
+        ({"workers": 12}, "12 workers need about 72 GB of memory; this machine has 64 GB: use --w"),
+        ({"cluster": "nonsense:x"}, "no Dask scheduler answers at 'nonsense:x'"),
+    ):
+        with pytest.raises(InputError, match=message), open_engine(demand, **given):
+            pass
+
+
+def test_sums_of_channels_are_added_and_not_changed():
+    from lusee_bayes.linear.joint import ComponentSums
+
+    rng = np.random.default_rng(1)
+
+    def sums():
+        shapes = (3, 4, 4), (2, 4), (2, 4), (), (), ()
+        return ComponentSums(*(np.asarray(rng.standard_normal(shape)) for shape in shapes))
+
+    one, other = sums(), sums()
+    before = one.matrices.copy()
+    both = one.plus(other)
+    np.testing.assert_array_equal(both.matrices, one.matrices + other.matrices)
+    np.testing.assert_array_equal(both.reference, one.reference)
+    np.testing.assert_array_equal(one.matrices, before)
+    assert both.misfit == one.misfit + other.misfit

@@ -1,0 +1,254 @@
+"""Runs on a real cluster: a scheduler and three workers, started as a user starts them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from lusee_bayes.core.engine import ThisProcess
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.runs.map_run import run_map
+
+pytest.importorskip("distributed")
+
+TWELVE = [12.0 + 2 * k for k in range(12)]
+SETTINGS = ["lmax=6", "observation.runs.0.cycles=0.1"]
+MAP = ["map", "fiducial", "--frequencies", "12:34:2", "--draws", "3"]
+MAP += [word for setting in SETTINGS for word in ("--set", setting)]
+
+
+class Cluster:
+    """Processes of ``dask scheduler`` and ``dask worker``, in a folder of their own."""
+
+    def __init__(self, folder: Path):
+        self.folder, self.workers = folder, []
+        self.environment = os.environ | {"MPLBACKEND": "agg", "DASK_LUSEE_BAYES__PATIENCE": "3s"}
+        self.environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+        self.start()
+
+    def start(self):
+        """A scheduler, anew where one has been killed."""
+        written = self.folder / f"scheduler-{time.monotonic_ns()}.json"
+        options = ["--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(written)]
+        self.scheduler = self._dask("scheduler", "--no-dashboard", *options)
+        self._wait(written.is_file)
+        self._wait(lambda: written.read_text().endswith("}"))
+        self.address = json.loads(written.read_text())["address"]
+        self.workers = []
+
+    def add(self, n=3):
+        """Workers of one thread."""
+        options = ["--nthreads", "1", "--no-dashboard", "--host", "127.0.0.1"]
+        self.workers += [self._dask("worker", self.address, *options) for _ in range(n)]
+
+    def command(self, *arguments) -> subprocess.Popen:
+        """The command line, as a process."""
+        words = [sys.executable, "-m", "lusee_bayes.cli", *map(str, arguments)]
+        environment = self.environment | {"DASK_SCHEDULER_ADDRESS": self.address}
+        return subprocess.Popen(
+            words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+
+    def kill(self, process: subprocess.Popen):
+        """With all that it has started: a nanny's worker ends with it."""
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+    def close(self):
+        for process in (*self.workers, self.scheduler):
+            self.kill(process)
+
+    def _dask(self, *words) -> subprocess.Popen:
+        return subprocess.Popen(
+            [sys.executable, "-m", "dask", *words],
+            env=self.environment,
+            cwd=self.folder,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+
+    @staticmethod
+    def _wait(there):
+        deadline = time.monotonic() + 60
+        while not there():
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    found = Cluster(tmp_path)
+    found.add()
+    yield found
+    found.close()
+
+
+def posterior_of(folder: Path) -> xr.Dataset:
+    return xr.load_dataset(folder / "posterior.nc", engine="h5netcdf").drop_attrs()
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """The same runs in this process, independent and joint, with one thread for each product."""
+    folder = tmp_path_factory.mktemp("alone")
+    settings = [*SETTINGS, f"frequencies_mhz={TWELVE}", "output.draws=3"]
+    for name in ("independent", "joint"):
+        scenario = load_scenario("fiducial", [*settings, f"joint={str(name == 'joint').lower()}"])
+        run_map(scenario, folder / name, engine=ThisProcess(2))
+    return {name: posterior_of(folder / name) for name in ("independent", "joint")}
+
+
+def assert_same(folder: Path, expected: xr.Dataset):
+    """Within 1e-9 standard deviations, whatever the threads for products of matrices."""
+    found, std = posterior_of(folder), expected["std"].values
+    for name in ("mean", "draws"):
+        far = np.abs(found[name].values - expected[name].values)
+        assert (far / (std if name == "mean" else std[:, None])).max() < 1e-9
+    np.testing.assert_allclose(found["std"].values, std, rtol=1e-9)
+
+
+def finished(folder: Path) -> dict[str, int]:
+    """The channels that are there, and when each was written."""
+    found = {}
+    for path in folder.glob("channels/*.nc"):
+        with suppress(FileNotFoundError):
+            found[path.name] = path.stat().st_mtime_ns
+    return found
+
+
+def when_some_are_there(process: subprocess.Popen, folder: Path, n: int = 3):
+    deadline = time.monotonic() + 120
+    while len(finished(folder)) < n:
+        assert time.monotonic() < deadline and process.poll() is None, process.communicate()
+        time.sleep(0.01)
+
+
+def goes_on(cluster: Cluster, folder: Path, *more):
+    """The same command ends well, and repeats nothing that was finished."""
+    before, seen = finished(folder), {}
+    process = cluster.command(*MAP, *more, "-o", folder, "-q")
+    while process.poll() is None:
+        seen |= finished(folder)
+        time.sleep(0.01)
+    assert process.returncode == 0, process.communicate()
+    process.communicate()
+    assert before and {name: seen[name] for name in before} == before
+
+
+@pytest.mark.essential
+def test_a_cluster_gives_the_same_numbers_though_a_worker_is_killed(cluster, alone, tmp_path):
+    process = cluster.command(*MAP, "-o", tmp_path / "a")
+    when_some_are_there(process, tmp_path / "a")
+    cluster.kill(cluster.workers[0])
+    said, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    assert "done again elsewhere: " in said
+    assert_same(tmp_path / "a", alone["independent"])
+    process = cluster.command(*MAP, "--joint", "-o", tmp_path / "b", "-q")
+    assert process.communicate(timeout=120) == ("", "") and process.returncode == 0
+    assert_same(tmp_path / "b", alone["joint"])
+
+
+@pytest.mark.long
+def test_all_workers_killed(cluster, alone, tmp_path):
+    process = cluster.command(*MAP, "--joint", "-o", tmp_path / "a")
+    when_some_are_there(process, tmp_path / "a")
+    for worker in cluster.workers:
+        cluster.kill(worker)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert errors.startswith(f"lusee-bayes: the Dask scheduler at {cluster.address} has had no ")
+    assert errors.endswith("the same command continues from the finished channels\n")
+    cluster.add()
+    goes_on(cluster, tmp_path / "a", "--joint")
+    assert_same(tmp_path / "a", alone["joint"])
+
+
+@pytest.mark.long
+def test_the_scheduler_killed(cluster, alone, tmp_path):
+    process = cluster.command(*MAP, "-o", tmp_path / "a")
+    when_some_are_there(process, tmp_path / "a")
+    cluster.kill(cluster.scheduler)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert errors == (
+        f"lusee-bayes: the Dask scheduler at {cluster.address} is gone, or has forgotten this run; "
+        f"nothing has been written in '{tmp_path}/a'; the same command continues from the finished "
+        "channels\n"
+    )
+    for worker in cluster.workers:
+        cluster.kill(worker)
+    cluster.start()
+    cluster.add()
+    goes_on(cluster, tmp_path / "a")
+    assert_same(tmp_path / "a", alone["independent"])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_the_command_ended(how, cluster, alone, tmp_path):
+    process = cluster.command(*MAP, "-o", tmp_path / "a", "-q")
+    when_some_are_there(process, tmp_path / "a")
+    process.send_signal(how)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == (130 if how == signal.SIGINT else -9)
+    assert ("continues from the finished channels" in errors) == (how == signal.SIGINT)
+    goes_on(cluster, tmp_path / "a")
+    assert_same(tmp_path / "a", alone["independent"])
+
+
+@pytest.mark.long
+def test_workers_of_a_killed_command_end_with_it(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lusee_bayes.cli", *MAP, "--workers", "2", "-o", tmp_path, "-q"]
+    )
+    when_some_are_there(process, tmp_path)
+    started = subprocess.run(
+        ["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True
+    ).stdout.split()
+    assert started
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 30
+    while any(Path(f"/proc/{pid}").exists() for pid in started):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    assert list(tmp_path.glob("channels/*.nc"))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("arguments", "same"),
+    [
+        (["plan", "fiducial", "--set", "lmax=6", "--vary", "frequency_mhz=10,20,30"], "plan.csv"),
+        (
+            ["validate", "fiducial", *MAP[6:], "--skies", "embedded:2", "smooth"],
+            "coverage.csv",
+        ),
+        (
+            ["compare-priors", "fiducial", *MAP[6:], "--priors", "isotropic,local_scales"],
+            "priors.csv",
+        ),
+    ],
+    ids=["plan", "validate", "compare-priors"],
+)
+def test_other_commands_say_the_same(arguments, same, cluster, tmp_path):
+    tables = []
+    for name, more in (("one", ["--workers", "1"]), ("three", [])):
+        process = cluster.command(*arguments, *more, "-o", tmp_path / name, "-q")
+        _, errors = process.communicate(timeout=200)
+        assert process.returncode in (0, 1), errors
+        tables.append((tmp_path / name / same).read_text())
+    assert tables[0] == tables[1]
