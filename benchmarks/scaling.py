@@ -1,7 +1,8 @@
-"""How time and memory grow: samples, lmax, channels, devices; each case in a process of its own.
+"""How time and memory grow: samples, lmax, channels, workers; each case in a process of its own.
 
     python benchmarks/scaling.py samples lmax        the structured normal matrix
-    python benchmarks/scaling.py channels devices    whole runs of lusee-bayes map (minutes)
+    python benchmarks/scaling.py channels workers    whole runs of lusee-bayes map (minutes)
+    python benchmarks/scaling.py tasks               bytes and seconds of the parts of a joint run
 
 The operation count beside a time is that of the products the structure leaves: for A^T N^-1 A
 16 (16 P) N_modes^2 / 2 (P powers of the tilt; P and Q of normal_matrix.py, both triangles left out)
@@ -17,6 +18,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -26,15 +29,18 @@ from scipy.linalg.blas import dsyrk
 
 import lusee_bayes as lb
 from lusee_bayes.core.rotations import tilt_powers
+from lusee_bayes.experiment.inference import inform
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.experiment.terms import Around
+from lusee_bayes.linear.joint import ComponentSums, summed
 from lusee_bayes.linear.normal_matrix import normal_matrix
 from lusee_bayes.noise import radiometer_noise
 
 SAMPLES = [(1.0, 7200.0), (1.0, 600.0), (3.0, 7200.0), (12.0, 600.0), (13.368, 600.0)]
 LMAX = [16, 24, 32, 47, 64, 95]
 CHANNELS = [1, 4, 12, 46]
+WORKERS = [1, 2, 4]
 REPEATS = 5
 
 
@@ -107,26 +113,71 @@ def posterior_of_a_year() -> dict:
     }
 
 
-def run_of_channels(n: int, joint: bool, devices: int, processes: int) -> dict:
+def run_of_channels(n: int, joint: bool, workers: int) -> dict:
     """lusee-bayes map of n channels from 5 MHz on."""
     step = 45.0 / max(n - 1, 1)
     frequencies = ",".join(f"{5 + k * step:g}" for k in range(n))
     command = [sys.executable, "-m", "lusee_bayes.cli", "map", "fiducial", "-q", "--draws=20"]
     command += [f"--frequencies={frequencies}"] + ["--joint"] * joint
-    command += [f"--devices={devices}"] * (devices > 1)
-    command += [f"--processes={processes}"] * (processes > 1)
+    command += [f"--workers={workers}"] if n > 1 else []
+    peak = 0.0
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        subprocess.run([*command, "-o", folder], check=True)
+        with subprocess.Popen([*command, "-o", folder]) as run:
+            while run.poll() is None:
+                peak = max(peak, memory_gb(run.pid))
+                time.sleep(0.1)
         seconds = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / 1e9
+    assert run.returncode == 0
     return {
         "channels": n,
         "kind": "joint" if joint else "independent",
-        "devices": devices,
-        "processes": processes,
+        "workers": workers,
         "seconds": seconds,
-        "peak of a process [GB]": peak,
+        "peak of all processes [GB]": peak,
+    }
+
+
+def memory_gb(pid: int) -> float:
+    """Resident memory of a process and of all that it has started; shared pages count once."""
+    total = 0
+    with suppress(OSError):
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+        total = 1024 * next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+        for tasks in Path(f"/proc/{pid}/task").glob("*/children"):
+            total += 1e9 * sum(memory_gb(int(child)) for child in tasks.read_text().split())
+    return total / 1e9
+
+
+def tasks_of_joint_run(lmax: int) -> dict:
+    """Bytes and seconds of what a joint run does for a channel, and of what it moves for a sum."""
+    scenario = lb.load_scenario("fiducial", [f"lmax={lmax}", "frequencies_mhz=[10,20,30,40]"])
+    scenario = scenario.model_copy(update={"joint": True})
+    channel = scenario.channels()[1]
+    start = time.perf_counter()
+    known = inform(lb.build(channel), jax.random.key(0))[0]
+    inform_s = time.perf_counter() - start
+    frequencies = np.array(scenario.frequencies_mhz)
+    reference = np.stack([np.asarray(known.reference)] * 4)
+    prior = scenario.spectral.prior(frequencies, reference)
+    sums = ComponentSums.empty(prior, reference)
+    start = time.perf_counter()
+    sums = jax.block_until_ready(summed(sums, prior, 1, known))
+    sum_s = time.perf_counter() - start
+    start = time.perf_counter()
+    sums.plus(sums)
+    merge_s = time.perf_counter() - start
+
+    def megabytes(tree: object) -> float:
+        return sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) / 1e6
+
+    return {
+        "lmax": lmax,
+        "information [s]": inform_s,
+        "its file [MB]": megabytes(known),
+        "adding to a sum [s]": sum_s,
+        "a sum [MB]": megabytes(sums),
+        "merging two [s]": merge_s,
     }
 
 
@@ -140,12 +191,14 @@ def cases(topic: str) -> list[list]:
         return [["normal", 1.0, 7200.0, lmax, 2, True] for lmax in LMAX]
     if topic == "channels":
         return [
-            ["run_of_channels", n, joint, 1, 1]
+            ["run_of_channels", n, joint, 1]
             for joint in (False, True)
             for n in CHANNELS
             if n > 1 or not joint
         ]
-    return [["run_of_channels", 12, False, d, p] for d, p in ((1, 1), (2, 1), (1, 2))]
+    if topic == "tasks":
+        return [["tasks_of_joint_run", lmax] for lmax in (31, 47)]
+    return [["run_of_channels", 46, joint, w] for joint in (False, True) for w in WORKERS]
 
 
 def main() -> None:

@@ -110,7 +110,6 @@ def test_lack_of_memory_or_disk_is_tried_again(engine, tmp_path):
     assert len(list(tmp_path.glob("10-*"))) == 4
 
 
-@pytest.mark.essential
 def test_a_task_whose_worker_dies_is_done_again_elsewhere(engine, tmp_path):
     def die(k):
         if k == 2 and attempts(tmp_path, k) < 3:
@@ -140,7 +139,6 @@ def test_a_task_whose_worker_dies_is_done_again_elsewhere(engine, tmp_path):
     assert engine.each(tasks_of(abs, 4), Stages(), "s") == [0, 1, 2, 3]
 
 
-@pytest.mark.essential
 def test_a_task_that_hangs_costs_its_worker(engine, tmp_path, monkeypatch):
     monkeypatch.setattr(engine, "_limit_s", 1.0)
 
@@ -154,7 +152,6 @@ def test_a_task_that_hangs_costs_its_worker(engine, tmp_path, monkeypatch):
     assert "its task took longer than 1 s" in said.lines[0]
 
 
-@pytest.mark.essential
 def test_a_task_that_takes_too_much_memory_is_named(tmp_path):
     def hold(k):
         if k == 1:

@@ -95,10 +95,11 @@ def test_every_gpu_has_a_worker(large, monkeypatch):
     monkeypatch.setattr(workers, "_gpus", lambda: 3)
     demand = Demand(n_tasks=46, base_bytes=1e9, task_bytes=1e9, seconds=1.0)
     assert workers_that_pay(demand) == 3
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,5,7")
-    assert [workers._gpu(k) for k in range(3)] == ["4", "5", "7"]
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
-    assert workers._gpu(2) == "2"
+    for seen, devices in (("4,5,7", "457"), ("", "012")):
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", seen)
+        given = [workers._environment(k, 3)["CUDA_VISIBLE_DEVICES"] for k in range(3)]
+        assert given == list(devices)
+    assert "CUDA_VISIBLE_DEVICES" not in workers._environment(0, 0)
 
 
 @pytest.mark.usefixtures("large")

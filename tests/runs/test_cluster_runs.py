@@ -147,6 +147,7 @@ def goes_on(cluster: Cluster, folder: Path, *more):
     assert before and {name: seen[name] for name in before} == before
 
 
+@pytest.mark.long
 @pytest.mark.essential
 def test_a_cluster_gives_the_same_numbers_though_a_worker_is_killed(cluster, alone, tmp_path):
     process = cluster.command(*MAP, "-o", tmp_path / "a")
