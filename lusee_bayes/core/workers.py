@@ -20,9 +20,10 @@ SCHEDULER = "DASK_SCHEDULER_ADDRESS"
 # workers pay where each has two processors for each of its tasks, and the run takes long enough
 # for them to start: on two processors a second process gains nothing (docs/cubes.md)
 PROCESSORS_OF_WORKER, LONG_S = 2 * SIDE_BY_SIDE, 60.0
-# Dask makes glibc return memory early (MALLOC_TRIM_THRESHOLD_), and so fixes at 128 kB the size from
-# which every array is new memory, which the system clears: two thirds more time for a channel
-LARGE_BYTES = 32 << 20
+# Dask makes glibc return memory early (MALLOC_TRIM_THRESHOLD_), which fixes at 128 kB the size from
+# which every array is new memory that the system clears: a third more time for a channel. This
+# is the largest size
+BEFORE_START = {"distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 32 << 20}
 # how long a scheduler has to answer
 ANSWER = "10s"
 
@@ -112,6 +113,7 @@ def _require_dask(option: str) -> None:
 @contextmanager
 def _own_workers(n: int, demand: Demand, verbose: bool) -> Iterator[object]:
     """A cluster of this machine alone, whose processors and memory its workers share."""
+    import dask
     import distributed
 
     side_by_side = min(demand.side_by_side, max(1, processors() // n))
@@ -129,6 +131,7 @@ def _own_workers(n: int, demand: Demand, verbose: bool) -> Iterator[object]:
     environments = [_environment(worker, _gpus()) for worker in range(n)]
     with (
         _quiet(),
+        dask.config.set(BEFORE_START),
         distributed.SpecCluster(
             scheduler={"cls": distributed.Scheduler, "options": server},
             workers={
@@ -144,14 +147,13 @@ def _own_workers(n: int, demand: Demand, verbose: bool) -> Iterator[object]:
 
 def _environment(worker: int, n_gpus: int) -> dict[str, str]:
     """What a worker has besides what this process has."""
-    found = {"MALLOC_MMAP_THRESHOLD_": str(LARGE_BYTES)}
-    if n_gpus:
-        # a GPU each, of those that this process may see; nobody takes all of its memory at once
-        seen = os.environ.get("CUDA_VISIBLE_DEVICES")
-        names = seen.split(",") if seen else [str(number) for number in range(n_gpus)]
-        found["CUDA_VISIBLE_DEVICES"] = names[worker % n_gpus]
-        found["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
-    return found
+    if n_gpus == 0:
+        return {}
+    # a GPU each, of those that this process may see; nobody takes all of its memory at once
+    seen = os.environ.get("CUDA_VISIBLE_DEVICES")
+    names = seen.split(",") if seen else [str(number) for number in range(n_gpus)]
+    device = names[worker % n_gpus]
+    return {"CUDA_VISIBLE_DEVICES": device, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
 
 
 @contextmanager
