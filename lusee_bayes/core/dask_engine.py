@@ -46,6 +46,8 @@ R = TypeVar("R")
 REPEATS = 3
 # seconds between looks at scheduler and workers
 POLL_S = 1.0
+# what a future says of a task that failed, and of one that the scheduler does not know
+BAD = ("error", "cancelled")
 # a task hangs that takes so many times as long as expected, and longer than that
 HANGING, LEAST_LIMIT_S = 50.0, 3600.0
 # seconds after which a result that does not come is asked for again
@@ -95,7 +97,7 @@ class DaskEngine(Engine):
     def work_in(self, folder: Path) -> None:
         self._folder = folder.resolve()
         with _scratch(self._folder) as place:
-            for worker, seen in self.client.run(os.path.isdir, str(place)).items():
+            for worker, seen in self._on_workers(os.path.isdir, str(place)).items():
                 if not seen:
                     raise InputError(
                         f"worker {worker} does not see '{self._folder}'; command and workers have "
@@ -106,8 +108,8 @@ class DaskEngine(Engine):
         found: list[Any] = [None] * len(tasks.items)
         with self._job(tasks) as job:
             futures = self._submitted(job, tasks)
-            for number, future in self._finished(futures, tasks, stages, stage):
-                found[number] = self._value(future)
+            for number, value in self._results(futures, 0, tasks, stages, stage):
+                found[number] = value
         return found
 
     def reduced(
@@ -122,13 +124,13 @@ class DaskEngine(Engine):
                     self._merged(job, level[first : first + 2], height)
                     for first in range(0, len(level), 2)
                 ]
-            root = level.pop()
-            if root not in futures:
-                futures.append(root)
+            if height:
+                futures.append(level[0])
+            level.clear()
             # what the tasks give is left with the workers
-            for _ in self._finished(futures, tasks, stages, stage):
-                pass
-            return self._value(root)
+            last = len(futures) - 1
+            ((_, value),) = self._results(futures, last, tasks, stages, stage)
+        return value
 
     def _submitted(self, job: Path, tasks: Tasks[T, R]) -> list[distributed.Future]:
         terms, label = Terms(self._threads(), self._limit_s), uuid4().hex
@@ -149,15 +151,22 @@ class DaskEngine(Engine):
             run_merge, job, *parts, pure=False, retries=REPEATS, priority=height
         )
 
-    def _finished(
-        self, futures: list[distributed.Future], tasks: Tasks[T, R], stages: Stages, stage: str
-    ) -> Iterator[tuple[int, distributed.Future]]:
-        """Every future with its number, as they finish; the list is emptied, to hold none longer.
+    def _results(
+        self,
+        futures: list[distributed.Future],
+        first: int,
+        tasks: Tasks[T, R],
+        stages: Stages,
+        stage: str,
+    ) -> Iterator[tuple[int, Any]]:
+        """Numbers and values of the futures from the ``first`` on, as they finish.
 
-        WorkersLost, in one sentence, if one does not; all others are cancelled then.
+        The list is emptied, so that none is held longer than needed. If one fails, the others are
+        cancelled.
         """
         ended: SimpleQueue[distributed.Future] = SimpleQueue()
         numbers = {future.key: number for number, future in enumerate(futures)}
+        names = dict(zip(numbers, tasks.names, strict=False))  # a sum has none
         waiting = dict(zip(numbers, futures, strict=True))
         futures.clear()
         for future in waiting.values():
@@ -172,59 +181,55 @@ class DaskEngine(Engine):
                         self._require_workers(absence)
                     else:
                         number = numbers[future.key]
-                        if future.status != "finished":
-                            raise self._lost(future, numbers, tasks, stage)
+                        if number >= first or future.status in BAD:
+                            yield number, self._value(future, names, stage)
                         del waiting[future.key]
-                        yield number, future
-                        if number < len(tasks.items):
+                        if future.key in names:
                             finished += 1
-                            done(finished, tasks.names[number])
-                    self._tell(numbers, tasks, stages)
+                            done(finished, names[future.key])
+                    self._tell(names, stages)
         except BaseException:
             # a scheduler that is gone cannot be told
             with suppress(Exception):
                 self.client.cancel(list(waiting.values()), force=True)
             raise
 
-    def _value(self, future: distributed.Future) -> Any:
-        """What a task gave, from the worker that holds it; if that has ended, from another."""
-        while True:
+    def _value(self, future: distributed.Future, names: dict[str, str], stage: str) -> Any:
+        """What a task gave, from the worker that holds it; if that has ended, from another.
+
+        WorkersLost, in one sentence, if it could not be carried out.
+        """
+        absence = _Absence()
+        while future.status not in BAD:
             try:
                 value = future.result(timeout=FETCH_S)
             except TimeoutError:
-                self._require_workers(_Absence())
-                continue
-            except distributed.CancelledError as error:
-                raise WorkersLost(f"{self._scheduler()} is gone") from error
-            if isinstance(value, Failed):
-                raise value.error
-            return value
-
-    def _lost(
-        self,
-        future: distributed.Future,
-        numbers: dict[str, int],
-        tasks: Tasks[T, R],
-        stage: str,
-    ) -> WorkersLost:
-        """Why a task could not be carried out, in one sentence."""
+                self._require_workers(absence)
+            except Exception:
+                # its status says why
+                if future.status not in BAD:
+                    raise
+            else:
+                if isinstance(value, Failed):
+                    raise value.error
+                return value
         if future.status != "error":
-            return WorkersLost(f"{self._scheduler()} is gone, or has forgotten this run")
+            raise WorkersLost(f"{self._scheduler()} is gone, or has forgotten this run")
         error = future.exception()
         killed = isinstance(error, distributed.KilledWorker)
-        number = numbers.get(str(error.task) if killed else future.key, len(tasks.names))
-        name = f"{stage}, {tasks.names[number]}" if number < len(tasks.names) else stage
+        key = str(error.task) if killed else future.key
+        name = f"{stage}, {names[key]}" if key in names else stage
         if not killed:
-            return WorkersLost(
+            raise WorkersLost(
                 f"{name}: failed {REPEATS + 1} times, at last with {type(error).__name__}: "
                 f"{' '.join(str(error).split())[:300]}"
-            )
+            ) from error
         last = str(error.last_worker.address)
         why = self._causes.get(last, "killed, or out of memory")
-        return WorkersLost(
+        raise WorkersLost(
             f"{name}: {error.allowed_failures + 1} workers ended while they worked on it, one "
             f"after the other, the last of them {last} ({why})"
-        )
+        ) from error
 
     def _require_workers(self, absence: _Absence) -> None:
         """WorkersLost if the scheduler is gone, or all workers have been for long."""
@@ -248,12 +253,16 @@ class DaskEngine(Engine):
     def _workers(self) -> dict[str, Any]:
         return dict(self.client.scheduler_info(n_workers=-1)["workers"])
 
+    def _on_workers(self, function: Callable[..., R], *arguments: object) -> dict[str, R]:
+        """What a function gives on every worker that answers."""
+        return dict(self.client.run(function, *arguments, on_error="ignore"))
+
     def _threads(self) -> dict[str, int]:
         """Threads for products of matrices of every task, by host."""
         at_once: Counter[str] = Counter()
         found: dict[str, int] = {}
         workers = self._workers()
-        for address, (host, n_processors) in self.client.run(host_of_worker).items():
+        for address, (host, n_processors) in self._on_workers(host_of_worker).items():
             if address in workers:
                 at_once[host] += workers[address]["nthreads"]
                 found[host] = n_processors
@@ -297,17 +306,17 @@ class DaskEngine(Engine):
         said = event[1]
         self._causes[said["worker"]] = f"its task took longer than {said['limit_s']:.0f} s"
 
-    def _tell(self, numbers: dict[str, int], tasks: Tasks[T, R], stages: Stages) -> None:
+    def _tell(self, names: dict[str, str], stages: Stages) -> None:
         """Say which workers have ended, and what is repeated."""
         while self._ended:
             said = self._ended.popleft()
             worker = said["worker"]
-            again = sorted(numbers[key] for key in said["processing-tasks"] if key in numbers)
-            names = [tasks.names[number] for number in again if number < len(tasks.names)]
+            again = [name for key, name in names.items() if key in said["processing-tasks"]]
             why = f" ({self._causes[worker]})" if worker in self._causes else ""
             if again:
-                repeated = ", ".join(names) or "a sum"
-                stages.say(f"  worker {worker} ended{why}; done again elsewhere: {repeated}")
+                stages.say(
+                    f"  worker {worker} ended{why}; done again elsewhere: {', '.join(again)}"
+                )
 
 
 class _Absence:

@@ -7,6 +7,7 @@ import os
 import pickle
 import signal
 import socket
+import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -89,15 +90,14 @@ class Preparation(distributed.WorkerPlugin):
     name = "lusee_bayes"
 
     def __init__(self, folder: str, demand: Demand | None):
-        self.folder, self.demand, self.version = folder, demand, __version__
+        self.folder, self.demand, self.versions = folder, demand, _versions()
 
     def setup(self, worker: distributed.Worker) -> None:
         """Prepare a worker. InputError if it cannot do what the command asks for."""
         here = f"worker {worker.address} on {socket.gethostname()}"
-        if __version__ != self.version:
+        if _versions() != self.versions:
             raise InputError(
-                f"{here} has lusee_bayes {__version__}, the command {self.version}; install the "
-                "same on both"
+                f"{here} has {_versions()}, the command {self.versions}; install the same on both"
             )
         limit, threads = worker.memory_manager.memory_limit, worker.state.nthreads
         if self.demand and limit and self.demand.process_bytes(threads) > limit:
@@ -115,6 +115,11 @@ class Preparation(distributed.WorkerPlugin):
             ) from error
         gc.set_threshold(100_000, 20, 100)
         use_compilation_cache()
+
+
+def _versions() -> str:
+    """Of what code is sent between processes by."""
+    return f"lusee_bayes {__version__} and Python {sys.version_info.major}.{sys.version_info.minor}"
 
 
 def host_of_worker() -> tuple[str, int]:
@@ -136,9 +141,12 @@ def run_task(job: Path, number: int, terms: Terms) -> Any:
         One of ``TRANSIENT``, for which Dask repeats the task.
     """
     _divide_processors(terms.threads.get(socket.gethostname(), 1))
-    watch = Timer(terms.limit_s, _end_hanging, (distributed.get_worker(), terms.limit_s))
+    worker = distributed.get_worker()
+    watch = Timer(terms.limit_s, _end_hanging, (worker, terms.limit_s))
     watch.daemon = True
-    watch.start()
+    if worker.nanny is not None:
+        # which starts another worker
+        watch.start()
     try:
         known = read_job(job)
         return _result(known.function, known.items[number])

@@ -184,8 +184,8 @@ def test_workers_that_cannot_do_it_are_refused(engine, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"does not see '.*gone' \(No such file"):
         engine.client.register_plugin(gone)
     other = Preparation(os.getcwd(), None)
-    other.version = "0.0"
-    with pytest.raises(InputError, match=r"has lusee_bayes .*, the command 0.0; install the same"):
+    other.versions = "lusee_bayes 0.0 and Python 3.0"
+    with pytest.raises(InputError, match=r"has lusee_bayes .*, the command lusee_bayes 0.0 and Py"):
         engine.client.register_plugin(other)
     large = Demand(n_tasks=4, base_bytes=1e9, task_bytes=1e15, seconds=1.0)
     with pytest.raises(InputError, match=r"may take .* of memory, and 1 task\(s\) at a time need"):
