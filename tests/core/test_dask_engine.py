@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +138,29 @@ def test_a_task_whose_worker_dies_is_done_again_elsewhere(engine, tmp_path):
     assert len(list(tmp_path.glob("10-*"))) == 4
     # and what comes next is not affected
     assert engine.each(tasks_of(abs, 4), Stages(), "s") == [0, 1, 2, 3]
+
+
+def test_a_result_whose_worker_ends_before_it_is_fetched_is_made_again(
+    engine, tmp_path, monkeypatch
+):
+    value, lost = engine._value, []
+
+    def late(future, *more):
+        if not lost:
+            lost.append(future.key)
+            (holder,) = engine.client.who_has([future])[future.key]
+            with suppress(Exception):  # nobody is left to answer
+                engine.client.run(os._exit, 1, workers=[holder])
+            time.sleep(0.5)
+        return value(future, *more)
+
+    def counted(k):
+        attempts(tmp_path, k)
+        return k
+
+    monkeypatch.setattr(engine, "_value", late)
+    assert engine.each(tasks_of(counted, 1), Stages(), "s") == [0]
+    assert len(list(tmp_path.glob("0-*"))) == 2
 
 
 def test_a_task_that_hangs_costs_its_worker(engine, tmp_path, monkeypatch):
