@@ -91,6 +91,11 @@ def validate_command(
     """
     if skies is not None and (data is not None or resume):
         raise InputError("--skies simulates its data, all at once; leave out --data and --resume")
+    if skies is None:
+        from lusee_bayes.sampling.least import require_draws, require_simulations
+
+        require_simulations(simulations)
+        require_draws(draws)
     from lusee_bayes.core.workers import open_engine
     from lusee_bayes.results.cost import demand_of, posterior_cost
 
@@ -101,10 +106,6 @@ def validate_command(
         with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
             given = {"engine": engine, "replace": force, "stages": stages}
             return _on_skies(resolved, scenario, skies, output, console, given)
-    from lusee_bayes.sampling.least import require_draws, require_simulations
-
-    require_simulations(simulations)
-    require_draws(draws)
     from lusee_bayes.cli.tables import checks_table
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.results.validation_result import demand_of_calibration

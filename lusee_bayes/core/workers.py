@@ -166,8 +166,11 @@ def _connected(
 
     with _quiet():
         try:
+            if isinstance(place, str):
+                # a client of something else complains when it is forgotten
+                distributed.comm.addressing.get_address_host_port(place, strict=True)
             client = distributed.Client(place, timeout=ANSWER, set_as_default=False)
-        except (OSError, ValueError, TypeError) as error:
+        except (OSError, ValueError) as error:
             raise InputError(
                 f"no Dask scheduler answers at '{place}' ({' '.join(str(error).split())[:200]}); "
                 "start one with: dask scheduler"

@@ -11,8 +11,10 @@ import pytest
 import scipy.linalg
 
 from lusee_bayes.cli.main import main
+from lusee_bayes.core.engine import ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import sum_over_m
+from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
@@ -29,10 +31,10 @@ from lusee_bayes.results.forecast import (
     expected_snr_squared,
     forecast,
     forecast_rows,
-    forecasts_of,
     informed_modes,
     without_ports,
 )
+from lusee_bayes.results.forecasts import ForecastFiles, forecasts_of
 from lusee_bayes.results.variations import default_variations
 from lusee_bayes.sky.priors import HarmonicPrior
 
@@ -240,17 +242,22 @@ def test_default_variations_compare_like_with_like():
     assert [v.lost for v in families["antenna lost"]] == [(0,), (1,), (2,), (3,)]
 
 
-def test_what_is_there_twice_is_computed_once(monkeypatch):
+def test_what_is_there_twice_is_computed_once(monkeypatch, tmp_path):
     computed = []
     whole = varied()
     first = forecast(whole)
     monkeypatch.setattr(
-        "lusee_bayes.results.forecast.forecast",
+        "lusee_bayes.results.forecasts.forecast",
         lambda variation: computed.append(variation) or replace(first, variation=variation),
     )
     again, broken = replace(whole, name="again"), replace(whole, lost=(1,))
-    rows = forecast_rows(forecasts_of([whole, again, broken]))
+    given = [whole, again, broken], ForecastFiles(tmp_path), ThisProcess(), Stages()
+    made = forecasts_of(*given)
+    rows = forecast_rows(made)
     assert computed == [whole, broken]
+    # and what was computed is taken from its file the next time
+    assert forecast_rows(forecasts_of(*given)) == rows and len(computed) == 2
+    np.testing.assert_array_equal(forecasts_of(*given)[0].snr_squared, made[0].snr_squared)
     assert [row["variation"] for row in rows] == ["test", "again", "test"]
     assert rows[1]["difference_bits"] == "0.00"
 

@@ -6,6 +6,7 @@ By the analytic posterior and by Hamiltonian Monte Carlo, with every kind of N. 
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
 
@@ -19,6 +20,7 @@ from scipy import stats
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.terms import Around
@@ -202,6 +204,18 @@ def test_the_standard_error_of_a_coverage():
 # --- calibrate, where the answer is known in closed form --------------------------------------
 
 
+class Counting(Stages):
+    """Keeps what is told of progress."""
+
+    def __init__(self):
+        super().__init__()
+        self.done = []
+
+    @contextmanager
+    def progress(self, name, total):
+        yield lambda done, remark="": self.done.append(done)
+
+
 def test_ranks_count_the_draws_below_the_truth():
     def simulate(key):
         return {"x": jnp.asarray([37.5, 0.5, N_DRAWS + 0.5]), "y": jnp.asarray(98.0)}, jnp.zeros(1)
@@ -211,15 +225,15 @@ def test_ranks_count_the_draws_below_the_truth():
         shuffled = jax.random.permutation(key, grid)
         return {"x": jnp.stack([shuffled, grid, grid], axis=1), "y": shuffled}
 
-    reports = []
+    stages = Counting()
     ranks = calibrate(
-        simulate, draw, lambda sky, data: sky, n_simulations=130, batch=60, report=reports.append
+        simulate, draw, lambda sky, data: sky, n_simulations=130, batch=60, stages=stages
     )
     assert ranks.names == ("x 0", "x 1", "x 2", "y")
     assert ranks.n_draws == N_DRAWS
     # 37 of 1, 2, ... lie below 37.5; 97 below 98
     np.testing.assert_array_equal(ranks.ranks, np.tile([37, 0, N_DRAWS, 97], (130, 1)))
-    assert reports == [60, 120, 130]
+    assert stages.done == [1, 2, 3]  # batches
 
 
 class Conjugate(eqx.Module):
