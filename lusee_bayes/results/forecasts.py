@@ -76,9 +76,11 @@ def forecasts_of(
     InputError
         As :func:`.forecast`.
     """
-    different = {_digest(variation): variation for variation in reversed(variations)}
+    different: dict[str, Variation] = {}
+    for variation in variations:
+        different.setdefault(_digest(variation), variation)
     stages.say(f"  {len(variations)} variations, {len(different)} of them different")
-    first, *others = reversed(different.values())
+    first, *others = different.values()
     start = time.perf_counter()
     with stages("first forecast"):
         found = [files.forecast(first)]

@@ -1,5 +1,7 @@
 """YAML without what is misread: PyYAML agrees on all that is plain."""
 
+import re
+
 import pytest
 import yaml
 from hypothesis import given, settings
@@ -8,14 +10,12 @@ from hypothesis import strategies as st
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.yaml_files import DEEPEST, parse_yaml, read_yaml
 
-LEAVES = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(allow_nan=False), st.text(max_size=10)
-)
+# to PyYAML 1e6 is text, which it writes without quotes; here it is a number
+TEXT = st.text(max_size=10).filter(lambda text: not re.fullmatch(r"[-+]?\d+[eE][-+]?\d+", text))
+LEAVES = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(allow_nan=False), TEXT)
 TREES = st.recursive(
     LEAVES,
-    lambda inner: (
-        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
-    ),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(TEXT, inner, max_size=3),
     max_leaves=8,
 )
 

@@ -26,6 +26,15 @@ SETTINGS = ["lmax=6", "observation.runs.0.cycles=0.1"]
 MAP = ["map", "fiducial", "--frequencies", "12:34:2", "--draws", "3"]
 MAP += [word for setting in SETTINGS for word in ("--set", setting)]
 
+# listens to Ctrl-C even where the tests run in the background, which ignores it
+PROGRAM = """
+import signal, sys
+from lusee_bayes.cli.main import main
+signal.signal(signal.SIGINT, signal.default_int_handler)
+if __name__ == "__main__":
+    sys.exit(main())
+"""
+
 
 class Cluster:
     """Processes of ``dask scheduler`` and ``dask worker``, in a folder of their own."""
@@ -53,7 +62,7 @@ class Cluster:
 
     def command(self, *arguments) -> subprocess.Popen:
         """The command line, as a process."""
-        words = [sys.executable, "-m", "lusee_bayes.cli", *map(str, arguments)]
+        words = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
         environment = self.environment | {"DASK_SCHEDULER_ADDRESS": self.address}
         return subprocess.Popen(
             words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
