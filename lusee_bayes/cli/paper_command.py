@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes.cli.options import Cluster, Force, Quiet, Workers, say
+from lusee_bayes.cli.options import Cluster, Force, Quiet, Verbose, Workers, say
 from lusee_bayes.core.progress import Stages
 
 
@@ -20,6 +20,7 @@ def paper_command(
     cluster: Cluster = None,
     force: Force = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Reproduce the figures of the reference paper and judge its claims.
 
@@ -43,6 +44,8 @@ def paper_command(
         Replace results of another run in the folder.
     quiet
         Print nothing but errors.
+    verbose
+        Print the memory in use after every stage.
     """
     from lusee_bayes.core.workers import open_engine
     from lusee_bayes.paper.cases import paper_scenarios
@@ -51,8 +54,9 @@ def paper_command(
 
     console, skies = Console(quiet=quiet, soft_wrap=True), sky or []
     demand = demand_of([posterior_cost(s) for s in paper_scenarios(skies=skies).values()])
-    with open_engine(demand, workers, cluster) as engine:
-        run = run_paper(output, skies=skies, engine=engine, replace=force, stages=Stages(console))
+    stages = Stages(console, verbose=verbose)
+    with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+        run = run_paper(output, skies=skies, engine=engine, replace=force, stages=stages)
     say(console, *(f"  {path}" for path in run.files if path.suffix != ".nc"))
     say(console, (run.folder / "claims.md").read_text().splitlines()[0])
     say(console, f"look at {run.folder}/claims.md")

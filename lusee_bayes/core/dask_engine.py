@@ -8,14 +8,15 @@ repeated elsewhere, by Dask, ``REPEATS`` times at most.
 
 from __future__ import annotations
 
-import os
 import shutil
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
+from threading import TIMEOUT_MAX
 from typing import Any, TypeVar
 from uuid import uuid4
 
@@ -27,11 +28,13 @@ from lusee_bayes.core.dask_worker import (
     HANGS,
     Failed,
     Job,
-    Preparation,
     Terms,
     host_of_worker,
+    refusal_of,
     run_merge,
     run_task,
+    this_process,
+    versions,
 )
 from lusee_bayes.core.engine import Demand, Engine, Tasks
 from lusee_bayes.core.errors import InputError, WorkersLost
@@ -67,42 +70,34 @@ class DaskEngine(Engine):
     client : distributed.Client
         Of the cluster; it stays open.
     demand : Demand, optional
-        What the tasks take. Workers whose memory would not suffice are refused, and tasks that
-        take far too long are taken for hanging.
-
-    Raises
-    ------
-    InputError
-        If a worker has another version of the package, does not see this folder, or has too little
-        memory.
+        What the tasks take. With it, workers whose memory would not suffice are refused, and tasks
+        that take far too long are taken for hanging.
     """
 
     def __init__(self, client: distributed.Client, demand: Demand | None = None):
         self.client = client
-        self._folder: Path | None = None
-        self._limit_s = LEAST_LIMIT_S
+        self._demand = demand
+        self._limit_s = TIMEOUT_MAX
         if demand is not None:
             expected = demand.seconds / max(demand.n_tasks, 1)
             self._limit_s = max(LEAST_LIMIT_S, HANGING * expected)
+        self._terms: Terms | None = None
         # workers that have ended, and why
         self._ended: deque[dict[str, Any]] = deque()
         self._causes: dict[str, str] = {}
-        try:
-            client.register_plugin(Preparation(os.getcwd(), demand))
-        except ModuleNotFoundError as error:
-            raise InputError(
-                f"workers of {self._scheduler()} lack {error.name}; install lusee_bayes for them"
-            ) from error
 
     def work_in(self, folder: Path) -> None:
-        self._folder = folder.resolve()
-        with _scratch(self._folder) as place:
-            for worker, seen in self._on_workers(os.path.isdir, str(place)).items():
-                if not seen:
-                    raise InputError(
-                        f"worker {worker} does not see '{self._folder}'; command and workers have "
-                        "to share a disk: give a folder on it with -o"
-                    )
+        place, process = folder.resolve(), this_process()
+        self._terms = Terms(versions(), place, self._demand, process)
+        answers = self.client.run(refusal_of, self._terms, on_error="return")
+        for answer in answers.values():
+            if isinstance(answer, ModuleNotFoundError):
+                raise InputError(
+                    f"workers of {self._scheduler()} lack {answer.name}; install lusee_bayes for "
+                    "them"
+                )
+            if isinstance(answer, str):
+                raise InputError(answer)
 
     def each(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> list[R]:
         found: list[Any] = [None] * len(tasks.items)
@@ -133,7 +128,8 @@ class DaskEngine(Engine):
         return value
 
     def _submitted(self, job: Path, tasks: Tasks[T, R]) -> list[distributed.Future]:
-        terms, label = Terms(self._threads(), self._limit_s), uuid4().hex
+        terms = replace(self._told(), threads=self._threads(), limit_s=self._limit_s)
+        label = uuid4().hex
         return [
             self.client.submit(
                 run_task, job, number, terms, key=f"{label}-{number}", retries=REPEATS
@@ -189,9 +185,9 @@ class DaskEngine(Engine):
                             done(finished, names[future.key])
                     self._tell(names, stages)
         except BaseException:
-            # a scheduler that is gone cannot be told
-            with suppress(Exception):
-                self.client.cancel(list(waiting.values()), force=True)
+            # to cancel them would be to ask for sums, too, which nobody holds
+            for future in waiting.values():
+                future.release()
             raise
 
     def _value(self, future: distributed.Future, names: dict[str, str], stage: str) -> Any:
@@ -253,27 +249,26 @@ class DaskEngine(Engine):
     def _workers(self) -> dict[str, Any]:
         return dict(self.client.scheduler_info(n_workers=-1)["workers"])
 
-    def _on_workers(self, function: Callable[..., R], *arguments: object) -> dict[str, R]:
-        """What a function gives on every worker that answers."""
-        return dict(self.client.run(function, *arguments, on_error="ignore"))
-
     def _threads(self) -> dict[str, int]:
         """Threads for products of matrices of every task, by host."""
         at_once: Counter[str] = Counter()
         found: dict[str, int] = {}
-        workers = self._workers()
-        for address, (host, n_processors) in self._on_workers(host_of_worker).items():
+        workers, hosts = self._workers(), self.client.run(host_of_worker, on_error="ignore")
+        for address, (host, n_processors) in hosts.items():
             if address in workers:
                 at_once[host] += workers[address]["nthreads"]
                 found[host] = n_processors
         return {host: max(1, n // at_once[host]) for host, n in found.items()}
 
+    def _told(self) -> Terms:
+        if self._terms is None:
+            raise RuntimeError("the engine is not told where to work: call work_in first")
+        return self._terms
+
     @contextmanager
     def _job(self, tasks: Tasks[T, R], merge: Callable[[R, R], R] | None = None) -> Iterator[Path]:
         """Write what all tasks share where the workers see it."""
-        if self._folder is None:
-            raise RuntimeError("the engine is not told where to work: call work_in first")
-        with _scratch(self._folder) as place:
+        with _scratch(self._told().folder) as place:
             path = place / "job.pickle"
             with path.open("wb") as file:
                 cloudpickle.dump(Job(tasks.function, tasks.items, merge), file)
@@ -307,16 +302,14 @@ class DaskEngine(Engine):
         self._causes[said["worker"]] = f"its task took longer than {said['limit_s']:.0f} s"
 
     def _tell(self, names: dict[str, str], stages: Stages) -> None:
-        """Say which workers have ended, and what is repeated."""
+        """Say which workers have ended, and what they had begun or were to begin."""
         while self._ended:
             said = self._ended.popleft()
             worker = said["worker"]
             again = [name for key, name in names.items() if key in said["processing-tasks"]]
             why = f" ({self._causes[worker]})" if worker in self._causes else ""
             if again:
-                stages.say(
-                    f"  worker {worker} ended{why}; done again elsewhere: {', '.join(again)}"
-                )
+                stages.say(f"  worker {worker} ended{why}; given to others: {', '.join(again)}")
 
 
 class _Absence:

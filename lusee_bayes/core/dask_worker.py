@@ -1,4 +1,4 @@
-"""What a worker of Dask does for a run: prepares itself, and carries out a task."""
+"""What a worker of Dask does for a run: it carries out tasks, if it can."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import socket
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from threading import Lock, Timer
+from threading import TIMEOUT_MAX, Lock, Timer
 from typing import Any
 
 import distributed
@@ -34,6 +34,7 @@ TRANSIENT = (MemoryError, OSError, jax.errors.JaxRuntimeError)
 HANGS = "lusee_bayes-hangs"
 
 _reading, _dividing, _threads = Lock(), Lock(), [0]
+_jobs: dict[Path, Job] = {}
 
 
 @dataclass(frozen=True)
@@ -62,69 +63,30 @@ class Job:
 
 @dataclass(frozen=True)
 class Terms:
-    """Under which conditions a task is carried out.
+    """Under which conditions tasks are carried out.
 
     Attributes
     ----------
-    threads : mapping
-        For products of matrices, by host name.
+    versions : str
+        Those that code is sent between processes by.
+    folder : Path
+        Of the run.
+    demand : Demand or None
+        What a task takes.
+    process : str
+        Of the command, which stays as it is where a worker is a thread of it.
     limit_s : float
         A task that takes longer hangs: its worker is ended.
+    threads : mapping
+        For products of matrices, by host name.
     """
 
-    threads: Mapping[str, int]
-    limit_s: float
-
-
-class Preparation(distributed.WorkerPlugin):
-    """Makes a worker work as the command does: in its folder, with its version and its programs.
-
-    Parameters
-    ----------
-    folder : str
-        In which the command was given; paths may be relative to it.
-    demand : Demand or None
-        What the tasks take.
-    """
-
-    name = "lusee_bayes"
-
-    def __init__(self, folder: str, demand: Demand | None):
-        self.folder, self.demand, self.versions = folder, demand, _versions()
-
-    def setup(self, worker: distributed.Worker) -> None:
-        """Prepare a worker. InputError if it cannot do what the command asks for."""
-        here = f"worker {worker.address} on {socket.gethostname()}"
-        if _versions() != self.versions:
-            raise InputError(
-                f"{here} has {_versions()}, the command {self.versions}; install the same on both"
-            )
-        limit, threads = worker.memory_manager.memory_limit, worker.state.nthreads
-        if self.demand and limit and self.demand.process_bytes(threads) > limit:
-            raise InputError(
-                f"{here} may take {gigabytes(limit)} of memory, and {threads} task(s) at a time "
-                f"need about {gigabytes(self.demand.process_bytes(threads))}; start it with a "
-                "larger --memory-limit or fewer --nthreads"
-            )
-        try:
-            os.chdir(self.folder)
-        except OSError as error:
-            raise InputError(
-                f"{here} does not see '{self.folder}' ({error.strerror}); command and workers have "
-                "to share a disk"
-            ) from error
-        gc.set_threshold(100_000, 20, 100)
-        use_compilation_cache()
-
-
-def _versions() -> str:
-    """Of what code is sent between processes by."""
-    return f"lusee_bayes {__version__} and Python {sys.version_info.major}.{sys.version_info.minor}"
-
-
-def host_of_worker() -> tuple[str, int]:
-    """Name of this host, and how many of its processors may be used."""
-    return socket.gethostname(), processors()
+    versions: str
+    folder: Path
+    demand: Demand | None
+    process: str
+    limit_s: float = TIMEOUT_MAX
+    threads: Mapping[str, int] = field(default_factory=dict)
 
 
 def run_task(job: Path, number: int, terms: Terms) -> Any:
@@ -140,8 +102,14 @@ def run_task(job: Path, number: int, terms: Terms) -> Any:
     Exception
         One of ``TRANSIENT``, for which Dask repeats the task.
     """
-    _divide_processors(terms.threads.get(socket.gethostname(), 1))
     worker = distributed.get_worker()
+    if refusal := refusal_of(terms, worker):
+        return Failed(InputError(refusal))
+    own = this_process() != terms.process
+    if own:
+        _prepare()
+        share = processors() // worker.state.nthreads
+        _divide_processors(terms.threads.get(socket.gethostname(), max(1, share)))
     watch = Timer(terms.limit_s, _end_hanging, (worker, terms.limit_s))
     watch.daemon = True
     if worker.nanny is not None:
@@ -154,7 +122,53 @@ def run_task(job: Path, number: int, terms: Terms) -> Any:
         watch.cancel()
         # what a task was made of may refer to itself, and is large
         gc.collect()
-        publish()
+        if own:
+            publish()
+
+
+def refusal_of(terms: Terms, dask_worker: distributed.Worker) -> str | None:
+    """Why a worker cannot do what a command asks for, in one sentence; None if it can.
+
+    Dask gives the worker to an argument of this name.
+    """
+    here = f"worker {dask_worker.address} on {socket.gethostname()}"
+    if versions() != terms.versions:
+        return f"{here} has {versions()}, the command {terms.versions}; install the same on both"
+    limit, n = dask_worker.memory_manager.memory_limit, dask_worker.state.nthreads
+    if terms.demand is not None and limit and terms.demand.process_bytes(n) > limit:
+        return (
+            f"{here} may take {gigabytes(limit)} of memory, and {n} task(s) at a time need about "
+            f"{gigabytes(terms.demand.process_bytes(n))}; start it with a larger --memory-limit or "
+            "fewer --nthreads"
+        )
+    if not terms.folder.is_dir():
+        return (
+            f"{here} does not see '{terms.folder}'; command and workers have to share a disk: give "
+            "a folder on it with -o"
+        )
+    return None
+
+
+def versions() -> str:
+    """Those that code is sent between processes by."""
+    return f"lusee_bayes {__version__} and Python {sys.version_info.major}.{sys.version_info.minor}"
+
+
+def this_process() -> str:
+    """A name that no other process has."""
+    return f"{socket.gethostname()} {os.getpid()}"
+
+
+def host_of_worker() -> tuple[str, int]:
+    """Name of this host, and how many of its processors may be used."""
+    return socket.gethostname(), processors()
+
+
+@lru_cache(maxsize=1)
+def _prepare() -> None:
+    """Let this process work as one of a command does."""
+    gc.set_threshold(100_000, 20, 100)
+    use_compilation_cache()
 
 
 def run_merge(job: Path, one: Any, other: Any) -> Any:
@@ -170,13 +184,12 @@ def run_merge(job: Path, one: Any, other: Any) -> Any:
 def read_job(path: Path) -> Job:
     """What :class:`.DaskEngine` has written; that of the last stage is kept."""
     with _reading:
-        return _read(path)
-
-
-@lru_cache(maxsize=1)
-def _read(path: Path) -> Job:
-    with path.open("rb") as file:
-        return pickle.load(file)
+        if path not in _jobs:
+            # not both at a time
+            _jobs.clear()
+            with path.open("rb") as file:
+                _jobs[path] = pickle.load(file)
+        return _jobs[path]
 
 
 def _result(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -184,10 +197,21 @@ def _result(function: Callable[..., Any], *arguments: Any) -> Any:
         return function(*arguments)
     except TRANSIENT:
         raise
-    except Exception as error:
-        if not isinstance(error, InputError):
-            error.add_note(f"of a worker:\n{traceback.format_exc()}")
+    except InputError as error:
         return Failed(error)
+    except Exception as error:
+        found = _to_send(error)
+        found.add_note(f"of a worker:\n{traceback.format_exc()}")
+        return Failed(found)
+
+
+def _to_send(error: Exception) -> Exception:
+    """The same, or its words where it would not arrive."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error
 
 
 def _divide_processors(n: int) -> None:

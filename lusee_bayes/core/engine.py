@@ -136,7 +136,7 @@ class Engine(ABC):
         Raises
         ------
         InputError
-            If a worker does not see it.
+            If a worker does not see it, has another version of the package, or too little memory.
         """
 
 
@@ -176,7 +176,6 @@ class ThisProcess(Engine):
     ) -> None:
         """Call ``keep`` with the number of every item and what the function gives for it."""
         n_threads = max(1, min(self.side_by_side, len(tasks.items)))
-        gc.freeze()  # modules stay: they need not be searched
         stopped, counting, finished = Event(), Lock(), 0
         waiting = iter(range(len(tasks.items)))
         with stages.progress(stage, len(tasks.items)) as done:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
+from threading import current_thread, main_thread
 
 import jax
 
 from lusee_bayes.core.engine import SIDE_BY_SIDE, Demand, Engine, ThisProcess
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.files import uninterrupted
 from lusee_bayes.core.memory import gigabytes, memory_limit
 from lusee_bayes.core.threads import processors
 
@@ -20,10 +24,13 @@ SCHEDULER = "DASK_SCHEDULER_ADDRESS"
 # workers pay where each has two processors for each of its tasks, and the run takes long enough
 # for them to start: on two processors a second process gains nothing (docs/cubes.md)
 PROCESSORS_OF_WORKER, LONG_S = 2 * SIDE_BY_SIDE, 60.0
-# Dask makes glibc return memory early (MALLOC_TRIM_THRESHOLD_), which fixes at 128 kB the size from
-# which every array is new memory that the system clears: a third more time for a channel. This
-# is the largest size
-BEFORE_START = {"distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 32 << 20}
+# of workers of our own. Dask makes glibc return memory early (MALLOC_TRIM_THRESHOLD_), which fixes
+# at 128 kB the size from which every array is new memory that the system clears: a third more time
+# for a channel; this is the largest size. And no worker has tasks that wait for others
+OWN = {
+    "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 32 << 20,
+    "distributed.scheduler.worker-saturation": 1.0,
+}
 # how long a scheduler has to answer
 ANSWER = "10s"
 
@@ -68,6 +75,9 @@ def open_engine(
         raise InputError("--workers starts workers of its own, --cluster uses others; give one")
     if workers is None and cluster is None:
         cluster = os.environ.get(SCHEDULER) or None
+    if workers != 1:
+        # before JAX starts: workers on the same GPU as this process need some of its memory
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     with ExitStack() as stack:
         if cluster is not None:
             _require_dask("--cluster")
@@ -76,6 +86,7 @@ def open_engine(
             wanted = workers_that_pay(demand) if workers is None else workers
             if wanted == 1:
                 fits = demand.process_bytes() <= memory_limit()
+                gc.freeze()  # modules stay: they need not be searched
                 yield ThisProcess(demand.side_by_side if fits else 1)
                 return
             _require_dask("--workers")
@@ -116,7 +127,10 @@ def _own_workers(n: int, demand: Demand, verbose: bool) -> Iterator[object]:
     import dask
     import distributed
 
-    side_by_side = min(demand.side_by_side, max(1, processors() // n))
+    n_gpus = _gpus()
+    if n_gpus and n > n_gpus:
+        raise InputError(f"--workers {n}: this machine has {n_gpus} GPU(s), one for each worker")
+    side_by_side = 1 if n_gpus else min(demand.side_by_side, max(1, processors() // n))
     needed, share = demand.process_bytes(side_by_side), memory_limit() / n
     if needed > share:
         fit = int(memory_limit() // demand.process_bytes(1))
@@ -128,32 +142,31 @@ def _own_workers(n: int, demand: Demand, verbose: bool) -> Iterator[object]:
     server = {**local, "port": 0, "dashboard": verbose, "dashboard_address": "127.0.0.1:0"}
     options = {**local, "nthreads": side_by_side, "memory_limit": int(share)}
     options["silence_logs"] = logging.CRITICAL
-    environments = [_environment(worker, _gpus()) for worker in range(n)]
-    with (
-        _quiet(),
-        dask.config.set(BEFORE_START),
-        distributed.SpecCluster(
-            scheduler={"cls": distributed.Scheduler, "options": server},
-            workers={
-                worker: {"cls": distributed.Nanny, "options": {**options, "env": environment}}
-                for worker, environment in enumerate(environments)
-            },
-            silence_logs=logging.CRITICAL,
-            name="lusee_bayes",
-        ) as own,
-    ):
-        yield own
+    nannies = [
+        {"cls": distributed.Nanny, "options": {**options, "env": _environment(worker, n_gpus)}}
+        for worker in range(n)
+    ]
+    with _quiet(), dask.config.set(OWN):
+        # Ctrl-C ends the command, which ends them: they do not hear it
+        with _ignoring_interrupts():
+            own = distributed.SpecCluster(
+                scheduler={"cls": distributed.Scheduler, "options": server},
+                workers=dict(enumerate(nannies)),
+                silence_logs=logging.CRITICAL,
+                name="lusee_bayes",
+            )
+        with own:
+            yield own
 
 
 def _environment(worker: int, n_gpus: int) -> dict[str, str]:
     """What a worker has besides what this process has."""
     if n_gpus == 0:
         return {}
-    # a GPU each, of those that this process may see; nobody takes all of its memory at once
+    # a GPU each, of those that this process may see
     seen = os.environ.get("CUDA_VISIBLE_DEVICES")
     names = seen.split(",") if seen else [str(number) for number in range(n_gpus)]
-    device = names[worker % n_gpus]
-    return {"CUDA_VISIBLE_DEVICES": device, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    return {"CUDA_VISIBLE_DEVICES": names[worker]}
 
 
 @contextmanager
@@ -165,11 +178,12 @@ def _connected(
     from lusee_bayes.core.dask_engine import DaskEngine
 
     with _quiet():
+        if isinstance(place, str):
+            _require_address(place)
         try:
-            if isinstance(place, str):
-                # a client of something else complains when it is forgotten
-                distributed.comm.addressing.get_address_host_port(place, strict=True)
-            client = distributed.Client(place, timeout=ANSWER, set_as_default=False)
+            # one that is not finished complains when it is forgotten
+            with uninterrupted():
+                client = distributed.Client(place, timeout=ANSWER, set_as_default=False)
         except (OSError, ValueError) as error:
             raise InputError(
                 f"no Dask scheduler answers at '{place}' ({' '.join(str(error).split())[:200]}); "
@@ -184,6 +198,24 @@ def _connected(
             client.close()
 
 
+def _require_address(address: str) -> None:
+    import distributed
+
+    try:
+        distributed.comm.addressing.get_address_host_port(address, strict=True)
+    except ValueError as error:
+        raise InputError(
+            f"'{address}' is no address of a Dask scheduler ({' '.join(str(error).split())}); give "
+            f"--cluster, or {SCHEDULER}, as tcp://host:8786"
+        ) from error
+    secret = distributed.Security().get_connection_args("client")["ssl_context"] is not None
+    if address.startswith(("tls:", "wss:")) and not secret:
+        raise InputError(
+            f"'{address}' needs certificates; name them in Dask's configuration, under "
+            "distributed.comm.tls"
+        )
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep Dask from writing into the terminal what the engine says in one sentence."""
@@ -196,3 +228,16 @@ def _quiet() -> Iterator[None]:
     finally:
         for logger, level in zip(loggers, before, strict=True):
             logger.setLevel(level)
+
+
+@contextmanager
+def _ignoring_interrupts() -> Iterator[None]:
+    """Ignore Ctrl-C during the block, and for ever in processes that are started in it."""
+    if current_thread() is not main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

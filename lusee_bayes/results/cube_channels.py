@@ -76,7 +76,8 @@ def cube_result(
     n_draws = max(scenario.output.draws, LEAST_DRAWS if iterative else 0)
     # workers may have other folders of their own
     files = ChannelFiles(folder.resolve(), identity_of(scenario, data, truth, n_draws))
-    channels = scenario.channels()
+    channels = tuple(channel.anchored() for channel in scenario.channels())
+    data = None if data is None else data.absolute()
     names = [names_of((channel,)) for channel in channels]
     wanted = "information" if scenario.joint else "result"
 

@@ -76,8 +76,10 @@ def forecasts_of(
     InputError
         As :func:`.forecast`.
     """
+    # workers may have other folders of their own
+    anchored = [replace(v, scenario=v.scenario.anchored()) for v in variations]
     different: dict[str, Variation] = {}
-    for variation in variations:
+    for variation in anchored:
         different.setdefault(_digest(variation), variation)
     stages.say(f"  {len(variations)} variations, {len(different)} of them different")
     first, *others = different.values()
@@ -90,4 +92,7 @@ def forecasts_of(
         names = [f"{other.source}, {other.name}" for other in others]
         found += engine.each(Tasks(files.forecast, others, names), stages, "planning")
     known = {_digest(one.variation): one for one in found}
-    return [replace(known[_digest(v)], variation=v) for v in variations]
+    return [
+        replace(known[_digest(there)], variation=here)
+        for here, there in zip(variations, anchored, strict=True)
+    ]

@@ -98,6 +98,7 @@ def run_compare_priors(
     if draws:
         require_draws(draws)
     sections = named_priors(priors, scenario, known_sky=data is None or truth)
+    sections = {name: section.anchored() for name, section in sections.items()}
     names = ",".join(sections)
     origin = origin_of(scenario, data, truth=truth or None, priors=names, draws=draws)
     with run_folder(folder, COMPARE_PRIORS, origin, replace=replace) as place:

@@ -131,7 +131,7 @@ def run_folder(
                 publish()
     finally:
         # nothing written: nothing left
-        for place in made:
+        for place in ([folder / kind.unfinished] if kind.unfinished else []) + made:
             with suppress(OSError):
                 place.rmdir()
 

@@ -77,4 +77,4 @@ def _given(text: str) -> GivenSky:
         )
     with open(text, "rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()[:12]
-    return GivenSky(Path(text).stem, FileSource(text), digest)
+    return GivenSky(Path(text).stem, FileSource(str(Path(text).absolute())), digest)

@@ -1,5 +1,6 @@
 """Tasks on workers of Dask: the same numbers, and workers that die, hang or lack memory."""
 
+import gc
 import os
 import signal
 import time
@@ -9,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from core.test_engine import joined, tasks_of, tree
+from threadpoolctl import threadpool_info
 
+from lusee_bayes.core import dask_engine
 from lusee_bayes.core.dask_engine import DaskEngine
-from lusee_bayes.core.dask_worker import Preparation
 from lusee_bayes.core.engine import Demand
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.progress import Stages
@@ -49,26 +51,24 @@ def test_results_come_in_order_and_merge_as_a_tree(engine, n):
     assert engine.each(tasks_of(abs, 0), Stages(), "s") == []
 
 
-def test_tasks_share_what_is_large_and_work_in_this_folder(engine):
+def test_tasks_share_what_is_large(engine):
     large = np.arange(1e6)
-    found = engine.each(tasks_of(lambda k: (large[k], os.getcwd(), os.getpid()), 6), Stages(), "s")
+    found = engine.each(tasks_of(lambda k: (large[k], os.getpid()), 6), Stages(), "s")
     assert [f[0] for f in found] == list(range(6))
-    assert {f[1] for f in found} == {os.getcwd()}
-    assert os.getpid() not in {f[2] for f in found}
+    assert os.getpid() not in {f[1] for f in found}
+
+
+def blas_threads(_):
+    """Those that products of matrices use here."""
+    assert np.ones((2, 2)) @ np.ones((2, 2)) is not None
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 
 
 def test_processors_are_divided_among_workers(engine, monkeypatch):
     assert set(engine._threads().values()) == {max(1, processors() // 2)}
 
-    def threads(_):
-        import numpy as np
-        from threadpoolctl import threadpool_info
-
-        np.ones((2, 2)) @ np.ones((2, 2))
-        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
-
     monkeypatch.setattr(engine, "_threads", lambda: {os.uname().nodename: 1})
-    assert engine.each(tasks_of(threads, 2), Stages(), "s") == [{1}, {1}]
+    assert engine.each(tasks_of(blas_threads, 2), Stages(), "s") == [{1}, {1}]
 
 
 def test_a_failure_of_ours_ends_the_stage_as_it_is(engine):
@@ -120,7 +120,7 @@ def test_a_task_whose_worker_dies_is_done_again_elsewhere(engine, tmp_path):
     said = Said()
     assert engine.each(tasks_of(die, 5), said, "s") == list(range(5))
     assert len(list(tmp_path.glob("2-*"))) == 3
-    assert said.lines and all("done again elsewhere: " in line for line in said.lines)
+    assert said.lines and all("given to others: " in line for line in said.lines)
     assert any("number 2" in line for line in said.lines)
 
     def always(k):
@@ -203,20 +203,58 @@ def test_a_task_that_takes_too_much_memory_is_named(tmp_path):
             engine.each(tasks_of(hold, 2), Stages(), "maps")
 
 
+LARGE = Demand(n_tasks=4, base_bytes=1e9, task_bytes=1e15, seconds=1.0)
+
+
 def test_workers_that_cannot_do_it_are_refused(engine, tmp_path, monkeypatch):
-    gone = Preparation(str(tmp_path / "gone"), None)
-    with pytest.raises(InputError, match=r"does not see '.*gone' \(No such file"):
-        engine.client.register_plugin(gone)
-    other = Preparation(os.getcwd(), None)
-    other.versions = "lusee_bayes 0.0 and Python 3.0"
-    with pytest.raises(InputError, match=r"has lusee_bayes .*, the command lusee_bayes 0.0 and Py"):
-        engine.client.register_plugin(other)
-    large = Demand(n_tasks=4, base_bytes=1e9, task_bytes=1e15, seconds=1.0)
     with pytest.raises(InputError, match=r"may take .* of memory, and 1 task\(s\) at a time need"):
-        DaskEngine(engine.client, large)
+        DaskEngine(engine.client, LARGE).work_in(tmp_path)
+    with pytest.raises(InputError, match=r"does not see '.*gone'; command and workers have to sh"):
+        DaskEngine(engine.client).work_in(tmp_path / "gone")
+    with monkeypatch.context() as patch:
+        patch.setattr(dask_engine, "versions", lambda: "lusee_bayes 0.0 and Python 3.0")
+        with pytest.raises(InputError, match=r"has lusee_bayes .*, the command lusee_bayes 0.0 an"):
+            DaskEngine(engine.client).work_in(tmp_path)
     with pytest.raises(RuntimeError, match="call work_in first"):
         DaskEngine(engine.client).each(tasks_of(abs, 1), Stages(), "s")
-    DaskEngine(engine.client, SMALL)
+
+
+def test_workers_that_come_later_are_refused_too(engine, tmp_path, monkeypatch):
+    late = DaskEngine(engine.client, LARGE)
+    monkeypatch.setattr(engine.client, "run", lambda *_, **__: {})  # nobody is there yet
+    late.work_in(tmp_path)
+    with pytest.raises(InputError, match=r"may take .* of memory"):
+        late.each(tasks_of(abs, 2), Stages(), "s")
+    # threads for products of matrices are those that the worker finds
+    late = DaskEngine(engine.client)
+    late.work_in(tmp_path)
+    assert late._threads() == {}
+    assert late.each(tasks_of(blas_threads, 1), Stages(), "s") == [{processors()}]
+
+
+def test_errors_that_cannot_be_sent_arrive_in_words(engine):
+    class Two(Exception):
+        def __init__(self, a, b):
+            super().__init__(f"{a} and {b}")
+
+    def fail(k):
+        raise Two("one", "other")
+
+    with pytest.raises(RuntimeError, match=r"Two: one and other") as caught:
+        engine.each(tasks_of(fail, 1), Stages(), "s")
+    assert "in fail" in caught.value.__notes__[0]
+
+
+def test_threads_of_this_process_leave_it_as_it_is(tmp_path):
+    before = blas_threads(0), gc.get_threshold(), os.getcwd()
+    with distributed.Client(
+        processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None,
+        set_as_default=False,
+    ) as client:  # fmt: skip
+        engine = DaskEngine(client)
+        engine.work_in(tmp_path)
+        assert engine.each(tasks_of(abs, 3), Stages(), "s") == [0, 1, 2]
+    assert (blas_threads(0), gc.get_threshold(), os.getcwd()) == before
 
 
 def test_a_scheduler_without_workers_is_not_waited_for_for_ever(tmp_path):

@@ -127,7 +127,8 @@ def test_what_cannot_be_started_is_refused():
     for given, message in (
         ({"workers": 2, "cluster": "tcp://x:1"}, "give one"),
         ({"workers": 12}, "12 workers need about 72 GB of memory; this machine has 64 GB: use --w"),
-        ({"cluster": "nonsense:x"}, "no Dask scheduler answers at 'nonsense:x'"),
+        ({"cluster": "nonsense:x"}, "'nonsense:x' is no address of a Dask scheduler .* as tcp://"),
+        ({"cluster": "tls://127.0.0.1:1"}, "needs certificates; name them in Dask's configuration"),
     ):
         with pytest.raises(InputError, match=message), open_engine(demand, **given):
             pass

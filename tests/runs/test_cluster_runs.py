@@ -164,7 +164,7 @@ def test_a_cluster_gives_the_same_numbers_though_a_worker_is_killed(cluster, alo
     cluster.kill(cluster.workers[0])
     said, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
-    assert "done again elsewhere: " in said
+    assert "given to others: " in said
     assert_same(tmp_path / "a", alone["independent"])
     process = cluster.command(*MAP, "--joint", "-o", tmp_path / "b", "-q")
     assert process.communicate(timeout=120) == ("", "") and process.returncode == 0

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+S = TypeVar("S", bound="Section")
 
 
 def _not_tiny(value: float) -> float:
@@ -27,6 +30,10 @@ Frequency = Annotated[float, Field(ge=1, le=50)]
 Treatment = Literal["marginalised", "sampled", "ignored"]
 
 
+# entries that name files; one that has its default names none
+FILES = ("file", "mean_file", "schedule", "spectrum_file", "template")
+
+
 class Section(BaseModel):
     """Part of a scenario: no key that is not declared, no NaN, nothing changed once made.
 
@@ -34,6 +41,17 @@ class Section(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+    def anchored(self: S) -> S:
+        """The same with absolute names of files, which are then the same in any folder."""
+        found: dict[str, Any] = {}
+        for name, declared in type(self).model_fields.items():
+            value = getattr(self, name)
+            if isinstance(value, Section):
+                found[name] = value.anchored()
+            elif name in FILES and value is not None and value != declared.default:
+                found[name] = os.path.abspath(value)
+        return self.model_copy(update=found)
 
     @model_validator(mode="before")
     @classmethod
