@@ -16,6 +16,7 @@ from pathlib import Path
 from threading import TIMEOUT_MAX, Lock, Timer
 from typing import Any
 
+import dask
 import distributed
 import jax
 from threadpoolctl import threadpool_limits
@@ -169,6 +170,8 @@ def _prepare() -> None:
     """Let this process work as one of a command does."""
     gc.set_threshold(100_000, 20, 100)
     use_compilation_cache()
+    # xarray would ask the scheduler for a lock for every file, over a client of its own
+    dask.config.set(scheduler="threads")
 
 
 def run_merge(job: Path, one: Any, other: Any) -> Any:
