@@ -256,9 +256,9 @@ def test_workers_of_a_killed_command_end_with_it(tmp_path):
 )
 def test_other_commands_say_the_same(arguments, same, cluster, tmp_path):
     tables = []
-    for name, more in (("one", ["--workers", "1"]), ("three", [])):
+    for name, more in (("one", ["--workers", "1"]), ("own", ["--workers", "2"]), ("all", [])):
         process = cluster.command(*arguments, *more, "-o", tmp_path / name, "-q")
         _, errors = process.communicate(timeout=200)
         assert process.returncode in (0, 1), errors
         tables.append((tmp_path / name / same).read_text())
-    assert tables[0] == tables[1]
+    assert tables[0] == tables[1] == tables[2]
