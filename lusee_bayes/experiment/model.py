@@ -23,11 +23,24 @@ from lusee_bayes.systematics import Marginalised, Systematic
 
 
 def radiometer(setup: Setup, data: Visibilities | None = None) -> Covariance:
-    """Radiometer term of N, from the modelled sky or, if the scenario says so, ``data``; in K^2."""
+    """Radiometer term of N, from the modelled sky or, if the scenario says so, ``data``; in K^2.
+
+    Averages of spectra say themselves how many samples they are made of; other data have the
+    scenario's bandwidth and duty cycle.
+    """
     section = setup.scenario.noise.radiometer
     visibilities = setup.signal
     if section.temperature == "measured" and data is not None:
         visibilities = measured_visibilities(data, setup.signal)
+    if setup.calibration is not None:
+        return radiometer_noise(
+            visibilities,
+            setup.layout,
+            bandwidth_hz=1.0,
+            step_s=setup.calibration.n_averaged,
+            form=section.form,
+            factor=section.factor,
+        )
     return radiometer_noise(
         visibilities,
         setup.layout,

@@ -15,6 +15,7 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import PriorSection, SourceSection
 from lusee_bayes.instrument.beams import BeamSource, Monopoles, ProductBeams, Receiver
 from lusee_bayes.instrument.beams.gridded import SAME_FREQUENCY_MHZ
+from lusee_bayes.instrument.calibration import Calibration
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.ephemeris import BODIES, body_direction
 from lusee_bayes.instrument.instrument import Instrument
@@ -64,6 +65,8 @@ class Setup:
     family : PriorFamily, LogNormalPrior or None
         Of which data choose the prior, or about whose mode it is Gaussian; None for a prior that
         is given.
+    calibration : Calibration or None
+        Of data that are averages of a spectrometer's spectra; None for others.
     """
 
     scenario: Scenario
@@ -79,6 +82,7 @@ class Setup:
     signal: Float[Array, "products times"]
     receiver: Receiver | None = None
     family: PriorFamily | LogNormalPrior | None = None
+    calibration: Calibration | None = None
 
     @property
     def pointing(self) -> Pointing:
@@ -198,6 +202,7 @@ def set_up(
         signal,
         receiver,
         family,
+        None if data is None else data.calibration,
     )
 
 

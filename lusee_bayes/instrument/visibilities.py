@@ -21,6 +21,7 @@ from lusee_bayes.core.representation import Described, extent, listed
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument import window_variables
 from lusee_bayes.instrument.beams.receiver import MeasuredReceiver
+from lusee_bayes.instrument.calibration import Calibration
 from lusee_bayes.instrument.correlations import numbers_of_times, real_products, runs_of, site_of
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation
@@ -52,6 +53,8 @@ class Visibilities(Described):
     says_window : bool
         Whether it is known what the times are. False for data of a file that says neither windows
         nor instants: they are of no use before :meth:`stamped`.
+    calibration : Calibration or None
+        Of averages of a spectrometer's spectra; None for other data.
 
     Raises
     ------
@@ -66,6 +69,7 @@ class Visibilities(Described):
     truth: Float[Array, " modes"] | None = None
     receiver: MeasuredReceiver | None = None
     says_window: bool = True
+    calibration: Calibration | None = None
 
     def __post_init__(self):
         require_float64("the data", self.data)
@@ -76,6 +80,9 @@ class Visibilities(Described):
                 f"the data have {self.layout.n_times} times, the observation "
                 f"{self.observation.n_times}"
             )
+        if self.calibration is not None:
+            n_averaged = self.calibration.n_averaged
+            require_shape("n_averaged of the calibration", n_averaged, (self.layout.n_times,))
 
     @classmethod
     def from_arrays(
@@ -192,6 +199,8 @@ class Visibilities(Described):
         if windows is not None:
             for values in (windows.sample, windows.start_s, windows.end_s, windows.live_s):
                 content.update(np.ascontiguousarray(values).tobytes())
+        if self.calibration is not None:
+            content.update(np.ascontiguousarray(self.calibration.n_averaged).tobytes())
         return content.hexdigest()
 
     def grid(self) -> Float[np.ndarray, "products times"]:
