@@ -15,6 +15,8 @@ POSTERIOR_CUBE = "lusee_bayes posterior cube 1"
 COMPACT_POSTERIOR = "lusee_bayes compact posterior 1"
 SAMPLES = "lusee_bayes samples 1"
 BEAMS = "lusee_bayes beams 1"
+GAINS = "lusee_bayes gains 1"
+REDUCED = "lusee_bayes reduced spectra 1"
 DIAGNOSTICS = "lusee_bayes diagnostics 2"
 PAPER_CASE = "lusee_bayes paper case 1"
 

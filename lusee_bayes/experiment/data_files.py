@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import is_fits
+from lusee_bayes.core.formats import format_of
 from lusee_bayes.core.reading import naming, require_file
+from lusee_bayes.experiment.flight_data import reduce_files, visibilities_of
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.averaging import averaged
+from lusee_bayes.instrument.flight.reduced_file import read_reduced
+from lusee_bayes.instrument.flight.sessions import is_session
 from lusee_bayes.instrument.timestamps import Timestamp
 from lusee_bayes.instrument.visibilities import HINT, Visibilities
 from lusee_bayes.instrument.visibilities_file import read_visibilities
@@ -23,12 +29,40 @@ SAME_SCALE = 1e-5
 SAME_TEMPERATURE = 1e-12
 
 
-def read_data(path: Path, scenario: Scenario) -> Visibilities:
-    """Read visibilities: the package's own files, or one channel of luseepy's waterfalls.
+# a file of visibilities or of reduced spectra, or sessions of the spectrometer
+Data = Path | Sequence[Path]
+
+
+def files_of(data: Data) -> tuple[Path, ...]:
+    """The files that data are in."""
+    return (data,) if isinstance(data, Path) else tuple(data)
+
+
+def are_sessions(data: Data) -> bool:
+    """Whether data are sessions of the spectrometer.
+
+    Raises
+    ------
+    InputError
+        If there are several files, and one is no session.
+    """
+    files = files_of(data)
+    sessions = [is_session(require_file(path, "data", HINT)) for path in files]
+    if len(files) > 1 and not all(sessions):
+        other = files[sessions.index(False)]
+        raise InputError(
+            f"'{other}' is no session of the spectrometer; of other data, give one file"
+        )
+    return all(sessions)
+
+
+def read_data(data: Data, scenario: Scenario) -> Visibilities:
+    """Read visibilities: the package's own files, a channel of luseepy's waterfalls, or sessions.
 
     Parameters
     ----------
-    path : Path
+    data : Path, or sequence of Path
+        A file, or sessions of the spectrometer, which are reduced.
     scenario : Scenario
         Of the frequency to read, of the instrument that a waterfall has to fit, of what the times
         of a file are that does not say so, and of the time to average over.
@@ -39,7 +73,11 @@ def read_data(path: Path, scenario: Scenario) -> Visibilities:
         If the file cannot be used, it is not known or contradicted what its times are, they cannot
         be averaged, or a waterfall does not fit the scenario's beams.
     """
-    require_file(path, "data", HINT)
+    if are_sessions(data):
+        return visibilities_of(reduce_files(files_of(data), scenario), scenario)
+    path = files_of(data)[0]
+    if format_of(path) == formats.REDUCED:
+        return visibilities_of(read_reduced(path), scenario)
     timestamp, average_s = scenario.observation.timestamp, scenario.observation.average_s
     if is_fits(path):
         data = _channel(path, scenario)

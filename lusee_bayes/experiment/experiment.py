@@ -9,6 +9,7 @@ import numpy as np
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.representation import Described
 from lusee_bayes.experiment.learned_prior import with_learned_prior
+from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.plausibility import require_plausible
 from lusee_bayes.experiment.scenario import Scenario
@@ -34,12 +35,15 @@ class Experiment(Described):
         What is doubtful about measured data, a sentence each.
     learned : Learned or None
         How the setup's prior was learned; None for one that was given.
+    fitting : Fitting or None
+        Of flight data: the times that did not fit and are left out; None for other data.
     """
 
     setup: Setup
     data: Visibilities
     doubts: tuple[str, ...] = ()
     learned: Learned | None = None
+    fitting: Fitting | None = None
 
     def description(self) -> tuple[str, ...]:
         scenario = self.scenario
@@ -80,7 +84,7 @@ def build(
         gives (:func:`.require_plausible`), and for a prior that does not settle.
     """
     stages = stages or Stages()
-    return _learned(observed(scenario, data, stages), stages)
+    return _learned(_fitting(observed(scenario, data, stages), stages), stages)
 
 
 def observed(
@@ -115,6 +119,23 @@ def simulated(scenario: Scenario, stages: Stages | None = None) -> Experiment:
     setup = set_up(scenario, None, stages)
     with stages("noise"):
         return Experiment(setup, simulate(setup))
+
+
+def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
+    """Without times that do not fit, where the data are flight data."""
+    section, data = experiment.scenario.flight, experiment.data
+    if section is None or not section.leave_out or data.calibration is None:
+        return experiment
+    with stages("times that do not fit"):
+        found = fitting(experiment.setup, data, section.false_alarm)
+        setup, kept = experiment.setup, data
+        if found.flagged.any():
+            setup, kept = without(setup, data, found.flagged)
+    remarks = (found.remark,) if found.remark else ()
+    for remark in remarks:
+        stages.say(f"  {remark}")
+    doubts = (*experiment.doubts, *remarks)
+    return replace(experiment, setup=setup, data=kept, doubts=doubts, fitting=found)
 
 
 def _learned(experiment: Experiment, stages: Stages) -> Experiment:

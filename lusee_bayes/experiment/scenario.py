@@ -21,6 +21,7 @@ from lusee_bayes.experiment.overrides import apply_override
 from lusee_bayes.experiment.scenario_errors import one_sentence
 from lusee_bayes.experiment.schema import (
     BeamSection,
+    FlightSection,
     Frequency,
     GalaxySection,
     IsotropicPriorSection,
@@ -72,6 +73,8 @@ class Scenario(Section):
         Point sources apart from the map.
     spectral : SpectralSection
         Prior of joint channels.
+    flight : FlightSection
+        How sessions of the spectrometer become visibilities.
     output : OutputSection
         What is written on request.
     seed : int
@@ -90,6 +93,7 @@ class Scenario(Section):
     noise: NoiseSection = NoiseSection()
     sources: SourcesSection = SourcesSection()
     spectral: SpectralSection = SpectralSection()
+    flight: FlightSection | None = None
     output: OutputSection = OutputSection()
     seed: Seed = 1
 

@@ -70,8 +70,8 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
             f"{observation.step_s:g} s; give at least that, or leave them as they are"
         )
     live_s = windows.live_per_sample_s
-    bin_of = _bins(observation, windows.bounds_s, to_s)
-    kept, used = _by_the_rule(np.asarray(data.layout.present), bin_of, live_s)
+    bin_of = bins_of(observation, windows.bounds_s, to_s)
+    kept, used = by_the_rule(np.asarray(data.layout.present), bin_of, live_s)
     left = np.flatnonzero(used)
     if not left.size:
         raise InputError(
@@ -88,7 +88,7 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
         data,
         data=layout.gather(np.add.reduceat(grid, first, axis=1)),
         layout=layout,
-        observation=_observation(observation, left, bin_of_left, first, to_s),
+        observation=binned(observation, left, bin_of_left, to_s),
     )
 
 
@@ -97,10 +97,19 @@ def product_live_s(data: Visibilities) -> float:
     return float(data.observation.live_s[data.layout.time].sum())
 
 
-def _bins(
+def bins_of(
     observation: Observation, bounds_s: Float[np.ndarray, "times 2"], to_s: float
 ) -> Int[np.ndarray, " times"]:
-    """The number of the bin of every sample."""
+    """Return the number of the bin of every sample.
+
+    Parameters
+    ----------
+    observation : Observation
+    bounds_s : (times, 2) array
+        Start and end of every sample, in seconds from its time.
+    to_s : float
+        Length of the bins, in seconds.
+    """
     seconds = _seconds(observation)
     start, end = seconds + bounds_s[:, 0], seconds + bounds_s[:, 1]
     origin = start[np.searchsorted(observation.run, observation.run)]
@@ -121,12 +130,21 @@ def _seconds(observation: Observation) -> Float[np.ndarray, " times"]:
         return (observation.times - observation.times[0]).to_value(u.s)
 
 
-def _by_the_rule(
+def by_the_rule(
     present: Bool[np.ndarray, "products times"],
     bin_of: Int[np.ndarray, " times"],
     live_s: Float[np.ndarray, " times"],
 ) -> tuple[Bool[np.ndarray, "products bins"], Bool[np.ndarray, " times"]]:
-    """Which products each bin has, and which samples it is made of."""
+    """Return which products each bin has, and which samples it is made of.
+
+    Parameters
+    ----------
+    present : (products, times) array of bool
+    bin_of : (times,) array of int
+        :func:`bins_of`.
+    live_s : (times,) array
+        Live time of the samples, in seconds.
+    """
     some = present.any(axis=0)
     first = np.searchsorted(bin_of, np.arange(bin_of[-1] + 1))
     total = np.add.reduceat(live_s * some, first)
@@ -137,14 +155,26 @@ def _by_the_rule(
     return kept, used
 
 
-def _observation(
+def binned(
     observation: Observation,
     left: Int[np.ndarray, " samples"],
-    bin_of: Int[np.ndarray, " samples"],
-    first: Int[np.ndarray, " bins"],
+    bin_of_left: Int[np.ndarray, " samples"],
     to_s: float,
 ) -> Observation:
-    """The bins' times and windows, of the samples that are left."""
+    """Return the times and windows of bins.
+
+    Parameters
+    ----------
+    observation : Observation
+        Of samples with windows.
+    left : (samples,) array of int
+        The samples that the bins are made of.
+    bin_of_left : (samples,) array of int
+        The bin of each of them: 0, 1, ... without a gap.
+    to_s : float
+        Length of the bins, in seconds.
+    """
+    first = np.searchsorted(bin_of_left, np.arange(bin_of_left[-1] + 1))
     keep = np.isin(np.arange(observation.n_times), left)
     here = observation.select(keep)
     windows = here.windows

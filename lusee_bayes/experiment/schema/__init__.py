@@ -9,6 +9,7 @@ from lusee_bayes.experiment.schema.beam import (
     ScalarBeamSection,
     section_of_file,
 )
+from lusee_bayes.experiment.schema.flight import FlightSection
 from lusee_bayes.experiment.schema.log_normal import LogNormalPriorSection
 from lusee_bayes.experiment.schema.noise import (
     BeamErrorSection,
@@ -43,6 +44,7 @@ __all__ = [
     "BeamErrorSection",
     "BeamSection",
     "FileSkySection",
+    "FlightSection",
     "Frequency",
     "GainSection",
     "GalaxySection",

@@ -31,7 +31,16 @@ Treatment = Literal["marginalised", "sampled", "ignored"]
 
 
 # entries that name files; one that has its default names none
-FILES = ("file", "mean_file", "schedule", "spectrum_file", "template")
+FILES = (
+    "clock",
+    "file",
+    "gain_table",
+    "lines",
+    "mean_file",
+    "schedule",
+    "spectrum_file",
+    "template",
+)
 
 
 class Section(BaseModel):

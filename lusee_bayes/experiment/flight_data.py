@@ -1,0 +1,165 @@
+"""Sessions of the spectrometer as a scenario reduces them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.schema import FlightSection
+from lusee_bayes.instrument.correlations import CONVENTIONS
+from lusee_bayes.instrument.flight.clock import read_clock
+from lusee_bayes.instrument.flight.filter_bank import shared_noise
+from lusee_bayes.instrument.flight.gain_files import read_gain_table
+from lusee_bayes.instrument.flight.gain_table import GainTable
+from lusee_bayes.instrument.flight.lines import NO_LINES, read_lines
+from lusee_bayes.instrument.flight.recipe import Recipe
+from lusee_bayes.instrument.flight.reduced import Reduced
+from lusee_bayes.instrument.flight.reduction import reduce_sessions
+from lusee_bayes.instrument.flight.sessions import read_session
+from lusee_bayes.instrument.visibilities import Visibilities
+
+
+def reduce_files(
+    paths: Sequence[Path], scenario: Scenario, stages: Stages | None = None
+) -> Reduced:
+    """Reduce sessions to the scenario's frequencies.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        HDF5 or FITS of luseepy's ``lusee.ingest``, in any order.
+    scenario : Scenario
+    stages : Stages, optional
+        Told how far it is.
+
+    Raises
+    ------
+    InputError
+        If the scenario does not say what the files leave open, a file is given twice, or as
+        :func:`.read_session` and :func:`.reduce_sessions`.
+    """
+    stages = stages or Stages()
+    known = [Path(path).resolve() for path in paths]
+    for k, path in enumerate(known):
+        if path in known[:k]:
+            raise InputError(f"'{paths[k]}' is given twice; give every session once")
+    recipe = recipe_of(scenario)
+    with stages("sessions"):
+        sessions = [read_session(path) for path in paths]
+    return reduce_sessions(sessions, recipe, stages)
+
+
+def recipe_of(scenario: Scenario) -> Recipe:
+    """How a scenario reduces sessions.
+
+    Raises
+    ------
+    InputError
+        If it does not say what the files leave open: gains, bin origin, what the times are.
+    """
+    section = _section(scenario)
+    if section.gain_table is None:
+        raise InputError(
+            "the sessions hold counts, and the scenario names no gain table; use --set "
+            "flight.gain_table=... (the folder of luseepy's gain model, or a netCDF file)"
+        )
+    if section.bin_origin is None:
+        raise InputError(
+            "it is not settled whether channel k of the spectrometer has its centre or its lower "
+            "edge at k times 25 kHz, which differ by 12.5 kHz; use --set flight.bin_origin=centre "
+            "(luseepy's labels) or edge"
+        )
+    timestamp = scenario.observation.timestamp
+    if timestamp is None:
+        raise InputError(
+            "the sessions do not say whether their times are the start, the middle or the end of "
+            "the integrations; use --set observation.timestamp=middle (or start, end, instant)"
+        )
+    here = scenario.observation
+    return Recipe(
+        _table(section),
+        section.bin_origin,
+        timestamp,
+        scenario.frequencies_mhz or (scenario.frequency_mhz,),
+        section.bandwidth_hz / 1e6,
+        section.degree,
+        here.average_s,
+        shared_noise(section.filter_taps, section.filter_window),
+        int(CONVENTIONS[section.convention]),
+        section.turntable_deg,
+        NO_LINES if section.lines is None else read_lines(section.lines),
+        section.comb,
+        section.false_alarm,
+        section.gain_std,
+        None if section.clock is None else read_clock(section.clock),
+        (here.lon_deg, here.lat_deg) if section.site == "scenario" else None,
+    )
+
+
+def visibilities_of(reduced: Reduced, scenario: Scenario) -> Visibilities:
+    """One band of reduced spectra, in K, as the scenario's beams have it.
+
+    Raises
+    ------
+    InputError
+        If there is no such band, nothing is left of it, or the beams know no volts.
+    """
+    return reduced.at(scenario.frequency_mhz, per_kelvin_of(scenario))
+
+
+def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
+    """V^2/Hz that an enclosure of 1 K makes at each port.
+
+    Raises
+    ------
+    InputError
+        If neither the beams nor the scenario say it.
+    """
+    said = None if scenario.flight is None else scenario.flight.per_kelvin_v2_hz
+    circuit = scenario.beam.source().circuit(scenario.frequency_mhz)
+    if circuit is None and said is None:
+        raise InputError(
+            "flight data are in V^2/Hz, at the receivers' inputs, and these beams know no volts; "
+            "give luseepy's four-port response as beam.file (beam.model=response), or say what "
+            "1 K makes: --set flight.per_kelvin_v2_hz=..."
+        )
+    if circuit is not None and said is not None:
+        raise InputError(
+            "flight.per_kelvin_v2_hz is for beams that know no volts, and these have impedances; "
+            "leave it out"
+        )
+    if circuit is None:
+        return np.full(scenario.beam.n_ports, float(said))
+    return np.ascontiguousarray(circuit.per_kelvin.diagonal().real)
+
+
+def _section(scenario: Scenario) -> FlightSection:
+    if scenario.flight is None:
+        raise InputError(
+            "the data are sessions of the spectrometer, and the scenario does not say how they "
+            "become visibilities; give it a section flight, or --set 'flight={gain_table: ..., "
+            "bin_origin: centre}' (docs/howto/first_light.md)"
+        )
+    return scenario.flight
+
+
+def _table(section: FlightSection) -> GainTable:
+    table = read_gain_table(section.gain_table, section.gain_model)
+    if section.component_std is None:
+        return table
+    if table.component_std is not None:
+        raise InputError(
+            f"{table.path} says by how much its components may be off, and so does "
+            "flight.component_std; leave that out"
+        )
+    return replace(
+        table,
+        component_std=np.broadcast_to(section.component_std, (*table.component.shape[:3],)).copy(),
+    )

@@ -1,0 +1,117 @@
+"""Spectra that do not fit those before and after them: bursts of Jupiter and the Sun, interference.
+
+Within a few hours the sky's visibilities change smoothly. A polynomial in time is fitted to the
+autos of a band; spectra off it, or stretches of them that are off together, are flagged. Noise is
+that of the radiometer, or what the data show where that is more.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lusee_bayes.instrument.flight.outliers import outliers, robust_scale, threshold
+
+# a polynomial of this degree takes up what the sky does within so many hours, to less than the
+# noise of a spectrum: at lmax 47 a millionth of what ell = 47 has
+DEGREE, SPAN_S = 3, 7200.0
+# with fewer spectra within a span, there is no telling
+LEAST = 16
+# lengths of stretches that are tested, in spectra
+LENGTHS = (1, 2, 4, 8, 16)
+
+
+def n_tests(ports: int) -> int:
+    """Return how many tests a spectrum has to pass."""
+    return ports * len(LENGTHS)
+
+
+def burst_flags(
+    seconds: Float[np.ndarray, " rows"],
+    autos: Float[np.ndarray, "rows ports"],
+    noise: Float[np.ndarray, "rows ports"],
+    good: Bool[np.ndarray, " rows"],
+    false_alarm: float,
+) -> tuple[Bool[np.ndarray, " rows"], Float[np.ndarray, " spans"]]:
+    """Find spectra off a smooth curve in time.
+
+    Parameters
+    ----------
+    seconds : (rows,) array
+        Times.
+    autos : (rows, ports) array
+        Of a band.
+    noise : (rows, ports) array
+        Their standard deviations.
+    good : (rows,) array of bool
+        Spectra to be looked at.
+    false_alarm : float
+        Chance that one of pure noise is flagged, shared by all tests.
+
+    Returns
+    -------
+    (rows,) array of bool
+    (spans,) array
+        Scatter over the noise expected, of every span of two hours that has enough spectra.
+    """
+    flagged, scatter = np.zeros(len(seconds), dtype=bool), []
+    limit = threshold(false_alarm, n_tests(autos.shape[1]))
+    for at in _spans(seconds):
+        if good[at].sum() < LEAST:
+            continue
+        here, scale = _one_span(seconds[at], autos[at], noise[at], good[at], limit)
+        flagged[at] = here
+        scatter.append(scale)
+    return flagged, np.array(scatter)
+
+
+def _spans(seconds: Float[np.ndarray, " rows"]) -> list[np.ndarray]:
+    """Rows of spans of equal length, none longer than ``SPAN_S``."""
+    whole = seconds[-1] - seconds[0]
+    n = max(1, int(np.ceil(whole / SPAN_S - 1e-9)))
+    number = np.minimum((seconds - seconds[0]) * n // max(whole, 1.0), n - 1).astype(int)
+    return [found for k in range(n) if (found := np.flatnonzero(number == k)).size]
+
+
+def _one_span(
+    seconds: Float[np.ndarray, " span"],
+    autos: Float[np.ndarray, "span ports"],
+    noise: Float[np.ndarray, "span ports"],
+    good: Bool[np.ndarray, " span"],
+    limit: float,
+) -> tuple[Bool[np.ndarray, " span"], float]:
+    x = np.polynomial.chebyshev.chebvander(
+        2.0 * (seconds - seconds[0]) / max(seconds[-1] - seconds[0], 1.0) - 1.0, DEGREE
+    )
+    values = np.where(good[:, None], autos, 0.0).T[None]
+    sigma = np.where(good[:, None], noise, 1.0).T[None]
+    # a first look, robustly, says how much noise there is
+    _, z = outliers(values, sigma, good[None], x, limit)
+    scale = np.array([robust_scale(z[:, p], good[None]) for p in range(autos.shape[1])])
+    sigma = sigma * np.maximum(scale, 1.0)[None, :, None]
+    kept = good.copy()
+    while kept.sum() >= LEAST // 2:
+        out, z = outliers(values, sigma, kept[None], x, limit)
+        found = out[0] | _stretches(z[0], kept & ~out[0], limit)
+        if not found.any():
+            break
+        kept &= ~found
+    return good & ~kept, float(np.median(scale))
+
+
+def _stretches(
+    z: Float[np.ndarray, "ports span"], kept: Bool[np.ndarray, " span"], limit: float
+) -> Bool[np.ndarray, " span"]:
+    """Those in stretches whose sum is beyond the limit."""
+    found = np.zeros(len(kept), dtype=bool)
+    clean, one = np.where(kept, z, 0.0), kept.astype(float)
+    for length in LENGTHS[1:]:
+        if length > len(kept) // 2:
+            break
+        window = np.ones(length)
+        count = np.convolve(one, window, "valid")
+        for port in clean:
+            total = np.convolve(port, window, "valid") / np.sqrt(np.maximum(count, 1.0))
+            for start in np.flatnonzero((np.abs(total) > limit) & (count > length / 2)):
+                found[start : start + length] = True
+    return found & kept

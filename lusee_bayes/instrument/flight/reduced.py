@@ -1,0 +1,235 @@
+"""Spectra reduced to a number for each band, product and bin of time, with what was flagged."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.representation import Described
+from lusee_bayes.instrument.averaging import binned
+from lusee_bayes.instrument.beams.gridded import SAME_FREQUENCY_MHZ
+from lusee_bayes.instrument.calibration import Calibration
+from lusee_bayes.instrument.flight.gain_table import LETTERS
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.products import all_products
+from lusee_bayes.instrument.visibilities import Visibilities
+
+# why a spectrum is not used in a band; the first is that it is
+REASONS = (
+    "used",
+    "saturated",
+    "no gain or no data",
+    "comb",
+    "too many channels flagged",
+    "burst",
+    "lacks a product of its bin",
+    "does not fit the map",
+)
+USED, SATURATED, NO_DATA, COMB, TOO_MANY, BURST, PRODUCT, NO_FIT = range(len(REASONS))
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Reduced(Described):
+    """Sessions, reduced.
+
+    Attributes
+    ----------
+    frequencies_mhz : (bands,) array
+    bandwidth_mhz : float
+    observation : Observation
+        A sample for each spectrum; a run for each state of the spectrometer.
+    bin_of : (rows,) array of int
+        The bin of time of each spectrum.
+    average_s : float or None
+        Length of the bins; None if each spectrum is one.
+    reason : (bands, rows) array of uint8
+        Why a spectrum is not used, of :data:`REASONS`.
+    values : (bands, products, bins) array
+        In V^2/Hz at the receivers' inputs, NaN where nothing is left.
+    before : (bands, products, bins) array
+        The mean before anything was flagged, for figures.
+    n_averaged : (bands, bins) array
+        Independent samples of voltages behind each value; 0 where nothing is left.
+    level : (bins, ports) array of str
+        Of the gain.
+    gain : (bands, ports, bins) array
+        Counts for 1 nV^2/Hz.
+    slope : (bands, ports, components, bins) array
+        Change of the power gain with each component of the gain table, relative to it.
+    component_std : (levels, ports, components) array or None
+        By how much the components may be off.
+    gain_std : float or None
+        By how much the gains of a level of a port may be off, relative.
+    scatter : (bands,) array
+        Scatter of the spectra in time over the radiometer noise, median; NaN if not known.
+    line_scatter : (bands,) array
+        Likewise of the channels about a smooth spectrum.
+    curvature : (bands,) array
+        What two further powers of the frequency would change, rms over the bins of the autos, in
+        standard deviations of a bin, less what noise alone would.
+    lines : (bands, rows) array
+        Share of a spectrum's channels in a band that are flagged.
+    sessions : tuple of mapping
+        Where the spectra come from.
+    """
+
+    frequencies_mhz: Float[np.ndarray, " bands"]
+    bandwidth_mhz: float
+    observation: Observation
+    bin_of: Int[np.ndarray, " rows"]
+    average_s: float | None
+    reason: UInt8[np.ndarray, "bands rows"]
+    values: Float[np.ndarray, "bands products bins"]
+    before: Float[np.ndarray, "bands products bins"]
+    n_averaged: Float[np.ndarray, "bands bins"]
+    level: Shaped[np.ndarray, "bins ports"]
+    gain: Float[np.ndarray, "bands ports bins"]
+    slope: Float[np.ndarray, "bands ports components bins"]
+    component_std: Float[np.ndarray, "levels ports components"] | None
+    gain_std: float | None
+    scatter: Float[np.ndarray, " bands"]
+    line_scatter: Float[np.ndarray, " bands"]
+    curvature: Float[np.ndarray, " bands"]
+    lines: Float32[np.ndarray, "bands rows"]
+    sessions: tuple[Mapping[str, Any], ...]
+
+    def description(self) -> tuple[str, ...]:
+        f = self.frequencies_mhz
+        used = self.reason == USED
+        return (
+            f"{len(self.bin_of)} spectra of {len(self.sessions)} sessions in "
+            f"{self.values.shape[2]} bins",
+            f"{len(f)} bands of {self.bandwidth_mhz:g} MHz at {f[0]:g} to {f[-1]:g} MHz",
+            f"{used.mean():.2%} of the spectra are used",
+        )
+
+    def band(self, frequency_mhz: float) -> int:
+        """Return the number of the band at a frequency. InputError if there is none."""
+        nearest = int(np.argmin(np.abs(self.frequencies_mhz - frequency_mhz)))
+        if abs(self.frequencies_mhz[nearest] - frequency_mhz) > SAME_FREQUENCY_MHZ:
+            known = ", ".join(f"{f:.9g}" for f in self.frequencies_mhz)
+            raise InputError(
+                f"the spectra were reduced to bands at {known} MHz, not at {frequency_mhz:.15g}; "
+                f"use --set frequency_mhz={self.frequencies_mhz[nearest]:.15g}, or reduce them "
+                "again"
+            )
+        return nearest
+
+    def at(self, frequency_mhz: float, per_kelvin: Float[np.ndarray, " ports"]) -> Visibilities:
+        """Return one band.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+        per_kelvin : (ports,) array
+            V^2/Hz that an enclosure of 1 K makes at each port.
+
+        Returns
+        -------
+        Visibilities
+            In K, with their calibration.
+
+        Raises
+        ------
+        InputError
+            If there is no such band, or nothing is left of it.
+        """
+        band = self.band(frequency_mhz)
+        present = np.isfinite(self.values[band])
+        bins = np.flatnonzero(present.any(axis=0))
+        if not bins.size:
+            counts = ", ".join(
+                f"{name} {int((self.reason[band] == k).sum())}"
+                for k, name in enumerate(REASONS)
+                if k and (self.reason[band] == k).any()
+            )
+            raise InputError(
+                f"nothing is left of the spectra at {frequency_mhz:g} MHz: of "
+                f"{self.reason.shape[1]}, {counts}"
+            )
+        left = np.flatnonzero((self.reason[band] == USED) & np.isin(self.bin_of, bins))
+        _, bin_of_left = np.unique(self.bin_of[left], return_inverse=True)
+        if self.average_s is None:
+            keep = np.zeros(len(self.bin_of), dtype=bool)
+            keep[left] = True
+            observation = self.observation.select(keep)
+        else:
+            observation = binned(self.observation, left, bin_of_left, self.average_s)
+        products = all_products()
+        scale = np.sqrt([per_kelvin[p.i] * per_kelvin[p.j] for p in products])
+        values = np.where(present, self.values[band], 0.0)[:, bins] / scale[:, None]
+        layout = DataLayout.from_flags(~present[:, bins])
+        return Visibilities(
+            layout.gather(values),
+            layout,
+            _one_run_an_angle(observation),
+            float(self.frequencies_mhz[band]),
+            calibration=self._calibration(band, bins),
+        )
+
+    def _calibration(self, band: int, bins: Int[np.ndarray, " left"]) -> Calibration:
+        names, ports, slopes = [], [], []
+        levels = self.level[bins]
+        for level in LETTERS:
+            for port in range(levels.shape[1]):
+                here = levels[:, port] == level
+                for name, slope in self._errors(band, bins, level, port):
+                    if here.any() and np.any(slope[here]):
+                        names.append(name)
+                        ports.append(port)
+                        slopes.append(np.where(here, slope, 0.0))
+        n_averaged = self.n_averaged[band, bins]
+        if not names:
+            return Calibration(n_averaged)
+        return Calibration(n_averaged, tuple(names), np.array(ports), np.array(slopes))
+
+    def _errors(
+        self, band: int, bins: Int[np.ndarray, " left"], level: str, port: int
+    ) -> list[tuple[str, Float[np.ndarray, " left"]]]:
+        """What may be off about a level of a port, by one standard deviation."""
+        found = []
+        if self.gain_std is not None:
+            found.append((f"{level}{port}", np.full(len(bins), self.gain_std)))
+        if self.component_std is not None:
+            std = self.component_std[LETTERS.index(level), port]
+            slope = self.slope[band, port][:, bins]
+            found += [(f"{level}{port} PC{r + 1}", std[r] * slope[r]) for r in range(len(std))]
+        return found
+
+    def without(self, band: int, bins: Bool[np.ndarray, " bins"]) -> Reduced:
+        """Return the same without some bins of a band, which do not fit the map."""
+        values, n_averaged, reason = self.values.copy(), self.n_averaged.copy(), self.reason.copy()
+        values[band][:, bins] = np.nan
+        n_averaged[band, bins] = 0.0
+        gone = bins[self.bin_of] & (reason[band] == USED)
+        reason[band, gone] = NO_FIT
+        return Reduced(
+            **{
+                **self.__dict__,
+                "values": values,
+                "n_averaged": n_averaged,
+                "reason": reason,
+            }
+        )
+
+
+def _one_run_an_angle(observation: Observation) -> Observation:
+    """The same with a run for each stretch of one turntable angle, whatever the gains were."""
+    angles = np.array(observation.turntable_deg)[observation.run]
+    run = np.concatenate([[0], np.cumsum(np.diff(angles) != 0.0)]).astype(np.int64)
+    first = np.searchsorted(run, np.arange(run[-1] + 1))
+    return Observation(
+        observation.lon_deg,
+        observation.lat_deg,
+        observation.times,
+        run,
+        tuple(angles[first].tolist()),
+        observation.step_s,
+        windows=observation.windows,
+    )
