@@ -24,6 +24,15 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "lusee-bayes average data.nc --to 30min --scenario gain_1e-2 --set lmax=31",
         ),
     ),
+    "reduce": (
+        "Calibrate, flag and average sessions of the spectrometer.",
+        "What the files leave open (gain table, bin origin, what the times are, a clock) is said "
+        "by the scenario. map does the same with --data SESSION..., for its own frequencies.",
+        (
+            "lusee-bayes reduce first_light.yaml session_*.h5 --frequencies 5:50:1 -o reduced.nc",
+            "lusee-bayes map first_light.yaml --data reduced.nc --frequencies 5:50:1",
+        ),
+    ),
     "map": (
         "Make a posterior map of a scenario, or of given data.",
         "",
@@ -31,6 +40,7 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "lusee-bayes map fiducial --set frequency_mhz=10 -o output/ten",
             "lusee-bayes map fiducial --data data.nc -o output/measured",
             "lusee-bayes map fiducial --data waterfall.fits --set beam.file=beam.fits",
+            "lusee-bayes map first_light.yaml --data session_*.h5 --clock clock.json",
             "lusee-bayes map fiducial --frequencies 5:50:1 --joint --draws 20 -o output/cube",
             "lusee-bayes map fiducial --data second_cycle.nc --onto output/first_cycle",
         ),

@@ -7,7 +7,9 @@ from pathlib import Path
 from rich.console import Console
 
 from lusee_bayes.cli.options import (
+    Clock,
     Cluster,
+    DataFiles,
     Flag,
     Force,
     Frequencies,
@@ -28,7 +30,8 @@ from lusee_bayes.core.progress import Stages
 def map_command(
     scenario: str,
     *,
-    data: Path | None = None,
+    data: DataFiles = None,
+    clock: Clock = None,
     truth: Flag = False,
     output: Output = None,
     draws: Number | None = None,
@@ -52,8 +55,11 @@ def map_command(
     scenario
         A YAML file, or the name of a scenario of the package (fiducial, ...).
     data
-        Visibilities to map, of a file of simulate or a waterfall of luseepy; without them the
-        scenario's own are simulated.
+        Visibilities to map, of a file of simulate or reduce, a waterfall of luseepy, or sessions of
+        its lusee.ingest, one or many; without them the scenario's own are simulated.
+    clock
+        Clock reference in JSON, for sessions that do not say which UTC their clock stands for
+        (flight.clock).
     truth
         The given data are of the scenario's own sky: compare the map with it.
     output
@@ -99,6 +105,7 @@ def map_command(
         set_,
         frequencies,
         joint=joint,
+        flight__clock=clock,
         output__draws=draws,
         output__covariance=covariance,
         output__compact=compact,
@@ -106,7 +113,8 @@ def map_command(
     )
     folder = output or default_folder(scenario)
     stages = Stages(console, verbose=verbose)
-    given = {"data": data, "truth": truth, "onto": onto, "replace": force, "stages": stages}
+    files = None if data is None else tuple(data)
+    given = {"data": files, "truth": truth, "onto": onto, "replace": force, "stages": stages}
     if resolved.frequencies_mhz:
         demand = demand_of_channels(resolved)
         with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:

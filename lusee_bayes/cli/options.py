@@ -46,6 +46,11 @@ Count = Annotated[int, Parameter(converter=_whole(1))]
 Workers = Annotated[int | None, Parameter(name="--workers", converter=_whole(1))]
 Cluster = Annotated[str | None, Parameter(name="--cluster")]
 Flag = Annotated[bool, Parameter(negative="")]
+# one file of visibilities, or sessions of the spectrometer
+DataFiles = Annotated[
+    list[Path] | None, Parameter(name="--data", consume_multiple=True, negative="")
+]
+Clock = Annotated[str | None, Parameter(name="--clock")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 Force = Annotated[bool, Parameter(name="--force", negative="")]
 

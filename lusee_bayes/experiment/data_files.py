@@ -11,10 +11,12 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import is_fits
 from lusee_bayes.core.formats import format_of
+from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.experiment.flight_data import reduce_files, visibilities_of
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.averaging import averaged
+from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.instrument.flight.reduced_file import read_reduced
 from lusee_bayes.instrument.flight.sessions import is_session
 from lusee_bayes.instrument.timestamps import Timestamp
@@ -56,6 +58,20 @@ def are_sessions(data: Data) -> bool:
     return all(sessions)
 
 
+def reduced_of(data: Data, scenario: Scenario, stages: Stages | None = None) -> Reduced | None:
+    """Reduced spectra, of their file or made of sessions; None of other data.
+
+    Raises
+    ------
+    InputError
+        As :func:`.reduce_files` and :func:`.read_reduced`.
+    """
+    files = files_of(data)
+    if are_sessions(data):
+        return reduce_files(files, scenario, stages)
+    return read_reduced(files[0]) if format_of(files[0]) == formats.REDUCED else None
+
+
 def read_data(data: Data, scenario: Scenario) -> Visibilities:
     """Read visibilities: the package's own files, a channel of luseepy's waterfalls, or sessions.
 
@@ -73,11 +89,10 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
         If the file cannot be used, it is not known or contradicted what its times are, they cannot
         be averaged, or a waterfall does not fit the scenario's beams.
     """
-    if are_sessions(data):
-        return visibilities_of(reduce_files(files_of(data), scenario), scenario)
+    reduced = reduced_of(data, scenario)
+    if reduced is not None:
+        return visibilities_of(reduced, scenario)
     path = files_of(data)[0]
-    if format_of(path) == formats.REDUCED:
-        return visibilities_of(read_reduced(path), scenario)
     timestamp, average_s = scenario.observation.timestamp, scenario.observation.average_s
     if is_fits(path):
         data = _channel(path, scenario)

@@ -27,6 +27,7 @@ FILES = {
     "posterior_compact.npz": "compact posterior, from which NumPy can draw",
     "diagnostics.nc": "residuals, groups, point-spread functions",
     "samples.nc": "draws of all chains, ArviZ DataTree",
+    "reduced.nc": "the spectra behind the map, reduced to bands and bins of time, with flags",
     "spectra.csv": "fidelity and power, a row for each multipole",
     "sources.csv": "fluxes of point sources",
     "pointing.csv": "offsets of clock and pointing",

@@ -13,6 +13,7 @@ from lusee_bayes.linear.fit import probability
 from lusee_bayes.report import head, html
 from lusee_bayes.report.coverage_table import COVERAGE_HEADER, coverage_cells
 from lusee_bayes.report.explorer import explorer
+from lusee_bayes.report.flight_section import SECTION, flight_section, is_flight
 from lusee_bayes.report.run_details import details
 from lusee_bayes.results.finished_runs import FinishedRun
 from lusee_bayes.results.saved import COVERAGE, POINTING, SOURCES
@@ -50,15 +51,18 @@ def map_page(folder: Path, name: str) -> str:
     run = FinishedRun.read(folder)
     summary, found = run.summary, run.diagnostics
     title = f"{name}: the sky at {summary['frequency_mhz']:g} MHz"
+    flight = is_flight(folder)
+    sections = [*SECTIONS[:2], SECTION, *SECTIONS[2:]] if flight else SECTIONS
     return html.page(
         title,
         [
-            html.contents(SECTIONS),
+            html.contents(sections),
             head.verdict(found.attrs["level"], found.attrs["verdict"]),
             head.doubts(folder / "summary.json", summary),
             head.about(folder, f"{summary['frequency_mhz']:g} MHz"),
             html.section(*SECTIONS[0], *_map(folder, summary, found)),
             html.section(*SECTIONS[1], *_scales(folder, run)),
+            *([flight_section(folder)] if flight else []),
             html.section(*SECTIONS[2], *_data(folder, found)),
             html.section(*SECTIONS[3], *_numbers(folder, summary)),
             html.section(*SECTIONS[4], head.downloads(folder), head.citation(folder)),

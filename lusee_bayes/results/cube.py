@@ -17,6 +17,7 @@ from lusee_bayes.core.progress import peak_memory_gb
 from lusee_bayes.core.representation import Described, extent
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.linear.fit import RULE, ChiSquare, Fit
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.cube_fit import ChannelFits
@@ -38,12 +39,15 @@ class CubeResult(Described):
         The component maps that all channels share; None where each has a posterior of its own.
     seconds : dict
         By stage.
+    reduced : Reduced or None
+        Of flight data: the spectra behind them.
     """
 
     scenario: Scenario
     channels: tuple[ChannelResult, ...]
     components: Components | None
     seconds: dict[str, float] = field(default_factory=dict)
+    reduced: Reduced | None = None
 
     def description(self) -> tuple[str, ...]:
         kind = "independent" if self.components is None else "joint"

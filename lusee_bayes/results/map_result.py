@@ -20,6 +20,7 @@ from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.terms import beam_rms_difference
+from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.linear.fit import LEVELS, RULE
 from lusee_bayes.linear.metrics import effective_resolution_deg
 from lusee_bayes.linear.updating import composed, deviation_model
@@ -56,6 +57,8 @@ class MapResult(Described):
         Of all data behind the posterior.
     seconds : dict
         By stage.
+    reduced : Reduced or None
+        Of flight data: the spectra behind them.
     """
 
     experiment: Experiment
@@ -67,6 +70,7 @@ class MapResult(Described):
     pointing: PointingReport | None
     digests: tuple[str, ...]
     seconds: dict[str, float] = field(default_factory=dict)
+    reduced: Reduced | None = None
 
     def description(self) -> tuple[str, ...]:
         channel = self.channel
@@ -85,6 +89,11 @@ class MapResult(Described):
     def channels(self) -> tuple[ChannelResult, ...]:
         """The one channel."""
         return (self.channel,)
+
+    @property
+    def band(self) -> int:
+        """The number of its band among the reduced spectra."""
+        return 0 if self.reduced is None else self.reduced.band(self.channel.frequency_mhz)
 
     def summary(self) -> dict[str, object]:
         """Figures of summary.json; null where a truth would be needed and is not known."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from lusee_bayes.core.command_line import COMMAND
 from lusee_bayes.core.reading import read_json
 from lusee_bayes.core.version import __version__
+from lusee_bayes.experiment.data_files import Data, files_of
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.observation import Observation
@@ -61,11 +62,11 @@ class Provenance:
 
     @classmethod
     def of(
-        cls, scenario: Scenario, observation: Observation, file: Path | None, *, known_sky: bool
+        cls, scenario: Scenario, observation: Observation, data: Data | None, *, known_sky: bool
     ) -> Provenance:
-        """Of a run that has used data of an observation, read from ``file`` or simulated."""
+        """Of a run that has used data of an observation, read from files or simulated."""
         return cls(
-            file="" if file is None else str(file),
+            file="" if data is None else ", ".join(map(str, files_of(data))),
             known_sky=known_sky,
             seed=scenario.seed,
             first=str(observation.times[0].isot)[:19],
@@ -81,10 +82,10 @@ class Provenance:
         )
 
     @classmethod
-    def of_experiment(cls, experiment: Experiment, file: Path | None) -> Provenance:
+    def of_experiment(cls, experiment: Experiment, data: Data | None) -> Provenance:
         """Of a run with an experiment's data."""
-        data, known = experiment.data, experiment.data.truth is not None
-        return cls.of(experiment.scenario, data.observation, file, known_sky=known)
+        known = experiment.data.truth is not None
+        return cls.of(experiment.scenario, experiment.data.observation, data, known_sky=known)
 
     @classmethod
     def read(cls, folder: Path) -> Provenance | None:

@@ -12,6 +12,8 @@ NUMBER, COUNT, TEXT = Attribute(), Attribute("integer", low=0.0), Attribute("tex
 KINDS = ("product", "day", "angle")
 LEVEL = Attribute("text", choices=LEVELS)
 HINT = "give the folder of a finished run"
+# of flight data: the spectra behind a map
+REDUCED = "reduced.nc"
 # the two parts of chi^2 of a map's data
 JUDGED = {
     f"{part}_{name}": attribute

@@ -4,18 +4,31 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from dataclasses import replace as replace_fields
 from pathlib import Path
+
+import numpy as np
 
 from lusee_bayes.core.engine import Engine
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.tables import rows_of, write_csv
-from lusee_bayes.experiment.data_files import read_data
-from lusee_bayes.experiment.experiment import build, with_truth
+from lusee_bayes.experiment.data_files import (
+    Data,
+    are_sessions,
+    files_of,
+    read_data,
+    reduced_of,
+)
+from lusee_bayes.experiment.experiment import Experiment, build, with_truth
+from lusee_bayes.experiment.flight_data import visibilities_of
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.instrument.flight.reduced import Reduced
+from lusee_bayes.instrument.flight.reduced_file import write_reduced
 from lusee_bayes.linear.compact import CompactPosterior
 from lusee_bayes.report.figures import channel as channel_figures
 from lusee_bayes.report.figures import cube as cube_figures
 from lusee_bayes.report.figures import diagnostics as diagnostic_figures
+from lusee_bayes.report.figures import flight as flight_figures
 from lusee_bayes.report.figures.pointing import pointing_by_day
 from lusee_bayes.results.channel_files import CHANNELS
 from lusee_bayes.results.cost import posterior_cost, require_fits, require_resources
@@ -26,6 +39,7 @@ from lusee_bayes.results.map_files import cards, write_cube, write_map
 from lusee_bayes.results.map_result import MapResult, map_result
 from lusee_bayes.results.posterior_file import about, write_posterior
 from lusee_bayes.results.provenance import Provenance
+from lusee_bayes.results.saved import REDUCED
 from lusee_bayes.runs.folder import (
     Output,
     RunKind,
@@ -60,7 +74,7 @@ def run_map(
     scenario: Scenario,
     folder: str | Path,
     *,
-    data: Path | None = None,
+    data: Data | None = None,
     truth: bool = False,
     onto: Path | None = None,
     engine: Engine | None = None,
@@ -78,8 +92,9 @@ def run_map(
         Of one frequency or of several; ``output`` says what is written besides the maps.
     folder : path
         Of the results.
-    data : Path, optional
-        Visibilities to map; without them the scenario's own are simulated.
+    data : Path or sequence of Path, optional
+        Visibilities to map, or sessions of the spectrometer; without them the scenario's own are
+        simulated.
     truth : bool
         The given data are of the scenario's own sky: compare the map with it.
     onto : Path, optional
@@ -111,7 +126,9 @@ def run_map(
     require_fits(cost, scenario)
     with run_folder(folder, CUBE, origin, resume, replace=replace) as place:
         stages.say(cost.line())
-        cube = cube_result(scenario, place, data=data, truth=truth, engine=engine, stages=stages)
+        file, reduced = _one_file(data, scenario, place, stages)
+        cube = cube_result(scenario, place, data=file, truth=truth, engine=engine, stages=stages)
+        cube = replace_fields(cube, reduced=reduced)
         provenance = _provenance_of_channels(scenario, data, cube)
         return MapRun(cube, place, write_run(place, cube, CUBE, origin, stages, provenance))
 
@@ -119,7 +136,7 @@ def run_map(
 def _run_single(
     scenario: Scenario,
     folder: str | Path,
-    data: Path | None,
+    data: Data | None,
     truth: bool,
     onto: Path | None,
     replace: bool,
@@ -127,24 +144,56 @@ def _run_single(
 ) -> MapRun:
     origin = origin_of(scenario, data, truth=truth or None, onto=onto)
     with run_folder(folder, MAP, origin, replace=replace) as place:
-        measured = None if data is None else read_data(data, scenario)
+        reduced = None if data is None else reduced_of(data, scenario, stages)
+        if reduced is not None:
+            measured = visibilities_of(reduced, scenario)
+        else:
+            measured = None if data is None else read_data(data, scenario)
         require_resources(scenario, measured, stages)
         experiment = build(scenario, measured, stages)
         if truth:
             experiment = with_truth(experiment)
         result = map_result(experiment, onto=onto, stages=stages)
+        if reduced is not None:
+            result = replace_fields(result, reduced=_as_used(reduced, experiment))
         provenance = Provenance.of_experiment(experiment, data)
         return MapRun(result, place, write_run(place, result, MAP, origin, stages, provenance))
 
 
-def _provenance_of_channels(scenario: Scenario, file: Path | None, cube: CubeResult) -> Provenance:
+def _as_used(reduced: Reduced, experiment: Experiment) -> Reduced:
+    """Reduced spectra without the times that did not fit."""
+    if experiment.fitting is None or not experiment.fitting.flagged.any():
+        return reduced
+    band = reduced.band(experiment.scenario.frequency_mhz)
+    bins = np.zeros(reduced.values.shape[2], dtype=bool)
+    bins[reduced.bins_at(band)[experiment.fitting.flagged]] = True
+    return reduced.without(band, bins)
+
+
+def _one_file(
+    data: Data | None, scenario: Scenario, folder: Path, stages: Stages
+) -> tuple[Path | None, Reduced | None]:
+    """The file that all channels are read from: of sessions, their reduced spectra."""
+    if data is None:
+        return None, None
+    reduced = reduced_of(data, scenario, stages)
+    if reduced is None or not are_sessions(data):
+        return files_of(data)[0], reduced
+    path = folder / CHANNELS / REDUCED
+    path.parent.mkdir(exist_ok=True)
+    return write_reduced(path, reduced, scenario.to_yaml()), reduced
+
+
+def _provenance_of_channels(scenario: Scenario, data: Data | None, cube: CubeResult) -> Provenance:
     """Of the data of the first channel; all have the same times."""
-    if file is None:
+    if data is None:
         observation = scenario.observation.observation()
+    elif cube.reduced is not None:
+        observation = visibilities_of(cube.reduced, scenario.channels()[0]).observation
     else:
-        observation = read_data(file, scenario.channels()[0]).observation
+        observation = read_data(data, scenario.channels()[0]).observation
     known = cube.stacked("truth") is not None
-    return Provenance.of(scenario, observation, file, known_sky=known)
+    return Provenance.of(scenario, observation, data, known_sky=known)
 
 
 def _write_maps(result: MapResult, folder: Path) -> None:
@@ -160,6 +209,10 @@ def _write_coefficients(result: MapResult, folder: Path) -> None:
 def _write_compact(result: MapResult, folder: Path) -> None:
     compact = CompactPosterior.of(result.inference.posterior)
     compact.write(folder / "posterior_compact.npz", about(result.scenario))
+
+
+def _write_reduced(result: MapResult | CubeResult, folder: Path) -> None:
+    write_reduced(folder / REDUCED, result.reduced, result.scenario.to_yaml())
 
 
 def _write_offsets(result: MapResult, folder: Path) -> None:
@@ -205,6 +258,7 @@ MAP = RunKind(
         Output(
             lambda result, folder: write_diagnostics(result.diagnostics, folder / "diagnostics.nc")
         ),
+        Output(_write_reduced, wanted=lambda result: result.reduced is not None),
         Output(_write_scenario),
         Output(_write_summary),
     ),
@@ -217,6 +271,9 @@ MAP = RunKind(
         "draws": lambda result: diagnostic_figures.draws(result.diagnostics),
         "residuals": lambda result: diagnostic_figures.residuals(result.diagnostics),
         "pointing": lambda result: result.pointing and pointing_by_day(result.pointing.preferred),
+        "flight_time_line": lambda r: r.reduced and flight_figures.time_line(r.reduced),
+        "flight_waterfall": lambda r: r.reduced and flight_figures.waterfall(r.reduced, r.band),
+        "flight_calibration": lambda r: r.reduced and flight_figures.calibration(r.reduced),
     },
 )
 
@@ -230,6 +287,7 @@ CUBE = RunKind(
         ),
         Output(_write_cubes),
         Output(lambda result, folder: write_csv(folder / "spectra.csv", result.spectra())),
+        Output(_write_reduced, wanted=lambda result: result.reduced is not None),
         Output(_write_scenario),
         Output(_write_summary),
     ),
@@ -238,6 +296,8 @@ CUBE = RunKind(
         "spectra": cube_figures.spectra,
         "fidelity": cube_figures.fidelity,
         "chi2": cube_figures.chi2,
+        "flight_time_line": lambda r: r.reduced and flight_figures.time_line(r.reduced),
+        "flight_calibration": lambda r: r.reduced and flight_figures.calibration(r.reduced),
     },
     unfinished=CHANNELS,
     dpi=100,

@@ -11,6 +11,7 @@ from typing import Any
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import read_manifest
 from lusee_bayes.core.reading import require_file
+from lusee_bayes.experiment.data_files import Data, files_of
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import HINT
 
@@ -18,7 +19,7 @@ Origin = Mapping[str, str]
 
 
 def origin_of(
-    scenario: Scenario | None = None, data: Path | None = None, **others: object
+    scenario: Scenario | None = None, data: Data | None = None, **others: object
 ) -> dict[str, str]:
     """What determines the numbers of a run, as text by name.
 
@@ -26,8 +27,8 @@ def origin_of(
     ----------
     scenario : Scenario, optional
         What it says of output does not count.
-    data : Path, optional
-        A file of visibilities; its content counts, not its name.
+    data : Path or sequence of Path, optional
+        Files of visibilities; their content counts, not their names.
     **others
         Whatever else does; None for what is not there.
 
@@ -46,9 +47,15 @@ def origin_of(
         tree = scenario.model_dump(mode="json", exclude={"output"})
         found |= {name: json.dumps(value) for name, value in _entries(tree)}
     if data is not None:
-        with require_file(data, "data", HINT).open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        found["data"] = f"'{Path(data).name}' ({digest[:12]})"
+        digests = []
+        for path in files_of(data):
+            with require_file(path, "data", HINT).open("rb") as file:
+                digests.append(hashlib.file_digest(file, "sha256").hexdigest())
+        names = ", ".join(f"'{path.name}'" for path in files_of(data))
+        digest = digests[0]
+        if len(digests) > 1:
+            digest = hashlib.sha256("".join(digests).encode()).hexdigest()
+        found["data"] = f"{names} ({digest[:12]})"
     return found | {name: str(value) for name, value in others.items() if value is not None}
 
 

@@ -33,6 +33,28 @@ REASONS = (
 )
 USED, SATURATED, NO_DATA, COMB, TOO_MANY, BURST, PRODUCT, NO_FIT = range(len(REASONS))
 
+# beyond these, something is said: scatter over the radiometer noise, and what two more powers of
+# the frequency change, in standard deviations of a bin
+NOISY, CURVED = 1.2, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Gains over frequency, at the mean telemetry.
+
+    Attributes
+    ----------
+    frequencies_mhz : (curve,) array
+    gain : (levels, ports, curve) array
+        Counts for 1 nV^2/Hz; NaN for levels that no spectrum has.
+    std : (levels, ports, curve) array
+        By how much they may be off; 0 where that is not known.
+    """
+
+    frequencies_mhz: Float[np.ndarray, " curve"]
+    gain: Float[np.ndarray, "levels ports curve"]
+    std: Float[np.ndarray, "levels ports curve"]
+
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Reduced(Described):
@@ -75,6 +97,8 @@ class Reduced(Described):
         standard deviations of a bin, less what noise alone would.
     lines : (bands, rows) array
         Share of a spectrum's channels in a band that are flagged.
+    curves : Curves
+        Of the gains, for figures.
     sessions : tuple of mapping
         Where the spectra come from.
     """
@@ -97,6 +121,7 @@ class Reduced(Described):
     line_scatter: Float[np.ndarray, " bands"]
     curvature: Float[np.ndarray, " bands"]
     lines: Float32[np.ndarray, "bands rows"]
+    curves: Curves
     sessions: tuple[Mapping[str, Any], ...]
 
     def description(self) -> tuple[str, ...]:
@@ -121,6 +146,36 @@ class Reduced(Described):
             )
         return nearest
 
+    def bins_at(self, band: int) -> Int[np.ndarray, " left"]:
+        """Return the bins of which a band has something left: the times of :meth:`at`."""
+        return np.flatnonzero(np.isfinite(self.values[band]).any(axis=0))
+
+    def shares(self, band: int) -> dict[str, float]:
+        """Return the share of the spectra that are used, and that are not for each reason."""
+        counts = np.bincount(self.reason[band], minlength=len(REASONS)) / self.reason.shape[1]
+        return {
+            name: float(share)
+            for k, (name, share) in enumerate(zip(REASONS, counts, strict=True))
+            if share or not k
+        }
+
+    def doubts(self, band: int) -> tuple[str, ...]:
+        """Return what is doubtful about a band, a sentence each."""
+        found = []
+        noise, curvature = float(self.scatter[band]), float(self.curvature[band])
+        if noise > NOISY:
+            found.append(
+                f"Spectra scatter {noise:.2g} times as much in time as the radiometer's noise: "
+                "gains drift, or something else than the sky changes; consider noise.gain."
+            )
+        if curvature > CURVED:
+            found.append(
+                f"The spectrum within the band is no polynomial of that degree: two more powers "
+                f"move a value by {curvature:.2g} standard deviations; use a smaller "
+                "flight.bandwidth_hz, or a higher flight.degree."
+            )
+        return tuple(found)
+
     def at(self, frequency_mhz: float, per_kelvin: Float[np.ndarray, " ports"]) -> Visibilities:
         """Return one band.
 
@@ -142,7 +197,7 @@ class Reduced(Described):
         """
         band = self.band(frequency_mhz)
         present = np.isfinite(self.values[band])
-        bins = np.flatnonzero(present.any(axis=0))
+        bins = self.bins_at(band)
         if not bins.size:
             counts = ", ".join(
                 f"{name} {int((self.reason[band] == k).sum())}"

@@ -16,7 +16,7 @@ from lusee_bayes.core.netcdf_files import read_netcdf
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument.flight.gain_table import LETTERS
-from lusee_bayes.instrument.flight.reduced import REASONS, Reduced
+from lusee_bayes.instrument.flight.reduced import REASONS, Curves, Reduced
 from lusee_bayes.instrument.flight.spectrometer import NO_LEVEL, PORTS
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import labels
@@ -24,6 +24,7 @@ from lusee_bayes.instrument.times import utc_of
 from lusee_bayes.instrument.windows import Windows
 
 HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."
+CURVES = ("level_3", "port", "curve")
 BANDS, GAINS = ("frequency", "product", "bin"), ("frequency", "port", "bin")
 LAYOUT = Layout(
     "reduced spectra",
@@ -36,7 +37,10 @@ LAYOUT = Layout(
         "level": Variable(("bin", PORTS), "text", choices=(*LETTERS, NO_LEVEL)),
         "gain": Variable(GAINS, missing=True),
         "gain_slope": Variable(("frequency", "port", "component", "bin"), missing=True),
-        "component_std": Variable(("level_3", PORTS, "component"), low=0.0, optional=True),
+        "component_std": Variable((len(LETTERS), PORTS, "component"), low=0.0, optional=True),
+        "curve_mhz": Variable(("curve",), low=0.0, grows=True),
+        "curve_gain": Variable((len(LETTERS), PORTS, "curve"), missing=True),
+        "curve_std": Variable((len(LETTERS), PORTS, "curve"), missing=True),
         "scatter": Variable(("frequency",), missing=True),
         "line_scatter": Variable(("frequency",), missing=True),
         "curvature": Variable(("frequency",), missing=True),
@@ -83,6 +87,9 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
         "level": (("bin", "port"), reduced.level.astype(object)),
         "gain": (GAINS, reduced.gain, {"units": "count / (nV^2/Hz)"}),
         "gain_slope": (("frequency", "port", "component", "bin"), reduced.slope),
+        "curve_mhz": (("curve",), reduced.curves.frequencies_mhz, {"units": "MHz"}),
+        "curve_gain": (CURVES, reduced.curves.gain, {"units": "count / (nV^2/Hz)"}),
+        "curve_std": (CURVES, reduced.curves.std, {"units": "count / (nV^2/Hz)"}),
         "scatter": (("frequency",), reduced.scatter),
         "line_scatter": (("frequency",), reduced.line_scatter),
         "curvature": (("frequency",), reduced.curvature),
@@ -185,5 +192,6 @@ def read_reduced(path: str | Path) -> Reduced:
         here["line_scatter"],
         here["curvature"],
         here["line_share"].astype(np.float32),
+        Curves(here["curve_mhz"], here["curve_gain"], here["curve_std"]),
         tuple(sessions),
     )

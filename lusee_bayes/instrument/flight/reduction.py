@@ -21,6 +21,7 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.threads import in_threads
 from lusee_bayes.instrument.averaging import by_the_rule
 from lusee_bayes.instrument.flight.bursts import burst_flags
+from lusee_bayes.instrument.flight.gain_table import LETTERS
 from lusee_bayes.instrument.flight.recipe import Recipe
 from lusee_bayes.instrument.flight.reduced import (
     BURST,
@@ -30,6 +31,7 @@ from lusee_bayes.instrument.flight.reduced import (
     SATURATED,
     TOO_MANY,
     USED,
+    Curves,
     Reduced,
 )
 from lusee_bayes.instrument.flight.session import Read, Session
@@ -41,6 +43,8 @@ from lusee_bayes.instrument.times import unannounced_leap_seconds
 
 # spectra that are worked on at once, and at least how many make a piece between two bins
 SLAB, PIECE = 128, 256
+# of the curves of gains: first, last, and how many
+CURVE_MHZ = (0.5, 51.0, 203)
 N_PRODUCTS = len(all_products())
 
 
@@ -145,6 +149,7 @@ class _Made:
             _medians(self.line_scatter),
             np.array([_mean_abs(one) for one in off]),
             self.lines,
+            _curves(line, recipe),
             tuple(_origin(s) for s in line.sessions),
         )
 
@@ -158,6 +163,33 @@ def _mean_abs(off: Float[np.ndarray, "ports bins"]) -> float:
     """Size of a common offset: the mean over bins, which noise does not have, of each port."""
     known = np.isfinite(off).any(axis=1)
     return float(np.abs(np.nanmean(off[known], axis=1)).max()) if known.any() else np.nan
+
+
+def _curves(line: Timeline, recipe: Recipe) -> Curves:
+    """Gains of every level of every port that some spectrum has."""
+    mhz = np.linspace(*CURVE_MHZ)
+    shape = (len(LETTERS), PORTS, len(mhz))
+    gain, std = np.full(shape, np.nan), np.zeros(shape)
+    levels = np.concatenate([s.level for s in line.sessions])
+    telemetry = {
+        name: np.array([np.concatenate([s.telemetry[name] for s in line.sessions]).mean()])
+        for name in line.sessions[0].telemetry
+    }
+    table = recipe.table
+    for number, level in enumerate(LETTERS):
+        for port in np.flatnonzero((levels == level).any(axis=0)).tolist():
+            basis = table.basis(level, port, mhz)
+            strengths = table.strengths(level, port, telemetry)[0]
+            gain[number, port] = basis[0] + strengths @ basis[1:]
+            variance = (0.0 if recipe.gain_std is None else recipe.gain_std) ** 2 * np.square(
+                gain[number, port]
+            )
+            if table.component_std is not None:
+                variance = variance + np.square(
+                    table.component_std[number, port][:, None] * basis[1:]
+                ).sum(axis=0)
+            std[number, port] = np.sqrt(variance)
+    return Curves(mhz, gain, std)
 
 
 def _origin(session: Session) -> Mapping[str, Any]:

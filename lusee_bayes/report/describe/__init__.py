@@ -10,6 +10,7 @@ from pkgutil import resolve_name
 from lusee_bayes.core import formats
 from lusee_bayes.core.fits_files import has_words, image_names, is_fits
 from lusee_bayes.core.reading import reading, require_file
+from lusee_bayes.instrument.flight.sessions import is_session
 
 # the package's own netCDF files, by their attribute ``format``. What describes a kind is named by
 # path and imported when there is such a file: each needs libraries that others do not
@@ -20,6 +21,8 @@ OWN_FORMATS = {
     formats.BEAMS: "beam_files:describe_sampled_beams",
     formats.DIAGNOSTICS: "diagnostics:describe_diagnostics",
     formats.SAMPLES: "samples:describe_samples",
+    formats.REDUCED: "flight:describe_reduced",
+    formats.GAINS: "flight:describe_gains",
 }
 
 
@@ -42,6 +45,7 @@ KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
     (_has_image("e_theta_real", "product_beam"), "beam_files:describe_sampled_beams"),
     (lambda path: has_words(path, formats.UVBEAM_WORDS), "beam_files:describe_sampled_beams"),
     (_has_image("combinations", "products"), "data_files:describe_waterfall"),
+    (is_session, "flight:describe_session"),
     (_is_compact, "compact:describe_compact"),
     (lambda path: True, "skies:describe_sky"),
 )

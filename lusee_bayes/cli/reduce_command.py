@@ -1,0 +1,58 @@
+"""lusee-bayes reduce: sessions of the spectrometer to bands and bins of time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from rich.console import Console
+
+from lusee_bayes.cli.options import Clock, Frequencies, Overrides, Quiet, Verbose, load, say
+from lusee_bayes.core.progress import Stages
+
+
+def reduce_command(
+    scenario: str,
+    files: Annotated[list[Path], Parameter(required=True)],
+    /,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("reduced.nc"),
+    frequencies: Frequencies = None,
+    clock: Clock = None,
+    set_: Overrides | None = None,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Calibrate, flag and average sessions of the spectrometer.
+
+    Parameters
+    ----------
+    scenario
+        A YAML file, or the name of a scenario of the package, with a section flight.
+    files
+        Sessions that luseepy has written, HDF5 or FITS, in any order.
+    output
+        The netCDF file to write, for map --data.
+    frequencies
+        Middles of the bands in MHz, as 10,25,30 or as first:last:step.
+    clock
+        Clock reference in JSON, for sessions that do not say which UTC their clock stands for
+        (flight.clock).
+    set_
+        key.path=value; overrides an entry of the scenario, as often as needed.
+    quiet
+        Print nothing but errors.
+    verbose
+        Print the memory in use after every stage.
+    """
+    from lusee_bayes.runs.reduce_run import run_reduce
+
+    console = Console(quiet=quiet, soft_wrap=True)
+    run = run_reduce(
+        load(scenario, set_, frequencies, flight__clock=clock),
+        files,
+        output,
+        stages=Stages(console, verbose=verbose),
+    )
+    say(console, *run.lines(), f"{len(run.reduced.frequencies_mhz)} bands -> {output}")
