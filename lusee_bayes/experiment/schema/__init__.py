@@ -35,6 +35,11 @@ from lusee_bayes.experiment.schema.sky import (
 )
 from lusee_bayes.experiment.schema.sources import SourceSection, SourcesSection
 from lusee_bayes.experiment.schema.spectral import SpectralSection
+from lusee_bayes.experiment.schema.unknowns import (
+    GainTableSection,
+    ReceiverNoiseSection,
+    RegolithSection,
+)
 
 __all__ = [
     "BEAM_SECTIONS",
@@ -45,6 +50,7 @@ __all__ = [
     "FileSkySection",
     "Frequency",
     "GainSection",
+    "GainTableSection",
     "GalaxySection",
     "IsotropicPriorSection",
     "LocalScalesPriorSection",
@@ -57,6 +63,8 @@ __all__ = [
     "PointingSection",
     "PriorSection",
     "RadiometerSection",
+    "ReceiverNoiseSection",
+    "RegolithSection",
     "ResponseSection",
     "RunSection",
     "SampledBeamSection",
