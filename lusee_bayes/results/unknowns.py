@@ -108,7 +108,7 @@ def _null_direction(
         own = np.eye(len(told.mean))[at : at + n]
         if isinstance(systematic, GainTable):
             names.append(GAIN)
-            weights.append(own.sum(0)[None] / np.sqrt(n))
+            weights.append(systematic.common[None] @ own)
         else:
             names.extend(systematic.labels)
             weights.append(own)

@@ -121,6 +121,12 @@ class GainTable(Expanded):
         return self.errors.stds
 
     @property
+    def common(self) -> Float[np.ndarray, " errors"]:
+        """Unit vector of errors along the mean power gain of all ports and times."""
+        along = np.asarray(self.errors.slope).mean(1)
+        return along / max(float(np.linalg.norm(along)), np.finfo(np.float64).tiny)
+
+    @property
     def templates(self) -> Float[np.ndarray, "data errors"]:
         """T, in K."""
         return self.errors.slopes(np.asarray(self.centre)) * np.asarray(self.seen)[:, None]

@@ -13,12 +13,10 @@ import pytest
 from experiments import four_ports
 from scipy import stats
 
-from lusee_bayes.experiment.emission import ground_per_kelvin
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.simulate import simulate, true_values
-from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.linear.templates import template_amplitudes
 from lusee_bayes.results.unknowns import GAIN, SKY, unknowns_report
 from lusee_bayes.sampling.calibration import N_DRAWS, Ranks
@@ -43,20 +41,6 @@ def drawn(first: Setup, seed: int) -> tuple[Setup, Experiment]:
     return setup, Experiment(setup, simulate(setup))
 
 
-def known(setup: Setup, truth) -> Setup:
-    """The same with receivers and ground that are known to be the truth."""
-    noise = setup.scenario.noise
-    fixed = {
-        name: getattr(noise, name).model_copy(update={"treatment": "ignored"})
-        for name in ("receiver", "regolith")
-    }
-    scenario = setup.scenario.model_copy(update={"noise": noise.model_copy(update=fixed)})
-    background = np.asarray(setup.beam_source.background(20.0)).copy()
-    background += (truth["regolith_k"] - 250.0) * ground_per_kelvin(setup.beam_source, 20.0)
-    background[auto_indices()] += [truth[f"receiver_{port}_k"] for port in range(4)]
-    return replace(setup, scenario=scenario, background=background)
-
-
 @pytest.mark.long
 @pytest.mark.essential
 def test_simulation_based_calibration(response_file):
@@ -65,7 +49,7 @@ def test_simulation_based_calibration(response_file):
     spectrum = 0.04 * np.asarray(first.prior.spectrum)
     first = replace(first, prior=HarmonicPrior(spectrum, mean=first.sky.modes))
     sky_std = np.sqrt(np.asarray(first.prior.variance()))
-    ranks, null, shares, moved = [], [], [], []
+    ranks, null, shares = [], [], []
     for seed in range(N):
         setup, experiment = drawn(first, seed)
         found, truth = settled(setup, experiment.data), true_values(setup)
@@ -89,16 +73,11 @@ def test_simulation_based_calibration(response_file):
         parts = np.concatenate([off[:1] / sky_std[0], off[16:21], [off[21:].sum() / 2.0]])
         null.append(report.null.weights @ parts)
         shares.append(report.null.share)
-        # what does not know receivers and ground tells the same of all but the monopole
-        other = settled(known(setup, truth), experiment.data).posterior
-        shift = (np.asarray(other.mean) - mean[:16]) / np.sqrt(np.diagonal(sky_covariance))
-        moved.append(np.abs(shift[1:]).max())
     names = [f"mode {k}" for k in MODES] + [f"receiver {port}" for port in range(4)]
     names += ["regolith", *(f"gain {port}" for port in range(4))]
     table = Ranks(np.array(ranks), N_DRAWS, tuple(names))
-    print(dict(zip(names, table.p_values().round(3), strict=True)))
-    print(np.quantile(moved, [0.5, 0.9, 1.0]), np.mean(shares), np.var(null))
     assert table.passed, dict(zip(names, table.p_values(), strict=True))
+    # the direction that the data do not tell scatters as its share of the prior says
+    assert min(shares) > 0.9
     low, high = stats.chi2(N).interval(1 - 1e-3)
     assert low < np.sum(np.array(null) ** 2 / shares) < high
-    assert max(moved) < 0.1
