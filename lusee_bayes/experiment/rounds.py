@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -14,10 +14,18 @@ from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import TERMS, Around, Term, pointed
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.linear.freedom import data_freedom
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.linear.templates import template_amplitudes, weighted_residual
-from lusee_bayes.systematics import Expanded, GainTable, PointingOffsets, Systematic
+from lusee_bayes.systematics import (
+    Expanded,
+    GainTable,
+    PointingOffsets,
+    PointSources,
+    Systematic,
+    Templated,
+)
 
 # N is rebuilt until the map moves by less than this (rms, in standard deviations)
 SETTLED, MAX_ROUNDS = 1e-2, 30
@@ -86,7 +94,7 @@ def settled(setup: Setup, data: Visibilities) -> Inference:
         model, found = model_about(setup, around)
         return Inference(model, found, model.condition(data.data), rounds, around)
 
-    found = conditioned(Around(data), 1)
+    found = conditioned(Around(data, freedom=_freedom(setup, data)), 1)
     if not rebuilds(setup):
         return found
     step = _Step()
@@ -140,7 +148,7 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
     visibilities, sky, values, seen = None, None, None, None
     if found.moving:
         solved = weighted_residual(found.model, found.posterior, found.around.data.data)
-        told = [np.asarray(s.columns).T @ solved for s in found.moving]
+        told = [s.expected + np.asarray(s.columns).T @ solved for s in found.moving]
         centres = [np.asarray(s.centre) for s in found.moving]
         step = step.after(np.concatenate(told) - np.concatenate(centres))
         values = {}
@@ -154,7 +162,24 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
                 sky = here + step.size * (np.asarray(found.posterior.mean) - here)
     if rebuilds_gains(setup):
         visibilities = prediction(pointed(setup, values), found.posterior)
-    return Around(found.around.data, visibilities, sky, values, seen), step
+    around = replace(found.around, visibilities=visibilities, sky=sky, values=values, seen=seen)
+    return around, step
+
+
+def _freedom(setup: Setup, data: Visibilities) -> Float[np.ndarray, " data"] | None:
+    """Share of each datum that the model follows whose gains are the table's; None without one.
+
+    The errors change it by no more than what they change the radiometer noise by.
+    """
+    found = systematics(setup, Around(data))
+    others = [(treatment, s) for treatment, s in found if not isinstance(s, GainTable)]
+    if len(others) == len(found):
+        return None
+    model = marginalised(base_model(setup, data), others)
+    columns = [np.zeros((model.n_data, 0))]
+    columns += [np.asarray(s.columns) for _, s in others if isinstance(s, Templated)]
+    columns += [np.asarray(s.templates()) for _, s in others if isinstance(s, PointSources)]
+    return data_freedom(model, model.condition(data.data), np.concatenate(columns, axis=1))
 
 
 def _before_gains(

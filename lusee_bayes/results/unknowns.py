@@ -79,7 +79,8 @@ def unknowns_report(experiment: Experiment, found: Inference) -> UnknownsReport 
     for systematic in listed:
         stds = np.asarray(systematic.stds)
         own = slice(at, at + len(stds))
-        value, prior = systematic.in_units(told.mean[own]), systematic.in_units(0.0 * stds)
+        value = systematic.in_units(systematic.expected + told.mean[own])
+        prior = systematic.in_units(0.0 * stds)
         true = None if truth is None else systematic.true(truth)
         for name, std, prior_std in zip(value, told.std[own] * stds, stds, strict=True):
             row = {

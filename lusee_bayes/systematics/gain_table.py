@@ -11,6 +11,15 @@ and about z_0 and v_0, to first order, ::
 
 With errors of 1 % what this leaves out, 1e-4, is ten times the radiometer noise, unless z_0 and
 v_0 are those that the data tell: then it is the Gaussian about the joint mode of all unknowns.
+
+That mode is not where the bulk is: a larger gain and a smaller sky fit as well, and of n modes that
+the data determine, each gains by being smaller. With the sky integrated out, ln|K| makes up for it,
+K(z) = F (A S A^T + ...) F + N_0, whose derivative is ::
+
+    d(-ln|K| / 2)/dz_e = -sum_k h_k dln F_k/dz_e,    h = diag(1 - N_0 K^-1),
+
+h_k the share of datum k that the model follows (:mod:`.linear.freedom`). It is that of a prior mean
+of -dln F/dz^T h in place of 0, with which rounds lead to the mode of p(z | d).
 """
 
 from __future__ import annotations
@@ -101,6 +110,8 @@ class GainTable(Expanded):
         z_0, in prior standard deviations.
     seen : (data,) array
         v_0: the visibilities before these gains, in K.
+    freedom : (data,) array or None
+        h: the share of each datum that sky and others follow; None for zeros.
     moves : bool
         Whether z_0 and v_0 are those that the data tell, found in rounds.
     """
@@ -108,6 +119,7 @@ class GainTable(Expanded):
     errors: TableErrors
     centre: Float[Array, " errors"]
     seen: Float[Array, " data"]
+    freedom: Float[Array, " data"] | None = None
     moves: bool = eqx.field(static=True, default=True)
 
     @property
@@ -132,6 +144,15 @@ class GainTable(Expanded):
         return self.errors.slopes(np.asarray(self.centre)) * np.asarray(self.seen)[:, None]
 
     @property
+    def expected(self) -> Float[np.ndarray, " errors"]:
+        """What makes up for the volume of skies that fit: -dln F/dz^T h."""
+        if self.freedom is None:
+            return np.zeros(len(self.names))
+        centre = np.asarray(self.centre)
+        log_slopes = self.errors.slopes(centre) / np.asarray(self.errors.factors(centre))[:, None]
+        return -log_slopes.T @ np.asarray(self.freedom)
+
+    @property
     def response(self) -> None:
         """T has the gains in it."""
         return
@@ -144,11 +165,13 @@ class GainTable(Expanded):
         return False
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
-        """Multiply by F(z_0), add T T^T to N and -T z_0 to the mean."""
+        """Multiply by F(z_0), add T T^T to N and T (expected - z_0) to the mean."""
         columns = self.templates
         model = multiplied(model, self.errors.factors(self.centre))
         noise = model.noise + LowRankCovariance(columns, "the gain table")
-        return with_added(replace(model, noise=noise), -columns @ self.centre)
+        return with_added(
+            replace(model, noise=noise), columns @ (self.expected - np.asarray(self.centre))
+        )
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """Sample the site ``gain_table`` (errors,), in prior standard deviations."""

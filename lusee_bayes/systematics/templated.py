@@ -40,6 +40,11 @@ class Templated(Systematic):
             return self.templates
         return self.templates * self.response[:, None]
 
+    @property
+    def expected(self) -> Float[Array, " n"]:
+        """What :meth:`marginalised` takes the prior mean for, in prior standard deviations."""
+        return np.zeros(len(self.names))
+
     def behind(self, response: Float[Array, " data"]) -> Systematic:
         return replace(self, response=response)
 

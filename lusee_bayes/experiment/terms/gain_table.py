@@ -45,7 +45,7 @@ class GainTableTerm(Term):
                 measured = around.data.data / errors.factors(centre)
             seen = measured
         treatment = setup.scenario.noise.gain_table.treatment
-        return [(treatment, GainTable(errors, centre, np.asarray(seen)))]
+        return [(treatment, GainTable(errors, centre, np.asarray(seen), around.freedom))]
 
     def truth(self, setup: Setup, key: PRNGKeyArray) -> Truth:
         if setup.scenario.noise.gain_table is None:

@@ -40,6 +40,8 @@ class Around:
         the gain table, by name; None for their prior means.
     seen : (data,) array or None
         Visibilities before the gains of the gain table, in K; None for the measured ones.
+    freedom : (data,) array or None
+        Share of each datum that sky and others follow, for the gain table; None for none.
     """
 
     data: Visibilities | None = None
@@ -47,6 +49,7 @@ class Around:
     sky: Float[Array, " modes"] | None = None
     values: Mapping[str, float] | None = None
     seen: Float[Array, " data"] | None = None
+    freedom: Float[Array, " data"] | None = None
 
 
 class Term(ABC):
