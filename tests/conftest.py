@@ -23,6 +23,7 @@ install_import_hook("lusee_bayes", "beartype.beartype")
 import jax  # noqa: E402
 import pytest  # noqa: E402
 from experiments import small_experiment as make_small_experiment  # noqa: E402
+from fits_files import write_response  # noqa: E402
 
 import lusee_bayes as lb  # noqa: E402
 from lusee_bayes.experiment.experiment import Experiment  # noqa: E402
@@ -75,6 +76,12 @@ def tiny_experiment() -> Experiment:
 def small_experiment() -> Experiment:
     """A fifth of a lunar day: enough data for a map that recovers its sky."""
     return make_small_experiment(cycles=0.2)
+
+
+@pytest.fixture(scope="session")
+def response_file(tmp_path_factory) -> Path:
+    """A small four-port response (:func:`fits_files.write_response`)."""
+    return write_response(tmp_path_factory.mktemp("response") / "response.fits")
 
 
 # a little of the observation, before and after a turn of the table

@@ -57,6 +57,22 @@ def log_prob_slope(a, s, n, d, ds, dn) -> float:
     return 0.5 * float(y @ dk @ y - np.trace(np.linalg.solve(k, dk)))
 
 
+def white_posterior(a, prior_std, noise_std, d) -> Answer:
+    """Independent unknowns x ~ N(0, prior_std^2) and noise, d = A x + n, by QR of whitened rows.
+
+    The condition is the root of Lambda's, so that float64 keeps ten digits where that has 1e12.
+    """
+    rows = np.concatenate([a * prior_std / noise_std[:, None], np.eye(len(prior_std))])
+    white = np.concatenate([d / noise_std, np.zeros(len(prior_std))])
+    q, r = np.linalg.qr(rows)
+    half = np.linalg.inv(r)
+    chi2 = ((white - q @ (q.T @ white)) ** 2).sum()
+    log_det = np.log(np.abs(np.diag(r))).sum() + np.log(noise_std).sum()
+    log_prob = -0.5 * chi2 - log_det - 0.5 * len(d) * np.log(2 * np.pi)
+    covariance = prior_std[:, None] * (half @ half.T) * prior_std
+    return Answer(prior_std * (half @ (q.T @ white)), covariance, float(log_prob))
+
+
 exact = np.vectorize(Decimal, otypes=[object])
 _float = np.vectorize(float, otypes=[np.float64])
 

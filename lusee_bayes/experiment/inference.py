@@ -49,7 +49,6 @@ def inform(
         found = infer(experiment)
     else:
         around = Around(experiment.data)
-        model, offsets = model_about(experiment.setup, around)
-        found = Inference(model, None, 1, around, offsets)
+        found = Inference(*model_about(experiment.setup, around), None, 1, around)
     information, posterior = found.model.inform(experiment.data.data, key, n_perturbations)
     return information, replace(found, posterior=posterior)

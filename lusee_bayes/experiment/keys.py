@@ -168,6 +168,8 @@ def _is_sequence(annotation: Any) -> bool:
 
 
 def _unit(name: str) -> str:
+    if name.endswith("_v2_hz"):
+        return "V²/Hz"
     return UNITS.get(name.rsplit("_", 1)[-1], "") if "_" in name else ""
 
 

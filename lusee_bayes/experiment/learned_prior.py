@@ -9,7 +9,7 @@ import numpy as np
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.rounds import rebuilds_gains, rebuilds_pointing, settled
+from lusee_bayes.experiment.rounds import first_order, rebuilds_gains, settled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import Around
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -49,10 +49,10 @@ def with_learned_prior(setup: Setup, data: Visibilities) -> tuple[Setup, Learned
 def about_sky(setup: Setup, data: Visibilities) -> Information:
     """What data say of the sky; only its reference sky depends on the setup's prior.
 
-    Clock and pointing are in N about what data and the prior before them tell. To first order
-    about none, what is left of large ones would be taken for the sky's.
+    Clock, pointing and gain table are in N about what data and the prior before them tell. To first
+    order about none, what is left of large ones would be taken for the sky's.
     """
-    around = settled(setup, data).around if rebuilds_pointing(setup) else Around(data)
+    around = settled(setup, data).around if first_order(setup) else Around(data)
     return full_model(setup, around).inform(data.data)[0]
 
 
@@ -84,10 +84,10 @@ def learned_prior(
                 "a log-normal sky is found under one N, and noise.gain.visibilities=posterior "
                 "builds several; use noise.gain.visibilities=measured"
             )
-        if rebuilds_pointing(setup):
+        for term in first_order(setup):
             raise InputError(
-                "a log-normal sky is found under one N, and noise.pointing.around=posterior "
-                "builds several; use noise.pointing.around=model"
+                f"a log-normal sky is found under one N, and {term.key} about what the data tell "
+                f"builds several; {term.fixed}"
             )
         return learn_log_normal(family, information, seed)
     if scenario.lmax <= COARSE_LMAX:

@@ -13,6 +13,7 @@ from lusee_bayes.experiment.terms import (
     PointingTerm,
     measured_visibilities,
     pointed,
+    table_factors,
 )
 from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -56,14 +57,18 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, S
     """Treatment and systematic, for all that the scenario does not ignore, in their order.
 
     Where clock and pointing are built around offsets, the others are, too: gains multiply, and
-    sources are seen, where the antennas then pointed.
+    sources are seen, where the antennas then pointed. Where the gain table is built around its
+    errors, what N holds of the others is seen through these gains.
     """
     around = around or Around()
-    there = pointed(setup, around.offsets)
+    there = pointed(setup, around.values)
+    gains = table_factors(setup, around)
     return [
-        found
+        (treatment, found if gains is None else found.behind(gains))
         for term in TERMS
-        for found in term.build(setup if isinstance(term, PointingTerm) else there, around)
+        for treatment, found in term.build(
+            setup if isinstance(term, PointingTerm) else there, around
+        )
     ]
 
 

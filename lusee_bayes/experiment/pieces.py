@@ -10,7 +10,7 @@ from lusee_bayes.core.arrays import on_device
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import model_to_sample
-from lusee_bayes.experiment.rounds import rebuilds_pointing, settled
+from lusee_bayes.experiment.rounds import first_order, settled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import TERMS, Around, gain_drifts, point_sources
 from lusee_bayes.instrument.instrument import Instrument
@@ -39,7 +39,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
 
     def around() -> Around:
         # about none, large offsets are not described, and gains are those of other antennas
-        return settled(setup, data).around if rebuilds_pointing(setup) else Around(data)
+        return settled(setup, data).around if first_order(setup) else Around(data)
 
     to_sample = cache(lambda: model_to_sample(setup, data, around()))
     return {

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, on_host
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.model import base_model, marginalised, systematics
+from lusee_bayes.experiment.model import base_model, marginalised, radiometer, systematics
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.terms import Around, pointed
+from lusee_bayes.experiment.terms import TERMS, Around, Term, pointed
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.linear.freedom import data_freedom
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.templates import template_amplitudes
-from lusee_bayes.systematics import PointingOffsets
+from lusee_bayes.linear.templates import template_amplitudes, weighted_residual
+from lusee_bayes.systematics import (
+    Expanded,
+    GainTable,
+    PointingOffsets,
+    PointSources,
+    Systematic,
+    Templated,
+)
 
 # N is rebuilt until the map moves by less than this (rms, in standard deviations)
 SETTLED, MAX_ROUNDS = 1e-2, 30
-# no offset moves further in a round, in prior standard deviations: beyond, the first order that
+# no unknown moves further in a round, in prior standard deviations: beyond, the first order that
 # the move comes from says little
 FARTHEST = 2.0
 # steps that swing about where they lead to are halved, down to this part of the whole
@@ -36,30 +44,40 @@ class Inference:
     ----------
     model : LinearGaussian
         With every systematic in N that the scenario does not ignore.
+    systematics : tuple of Systematic
+        Those, as they are in N.
     posterior : Posterior
     rounds : int
         How often N was built.
     around : Around
         What it was built around.
-    offsets : PointingOffsets or None
-        Of clock and pointing, as they are in N.
     """
 
     model: LinearGaussian
+    systematics: tuple[Systematic, ...]
     posterior: Posterior | None
     rounds: int
     around: Around
-    offsets: PointingOffsets | None = None
+
+    @property
+    def offsets(self) -> PointingOffsets | None:
+        """Of clock and pointing, as they are in N."""
+        return next((s for s in self.systematics if isinstance(s, PointingOffsets)), None)
+
+    @property
+    def moving(self) -> tuple[Expanded, ...]:
+        """What is to first order about values that the data tell, as it is in N."""
+        return tuple(s for s in self.systematics if isinstance(s, Expanded) and s.moves)
 
 
 def settled(setup: Setup, data: Visibilities) -> Inference:
     """Condition the model on data, in as many rounds as its N needs.
 
     One round, unless a term of N is built around what the data tell: the gains around the
-    posterior's own prediction, or clock and pointing around its sky and their own values. Then N
-    and the map are repeated until the map moves by less than 0.01 standard deviations (rms).
-    Clock and pointing go part of the way where they would go far, or swing: what is second order
-    in them may outweigh what tells two offsets apart.
+    posterior's own prediction, or clock, pointing and gain table around its sky and their own
+    values. Then N and the map are repeated until the map moves by less than 0.01 standard
+    deviations (rms). Those values go part of the way where they would go far, or swing: what is
+    second order in them may outweigh what tells two of them apart.
 
     Parameters
     ----------
@@ -73,10 +91,10 @@ def settled(setup: Setup, data: Visibilities) -> Inference:
     """
 
     def conditioned(around: Around, rounds: int) -> Inference:
-        model, offsets = model_about(setup, around)
-        return Inference(model, model.condition(data.data), rounds, around, offsets)
+        model, found = model_about(setup, around)
+        return Inference(model, found, model.condition(data.data), rounds, around)
 
-    found = conditioned(Around(data), 1)
+    found = conditioned(Around(data, freedom=_freedom(setup, data)), 1)
     if not rebuilds(setup):
         return found
     step = _Step()
@@ -88,34 +106,32 @@ def settled(setup: Setup, data: Visibilities) -> Inference:
     remedies = []
     if rebuilds_gains(setup):
         remedies.append("noise.gain.visibilities=model")
-    if rebuilds_pointing(setup):
-        remedies.append("smaller standard deviations in noise.pointing, or its treatment=sampled")
+    remedies += [term.remedy for term in first_order(setup)]
     raise InputError(
         f"the map still moves after {MAX_ROUNDS} rounds of rebuilding N around it; use "
         + ", and ".join(remedies)
     )
 
 
-def model_about(setup: Setup, around: Around) -> tuple[LinearGaussian, PointingOffsets | None]:
-    """The full model, and the offsets of clock and pointing in its N."""
+def model_about(setup: Setup, around: Around) -> tuple[LinearGaussian, tuple[Systematic, ...]]:
+    """The full model, and the systematics in its N."""
     found = systematics(setup, around)
-    offsets = [s for _, s in found if isinstance(s, PointingOffsets)]
-    return marginalised(base_model(setup, around.data), found), next(iter(offsets), None)
+    return marginalised(base_model(setup, around.data), found), tuple(s for _, s in found)
 
 
 @dataclass(frozen=True)
 class _Step:
-    """Of clock and pointing, from what N is built around to what the data then tell.
+    """Of all that moves, from what N is built around to what the data then tell.
 
-    whole : (offsets,) array, the way there in prior standard deviations, None before the first;
+    whole : (n,) array, the way there in prior standard deviations, None before the first;
     swing : how much of it is gone unless it is far; size : how much of it is gone
     """
 
-    whole: Float[np.ndarray, " offsets"] | None = None
+    whole: Float[np.ndarray, " n"] | None = None
     swing: float = 1.0
     size: float = 1.0
 
-    def after(self, whole: Float[np.ndarray, " offsets"]) -> _Step:
+    def after(self, whole: Float[np.ndarray, " n"]) -> _Step:
         """The next step: a smaller part if it turns back without becoming short."""
         back = (
             self.whole is not None
@@ -129,18 +145,54 @@ class _Step:
 
 def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]:
     """What the terms of N are built around next, given a posterior, and the step there."""
-    visibilities, sky, values = None, None, None
-    if rebuilds_pointing(setup):
-        offsets = found.offsets
-        here = np.asarray(setup.sky.modes if found.around.sky is None else found.around.sky)
-        told, _ = offset_posterior(found)
-        whole = np.array(list(told.values())) / np.asarray(offsets.stds) - offsets.centre
-        step = step.after(whole)
-        sky = here + step.size * (np.asarray(found.posterior.mean) - here)
-        values = offsets.in_units(offsets.centre + step.size * whole)
+    visibilities, sky, values, seen = None, None, None, None
+    if found.moving:
+        solved = weighted_residual(found.model, found.posterior, found.around.data.data)
+        told = [s.expected + np.asarray(s.columns).T @ solved for s in found.moving]
+        centres = [np.asarray(s.centre) for s in found.moving]
+        step = step.after(np.concatenate(told) - np.concatenate(centres))
+        values = {}
+        for moving, z, centre in zip(found.moving, told, centres, strict=True):
+            values |= moving.in_units(centre + step.size * (z - centre))
+            if isinstance(moving, GainTable):
+                before = _before_gains(setup, found, moving, z, solved)
+                seen = moving.seen + step.size * (before - moving.seen)
+            else:
+                here = np.asarray(setup.sky.modes if found.around.sky is None else found.around.sky)
+                sky = here + step.size * (np.asarray(found.posterior.mean) - here)
     if rebuilds_gains(setup):
         visibilities = prediction(pointed(setup, values), found.posterior)
-    return Around(found.around.data, visibilities, sky, values), step
+    around = replace(found.around, visibilities=visibilities, sky=sky, values=values, seen=seen)
+    return around, step
+
+
+def _freedom(setup: Setup, data: Visibilities) -> Float[np.ndarray, " data"] | None:
+    """Share of each datum that the model follows whose gains are the table's; None without one.
+
+    The errors change it by no more than what they change the radiometer noise by.
+    """
+    found = systematics(setup, Around(data))
+    others = [(treatment, s) for treatment, s in found if not isinstance(s, GainTable)]
+    if len(others) == len(found):
+        return None
+    model = marginalised(base_model(setup, data), others)
+    columns = [np.zeros((model.n_data, 0))]
+    columns += [np.asarray(s.columns) for _, s in others if isinstance(s, Templated)]
+    columns += [np.asarray(s.templates()) for _, s in others if isinstance(s, PointSources)]
+    return data_freedom(model, model.condition(data.data), np.concatenate(columns, axis=1))
+
+
+def _before_gains(
+    setup: Setup,
+    found: Inference,
+    table: GainTable,
+    z: Float[np.ndarray, " errors"],
+    solved: Float[np.ndarray, " data"],
+) -> Float[np.ndarray, " data"]:
+    """What the data tell of the visibilities before the gains: less radiometer noise, and gains."""
+    data = found.around.data
+    noise = np.asarray(on_host(radiometer(setup, data)).mv(solved))
+    return (np.asarray(data.data) - noise) / np.asarray(table.errors.factors(z))
 
 
 def offset_posterior(
@@ -161,20 +213,19 @@ def offset_posterior(
         In these units.
     """
     offsets, data = found.offsets, found.around.data.data
-    z, covariance = template_amplitudes(found.model, found.posterior, data, offsets.templates)
+    told = template_amplitudes(found.model, found.posterior, data, offsets.columns)
     stds = np.asarray(offsets.stds)
-    return offsets.in_units(z), covariance * np.outer(stds, stds)
+    return offsets.in_units(told.mean), told.covariance * np.outer(stds, stds)
 
 
 def rebuilds(setup: Setup) -> bool:
     """Whether some term of N is built around what the data tell."""
-    return rebuilds_gains(setup) or rebuilds_pointing(setup)
+    return rebuilds_gains(setup) or bool(first_order(setup))
 
 
-def rebuilds_pointing(setup: Setup) -> bool:
-    """Whether clock and pointing are to first order about the sky and the values of the data."""
-    section = setup.scenario.noise.pointing
-    return section is not None and section.treatment != "ignored" and section.around == "posterior"
+def first_order(setup: Setup) -> tuple[Term, ...]:
+    """The terms that are to first order about values that the data tell."""
+    return tuple(term for term in TERMS if term.moves(setup.scenario))
 
 
 def rebuilds_gains(setup: Setup) -> bool:

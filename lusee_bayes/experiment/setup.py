@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.emission import background_of
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import PriorSection, SourceSection
 from lusee_bayes.instrument.beams import BeamSource, Monopoles, ProductBeams, Receiver
@@ -57,7 +58,7 @@ class Setup:
     responses : tuple of (products, times) arrays
         Of each point source beside the map, to 1 K sr.
     background : (products,) array
-        Visibilities without any sky, in K.
+        Visibilities without any sky, of ground, antennas and the mean receiver, in K.
     signal : (products, times) array
         Visibilities of sky, background and sources through the modelled beams, in K.
     receiver : Receiver or None
@@ -96,8 +97,8 @@ class Setup:
 
     @property
     def offset(self) -> Float[Array, " data"] | None:
-        """The background in every datum, in K; None where nothing emits."""
-        if not self.beam_source.emits:
+        """The background in every datum, in K; None where there is none."""
+        if not np.any(self.background):
             return None
         grid = (self.layout.n_products, self.layout.n_times)
         return self.layout.gather(np.broadcast_to(self.background[:, None], grid))
@@ -168,7 +169,7 @@ def set_up(
         receiver = None if data is None else data.receiver
         source = scenario.beam.source().behind(receiver)
         beams = source.beams(scenario.frequency_mhz, scenario.lmax)
-        background = source.background(scenario.frequency_mhz)
+        background = background_of(scenario, source)
         # sources need the exact pattern, which only the embedded antennas have
         responses: tuple[Float[Array, "products times"], ...] = ()
         if scenario.sources.list:

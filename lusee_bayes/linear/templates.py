@@ -4,12 +4,15 @@ With N = N_0 + T T^T, an amplitude of each column of T is N(0, 1) before there a
 K = A S A^T + N the covariance of data under the model, and C that of the sky, ::
 
     mean = T^T K^-1 (d - offset) = T^T N^-1 (d - offset - A m),    m the posterior mean of the sky,
-    covariance = 1 - T^T K^-1 T = 1 - T^T N^-1 T + P C P^T,        P = T^T N^-1 A.
+    covariance = 1 - T^T K^-1 T = 1 - T^T N^-1 T + P C P^T,        P = T^T N^-1 A,
+    Cov(m, amplitudes) = -S A^T K^-1 T = -C P^T.
 
 A is not formed.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -19,13 +22,36 @@ from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 
 
+@dataclass(frozen=True)
+class Amplitudes:
+    """Posterior of templates' amplitudes in prior standard deviations, the sky integrated out.
+
+    Attributes
+    ----------
+    mean : (n,) array
+    covariance : (n, n) array
+        The unit matrix where the data say nothing.
+    with_sky : (modes, n) array
+        Covariance of the sky with the amplitudes, in K.
+    """
+
+    mean: Float[np.ndarray, " n"]
+    covariance: Float[np.ndarray, "n n"]
+    with_sky: Float[np.ndarray, "modes n"]
+
+    @property
+    def std(self) -> Float[np.ndarray, " n"]:
+        """Standard deviations."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+
 def template_amplitudes(
     model: LinearGaussian,
     posterior: Posterior,
     data: Float[Array, " data"],
     templates: Float[Array, "data n"],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
-    """Compute the posterior of templates' amplitudes, with the sky integrated out.
+) -> Amplitudes:
+    """Compute the posterior of templates' amplitudes.
 
     Parameters
     ----------
@@ -38,13 +64,6 @@ def template_amplitudes(
     templates : (data, n) array
         T, in K.
 
-    Returns
-    -------
-    mean : (n,) array
-        In prior standard deviations.
-    covariance : (n, n) array
-        The unit matrix where the data say nothing.
-
     Raises
     ------
     InputError
@@ -52,8 +71,36 @@ def template_amplitudes(
     """
     model, posterior, data, t = on_host((model, posterior, data, templates))
     factor = model.noise.factor()
-    residual = data - np.asarray(model.predict(posterior.mean))
     solved = np.asarray(factor.solve(t))
-    pulled = np.stack([model.coupling.transpose_mv(column) for column in solved.T])
-    left = pulled @ posterior.covariance() @ pulled.T
-    return solved.T @ residual, np.eye(t.shape[1]) - t.T @ solved + left
+    pulled = np.stack([np.asarray(model.coupling.transpose_mv(column)) for column in solved.T])
+    with_sky = -np.asarray(posterior.covariance()) @ pulled.T
+    return Amplitudes(
+        mean=solved.T @ (data - np.asarray(model.predict(posterior.mean))),
+        covariance=np.eye(t.shape[1]) - t.T @ solved - pulled @ with_sky,
+        with_sky=with_sky,
+    )
+
+
+def weighted_residual(
+    model: LinearGaussian, posterior: Posterior, data: Float[Array, " data"]
+) -> Float[np.ndarray, " data"]:
+    """Compute N^-1 (d - offset - A m), m the posterior mean of the sky.
+
+    T^T of it is the mean of amplitudes, and a term N_0 of N times it that of its part in the data.
+
+    Parameters
+    ----------
+    model : LinearGaussian
+    posterior : Posterior
+        Of this model, given these data alone.
+    data : (data,) array
+        d, in K.
+
+    Raises
+    ------
+    InputError
+        If N is not positive definite.
+    """
+    model, posterior, data = on_host((model, posterior, data))
+    residual = data - np.asarray(model.predict(posterior.mean))
+    return np.asarray(model.noise.factor().solve(residual))

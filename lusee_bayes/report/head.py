@@ -31,6 +31,7 @@ FILES = {
     "spectra.csv": "fidelity and power, a row for each multipole",
     "sources.csv": "fluxes of point sources",
     "pointing.csv": "offsets of clock and pointing",
+    "unknowns.csv": "receivers, ground and gain table",
     "pointing_by_day.csv": "offsets that all days, and each day, would prefer",
     "summary.csv": "ArviZ's summary of the draws",
     "coverage.json": "coverage of every sky, and the verdicts",

@@ -16,7 +16,7 @@ from lusee_bayes.report.explorer import explorer
 from lusee_bayes.report.flight_section import SECTION, flight_section, is_flight
 from lusee_bayes.report.run_details import details
 from lusee_bayes.results.finished_runs import FinishedRun
-from lusee_bayes.results.saved import COVERAGE, POINTING, SOURCES
+from lusee_bayes.results.saved import COVERAGE, NULL_DIRECTION, POINTING, SOURCES, UNKNOWNS
 
 NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "diagnostics.nc", "mean.fits", "std.fits")
 FIGURES = ("maps", "draws", "fidelity", "spectra", "data_vector", "residuals", "beams")
@@ -63,7 +63,7 @@ def map_page(folder: Path, name: str) -> str:
             html.section(*SECTIONS[0], *_map(folder, summary, found)),
             html.section(*SECTIONS[1], *_scales(folder, run)),
             *([flight_section(folder)] if flight else []),
-            html.section(*SECTIONS[2], *_data(folder, found)),
+            html.section(*SECTIONS[2], *_data(folder, summary, found)),
             html.section(*SECTIONS[3], *_numbers(folder, summary)),
             html.section(*SECTIONS[4], head.downloads(folder), head.citation(folder)),
             html.section(*SECTIONS[5], *details(folder, summary)),
@@ -178,7 +178,7 @@ def _by_ell(run: FinishedRun) -> str:
     return html.folded("every multipole", html.table([names[name] for name in here], rows))
 
 
-def _data(folder: Path, found: xr.Dataset) -> list[str]:
+def _data(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
     kinds = found["group_kind"].values
     header = ("", "data", "chi² given all others", "expected", "p", "p of the others without it")
     parts = [
@@ -215,6 +215,7 @@ def _data(folder: Path, found: xr.Dataset) -> list[str]:
         bad = [f"{name} {cell[0]}" in marked for cell in cells]
         parts += [html.paragraph(f"{title}{note}"), html.table(header, cells, bad)]
     parts += _pointing(folder)
+    parts += _unknowns(folder, summary)
     parts.append(
         _figure(
             folder,
@@ -250,6 +251,25 @@ def _pointing(folder: Path) -> list[str]:
             )
         )
     return [html.subsection("Clock and pointing"), *parts] if parts else []
+
+
+def _unknowns(folder: Path, summary: dict) -> list[str]:
+    """Receivers, ground and gain table, and what the data cannot tell, where the run has them."""
+    if not (folder / "unknowns.csv").is_file():
+        return []
+    table = read_table(folder / "unknowns.csv", UNKNOWNS)
+    cells = [
+        (name, unit or "relative", f"{value:.5g}", f"{std:.2g}", f"{prior:.5g}", f"{before:.2g}")
+        for name, unit, value, std, prior, before in zip(
+            *(table[name] for name in UNKNOWNS.variables), strict=True
+        )
+    ]
+    header = ("unknown", "unit", "found", "+-", "before the data", "+-")
+    null = entries(
+        folder / "summary.json", {"unknowns": [summary.get("unknowns")]}, "unknowns", NULL_DIRECTION
+    )[0]
+    parts = [html.subsection("Receivers, ground and gain table"), html.table(header, cells)]
+    return [*parts, html.paragraph(null["null_sentence"])] if null["null_sentence"] else parts
 
 
 def _group_row(found: xr.Dataset, row: int) -> tuple[str, ...]:

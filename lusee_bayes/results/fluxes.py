@@ -8,9 +8,9 @@ import pandas as pd
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.simulate import true_values
-from lusee_bayes.experiment.terms import point_sources, pointed
 from lusee_bayes.linear.templates import template_amplitudes
 from lusee_bayes.sky import kelvin_steradian
+from lusee_bayes.systematics import PointSources
 
 
 def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
@@ -30,13 +30,13 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
         its flux is known from the prior only.
     """
     setup, data = experiment.setup, experiment.data
-    sources = point_sources(pointed(setup, inference.around.offsets))
-    amplitudes, covariance = template_amplitudes(
+    sources = next(s for s in inference.systematics if isinstance(s, PointSources))
+    amplitudes = template_amplitudes(
         inference.model, inference.posterior, data.data, sources.templates()
     )
     prior_std = np.asarray(sources.std())
-    mean = np.asarray(sources.mean()) + prior_std * amplitudes
-    std = prior_std * np.sqrt(np.diagonal(covariance))
+    mean = np.asarray(sources.mean()) + prior_std * amplitudes.mean
+    std = prior_std * amplitudes.std
     jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
     truth = true_values(setup) if data.truth is not None else {}
     rows, at = [], 0

@@ -158,8 +158,8 @@ def expected_offsets(setup: Setup, model: LinearGaussian, posterior: Posterior) 
         return {}
     offsets = pointing_offsets(setup, Around())
     no_data = np.zeros(model.n_data)
-    _, covariance = template_amplitudes(model, posterior, no_data, offsets.templates)
-    return offsets.in_units(np.sqrt(np.diagonal(covariance)))
+    amplitudes = template_amplitudes(model, posterior, no_data, offsets.templates)
+    return offsets.in_units(amplitudes.std)
 
 
 def forecast(variation: Variation) -> Forecast:

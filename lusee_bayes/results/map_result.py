@@ -30,6 +30,7 @@ from lusee_bayes.results.fluxes import flux_lines, flux_table
 from lusee_bayes.results.pointing import PointingReport, pointing_report
 from lusee_bayes.results.prior_words import prior_sentence, prior_summary
 from lusee_bayes.results.saved import JUDGED
+from lusee_bayes.results.unknowns import UnknownsReport, unknowns_report
 from lusee_bayes.results.updatable import Updatable, read_updatable
 
 DOES_NOT_FIT = LEVELS[-1]
@@ -53,6 +54,8 @@ class MapResult(Described):
         Of the point sources beside the map, a row each, if there are any.
     pointing : PointingReport or None
         Of clock and pointing, where the scenario has them or the data do not fit.
+    unknowns : UnknownsReport or None
+        Of receivers, ground and gain table, where the model has them.
     digests : tuple of str
         Of all data behind the posterior.
     seconds : dict
@@ -68,6 +71,7 @@ class MapResult(Described):
     diagnostics: xr.Dataset
     fluxes: pd.DataFrame | None
     pointing: PointingReport | None
+    unknowns: UnknownsReport | None
     digests: tuple[str, ...]
     seconds: dict[str, float] = field(default_factory=dict)
     reduced: Reduced | None = None
@@ -116,6 +120,7 @@ class MapResult(Described):
             "rounds": channel.rounds,
             **prior_summary(self.experiment),
             "pointing": self._pointing_rows(),
+            "unknowns": None if self.unknowns is None else self.unknowns.summary(),
             "beam_rms_difference": beam_rms_difference(self.experiment.setup),
             "mean_refinement_sigma": channel.refinement,
             "never_observed_fraction": channel.never_observed,
@@ -155,7 +160,8 @@ class MapResult(Described):
         """What a terminal shows: headline, fluxes, verdict with its rule."""
         fluxes = [] if self.fluxes is None else flux_lines(self.fluxes)
         offsets = [] if self.pointing is None else self.pointing.lines()
-        told = [prior_sentence(self.experiment), *fluxes, *offsets]
+        unknowns = [] if self.unknowns is None else self.unknowns.lines()
+        told = [prior_sentence(self.experiment), *fluxes, *offsets, *unknowns]
         return [self.headline(), *told, self.verdict(), RULE, *self.channel.doubts]
 
 
@@ -204,6 +210,7 @@ def map_result(
     if experiment.setup.responses and scenario.sources.treatment != "ignored":
         with stages("fluxes"):
             fluxes = flux_table(experiment, alone)
+    unknowns = unknowns_report(experiment, alone)
     with stages("diagnostics"):
         page = diagnostics(experiment, found, judged, channel, covariance)
     pointing = None
@@ -213,7 +220,16 @@ def map_result(
             pointing = pointing_report(experiment, alone, own)
         page.attrs["verdict"] = f"{page.attrs['verdict']} {pointing.sentence()}".strip()
     return MapResult(
-        experiment, found, judged, channel, page, fluxes, pointing, digests, stages.seconds
+        experiment,
+        found,
+        judged,
+        channel,
+        page,
+        fluxes,
+        pointing,
+        unknowns,
+        digests,
+        stages.seconds,
     )
 
 
@@ -232,5 +248,5 @@ def _updated(
     posterior = composed(earlier.posterior, deviation)
     return (
         replace(alone, posterior=posterior),
-        Inference(deviations, deviation, alone.rounds, alone.around),
+        Inference(deviations, alone.systematics, deviation, alone.rounds, alone.around),
     )

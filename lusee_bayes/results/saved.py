@@ -277,6 +277,21 @@ POINTING = Layout(
         "beyond_first_order": Variable(("offset",), low=0.0),
     },
 )
+UNKNOWNS = Layout(
+    "receivers, ground and gain table",
+    {
+        "unknown": Variable(("unknown",), "text"),
+        "unit": Variable(("unknown",), "text"),
+        "value": Variable(("unknown",)),
+        "std": Variable(("unknown",), low=0.0),
+        "prior": Variable(("unknown",)),
+        "prior_std": Variable(("unknown",), low=0.0),
+    },
+)
+NULL_DIRECTION = Layout(
+    "what a map's data cannot tell of receivers, ground and gain table",
+    attributes={"null_share": Attribute(low=0.0), "null_sentence": TEXT},
+)
 SPECTRA = Layout(
     "spectra of a map",
     {

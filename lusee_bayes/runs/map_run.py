@@ -254,6 +254,12 @@ MAP = RunKind(
             wanted=lambda result: result.fluxes is not None,
         ),
         Output(_write_offsets, wanted=lambda r: r.pointing and r.pointing.offsets is not None),
+        Output(
+            lambda result, folder: result.unknowns.table.to_csv(
+                folder / "unknowns.csv", index=False
+            ),
+            wanted=lambda result: result.unknowns is not None,
+        ),
         Output(_write_preferred, wanted=lambda result: result.pointing is not None),
         Output(
             lambda result, folder: write_diagnostics(result.diagnostics, folder / "diagnostics.nc")

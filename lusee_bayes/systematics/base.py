@@ -59,6 +59,16 @@ class Systematic(eqx.Module):
         """
         return None
 
+    def behind(self, response: Float[Array, " data"]) -> Systematic:
+        """Return it as N holds it where gains multiply what the data are of.
+
+        Parameters
+        ----------
+        response : (data,) array
+            The gains.
+        """
+        return self
+
     @abstractmethod
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Integrate it out of the model, as a term of N (and of the mean).
@@ -181,6 +191,12 @@ class Scale(Systematic):
 def with_added(model: LinearGaussian, signal: Float[Array, " data"]) -> LinearGaussian:
     """Add a signal in K to the mean of a model's data."""
     return replace(model, offset=signal if model.offset is None else model.offset + signal)
+
+
+def multiplied(model: LinearGaussian, response: Float[Array, " data"]) -> LinearGaussian:
+    """Multiply the mean of a model's data, of sky and offset, by gains."""
+    offset = None if model.offset is None else model.offset * response
+    return replace(model, coupling=model.coupling.with_response(response), offset=offset)
 
 
 def scalar(value: float | Float[Array, ""]) -> Float[Array, ""]:

@@ -14,7 +14,13 @@ from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise import GainDrift, white_grid, with_gains
-from lusee_bayes.systematics.base import SKY, Systematic, scalar_or_none, uncertain_scale
+from lusee_bayes.systematics.base import (
+    SKY,
+    Systematic,
+    multiplied,
+    scalar_or_none,
+    uncertain_scale,
+)
 from lusee_bayes.systematics.chart import Chart
 
 # how far, in standard deviations of ln, a correlation time that is not known can be off, and by
@@ -193,16 +199,11 @@ class GainDrifts(Systematic):
         noise = drift.covariance(self.visibilities, self.hours, self.layout, width)
         mean = drift.mean_response(self.layout.n_products)[:, None]
         grid = jnp.broadcast_to(mean, (self.layout.n_products, self.layout.n_times))
-        return _multiplied(replace(model, noise=model.noise + noise), self.layout.gather(grid))
+        return multiplied(replace(model, noise=model.noise + noise), self.layout.gather(grid))
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """Sample the sites of :meth:`scales` and :meth:`histories`."""
-        return _multiplied(model, self.response(self.histories(self.scales())))
-
-
-def _multiplied(model: LinearGaussian, response: Float[Array, " data"]) -> LinearGaussian:
-    offset = None if model.offset is None else model.offset * response
-    return replace(model, coupling=model.coupling.with_response(response), offset=offset)
+        return multiplied(model, self.response(self.histories(self.scales())))
 
 
 class GainCoordinates(Chart):

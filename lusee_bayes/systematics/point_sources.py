@@ -72,9 +72,12 @@ class PointSources(Systematic):
     ----------
     sources : tuple of Source
         The sources.
+    response : (data,) array or None
+        Gains that they are seen through in N; None for ones.
     """
 
     sources: tuple[Source, ...]
+    response: Float[Array, " data"] | None = None
 
     @property
     def changes_coupling(self) -> bool:
@@ -94,7 +97,11 @@ class PointSources(Systematic):
 
     def templates(self) -> Float[Array, "data amplitudes"]:
         """What fluxes one prior standard deviation above their means add to the data, in K."""
-        return self.columns() * self.std()[None]
+        templates = self.columns() * self.std()[None]
+        return templates if self.response is None else templates * self.response[:, None]
+
+    def behind(self, response: Float[Array, " data"]) -> PointSources:
+        return replace(self, response=response)
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Add T P T^T to N, and the mean fluxes to the offset."""

@@ -15,7 +15,6 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
@@ -24,10 +23,11 @@ from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing_offsets import turned_by_offsets
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankCovariance
-from lusee_bayes.systematics.base import Systematic, with_added
+from lusee_bayes.systematics.base import with_added
+from lusee_bayes.systematics.templated import Expanded
 
 
-class PointingOffsets(Systematic):
+class PointingOffsets(Expanded):
     """Offsets of clock and pointing with independent Gaussian priors about zero.
 
     Attributes
@@ -50,6 +50,10 @@ class PointingOffsets(Systematic):
         Since the first sample.
     sources : (data, offsets) array
         The part of the templates that is the point sources', in K.
+    moves : bool
+        Whether z_0 and m_0 are those that the data tell, found in rounds.
+    response : (data,) array or None
+        Gains that the templates are seen through in N; None for ones.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -61,10 +65,12 @@ class PointingOffsets(Systematic):
     modes: Float[Array, "products modes"]
     hours: Float[Array, " times"]
     sources: Float[Array, "data offsets"]
+    moves: bool = eqx.field(static=True, default=True)
+    response: Float[Array, " data"] | None = None
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Take A(z_0), add T T^T to N and -T z_0 to the mean."""
-        noise = model.noise + LowRankCovariance(self.templates, "clock and pointing")
+        noise = model.noise + LowRankCovariance(self.columns, "clock and pointing")
         return with_added(
             replace(model, coupling=self.coupling, noise=noise), -self.templates @ self.centre
         )
@@ -79,7 +85,3 @@ class PointingOffsets(Systematic):
         coupling = CouplingMatrix.of_modes(self.modes, pointing, self.nominal.layout)
         z = jnp.stack([jnp.asarray(value) for value in values.values()]) / self.stds
         return with_added(replace(model, coupling=coupling), self.sources @ (z - self.centre))
-
-    def in_units(self, z: Float[np.ndarray, " offsets"]) -> dict[str, float]:
-        """Values by name, of numbers in prior standard deviations."""
-        return dict(zip(self.names, (np.asarray(self.stds) * z).tolist(), strict=True))

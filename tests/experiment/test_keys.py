@@ -19,6 +19,9 @@ WITHIN = {
     "noise.gain": "noise.gain={}",
     "noise.beam": "noise.beam={shift_mhz: 4}",
     "noise.pointing": "noise.pointing={clock_s: 60}",
+    "noise.receiver": "noise.receiver={power_k: 100}",
+    "noise.regolith": "noise.regolith={std_k: 20}",
+    "noise.gain_table": "noise.gain_table={std: 0.01}",
     "sources.list.0": "sources.list=[{name: Cas A}]",
 }
 
@@ -80,10 +83,14 @@ def test_bounds_are_those_that_are_enforced(key, bounds):
 
 
 def test_units_are_those_of_the_names():
-    units = {key.path.rsplit("_", 1)[-1]: key.unit for key in KEYS if key.unit}
+    units = {
+        "v2_hz" if key.path.endswith("_v2_hz") else key.path.rsplit("_", 1)[-1]: key.unit
+        for key in KEYS
+        if key.unit
+    }
     assert units == {
         "mhz": "MHz", "hz": "Hz", "deg": "degrees", "m": "m", "s": "s", "h": "h", "k": "K",
-        "day": "s/day",
+        "day": "s/day", "v2_hz": "V²/Hz",
         "jy": "Jy", "pf": "pF", "nh": "nH", "ohm": "Ohm",
     }  # fmt: skip
 

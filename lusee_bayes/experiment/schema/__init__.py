@@ -36,6 +36,11 @@ from lusee_bayes.experiment.schema.sky import (
 )
 from lusee_bayes.experiment.schema.sources import SourceSection, SourcesSection
 from lusee_bayes.experiment.schema.spectral import SpectralSection
+from lusee_bayes.experiment.schema.unknowns import (
+    GainTableSection,
+    ReceiverNoiseSection,
+    RegolithSection,
+)
 
 __all__ = [
     "BEAM_SECTIONS",
@@ -47,6 +52,7 @@ __all__ = [
     "FlightSection",
     "Frequency",
     "GainSection",
+    "GainTableSection",
     "GalaxySection",
     "IsotropicPriorSection",
     "LocalScalesPriorSection",
@@ -59,6 +65,8 @@ __all__ = [
     "PointingSection",
     "PriorSection",
     "RadiometerSection",
+    "ReceiverNoiseSection",
+    "RegolithSection",
     "ResponseSection",
     "RunSection",
     "SampledBeamSection",

@@ -8,6 +8,11 @@ from pydantic import Field, model_validator
 
 from lusee_bayes.experiment.schema.pointing import PointingSection
 from lusee_bayes.experiment.schema.section import Positive, Section, Treatment
+from lusee_bayes.experiment.schema.unknowns import (
+    GainTableSection,
+    ReceiverNoiseSection,
+    RegolithSection,
+)
 
 
 class RadiometerSection(Section):
@@ -122,9 +127,18 @@ class NoiseSection(Section):
         Beam errors.
     pointing : PointingSection
         Offsets of clock and pointing.
+    receiver : ReceiverNoiseSection
+        Noise of the receivers.
+    regolith : RegolithSection
+        Temperature of the ground.
+    gain_table : GainTableSection
+        Errors of the gain table.
     """
 
     radiometer: RadiometerSection = RadiometerSection()
     gain: GainSection | None = None
     beam: BeamErrorSection | None = None
     pointing: PointingSection | None = None
+    receiver: ReceiverNoiseSection | None = None
+    regolith: RegolithSection | None = None
+    gain_table: GainTableSection | None = None

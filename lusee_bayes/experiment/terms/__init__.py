@@ -11,6 +11,7 @@ from lusee_bayes.experiment.terms.beam_error import (
     true_instrument,
 )
 from lusee_bayes.experiment.terms.gain_drift import GainTerm, gain_drifts, measured_visibilities
+from lusee_bayes.experiment.terms.gain_table import GainTableTerm, table_factors
 from lusee_bayes.experiment.terms.noise_level import NoiseLevelTerm
 from lusee_bayes.experiment.terms.pointing import (
     PointingTerm,
@@ -21,6 +22,8 @@ from lusee_bayes.experiment.terms.pointing import (
     true_setup,
 )
 from lusee_bayes.experiment.terms.prior_spectrum import PriorSpectrumTerm
+from lusee_bayes.experiment.terms.receiver import ReceiverTerm
+from lusee_bayes.experiment.terms.regolith import RegolithTerm
 from lusee_bayes.experiment.terms.sources import SourcesTerm, point_sources
 from lusee_bayes.experiment.terms.term import AdditiveTerm, Around, Term, Truth
 
@@ -31,6 +34,9 @@ TERMS: tuple[Term, ...] = (
     PointingTerm(),
     BeamErrorTerm(),
     SourcesTerm(),
+    ReceiverTerm(),
+    RegolithTerm(),
+    GainTableTerm(),
     GainTerm(),
 )
 
@@ -50,6 +56,7 @@ __all__ = [
     "pointed",
     "pointing_offsets",
     "second_order",
+    "table_factors",
     "true_beams",
     "true_instrument",
     "true_setup",

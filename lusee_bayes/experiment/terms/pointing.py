@@ -11,6 +11,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.reading import naming
+from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, expected_signal, mean_flux, source_responses
 from lusee_bayes.experiment.terms.term import Around, Term, Truth
 from lusee_bayes.instrument.coupling import CouplingMatrix
@@ -26,6 +27,14 @@ class PointingTerm(Term):
     """``noise.pointing``; simulated data are taken with drawn offsets (:func:`true_setup`)."""
 
     key = "noise.pointing"
+    remedy = "smaller standard deviations in noise.pointing, or its treatment=sampled"
+    fixed = "use noise.pointing.around=model"
+
+    def moves(self, scenario: Scenario) -> bool:
+        section = scenario.noise.pointing
+        return (
+            section is not None and section.treatment != "ignored" and section.around == "posterior"
+        )
 
     def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
         section = setup.scenario.noise.pointing
@@ -92,9 +101,12 @@ def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
 
 def pointed(setup: Setup, values: Mapping[str, float] | None) -> Setup:
     """The setup as the other terms are built about: shifted, its signal with it."""
-    if not values:
+    section = setup.scenario.noise.pointing
+    names = () if section is None else offset_names(section.kinds, setup.observation.n_runs)
+    offsets = {name: value for name, value in (values or {}).items() if name in names}
+    if not offsets:
         return setup
-    there = shifted(setup, values)
+    there = shifted(setup, offsets)
     complete = CouplingMatrix.build(there.beams, there.pointing)
     signal = expected_signal(there.scenario, complete, there.sky, there.background, there.responses)
     return replace(there, signal=signal)
@@ -107,8 +119,11 @@ def pointing_offsets(setup: Setup, around: Around) -> PointingOffsets:
         raise InputError("the scenario has no noise.pointing that could be fitted")
     names = offset_names(section.kinds, setup.observation.n_runs)
     sky = setup.sky.modes if around.sky is None else np.asarray(around.sky)
-    centre = dict.fromkeys(names, 0.0) | dict(around.offsets or {})
-    return offsets_about(setup, dict(zip(names, _stds(setup, names), strict=True)), sky, centre)
+    values = around.values or {}
+    centre = {name: float(values.get(name, 0.0)) for name in names}
+    stds = dict(zip(names, _stds(setup, names), strict=True))
+    offsets = offsets_about(setup, stds, sky, centre)
+    return replace(offsets, moves=section.around == "posterior")
 
 
 def offsets_about(

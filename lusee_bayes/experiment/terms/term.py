@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array
+from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.systematics import AdditiveNoise, Systematic
@@ -34,14 +35,21 @@ class Around:
         Visibilities for the gain term, in K; None for those that the scenario names.
     sky : (modes,) array or None
         For the templates of clock and pointing, in K; None for the scenario's.
-    offsets : mapping of float or None
-        Values of clock and pointing, by name; None for none.
+    values : mapping of float or None
+        Of unknowns that are taken to first order about values, clock and pointing or errors of
+        the gain table, by name; None for their prior means.
+    seen : (data,) array or None
+        Visibilities before the gains of the gain table, in K; None for the measured ones.
+    freedom : (data,) array or None
+        Share of each datum that sky and others follow, for the gain table; None for none.
     """
 
     data: Visibilities | None = None
     visibilities: Float[Array, "products times"] | None = None
     sky: Float[Array, " modes"] | None = None
-    offsets: Mapping[str, float] | None = None
+    values: Mapping[str, float] | None = None
+    seen: Float[Array, " data"] | None = None
+    freedom: Float[Array, " data"] | None = None
 
 
 class Term(ABC):
@@ -51,13 +59,23 @@ class Term(ABC):
     ----------
     key : str
         Where a scenario says it, such as ``noise.gain``.
+    remedy : str
+        What may help where it :meth:`moves` and rounds do not settle.
+    fixed : str
+        How it does not move.
     """
 
     key: ClassVar[str]
+    remedy: ClassVar[str] = ""
+    fixed: ClassVar[str] = ""
 
     @abstractmethod
     def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
         """Treatment and systematic, for all that the scenario has of it and does not ignore."""
+
+    def moves(self, scenario: Scenario) -> bool:
+        """Tell whether it is to first order about values that the data tell, found in rounds."""
+        return False
 
     def truth(self, setup: Setup, key: PRNGKeyArray) -> Truth:
         """True values in simulated data, drawn from their priors.

@@ -1,0 +1,178 @@
+"""The table of receivers, ground and gain table, and the direction that data cannot tell."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from experiments import four_ports
+from reference_linear import white_posterior
+
+import lusee_bayes as lb
+from lusee_bayes.experiment.emission import ground_per_kelvin
+from lusee_bayes.experiment.experiment import Experiment, build
+from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.experiment.setup import Setup, set_up
+from lusee_bayes.experiment.simulate import simulate, true_values
+from lusee_bayes.instrument.products import auto_indices
+from lusee_bayes.report.map_page import map_page
+from lusee_bayes.results.null_direction import NullDirection
+from lusee_bayes.results.unknowns import unknowns_report
+from lusee_bayes.sky.priors import HarmonicPrior
+
+RECEIVER, GROUND = "noise.receiver={power_k: 2000}", "noise.regolith={std_k: 30}"
+TABLE = "noise.gain_table={std: 0.01}"
+COLUMNS = ["unknown", "unit", "value", "std", "prior", "prior_std"]
+
+
+@pytest.fixture(scope="module")
+def experiment(response_file) -> Experiment:
+    return build(four_ports(response_file, RECEIVER, GROUND, TABLE))
+
+
+def joint(experiment: Experiment):
+    """Sky and unknowns of the model about what the data told, as one Gaussian in NumPy."""
+    found, setup = infer(experiment), experiment.setup
+    table = found.systematics[-1]
+    factors = np.asarray(table.errors.factors(table.centre))
+    t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
+    a = np.concatenate([factors[:, None] * np.asarray(setup.coupling.dense()), t], axis=1)
+    prior = np.append(np.sqrt(np.asarray(setup.prior.variance())), np.ones(t.shape[1]))
+    noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    own = table.templates @ (np.asarray(table.centre) - table.expected)
+    rest = np.asarray(experiment.data.data) - factors * np.asarray(setup.offset) + own
+    return found, prior, white_posterior(a, prior, noise, rest)
+
+
+def test_table_and_null_direction_are_those_of_the_joint_posterior(experiment):
+    found, prior, expected = joint(experiment)
+    report = unknowns_report(experiment, found)
+    table = report.table
+    assert list(table) == [*COLUMNS, "true"]
+    names = [*(f"receiver_{p}_k" for p in range(4)), "regolith_k", *(f"gain_{p}" for p in range(4))]
+    assert list(table["unknown"]) == names
+    assert list(table["unit"]) == ["K"] * 5 + [""] * 4
+    mean, scale = (
+        np.array([2000.0] * 4 + [250.0] + [0.0] * 4),
+        np.array([200.0] * 4 + [30.0] + [0.01] * 4),
+    )
+    shift = np.append(np.zeros(5), found.systematics[-1].expected)
+    np.testing.assert_allclose(table["prior"], mean, rtol=1e-12)
+    np.testing.assert_allclose(table["prior_std"], scale, rtol=1e-12)
+    np.testing.assert_allclose(table["std"], scale * expected.std[16:], rtol=1e-5)
+    off = (table["value"] - mean - scale * (shift + expected.mean[16:])) / table["std"]
+    assert np.abs(off).max() < 1e-4
+    truth = true_values(experiment.setup)
+    wanted = [truth[name] for name in names[:5]] + list(0.01 * truth["gain_table"])
+    np.testing.assert_allclose(table["true"], wanted, rtol=1e-12)
+    assert (np.abs(table["value"] - table["true"]) < 4 * table["std"]).all()
+    # monopole, receivers, ground, and the unit vector of all gains
+    pick = np.zeros((7, 25))
+    pick[0, 0] = 1.0 / prior[0]
+    pick[1:6, 16:21] = np.eye(5)
+    pick[6, 21:] = 0.5
+    variances, directions = np.linalg.eigh(pick @ expected.covariance @ pick.T)
+    assert report.null.share == pytest.approx(variances[-1], rel=1e-5)
+    assert abs(report.null.weights @ directions[:, -1]) == pytest.approx(1.0, abs=1e-5)
+    assert report.null.names == (
+        "uniform sky", "receiver 0", "receiver 1", "receiver 2", "receiver 3", "regolith",
+        "common gain",
+    )  # fmt: skip
+
+
+def test_only_what_the_model_has_is_listed(response_file):
+    bare = build(four_ports(response_file))
+    assert unknowns_report(bare, infer(bare)) is None
+    ground = build(four_ports(response_file, GROUND))
+    report = unknowns_report(ground, infer(ground))
+    assert report.null.names == ("uniform sky", "regolith")
+    assert list(report.table["unknown"]) == ["regolith_k"]
+    # of measured data no truth is known
+    measured = replace(ground, data=replace(ground.data, truth=None))
+    assert list(unknowns_report(measured, infer(measured)).table) == COLUMNS
+
+
+def test_the_null_direction_in_words():
+    """Two unknowns of which the data tell the sum only, and one that they tell."""
+    ridge = np.array([[0.5, -0.5, 0.0], [-0.5, 0.5, 0.0], [0.0, 0.0, 0.01]])
+    null = NullDirection.of(
+        ["uniform sky", "regolith", "receiver 0"], 0.8 * ridge + 1e-6 * np.eye(3)
+    )
+    assert null.share == pytest.approx(0.8, abs=1e-5)
+    assert sorted(null.words().split(", ")) in (
+        ["regolith +0.71", "uniform sky -0.71"],
+        ["regolith -0.71", "uniform sky +0.71"],
+    )
+    assert null.sentence().endswith("it keeps 80% of its prior variance.")
+    # nothing to say where the data tell most of it
+    assert NullDirection.of(["uniform sky", "regolith"], 0.4 * np.eye(2)).sentence() == ""
+
+
+def test_a_run_writes_them(experiment, tmp_path):
+    run = lb.run_map(experiment.scenario, tmp_path / "map")
+    table = pd.read_csv(tmp_path / "map" / "unknowns.csv", keep_default_na=False)
+    assert len(table) == 9
+    summary = json.loads((tmp_path / "map" / "summary.json").read_text())["unknowns"]
+    np.testing.assert_allclose([row["value"] for row in summary["rows"]], table["value"], rtol=1e-9)
+    assert summary["null_share"] > 0.5
+    assert sum(weight**2 for weight in summary["null_direction"].values()) == pytest.approx(1.0)
+    lines = run.result.lines()
+    assert any(line.startswith("receiver_0_k: ") and line.endswith(" K") for line in lines)
+    assert any("regolith_k" in line and "these data do not tell it" in line for line in lines)
+    assert summary["null_sentence"] in lines
+    page = map_page(tmp_path / "map", "a run")
+    assert "Receivers, ground and gain table" in page
+    assert summary["null_sentence"] in page
+    for text in ("<td>regolith_k</td><td>K</td>", "<td>gain_3</td><td>relative</td>"):
+        assert text in page
+
+
+def test_runs_without_them_are_as_before(small_map):
+    assert not (small_map.folder / "unknowns.csv").exists()
+    assert json.loads((small_map.folder / "summary.json").read_text())["unknowns"] is None
+    assert "gain table" not in map_page(small_map.folder, "a run")
+
+
+def known(setup: Setup) -> Setup:
+    """The same with receivers and ground that are known to be the truth."""
+    noise, truth = setup.scenario.noise, true_values(setup)
+    fixed = {
+        name: getattr(noise, name).model_copy(update={"treatment": "ignored"})
+        for name in ("receiver", "regolith")
+    }
+    scenario = setup.scenario.model_copy(update={"noise": noise.model_copy(update=fixed)})
+    background = np.array(setup.beam_source.background(20.0))
+    background += (truth["regolith_k"] - 250.0) * ground_per_kelvin(setup.beam_source, 20.0)
+    background[auto_indices()] += [truth[f"receiver_{port}_k"] for port in range(4)]
+    return replace(setup, scenario=scenario, background=background)
+
+
+def test_receivers_and_ground_that_are_not_known_cost_the_monopole_alone(response_file):
+    """Of 20 data sets no mode with ell >= 1 moves by 0.1 standard deviations."""
+    first = set_up(four_ports(response_file, RECEIVER, GROUND))
+    # known to a fifth, as one who maps a sky with structure knows it
+    spectrum = 0.04 * np.asarray(first.prior.spectrum)
+    first = replace(first, prior=HarmonicPrior(spectrum, mean=first.sky.modes))
+    moved = []
+    for seed in range(20):
+        z = np.random.default_rng(seed).standard_normal(first.prior.size)
+        modes = first.sky.modes + np.asarray(first.prior.colour(z))
+        scenario = first.scenario.model_copy(update={"seed": seed})
+        setup = replace(first, sky=replace(first.sky, modes=modes), scenario=scenario)
+        data = simulate(setup)
+        unknown, told = (infer(Experiment(s, data)).posterior for s in (setup, known(setup)))
+        off = np.asarray(unknown.mean) - np.asarray(told.mean)
+        moved.append(off / np.asarray(unknown.std()))
+    moved = np.abs(moved)
+    assert moved[:, 1:].max() < 0.1
+    assert moved[:, 0].max() > 0.1
+    # taken for their prior means they move them by many: the test can tell
+    wrong = known(first)
+    wrong = replace(wrong, scenario=wrong.scenario.model_copy(update={"seed": 19}))
+    wrong = replace(wrong, background=first.background)
+    off = np.asarray(infer(Experiment(wrong, data)).posterior.mean) - np.asarray(unknown.mean)
+    assert np.abs(off / np.asarray(unknown.std()))[1:].max() > 1.0

@@ -1,0 +1,411 @@
+"""Errors of the gain table: exact factors, and the Gaussian about what the data tell of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from arviz_stats.base import array_stats
+from experiments import four_ports, program_arguments
+from numpyro.infer.util import log_density
+from reference_linear import white_posterior, z_of
+from scipy.optimize import least_squares
+from scipy.stats import chi2, norm
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.experiment.experiment import Experiment, build
+from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.model import full_model, radiometer, systematics
+from lusee_bayes.experiment.rounds import Inference, model_about, offset_posterior
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.experiment.setup import Setup, set_up
+from lusee_bayes.experiment.simulate import simulate, true_signal, true_values
+from lusee_bayes.experiment.terms import Around, pointed
+from lusee_bayes.instrument.calibration import Calibration
+from lusee_bayes.instrument.products import all_products
+from lusee_bayes.linear.templates import template_amplitudes
+from lusee_bayes.sampling.hmc import Sampler, sample
+from lusee_bayes.sampling.mode import laplace_approximation
+from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.sampling.promotion import numpyro_promotion
+
+TABLE = "noise.gain_table={std: 0.01, treatment: %s}"
+UNKNOWN = ("noise.receiver={power_k: 2000}", "noise.regolith={std_k: 30}", TABLE % "marginalised")
+LEVELS = ("M0 PC1", "M0 PC2", "L3 PC1", "M1 PC1", "H2 PC1")
+PORTS = np.array([0, 0, 0, 1, 2])
+
+
+def slopes(n_times: int) -> np.ndarray:
+    """Two components at one level of port 0 and another level after it; port 3 has no error, and
+    port 2 never the level that the last is of."""
+    early = np.arange(n_times) < n_times // 2
+    ramp = np.linspace(-1.0, 1.0, n_times)
+    return np.stack([0.01 * early, 0.004 * ramp * early, 0.02 * ~early, 0.008 + 0 * ramp, 0 * ramp])
+
+
+def calibrated(setup: Setup) -> Setup:
+    """As of averaged spectra, whose files name the errors of their table."""
+    n = setup.layout.n_times
+    return replace(setup, calibration=Calibration(np.full(n, 1e10), LEVELS, PORTS, slopes(n)))
+
+
+def by_hand(z: np.ndarray, port, slope: np.ndarray) -> np.ndarray:
+    """sqrt((1 + eps_i)(1 + eps_j)) of every datum."""
+    gain = np.ones((4, slope.shape[1]))
+    for value, p, s in zip(z, port, slope, strict=True):
+        gain[p] += value * s
+    return np.concatenate([np.sqrt(gain[p.i] * gain[p.j]) for p in all_products()])
+
+
+def per_port(z: np.ndarray, n_times: int = 23) -> np.ndarray:
+    return by_hand(z, range(4), np.full((4, n_times), 0.01))
+
+
+@pytest.fixture(scope="module")
+def experiment(response_file) -> Experiment:
+    return build(four_ports(response_file, *UNKNOWN, "seed=5"))
+
+
+# --- simulated data -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("treatment", ["marginalised", "sampled", "ignored"])
+def test_simulated_data_hold_one_error_for_each_port(response_file, treatment):
+    setup = set_up(four_ports(response_file, TABLE % treatment))
+    truth = true_values(setup)
+    assert list(truth) == ["gain_table"]
+    z = truth["gain_table"]
+    assert z.shape == (4,)
+    assert 0.01 < np.abs(z).min() < np.abs(z).max() < 4.0
+    seen = np.asarray(setup.layout.gather(true_signal(setup, truth)))
+    plain = np.asarray(setup.layout.gather(setup.signal))
+    np.testing.assert_allclose(seen, per_port(z) * plain, rtol=1e-9, atol=1e-9)
+
+
+def test_simulated_data_hold_the_errors_that_data_name(response_file):
+    setup = calibrated(set_up(four_ports(response_file, "noise.gain_table={}")))
+    z = true_values(setup)["gain_table"]
+    # the last has no effect and is none
+    assert z.shape == (4,)
+    seen = np.asarray(setup.layout.gather(true_signal(setup, {"gain_table": z})))
+    factors = by_hand(z, PORTS[:4], slopes(23)[:4])
+    plain = np.asarray(setup.layout.gather(setup.signal))
+    np.testing.assert_allclose(seen, factors * plain, rtol=1e-9, atol=1e-9)
+
+
+def test_receivers_and_ground_pass_through_the_gains(experiment):
+    setup, truth = experiment.setup, true_values(experiment.setup)
+    none = true_signal(setup, truth | {"gain_table": np.zeros(4)})
+    seen = np.asarray(setup.layout.gather(true_signal(setup, truth)))
+    expected = per_port(truth["gain_table"]) * np.asarray(setup.layout.gather(none))
+    np.testing.assert_allclose(seen, expected, rtol=1e-9, atol=1e-9)
+
+
+# --- marginalised ---------------------------------------------------------------------------------
+
+
+def test_about_given_values_it_is_the_closed_form(experiment):
+    """d = F(z_0)(A m + c + T_l z_l) + dF/dz v_0 (z - z_0) + n with 25 unknowns, and flags."""
+    setup, data = experiment.setup, experiment.data
+    rng = np.random.default_rng(3)
+    z, seen = np.array([0.7, -1.0, 0.4, 1.5]), np.asarray(data.data) * rng.uniform(0.9, 1.1, 368)
+    values = {f"gain_{port}": 0.01 * z[port] for port in range(4)}
+    around = Around(data, values=values, seen=seen)
+    found = Inference(*model_about(setup, around), None, 1, around)
+    found = replace(found, posterior=found.model.condition(data.data))
+    linear = np.concatenate([np.asarray(s.templates) for s in found.systematics[:2]], axis=1)
+    step = 1e-4
+    slope = np.stack(
+        [(per_port(z + step * e) - per_port(z - step * e)) / (2 * step) for e in np.eye(4)], axis=1
+    )
+    factors = per_port(z)[:, None]
+    t = slope * seen[:, None]
+    columns = [factors * np.asarray(setup.coupling.dense()), factors * linear, t]
+    prior = np.append(np.sqrt(np.asarray(setup.prior.variance())), np.ones(9))
+    noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    rest = np.asarray(data.data) - factors[:, 0] * np.asarray(setup.offset) + t @ z
+    expected = white_posterior(np.concatenate(columns, axis=1), prior, noise, rest)
+    # differences of slopes are good to 1e-9, and residuals here are 1e4 standard deviations
+    std = expected.std
+    assert np.abs((np.asarray(found.posterior.mean) - expected.mean[:16]) / std[:16]).max() < 1e-3
+    got, scale = np.asarray(found.posterior.covariance()), np.outer(std, std)
+    np.testing.assert_allclose(
+        got / scale[:16, :16], expected.covariance[:16, :16] / scale[:16, :16], rtol=0, atol=1e-5
+    )
+    t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
+    told = template_amplitudes(found.model, found.posterior, data.data, t)
+    assert np.abs((told.mean - expected.mean[16:]) / std[16:]).max() < 1e-3
+    np.testing.assert_allclose(
+        told.covariance / scale[16:, 16:],
+        expected.covariance[16:, 16:] / scale[16:, 16:],
+        rtol=0,
+        atol=1e-5,
+    )
+
+
+def share() -> np.ndarray:
+    """How often each port is in the product of every datum: (data, ports)."""
+    ports = [[(p.i == port) + (p.j == port) for port in range(4)] for p in all_products()]
+    return np.repeat(np.array(ports, dtype=np.float64), 23, axis=0)
+
+
+def test_rounds_find_the_mode_and_the_first_order_does_not(experiment):
+    """Errors of 1 %, noise of 1e-5 of the signal: all unknowns, where p(z | d) is the largest.
+
+    Its gradient is that of exact least squares in all unknowns and of ln|K(z)|, by hand, with
+    K = F (A S A^T + T_l T_l^T) F + N_0 a matrix; the mode is where both cancel, to 1e-12.
+    """
+    setup, d = experiment.setup, np.asarray(experiment.data.data)
+    found = infer(experiment)
+    assert found.rounds > 2
+    a, offset = np.asarray(setup.coupling.dense()), np.asarray(setup.offset)
+    prior = np.sqrt(np.asarray(setup.prior.variance()))
+    noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    linear = np.concatenate([np.asarray(s.templates) for s in found.systematics[:2]], axis=1)
+    rows = np.concatenate([a * prior, linear], axis=1)
+
+    def log_slopes(z):
+        # of gains that differ for each port ln F is half of the sum of two logarithms
+        return 0.005 * share() / (1.0 + 0.01 * z)
+
+    def volume(z):
+        """d(ln|K| / 2)/dz."""
+        inside = np.linalg.svd(per_port(z)[:, None] * rows / noise[:, None], full_matrices=False)
+        left, values, _ = inside
+        followed = (left**2 * (values**2 / (1.0 + values**2))).sum(1)
+        return log_slopes(z).T @ followed
+
+    def residuals(x, force):
+        seen = rows @ x[:21] + offset
+        return np.append((per_port(x[21:]) * seen - d) / noise, x + np.append(np.zeros(21), force))
+
+    def jacobian(x, force):
+        seen, factors = rows @ x[:21] + offset, per_port(x[21:])
+        by_gain = (factors * seen)[:, None] * log_slopes(x[21:])
+        white = np.concatenate([factors[:, None] * rows, by_gain], axis=1) / noise[:, None]
+        return np.concatenate([white, np.eye(25)])
+
+    tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15, "max_nfev": 2000, "x_scale": "jac"}
+    mode = np.zeros(25)
+    for _ in range(4):
+        force = volume(mode[21:])
+        mode = least_squares(residuals, mode, jacobian, args=(force,), **tight).x
+    assert np.abs(volume(mode[21:]) - force).max() < 1e-6
+    root = np.linalg.qr(jacobian(mode, force))[1]
+    std = np.sqrt(np.diag(np.linalg.inv(root.T @ root)))
+
+    def off(it: Inference) -> np.ndarray:
+        told = [
+            s.expected + template_amplitudes(it.model, it.posterior, d, np.asarray(s.columns)).mean
+            for s in it.systematics
+        ]
+        return np.concatenate([np.asarray(it.posterior.mean) / prior, *told]) - mode
+
+    # every unknown, and every direction of them
+    assert np.abs(off(found) / std).max() < 0.05
+    assert np.abs(root @ off(found)).max() < 0.05
+    around = Around(experiment.data)
+    model, unknowns = model_about(setup, around)
+    first = Inference(model, unknowns, model.condition(d), 1, around)
+    assert np.abs(off(first) / std).max() > 1.0
+    assert np.abs(root @ off(first)).max() > 50.0
+    # the joint mode is another: each of 21 skies and powers gains by being 0.5 % smaller
+    assert force.min() > 0.04
+    joint = least_squares(residuals, mode, jacobian, args=(np.zeros(4),), **tight).x
+    assert ((joint - mode) / std)[21:].min() > 0.04
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_many_modes_do_not_pass_for_a_gain():
+    """Of 20 skies of 121 modes the common gain is not off on average, and scatters as it says.
+
+    About the joint mode it would be by 121 x 0.005^2 of 0.005, 0.6 standard deviations.
+    """
+    table = "noise.gain_table={std: 0.01}"
+    given = ["lmax=10", "prior={model: isotropic, spectrum: sky}", "noise.receiver={power_k: 2000}"]
+    first = set_up(load_scenario("fiducial", [*given, table]))
+    pulls = []
+    for seed in range(20):
+        z = np.random.default_rng(seed).standard_normal(first.prior.size)
+        modes = np.asarray(first.prior.colour(z))
+        modes[0] = abs(modes[0])  # else there is no sky to speak of
+        scenario = first.scenario.model_copy(update={"seed": seed})
+        setup = replace(first, sky=replace(first.sky, modes=modes), scenario=scenario)
+        data = simulate(setup)
+        found = infer(Experiment(setup, data))
+        gains = found.systematics[-1]
+        told = template_amplitudes(found.model, found.posterior, data.data, gains.columns)
+        off = gains.expected + told.mean - true_values(setup)["gain_table"]
+        std = np.sqrt(gains.common @ told.covariance @ gains.common)
+        pulls.append(gains.common @ off / std)
+    assert abs(np.mean(pulls)) * np.sqrt(20) < 3.5
+    low, high = chi2.interval(1 - 1e-3, 20)
+    assert low < np.sum(np.square(pulls)) < high
+    print(np.mean(pulls), np.std(pulls))
+
+
+def test_errors_that_data_name_are_found(response_file):
+    setup = calibrated(set_up(four_ports(response_file, "noise.gain_table={}")))
+    data = replace(simulate(setup), calibration=setup.calibration)
+    experiment = Experiment(setup, data)
+    found = infer(experiment)
+    (table,) = found.systematics
+    assert table.names == ("gain_M0_PC1", "gain_M0_PC2", "gain_L3_PC1", "gain_M1_PC1")
+    slope = slopes(23)[:4]
+    rms = [np.sqrt((s[s != 0] ** 2).mean()) for s in slope]
+    np.testing.assert_allclose(table.stds, rms, rtol=1e-12)
+    told = template_amplitudes(found.model, found.posterior, data.data, table.columns)
+    off = (table.expected + told.mean - true_values(setup)["gain_table"]) / told.std
+    assert np.abs(off).max() < 4.0
+    # port 3 is right, so that the others are told from it
+    assert told.std.max() < 0.05
+    misfit = float(found.model.chi2(found.posterior.mean, data.data) + found.posterior.prior_chi2())
+    assert abs(misfit - 368) < 4 * np.sqrt(2 * 368)
+
+
+def test_clock_and_pointing_beside_it_settle_in_the_same_rounds(response_file):
+    """The step of Gauss and Newton that is left, with derivatives of the exact model in all 26."""
+    pointing = "noise.pointing={turntable_deg: 0.05, true_values: {turntable_deg: 0.08}}"
+    experiment = build(four_ports(response_file, *UNKNOWN, pointing, "seed=5"))
+    setup, d = experiment.setup, np.asarray(experiment.data.data)
+    found = infer(experiment)
+    assert [type(s).__name__ for s in found.moving] == ["PointingOffsets", "GainTable"]
+    prior = np.sqrt(np.asarray(setup.prior.variance()))
+    noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    turntable = offset_posterior(found)[0]["turntable_deg"] / 0.05
+    _, *rest = found.systematics
+    linear = np.concatenate([np.asarray(s.templates) for s in rest[:2]], axis=1)
+    told = [template_amplitudes(found.model, found.posterior, d, s.columns).mean for s in rest]
+    told[-1] = told[-1] + rest[-1].expected
+    x = np.concatenate([np.asarray(found.posterior.mean) / prior, *told, [turntable]])
+
+    def residuals(x):
+        there = pointed(setup, {"turntable_deg": 0.05 * x[25]})
+        seen = np.asarray(there.coupling @ (prior * x[:16])) + np.asarray(setup.offset)
+        seen = seen + linear @ x[16:21]
+        force = np.concatenate([np.zeros(21), rest[-1].expected, [0.0]])
+        return np.append((per_port(x[21:25]) * seen - d) / noise, x - force)
+
+    steps = 1e-4 * np.eye(26)
+    slope = np.stack([(residuals(x + s) - residuals(x - s)) / 2e-4 for s in steps], axis=1)
+    left = np.linalg.lstsq(slope, residuals(x), rcond=None)[0]
+    root = np.linalg.qr(slope)[1]
+    assert np.abs(root @ left).max() < 0.05
+    truth = true_values(setup)["turntable_deg"] / 0.05
+    std = np.sqrt(np.diag(np.linalg.inv(root.T @ root)))
+    assert abs(turntable - truth) < 4 * std[25]
+    # it is told from none
+    assert truth > 10 * std[25]
+
+
+def test_what_n_holds_of_the_others_is_seen_through_the_gains(response_file):
+    setup = set_up(four_ports(response_file, *UNKNOWN, "noise.pointing={turntable_deg: 1}"))
+    values = {"gain_0": 0.02}
+    factors = per_port(np.array([2.0, 0, 0, 0]))
+    for (_, found), (_, bare) in zip(
+        systematics(setup, Around(values=values)), systematics(setup), strict=True
+    ):
+        if "gain_0" in found.names:
+            np.testing.assert_allclose(found.centre, [2.0, 0.0, 0.0, 0.0], rtol=1e-12)
+        else:
+            expected = np.asarray(bare.columns) * factors[:, None]
+            np.testing.assert_allclose(found.columns, expected, rtol=1e-9, atol=1e-9)
+
+
+# --- sampled --------------------------------------------------------------------------------------
+
+
+def test_sampled_the_density_is_the_closed_form(response_file):
+    """Factors by hand on the rows of A and on the offset."""
+    e = build(four_ports(response_file, TABLE % "sampled"))
+    setup, z = e.setup, np.array([0.5, -1.5, 0.2, 1.1])
+    program = load_program("systematics")
+    arguments = program_arguments(program, e)
+    with numpyro_promotion():
+        got, trace = log_density(program.model, (), arguments, {"gain_table": jnp.asarray(z)})
+    assert set(trace) == {"gain_table", "data"}
+    factors = per_port(z)
+    a = factors[:, None] * np.asarray(setup.coupling.dense())
+    rest = np.asarray(e.data.data) - factors * np.asarray(setup.offset)
+    noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    prior = np.sqrt(np.asarray(setup.prior.variance()))
+    expected = white_posterior(a, prior, noise, rest).log_prob + norm.logpdf(z).sum()
+    assert abs(expected) > 1e4
+    # chi^2 of 1e7, each of whose squares is right to 1e-10 of itself
+    assert float(got) == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.long
+def test_sampled_and_marginalised_tell_the_same(response_file):
+    """All three by HMC, against the Gaussian of the rounds: means and variances.
+
+    Noise of 1e-3: what the Gaussian leaves out is of the size of the gains' errors after the data,
+    0.5 % of a standard deviation, a third of the Monte Carlo error of some 4000 draws.
+    """
+    loud = "noise.radiometer.factor=1e4"
+    e = build(four_ports(response_file, *UNKNOWN, loud, "seed=7"))
+    found = infer(e)
+    columns = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
+    told = template_amplitudes(found.model, found.posterior, e.data.data, columns)
+    centre = told.mean + np.append(np.zeros(5), found.systematics[-1].expected)
+    tree = e.scenario.model_dump()
+    for name in ("receiver", "regolith", "gain_table"):
+        tree["noise"][name]["treatment"] = "sampled"
+    e = replace(e, setup=replace(e.setup, scenario=type(e.scenario).model_validate(tree)))
+    program = load_program("systematics")
+    arguments = program_arguments(program, e)
+    approximation = laplace_approximation(program.model, arguments)
+    assert bool(approximation.converged)
+    sampler = Sampler(draws=1500, seed=3)
+    chains = sample(program.model, arguments, sampler, approximation.whitening)
+    assert not chains.statistics["diverging"].any()
+    powers = [(chains.sites[f"receiver_{port}_k"] - 2000.0) / 200.0 for port in range(4)]
+    ground = (chains.sites["regolith_k"] - 250.0) / 30.0
+    draws = [*powers, ground, *np.moveaxis(chains.sites["gain_table"], -1, 0)]
+    limit = z_of(2 * len(draws))
+    for values, mean, std in zip(draws, centre, told.std, strict=True):
+        z = (values - mean) / std
+        for moment, expected in [(z, 0.0), (z**2, 1.0)]:
+            ess = array_stats.ess(moment, chain_axis=0, draw_axis=1, method="mean")
+            assert ess > 1000
+            assert abs(moment.mean() - expected) < limit * moment.std() / np.sqrt(ess)
+
+
+# --- refused --------------------------------------------------------------------------------------
+
+
+def refused(setup: Setup, message: str) -> None:
+    for ask in (true_values, full_model):
+        with pytest.raises(InputError, match=message) as caught:
+            ask(setup)
+        assert "\n" not in str(caught.value)
+
+
+def test_errors_that_nobody_says_and_errors_that_both_say(response_file):
+    nothing = set_up(four_ports(response_file, "noise.gain_table={}"))
+    refused(nothing, r"say nothing of a gain table; give noise\.gain_table\.std")
+    n = nothing.layout.n_times
+    refused(
+        replace(nothing, calibration=Calibration(np.full(n, 1e10))), r"give noise\.gain_table\.std"
+    )
+    both = calibrated(set_up(four_ports(response_file, TABLE % "marginalised")))
+    refused(
+        both, r"say the errors of their gain table themselves; leave out noise\.gain_table\.std"
+    )
+
+
+def test_tables_that_are_hardly_known(response_file):
+    setup = set_up(four_ports(response_file, "noise.gain_table={}"))
+    n = setup.layout.n_times
+    slope = np.stack([np.full(n, 0.08), np.full(n, 0.07)])
+    wide = Calibration(np.full(n, 1e10), ("a", "b"), np.array([1, 1]), slope)
+    refused(replace(setup, calibration=wide), "of port 1 is known to 0.11 of itself, expected at")
+
+
+@pytest.mark.parametrize("std", ["0", "-0.01", "0.2", "x"])
+def test_what_is_no_standard_deviation(response_file, std):
+    with pytest.raises(InputError, match=r"noise\.gain_table\.std"):
+        four_ports(response_file, f"noise.gain_table={{std: {std}}}")
