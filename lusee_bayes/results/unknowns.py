@@ -74,7 +74,9 @@ def unknowns_report(experiment: Experiment, found: Inference) -> UnknownsReport 
         return None
     columns = np.concatenate([np.asarray(s.columns) for s in listed], axis=1)
     told = template_amplitudes(found.model, found.posterior, experiment.data.data, columns)
-    truth = true_values(experiment.setup) if experiment.data.truth is not None else None
+    # of spectra, the sky behind them may be known, but not what the scenario would have drawn
+    simulated = experiment.data.truth is not None and experiment.data.calibration is None
+    truth = true_values(experiment.setup) if simulated else None
     rows, at = [], 0
     for systematic in listed:
         stds = np.asarray(systematic.stds)

@@ -353,12 +353,13 @@ def _average(
 
     def mean(name: str, weights: Float[np.ndarray, " rows"]) -> np.ndarray:
         values = np.concatenate([getattr(part, name) for part in parts])
-        shape = (-1,) + (1,) * (values.ndim - 1)
-        total = np.bincount(at, weights, n)
-        summed = np.zeros((n, *values.shape[1:]))
-        np.add.at(summed, at, np.where(np.isfinite(values), values, 0.0) * weights.reshape(shape))
+        weights = weights.reshape(-1, *(1,) * (values.ndim - 1))
+        known = np.isfinite(values) * weights
+        total, summed = (np.zeros((n, *values.shape[1:])) for _ in range(2))
+        np.add.at(total, at, known)
+        np.add.at(summed, at, np.where(known > 0.0, values, 0.0) * weights)
         with np.errstate(invalid="ignore", divide="ignore"):
-            return summed / total.reshape(shape)
+            return summed / total
 
     first, n = int(bin_of[0]), int(bin_of[-1] - bin_of[0]) + 1
     at = bin_of - first

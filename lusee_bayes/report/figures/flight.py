@@ -79,7 +79,6 @@ def waterfall(reduced: Reduced, band: int) -> Figure:
         axes.set_ylim(low, high)
         axes.set_title(product.label, fontsize=9)
         plain_ticks(axes, 3)
-        axes.yaxis.get_major_formatter()
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:.2g}")
     panels[0, 0].legend(frameon=False, fontsize=8)
     for axes in panels[-1]:
@@ -131,7 +130,8 @@ def calibration(reduced: Reduced) -> Figure:
                 reduced.frequencies_mhz, values, mark, color=colour, label=name, fillstyle="none"
             )
     right.set(xlabel="frequency [MHz]", ylabel="scatter over radiometer noise")
-    right.set_ylim(bottom=0.0)
+    found = np.concatenate([reduced.line_scatter, reduced.scatter, [1.0]])
+    right.set_ylim(0.0, 1.3 * float(np.nanmax(found)))
     right.set_title("Noise found over noise expected")
     if right.get_legend_handles_labels()[0]:
         right.legend(frameon=False, fontsize=8)
