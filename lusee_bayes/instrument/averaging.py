@@ -180,7 +180,7 @@ def binned(
     windows = here.windows
     offset = _seconds(here)[windows.sample]
     start, end = windows.start_s + offset, windows.end_s + offset
-    bin_of_piece, share = bin_of[windows.sample], windows.live_s / (end - start)
+    bin_of_piece, share = bin_of_left[windows.sample], windows.live_s / (end - start)
     gap = start[1:] - end[:-1]
     # the live time that the piece would have with the share of the one before
     differ = np.abs(np.diff(share)) * (end - start)[1:]

@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float
 
 from lusee_bayes.instrument.flight.outliers import outliers, robust_scale, threshold
 
-# a polynomial of this degree takes up what the sky does within so many hours, to less than the
-# noise of a spectrum: at lmax 47 a millionth of what ell = 47 has
-DEGREE, SPAN_S = 3, 7200.0
+# a polynomial of this degree takes up what the sky does within four hours, to less than the noise
+# of a spectrum: 2e-5 of what ell = 47 has
+DEGREE, SPAN_S = 5, 14400.0
 # with fewer spectra within a span, there is no telling
 LEAST = 16
 # lengths of stretches that are tested, in spectra
@@ -52,7 +52,7 @@ def burst_flags(
     -------
     (rows,) array of bool
     (spans,) array
-        Scatter over the noise expected, of every span of two hours that has enough spectra.
+        Scatter over the noise expected, of every span of four hours that has enough spectra.
     """
     flagged, scatter = np.zeros(len(seconds), dtype=bool), []
     limit = threshold(false_alarm, n_tests(autos.shape[1]))

@@ -30,6 +30,8 @@ COMB_MHZ = (5.0, 45.0)
 AROUND = ((-3, -1.0 / 16.0), (-1, 9.0 / 16.0), (1, 9.0 / 16.0), (3, -1.0 / 16.0))
 # standard deviations of a whole spectrum: no chance, since neighbours never tell it exactly
 COMB_LIMIT = 8.0
+# a line is in its channel and those beside it; half-way between two, in four
+BESIDE_MHZ = 1.5 * CHANNEL_MHZ + 1e-9
 TABLE = Layout(
     "known lines",
     {
@@ -57,7 +59,7 @@ class KnownLines:
         self, averaging: Averaging, middles_mhz: Float[np.ndarray, " channels"]
     ) -> Bool[np.ndarray, " bins"]:
         """Return the bins that hold a line, or a channel beside one."""
-        near = np.abs(middles_mhz[:, None] - self.frequency_mhz) <= 1.5 * CHANNEL_MHZ
+        near = np.abs(middles_mhz[:, None] - self.frequency_mhz) <= BESIDE_MHZ
         return near.any(axis=1)[averaging.channels()].any(axis=1)
 
 

@@ -42,7 +42,7 @@ from lusee_bayes.instrument.products import all_products
 from lusee_bayes.instrument.times import unannounced_leap_seconds
 
 # spectra that are worked on at once, and at least how many make a piece between two bins
-SLAB, PIECE = 128, 256
+SLAB, PIECE = 128, 1024
 # of the curves of gains: first, last, and how many
 CURVE_MHZ = (0.5, 51.0, 203)
 N_PRODUCTS = len(all_products())

@@ -30,17 +30,17 @@ def _counts(*more: int, low: float = -np.inf, high: float = np.inf, optional: bo
 ROWS = {
     "spectra/raw_times": Variable(("row",)),
     f"{META}/Navgf": _counts(),
-    f"{META}/Navg1_shift": _counts(low=0, high=40),
-    f"{META}/Navg2_shift": _counts(low=0, high=40),
-    f"{META}/actual_bitslice": _counts(16, low=0, high=31),
+    f"{META}/Navg1_shift": _counts(low=0.0, high=40.0),
+    f"{META}/Navg2_shift": _counts(low=0.0, high=40.0),
+    f"{META}/actual_bitslice": _counts(16, low=0.0, high=31.0),
     f"{META}/adc_min": _counts(PORTS),
     f"{META}/adc_max": _counts(PORTS),
-    f"{META}/adc_invalid_count_min": _counts(PORTS, low=0, optional=True),
-    f"{META}/adc_invalid_count_max": _counts(PORTS, low=0, optional=True),
+    f"{META}/adc_invalid_count_min": _counts(PORTS, low=0.0, optional=True),
+    f"{META}/adc_invalid_count_max": _counts(PORTS, low=0.0, optional=True),
     f"{META}/errors": _counts(optional=True),
     # layout 4 alone has these two
-    f"{META}/weight": _counts(low=0, optional=True),
-    f"{META}/notch": _counts(low=0, optional=True),
+    f"{META}/weight": _counts(low=0.0, optional=True),
+    f"{META}/notch": _counts(low=0.0, optional=True),
     **{f"telemetry/{name}": Variable(("row",), optional=True) for name in TELEMETRY},
 }
 SITE = {

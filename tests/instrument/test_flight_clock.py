@@ -1,0 +1,101 @@
+"""Mission clocks: which UTC they stand for, and what contradicts them."""
+
+import json
+from datetime import datetime
+
+import numpy as np
+import pytest
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.instrument.flight.clock import Clock, clock_of, read_clock
+from lusee_bayes.testing import assert_refused
+
+RECORD = {
+    "format_version": 1,
+    "reference_event": "landing",
+    "clock_reference_isot": "2027-01-10T00:00:00",
+    "time_scale": "utc",
+    "clocks": {"spectrometer": {"clock_reference_raw_seconds": 100.0}},
+    "source": "a record",
+    "assumed": False,
+}
+RAW = np.array([100.0, 1e5, 3.0e7])
+
+
+def written(tmp_path, **changes):
+    path = tmp_path / "clock.json"
+    path.write_text(json.dumps(RECORD | changes))
+    return path
+
+
+def seconds_after(time, text):
+    """Since a date, by the standard library, which knows no leap seconds (there are none here)."""
+    at = datetime.fromisoformat(time.isot[:23])
+    return (at - datetime.fromisoformat(text)).total_seconds()
+
+
+# TAI - UTC is 37 s since 2017, TT - TAI 32.184 s: a reading in TT is 69.184 s earlier in UTC
+@pytest.mark.parametrize(("scale", "offset"), [("utc", 0.0), ("tai", -37.0), ("tt", -69.184)])
+def test_seconds_since_the_reference_in_each_scale(tmp_path, scale, offset):
+    clock = read_clock(written(tmp_path, time_scale=scale))
+    utc = clock.utc(RAW)
+    for k, raw in enumerate(RAW):
+        found = seconds_after(utc[k], "2027-01-10T00:00:00")
+        assert found == pytest.approx(raw - 100.0 + offset, abs=2e-3)  # isot has milliseconds
+
+
+def test_a_clock_that_runs_fast(tmp_path):
+    clock = read_clock(written(tmp_path, rate=1.0 + 1e-5))
+    found = seconds_after(clock.utc(RAW)[2], "2027-01-10T00:00:00")
+    assert found == pytest.approx((3.0e7 - 100.0) * (1.0 + 1e-5), abs=2e-3)
+
+
+def test_times_are_exact_to_a_microsecond_over_a_year():
+    clock = Clock("here", 2461550.5, 0.0, "utc", 0.0)
+    raw = np.array([0.0, 3.0e7, 3.0e7 + 1e-3])
+    utc = clock.utc(raw)
+    assert (utc[2] - utc[1]).sec == pytest.approx(1e-3, abs=1e-6)
+
+
+def test_a_clock_has_to_be_known():
+    clock = Clock("file", 2461550.5, 0.0, "utc", 0.0)
+    assert clock_of("session", clock, None, RAW) is clock
+    assert clock_of("session", None, clock, RAW) is clock
+    with pytest.raises(InputError, match=r"give --clock clock\.json \(epoch, scale, rate\)"):
+        clock_of("session", None, None, RAW)
+
+
+def test_two_clocks_that_differ_are_refused():
+    said = Clock("file", 2461550.5, 0.0, "utc", 0.0)
+    other = Clock("clock.json", 2461550.5, 0.0, "tt", 0.0)
+    with pytest.raises(InputError, match=r"differ by 69\.184 s"):
+        clock_of("session", said, other, RAW)
+    # the same said in another way
+    same = Clock("clock.json", 2461550.5, 100.0 / 86400.0, "utc", 100.0)
+    assert clock_of("session", said, same, RAW) is same
+
+
+BAD = [
+    {"format_version": 2},
+    {"time_scale": "lunar"},
+    {"clock_reference_isot": "yesterday"},
+    {"clock_reference_isot": "2027-13-10T00:00:00"},
+    {"clocks": {}},
+    {"clocks": {"spectrometer": {"clock_reference_raw_seconds": "100"}}},
+    {"clocks": {"spectrometer": {"clock_reference_raw_seconds": True}}},
+    {"rate": 2.0},
+    {"source": 3},
+    {"drift": 1.0},
+]
+
+
+@pytest.mark.parametrize("changes", BAD, ids=str)
+def test_a_clock_file_that_cannot_be_is_refused(tmp_path, changes):
+    assert_refused(lambda: read_clock(written(tmp_path, **changes)))
+
+
+def test_a_clock_file_that_is_no_json_is_refused(tmp_path):
+    path = tmp_path / "clock.json"
+    path.write_text("{")
+    assert_refused(lambda: read_clock(path))
+    assert_refused(lambda: read_clock(tmp_path / "absent.json"))
