@@ -40,10 +40,9 @@ class GainTableTerm(Term):
         centre = _centre(errors, around)
         seen = around.seen
         if seen is None:
-            measured = setup.layout.gather(setup.signal)
-            if around.data is not None:
-                measured = around.data.data / errors.factors(centre)
-            seen = measured
+            # those of some sky: what gains make of the data is none, and to first order would be
+            # explained by gains that take all of the data away
+            seen = setup.layout.gather(setup.signal)
         treatment = setup.scenario.noise.gain_table.treatment
         return [(treatment, GainTable(errors, centre, np.asarray(seen), around.freedom))]
 
