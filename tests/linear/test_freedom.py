@@ -1,6 +1,7 @@
 """The share of each datum that the model follows, against matrices."""
 
 import numpy as np
+import pytest
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.coupling import DenseCoupling
@@ -9,9 +10,11 @@ from lusee_bayes.noise.covariance import DiagonalCovariance, LowRankCovariance
 from lusee_bayes.sky.priors import HarmonicPrior
 
 
-def test_it_is_the_diagonal_of_a_product_of_matrices(monkeypatch):
+@pytest.mark.parametrize("dense", [0, 10**8])
+def test_it_is_the_diagonal_of_a_product_of_matrices(monkeypatch, dense):
     """K_s K^-1 with templates and another low-rank term, five directions at once."""
     monkeypatch.setattr("lusee_bayes.linear.freedom.CHUNK", 5)
+    monkeypatch.setattr("lusee_bayes.linear.freedom.DENSE", dense)
     rng = np.random.default_rng(0)
     a, v, other = rng.normal(size=(30, 9)), rng.normal(size=(30, 2)), rng.normal(size=(30, 1))
     spectrum, n = np.array([4.0, 1.0, 0.3]), rng.uniform(0.5, 2.0, 30)
