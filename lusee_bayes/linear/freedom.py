@@ -9,8 +9,9 @@ from lusee_bayes.core.arrays import Array, on_host
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 
-# directions of the sky that are seen at once
-CHUNK = 256
+# directions of the sky that are seen at once, and entries of A up to which it is made a matrix:
+# products of matrices take a tenth of the time
+CHUNK, DENSE = 256, 10**8
 
 
 def data_freedom(
@@ -41,9 +42,14 @@ def data_freedom(
     weighted_columns = np.asarray(factor.solve(columns))
     solved = weighted_columns
     freedom = np.zeros(model.n_data)
+    coupling = model.coupling
+    dense = np.asarray(coupling.dense()) if coupling.shape[0] * coupling.shape[1] <= DENSE else None
     for start in range(0, root.shape[1], CHUNK):
-        directions = root[:, start : start + CHUNK].T
-        seen = np.stack([np.asarray(model.coupling @ r) for r in directions], axis=1)
+        directions = root[:, start : start + CHUNK]
+        if dense is not None:
+            seen = dense @ directions
+        else:
+            seen = np.stack([np.asarray(coupling @ r) for r in directions.T], axis=1)
         weighted = np.asarray(factor.solve(seen))
         freedom += (seen * weighted).sum(1)
         solved = solved - weighted @ (seen.T @ weighted_columns)
