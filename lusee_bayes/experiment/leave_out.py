@@ -17,11 +17,12 @@ from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.threads import in_threads
-from lusee_bayes.experiment.rounds import model_about
+from lusee_bayes.experiment.rounds import model_about, settled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import Around
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.linear.residuals import leave_out
 from lusee_bayes.linear.split import WIDER, Split, widened
@@ -108,9 +109,7 @@ def _tails(
     setup: Setup, data: Visibilities
 ) -> tuple[Float[np.ndarray, " times"] | None, Float[np.ndarray, " times"]]:
     """Probability of each time's chi^2 or more, and chi^2 over its mean; None if not known."""
-    model, _ = model_about(setup, Around(data))
-    posterior = model.condition(data.data)
-    model, posterior = on_host((model, posterior))
+    model, posterior = on_host(_conditioned(setup, data))
     wide = _wide(posterior, model.n_data)
     left_out = leave_out(replace(model, prior=wide.prior), wide, data)
     n = data.layout.n_times
@@ -129,6 +128,16 @@ def _tails(
     tail[some[judged]] = special.chdtrc(degrees[judged], found[judged])
     ratio[some[judged]] = found[judged] / degrees[judged]
     return tail, ratio
+
+
+def _conditioned(setup: Setup, data: Visibilities) -> tuple[LinearGaussian, Posterior]:
+    """Model and posterior, in as many rounds as N needs; in one where bad data let none settle."""
+    try:
+        found = settled(setup, data)
+    except InputError:
+        model, _ = model_about(setup, Around(data))
+        return model, model.condition(data.data)
+    return found.model, found.posterior
 
 
 def _wide(posterior: Posterior, n_data: int) -> Posterior:
