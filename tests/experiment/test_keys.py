@@ -23,6 +23,8 @@ WITHIN = {
     "noise.regolith": "noise.regolith={std_k: 20}",
     "noise.gain_table": "noise.gain_table={std: 0.01}",
     "sources.list.0": "sources.list=[{name: Cas A}]",
+    "flight": "flight={}",
+    "flight.simulated": "flight.simulated={}",
 }
 
 

@@ -10,6 +10,7 @@ from lusee_bayes.experiment.schema.beam import (
     section_of_file,
 )
 from lusee_bayes.experiment.schema.flight import FlightSection
+from lusee_bayes.experiment.schema.flight_simulated import FlightSimulatedSection
 from lusee_bayes.experiment.schema.log_normal import LogNormalPriorSection
 from lusee_bayes.experiment.schema.noise import (
     BeamErrorSection,
@@ -50,6 +51,7 @@ __all__ = [
     "BeamSection",
     "FileSkySection",
     "FlightSection",
+    "FlightSimulatedSection",
     "Frequency",
     "GainSection",
     "GainTableSection",

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from lusee_bayes.experiment.schema.flight_simulated import FlightSimulatedSection
 from lusee_bayes.experiment.schema.section import Angle, Positive, Section
 
 # probabilities of a false alarm
@@ -54,6 +55,8 @@ class FlightSection(Section):
         Chance that a value of pure noise is flagged, of each kind of test.
     leave_out : bool
         Flag bins of time that do not fit what all others predict for them.
+    simulated : FlightSimulatedSection
+        Sessions that are simulated, and what disturbs them.
     """
 
     gain_table: str | None = None
@@ -74,6 +77,7 @@ class FlightSection(Section):
     comb: Literal["found", "always", "never"] = "found"
     false_alarm: Rare = 1e-4
     leave_out: bool = True
+    simulated: FlightSimulatedSection | None = None
 
     @model_validator(mode="after")
     def _one_kind_of_error(self) -> FlightSection:

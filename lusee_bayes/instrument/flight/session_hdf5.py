@@ -22,6 +22,7 @@ from lusee_bayes.core.hdf5_probe import require_readable_hdf5
 from lusee_bayes.core.layouts import Unread
 from lusee_bayes.core.reading import reading
 from lusee_bayes.instrument.flight.clock import SCALES, Clock
+from lusee_bayes.instrument.flight.cubes import cache_for
 from lusee_bayes.instrument.flight.session import TELEMETRY, Read, Session
 from lusee_bayes.instrument.flight.session_layout import META, at_rows, session_of
 from lusee_bayes.instrument.times import unannounced_leap_seconds
@@ -115,6 +116,8 @@ def _opener(path: Path) -> Callable[[], AbstractContextManager[Read]]:
     @contextmanager
     def opened() -> Iterator[Read]:
         with h5py.File(path) as file:
+            cache = cache_for(file["spectra/data"].chunks)
+        with h5py.File(path, **cache) as file:
             cube = file["spectra/data"]
 
             def read(first: int, last: int) -> Shaped[np.ndarray, "rows products channels"]:

@@ -1,0 +1,282 @@
+"""Sessions of the spectrometer, simulated: counts, gains, telemetry and clock of a scenario's sky.
+
+The inverse of :mod:`.instrument.flight`: visibilities become spectra of all channels, with the
+radiometer noise of each and with what disturbs them, and those become counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.threads import in_threads, processors
+from lusee_bayes.experiment.flight_disturbances import SATURATED, Disturbances
+from lusee_bayes.experiment.flight_visibilities import spectra_observation, true_visibilities
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.schema import FlightSection, FlightSimulatedSection
+from lusee_bayes.instrument.correlations import CONVENTIONS
+from lusee_bayes.instrument.flight.channel_spectra import ChannelSpectra
+from lusee_bayes.instrument.flight.clock import DAY_S, Clock
+from lusee_bayes.instrument.flight.counts import Counting, bit_slices, rounded
+from lusee_bayes.instrument.flight.gain_files import read_gain_table
+from lusee_bayes.instrument.flight.gain_table import GainTable
+from lusee_bayes.instrument.flight.session_layout import MJD_ZERO
+from lusee_bayes.instrument.flight.session_rows import SessionRows
+from lusee_bayes.instrument.flight.spectrometer import (
+    ADC_HIGH,
+    ADC_LOW,
+    FRAME_S,
+    PORTS,
+    BinOrigin,
+    channel_mhz,
+)
+from lusee_bayes.instrument.flight.synthetic_gains import synthetic_gains
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.products import to_matrix, to_real
+from lusee_bayes.noise.sample_covariances import sample_covariances
+
+# spectra that a thread works on at once
+BLOCK = 16
+# the clock was started so long before the observation, and showed so much
+CLOCK_DAYS, CLOCK_S = 100, 1000.0
+# rms of the ADC at each gain, its extremes in these, and what it has where it is at its ends
+ADC_RMS, ADC_PEAK = {"L": 55.0, "M": 310.0, "H": 1700.0}, 4.6
+SATURATED_RMS, OUT_OF_RANGE = 6200.0, 1000
+SOFTWARE = 0x307
+# telemetry: mean, amplitude and period in hours
+TELEMETRY = {
+    "THERM_FPGA": (30.0, 2.0, 700.0),
+    "SPE_ADC0_T": (29.5, 1.5, 650.0),
+    "SPE_ADC1_T": (28.5, 1.5, 600.0),
+    "SPE_1VAD8_V": (1.8, 2e-3, 90.0),
+    "VMON_1V2D": (1.2, 2e-3, 130.0),
+    "SPE_1VAD8_C": (0.045, 1e-3, 110.0),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FlightSimulation:
+    """Sessions, made when they are asked for.
+
+    Attributes
+    ----------
+    scenario : Scenario
+    section : FlightSimulatedSection
+    observation : Observation
+        A sample for each spectrum.
+    frequencies_mhz : (nodes,) array
+        Where the visibilities are those of the sky; others lie smoothly between.
+    visibilities : (nodes, products, rows) array
+        Without noise, in V^2/Hz.
+    disturbances : Disturbances
+    table : GainTable
+    origin : {"centre", "edge"}
+        What of channel k lies at k times 25 kHz.
+    navg_shift : int
+        Logarithm of the number of frames that a spectrum averages, to base 2.
+    clock : Clock
+    """
+
+    scenario: Scenario
+    section: FlightSimulatedSection
+    observation: Observation
+    frequencies_mhz: Float[np.ndarray, " nodes"]
+    visibilities: Float[np.ndarray, "nodes products rows"]
+    disturbances: Disturbances
+    table: GainTable
+    origin: BinOrigin
+    navg_shift: int
+    clock: Clock
+
+    @property
+    def frames(self) -> float:
+        """How many frames each spectrum averages."""
+        return 2.0**self.navg_shift
+
+    @cached_property
+    def _spectra(self) -> ChannelSpectra:
+        return ChannelSpectra.of(self.frequencies_mhz, channel_mhz(self.origin))
+
+    @cached_property
+    def _hours(self) -> Float[np.ndarray, " rows"]:
+        return self.observation.hours
+
+    @cached_property
+    def sessions(self) -> tuple[slice, ...]:
+        """Which spectra each session has."""
+        number = np.floor((self._hours - self._hours[0]) / self.section.session_h + 1e-9)
+        starts = np.flatnonzero(np.diff(number, prepend=-1.0))
+        ends = np.append(starts[1:], len(number))
+        return tuple(slice(int(a), int(b)) for a, b in zip(starts, ends, strict=True))
+
+    def rows(self, session: slice) -> SessionRows:
+        """Return what a session says of its spectra.
+
+        Parameters
+        ----------
+        session : slice
+            Of :attr:`sessions`.
+        """
+        made = self.disturbances
+        level, saturated = made.level[session], made.saturated[session, None]
+        n = len(level)
+        rms = np.vectorize(ADC_RMS.__getitem__, otypes=[np.float64])(level)
+        peak = np.rint(ADC_PEAK * rms).astype(np.int64)
+        times = self.observation.times[session]
+        days = (times.jd1 - self.clock.jd1) + (times.jd2 - self.clock.jd2)
+        return SessionRows(
+            raw_s=self.clock.raw_s + days * DAY_S,
+            navgf=np.full(n, self.section.navgf, dtype=np.int64),
+            navg_shift=np.full(n, self.navg_shift, dtype=np.int64),
+            level=level,
+            bitslice=np.array([self._slices["".join(one)] for one in level]),
+            adc_low=np.where(saturated, ADC_LOW, -peak),
+            adc_high=np.where(saturated, ADC_HIGH, peak),
+            adc_invalid=np.where(saturated, OUT_OF_RANGE, np.zeros((n, PORTS), dtype=np.int64)),
+            adc_rms=np.where(saturated, SATURATED_RMS, rms),
+            telemetry=self._telemetry(session),
+            clock=self.clock if self.section.clock == "known" else None,
+            lon_deg=self.observation.lon_deg,
+            lat_deg=self.observation.lat_deg,
+            software=SOFTWARE,
+        )
+
+    def blocks(self, session: slice) -> Iterator[Float32[np.ndarray, "_ products bins"]]:
+        """Make the counts of a session, some spectra after the other.
+
+        Parameters
+        ----------
+        session : slice
+            Of :attr:`sessions`.
+
+        Raises
+        ------
+        InputError
+            If the visibilities are none that voltages have.
+        """
+        level = self.disturbances.level
+        changes = np.flatnonzero((level[1:] != level[:-1]).any(axis=1)) + 1
+        ends = sorted({*range(session.start, session.stop, BLOCK), session.stop, *changes.tolist()})
+        ends = [end for end in ends if session.start <= end <= session.stop]
+        blocks = [slice(a, b) for a, b in pairwise(ends)]
+        together = 2 * processors()
+        for k in range(0, len(blocks), together):
+            yield from in_threads(self._block, blocks[k : k + together])
+
+    def spectra(self, rows: slice) -> Float[np.ndarray, "products _ channels"]:
+        """Return the spectra of all channels without noise or disturbances, in V^2/Hz."""
+        return self._spectra(self.visibilities[..., rows])
+
+    def _block(self, rows: slice) -> Float32[np.ndarray, "_ products bins"]:
+        t = to_matrix(self.spectra(rows))
+        self.disturbances.add(t, rows, self.frames)
+        if self.section.radiometer:
+            generator = np.random.default_rng([self.scenario.seed, 2, rows.start])
+            factor = self.scenario.noise.radiometer.factor
+            t = sample_covariances(t, self.frames / factor, generator)
+        levels = "".join(self.disturbances.level[rows.start])
+        counts = self._counting(levels)(to_real(t), self._telemetry(rows))
+        saturated = self.disturbances.saturated[rows]
+        counts[saturated] *= SATURATED
+        bitslice = np.broadcast_to(self._slices[levels], counts.shape[:2])
+        found = rounded(counts, bitslice)
+        found[self.disturbances.absent[rows]] = np.nan
+        return found
+
+    @cached_property
+    def _slices(self) -> dict[str, Int[np.ndarray, " products"]]:
+        """Bit slices for each state of the gains."""
+        first, at = slice(0, 1), self._telemetry(slice(0, 1))
+        states = {"".join(one) for one in np.unique(self.disturbances.level, axis=0)}
+        return {
+            levels: bit_slices(self._counting(levels)(self.spectra(first), at)) for levels in states
+        }
+
+    def _counting(self, levels: str) -> Counting:
+        sign = int(CONVENTIONS[flight_of(self.scenario).convention])
+        return Counting(self.table, levels, self.section.navgf, self.origin, sign)
+
+    def _telemetry(self, rows: slice) -> Mapping[str, Float[np.ndarray, " _"]]:
+        hours = self._hours[rows]
+        return {
+            name: mean + amplitude * np.sin(2.0 * np.pi * hours / period_h)
+            for name, (mean, amplitude, period_h) in TELEMETRY.items()
+        }
+
+
+def flight_of(scenario: Scenario) -> FlightSection:
+    """Return what a scenario says about flight data; defaults if it says nothing."""
+    return scenario.flight or FlightSection()
+
+
+def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightSimulation:
+    """Simulate sessions of a scenario.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of one frequency, or several.
+    stages : Stages, optional
+        Told how far it is.
+
+    Raises
+    ------
+    InputError
+        If the beams know no volts, the scenario's samples are no spectra, the gain table cannot be
+        read, or the scenario has noise that no spectra have.
+    """
+    stages = stages or Stages()
+    flight = flight_of(scenario)
+    section = flight.simulated or FlightSimulatedSection()
+    _require_own_noise(scenario, flight)
+    step_s = scenario.observation.step_s
+    if step_s < FRAME_S:
+        raise InputError(
+            f"a frame of the spectrometer lasts {FRAME_S:g} s, and a sample {step_s:g} s; use a "
+            "longer observation.step_s (42 s in flight)"
+        )
+    shift = int(np.floor(np.log2(step_s / FRAME_S * (1.0 + 1e-12))))
+    table = synthetic_gains()
+    if flight.gain_table is not None:
+        table = read_gain_table(flight.gain_table, flight.gain_model)
+    observation = spectra_observation(scenario, FRAME_S * 2.0**shift)
+    origin = flight.bin_origin or "centre"
+    nodes = np.array(scenario.frequencies_mhz or (scenario.frequency_mhz,))
+    visibilities = true_visibilities(scenario, observation, stages)
+    hours = observation.hours
+    made = Disturbances.drawn(section, hours - hours[0], step_s, origin, scenario.seed)
+    mjd = float(np.floor(observation.times[0].mjd)) - CLOCK_DAYS
+    clock = Clock("the simulation", MJD_ZERO, mjd, "utc", CLOCK_S)
+    return FlightSimulation(
+        scenario,
+        section,
+        observation,
+        nodes,
+        visibilities,
+        made,
+        table,
+        origin,
+        shift,
+        clock,
+    )
+
+
+def _require_own_noise(scenario: Scenario, flight: FlightSection) -> None:
+    radiometer = scenario.noise.radiometer
+    if radiometer.duty_cycle != 1.0 or radiometer.log_factor_std is not None:
+        raise InputError(
+            "the noise of spectra is that of the frames they average; leave out duty_cycle and "
+            "log_factor_std of noise.radiometer"
+        )
+    if flight.filter_taps:
+        raise InputError(
+            "channels of simulated spectra share no noise, and flight.filter_taps says that they "
+            "do; set it to 0"
+        )

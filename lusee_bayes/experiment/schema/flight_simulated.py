@@ -1,0 +1,89 @@
+"""Sessions of the spectrometer that are simulated: their layout, and what disturbs them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from lusee_bayes.experiment.schema.section import Frequency, Positive, Section
+
+Share = Annotated[float, Field(ge=0, le=0.5)]
+Levels = Annotated[str, Field(pattern="^[LMH]{4}$")]
+
+
+class FlightSimulatedSection(Section):
+    """Sessions that ``simulate --flight`` writes; by default nothing disturbs them.
+
+    Attributes
+    ----------
+    layout : {3, 4}
+        Of luseepy's ingest.
+    kind : {"hdf5", "fits"}
+        Of file; FITS is of layout 3.
+    navgf : {1, 2, 3, 4}
+        Averaging over channels.
+    levels : str
+        Gains of the four ports, of L, M and H.
+    session_h : float
+        Length of a session.
+    clock : {"known", "unknown"}
+        Whether the files say which UTC their clock stands for; if not, a clock file does.
+    radiometer : bool
+        Add the radiometer noise of every channel.
+    switch_h : float
+        When the gains change to ``switch_levels``, from the beginning of the observation.
+    switch_levels : str
+        Gains from then on.
+    absent_share : float
+        Share of the spectra that lack one of the products.
+    saturated_share : float
+        Share of the spectra in which the ADCs are at their ends.
+    tones_mhz : tuple of float
+        Frequencies of tones, each in one channel.
+    tone_share : float
+        Share of the spectra that have the tones.
+    tone_factor : float
+        Power of a tone, in multiples of the radiometer noise of a channel.
+    comb_share : float
+        Share of the spectra in which the calibrator's comb is on.
+    comb_factor : float
+        Power of each of its lines, in multiples of the radiometer noise of a channel.
+    burst_every_h : float
+        Mean time from burst to burst, as those of Jupiter and the Sun.
+    burst_s : float
+        Length of the longest; the shortest last for a spectrum.
+    burst_factor : float
+        Power of a burst, in multiples of the radiometer noise of a spectrum in 1 MHz.
+    """
+
+    layout: Literal[3, 4] = 3
+    kind: Literal["hdf5", "fits"] = "hdf5"
+    navgf: Literal[1, 2, 3, 4] = 1
+    levels: Levels = "MMMM"
+    session_h: Positive = 24.0
+    clock: Literal["known", "unknown"] = "known"
+    radiometer: bool = True
+    switch_h: Positive | None = None
+    switch_levels: Levels = "LLLL"
+    absent_share: Share = 0.0
+    saturated_share: Share = 0.0
+    tones_mhz: Annotated[tuple[Frequency, ...], Field(max_length=100)] = ()
+    tone_share: Share = 0.1
+    tone_factor: Positive = 30.0
+    comb_share: Share = 0.0
+    comb_factor: Positive = 3.0
+    burst_every_h: Positive | None = None
+    burst_s: Positive = 600.0
+    burst_factor: Positive = 30.0
+
+    @model_validator(mode="after")
+    def _layouts_have_what_they_need(self) -> FlightSimulatedSection:
+        if self.layout == 4 and self.kind == "fits":
+            raise ValueError("layout 4 is HDF5 here; use kind: hdf5, or layout: 3")
+        if self.layout == 4 and self.clock == "unknown":
+            raise ValueError(
+                "telemetry of layout 4 has a clock of its own, which nothing ties to the spectra "
+                "where the clock is unknown; use layout: 3, or clock: known"
+            )
+        return self
