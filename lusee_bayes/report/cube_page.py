@@ -9,6 +9,7 @@ from lusee_bayes.core.reading import entries, read_json
 from lusee_bayes.linear.fit import stands_out
 from lusee_bayes.report import head, html
 from lusee_bayes.report.cube_explorer import cube_explorer
+from lusee_bayes.report.flight_section import SECTION, flight_section, is_flight
 from lusee_bayes.report.run_details import details
 from lusee_bayes.results.cube_fit import N_TESTS
 from lusee_bayes.results.saved import (
@@ -91,14 +92,16 @@ def cube_page(folder: Path, name: str) -> str:
     parts["chi2"] = [_tests(folder, summary), *parts["chi2"], _table(channels)]
     if "coverage" in channels[0]:
         parts["maps"].append(_coverage(folder, channels))
+    sections = [*SECTIONS[:-2], SECTION, *SECTIONS[-2:]] if is_flight(folder) else SECTIONS
     return html.page(
         title,
         [
-            html.contents(SECTIONS),
+            html.contents(sections),
             head.verdict(summary["level"], summary["verdict"]),
             head.doubts(folder / "summary.json", summary),
             head.about(folder, channel_words),
             *(html.section(*anchors[name], *inside) for name, inside in parts.items()),
+            *([flight_section(folder)] if is_flight(folder) else []),
             html.section(*SECTIONS[-2], head.downloads(folder), head.citation(folder)),
             html.section(*SECTIONS[-1], *details(folder, summary)),
         ],

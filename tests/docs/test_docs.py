@@ -31,7 +31,7 @@ def run_command(line: str) -> None:
     """Run a line of a page at a small size."""
     program, *arguments = shlex.split(line, comments=True)
     assert program == "lusee-bayes"
-    if arguments[0] in ("simulate", "map", "sample", "plan"):
+    if arguments[0] in ("simulate", "map", "reduce", "sample", "plan"):
         arguments += SMALL
     if arguments[0] == "average":
         arguments[arguments.index("--to") + 1] = "3d"
