@@ -30,7 +30,7 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "by the scenario. map does the same with --data SESSION..., for its own frequencies.",
         (
             "lusee-bayes reduce first_light.yaml session_*.h5 --frequencies 5:50:1 -o reduced.nc",
-            "lusee-bayes map first_light.yaml --data reduced.nc --frequencies 5:50:1",
+            "lusee-bayes reduce first_light.yaml session.h5 --clock clock.json -o reduced.nc",
         ),
     ),
     "map": (
@@ -41,6 +41,7 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "lusee-bayes map fiducial --data data.nc -o output/measured",
             "lusee-bayes map fiducial --data waterfall.fits --set beam.file=beam.fits",
             "lusee-bayes map first_light.yaml --data session_*.h5 --clock clock.json",
+            "lusee-bayes map first_light.yaml --data reduced.nc --frequencies 5:50:1",
             "lusee-bayes map fiducial --frequencies 5:50:1 --joint --draws 20 -o output/cube",
             "lusee-bayes map fiducial --data second_cycle.nc --onto output/first_cycle",
         ),

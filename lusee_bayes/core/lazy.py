@@ -30,6 +30,7 @@ class LazyModule:
 healpy = LazyModule("healpy")
 coordinates = LazyModule("astropy.coordinates")
 numpyro = LazyModule("numpyro")
+interpolate = LazyModule("scipy.interpolate")
 special = LazyModule("scipy.special")
 # an optional extra
 pyuvdata = LazyModule("pyuvdata")

@@ -207,7 +207,7 @@ def test_rounds_find_the_mode_and_the_first_order_does_not(experiment):
     # every unknown, and every direction of them
     assert np.abs(off(found) / std).max() < 0.05
     assert np.abs(root @ off(found)).max() < 0.05
-    around = Around(experiment.data)
+    around = Around(experiment.data, seen=d)
     model, unknowns = model_about(setup, around)
     first = Inference(model, unknowns, model.condition(d), 1, around)
     assert np.abs(off(first) / std).max() > 1.0

@@ -20,10 +20,10 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import CubicSpline
 
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.lazy import interpolate
 from lusee_bayes.instrument.flight.session import TELEMETRY
 from lusee_bayes.instrument.flight.spectrometer import LEVELS, PORTS
 
@@ -73,9 +73,9 @@ class GainTable:
             raise InputError(f"{self.path}: the frequencies of the gains do not grow")
 
     @cached_property
-    def _splines(self) -> dict[tuple[int, int], CubicSpline]:
+    def _splines(self) -> dict[tuple[int, int], interpolate.CubicSpline]:
         return {
-            (level, port): CubicSpline(
+            (level, port): interpolate.CubicSpline(
                 self.anchor_mhz[level, port],
                 np.vstack([self.mean[level, port], self.component[level, port]]).T,
                 extrapolate=False,

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.special import ndtri
+
+from lusee_bayes.core.lazy import special
 
 # of the points beyond the threshold, those within this share of the worst go in one round
 WORST = 0.5
@@ -28,7 +29,7 @@ def threshold(false_alarm: float, n_tests: int) -> float:
     n_tests : int
         Tests that a point has to pass, on both sides.
     """
-    return float(-ndtri(false_alarm / (2.0 * n_tests)))
+    return float(-special.ndtri(false_alarm / (2.0 * n_tests)))
 
 
 def outliers(

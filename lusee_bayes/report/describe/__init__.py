@@ -10,7 +10,6 @@ from pkgutil import resolve_name
 from lusee_bayes.core import formats
 from lusee_bayes.core.fits_files import has_words, image_names, is_fits
 from lusee_bayes.core.reading import reading, require_file
-from lusee_bayes.instrument.flight.sessions import is_session
 
 # the package's own netCDF files, by their attribute ``format``. What describes a kind is named by
 # path and imported when there is such a file: each needs libraries that others do not
@@ -38,6 +37,10 @@ def _is_compact(path: Path) -> bool:
         return "directions.npy" in file.namelist()
 
 
+def _is_session(path: Path) -> bool:
+    return bool(resolve_name("lusee_bayes.instrument.flight.sessions:is_session")(path))
+
+
 # other files: how each kind is recognised; what is none of them is a sky
 KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
     (_has_image("h_theta_real"), "beam_files:describe_response"),
@@ -45,7 +48,7 @@ KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
     (_has_image("e_theta_real", "product_beam"), "beam_files:describe_sampled_beams"),
     (lambda path: has_words(path, formats.UVBEAM_WORDS), "beam_files:describe_sampled_beams"),
     (_has_image("combinations", "products"), "data_files:describe_waterfall"),
-    (is_session, "flight:describe_session"),
+    (_is_session, "flight:describe_session"),
     (_is_compact, "compact:describe_compact"),
     (lambda path: True, "skies:describe_sky"),
 )
