@@ -1,0 +1,80 @@
+"""Times that do not fit what all others predict are found, and no others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.leave_out import NOT_JUDGED, TOO_MANY, fitting, without
+from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.testing import assert_refused
+
+FALSE_ALARM = 1e-4
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    """A fifth of a lunar day, noise of all products together."""
+    changes = ["lmax=6", "observation.runs.0.cycles=0.2", "noise.radiometer.form=exact"]
+    return build(load_scenario("fiducial", changes))
+
+
+def with_bursts(experiment, times, strength):
+    """All products of some times off by so many standard deviations of their noise."""
+    data = experiment.data
+    std = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
+    rng = np.random.default_rng(5)
+    off = np.where(np.isin(data.layout.time, times), strength * rng.standard_normal(std.size), 0.0)
+    return replace(data, data=np.asarray(data.data) + off * std)
+
+
+def test_clean_data_are_left_as_they_are(experiment):
+    """65 times, 30 data sets: 0.2 false alarms are expected."""
+    setup, flagged = experiment.setup, 0
+    for seed in range(30):
+        noise = np.asarray(radiometer(setup).sample(jax.random.key(seed)))
+        signal = setup.layout.gather(setup.signal)
+        data = replace(experiment.data, data=np.asarray(signal) + noise)
+        found = fitting(setup, data, FALSE_ALARM)
+        assert found.remark == "" or found.flagged.any()
+        flagged += int(found.flagged.sum())
+    assert flagged <= 3
+
+
+@pytest.mark.parametrize("strength", [6.0, 1e3])
+@pytest.mark.parametrize("times", [[7], [20, 21, 22], [0, 30, 64]])
+def test_bad_times_are_found(experiment, times, strength):
+    data = with_bursts(experiment, times, strength)
+    found = fitting(experiment.setup, data, FALSE_ALARM)
+    assert np.flatnonzero(found.flagged).tolist() == times
+    assert f"{len(times)} of 65 times" in found.remark
+    # what is left is what clean data without these times are
+    setup, kept = without(experiment.setup, data, found.flagged)
+    assert kept.layout.size == data.layout.size - 16 * len(times)
+    assert setup.layout is setup.instrument.layout
+    untouched = np.flatnonzero(~np.isin(data.layout.time, times))
+    np.testing.assert_array_equal(kept.data, np.asarray(experiment.data.data)[untouched])
+
+
+def test_noise_that_is_larger_than_said_is_not_the_times_fault(experiment):
+    data = with_bursts(experiment, np.arange(65), 2.0)
+    found = fitting(experiment.setup, data, FALSE_ALARM)
+    assert not found.flagged.any()
+    assert found.remark == TOO_MANY
+
+
+def test_what_cannot_be_judged_is_said(experiment, monkeypatch):
+    monkeypatch.setattr("lusee_bayes.experiment.leave_out.leave_out", lambda *_: None)
+    found = fitting(experiment.setup, experiment.data, FALSE_ALARM)
+    assert not found.flagged.any()
+    assert found.remark == NOT_JUDGED
+
+
+def test_not_all_times_can_go(experiment):
+    gone = np.ones(65, dtype=bool)
+    assert_refused(lambda: without(experiment.setup, experiment.data, gone))
