@@ -18,13 +18,18 @@ from outcomes import SCALE, require_answer
 import lusee_bayes as lb
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.beams import read_beam, sampled_beams, write_sampled_beams
+from lusee_bayes.instrument.flight.gain_files import read_gain_table
+from lusee_bayes.instrument.flight.reduced_file import read_reduced, write_reduced
+from lusee_bayes.instrument.flight.sessions import read_session
 from lusee_bayes.instrument.visibilities_file import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.linear.compact import read_compact
 from lusee_bayes.report.describe import describe
 from lusee_bayes.results.updatable import read_updatable
+from lusee_bayes.runs.flight_run import run_simulate_flight
 from lusee_bayes.sky import write_alms
 from lusee_bayes.testing import small_scenario
 
@@ -50,6 +55,12 @@ def read_onto(path: Path) -> object:
         shutil.rmtree(folder)
 
 
+def read_spectra(path: Path) -> object:
+    session = read_session(path)
+    with session.spectra() as read:
+        return read(0, session.n_rows)
+
+
 READERS = {
     "visibilities.nc": (describe, read_visibilities),
     "windows.nc": (describe, read_visibilities),
@@ -70,6 +81,11 @@ READERS = {
     "alm.fits": (describe, read_sky),
     "alms.npz": (describe, read_sky),
     "sky.hdf5": (describe, read_sky),
+    "session.h5": (describe, read_spectra),
+    "session_4.h5": (describe, read_spectra),
+    "session.fits": (describe, read_spectra),
+    "reduced.nc": (describe, lambda path: read_reduced(path).at(25.0, np.ones(4))),
+    "gains.nc": (describe, read_gain_table),
 }
 
 LUSEEPYS = {
@@ -107,9 +123,24 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
     write_alms(folder / "alm.fits", np.arange(1.0, 10.0), {"FREQ": 25.0})
     alm = np.ones((2, 6), dtype=complex)
     np.savez(folder / "alms.npz", freq=np.array([20.0, 25.0]), alm=alm)
+    write_sessions(folder)
     with h5py.File(folder / "sky.hdf5", "w") as file:
         file["smooth_absorb"] = np.linspace(1.0, 2.0, 192)
     return folder
+
+
+def write_sessions(folder: Path) -> None:
+    """Three spectra in every layout, and what is made of them."""
+    flight = "flight={per_kelvin_v2_hz: 1e-21, simulated: {layout: %d, kind: %s}}"
+    size = ["observation.step_s=900", "observation.runs=[{cycles: 0.0012}]"]
+    for layout, kind, name in ((3, "hdf5", "session.h5"), (4, "hdf5", "session_4.h5"),
+                               (3, "fits", "session.fits")):  # fmt: skip
+        scenario = load_scenario("fiducial", ["lmax=2", *size, flight % (layout, kind)])
+        made = run_simulate_flight(scenario, folder / name.replace(".", "_"))
+        shutil.copy(made.sessions[0], folder / name)
+    known = load_scenario(str(made.scenario), ["observation.average_s=null"])
+    write_reduced(folder / "reduced.nc", reduce_files(list(made.sessions), known))
+    shutil.copy(made.scenario.parent / "gains.nc", folder / "gains.nc")
 
 
 @pytest.fixture(scope="session")
