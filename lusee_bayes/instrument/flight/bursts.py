@@ -42,7 +42,7 @@ def burst_flags(
     autos : (rows, ports) array
         Of a band.
     noise : (rows, ports) array
-        Their standard deviations.
+        Their standard deviations; infinite for autos that are absent.
     good : (rows,) array of bool
         Spectra to be looked at.
     false_alarm : float
@@ -56,6 +56,7 @@ def burst_flags(
     """
     flagged, scatter = np.zeros(len(seconds), dtype=bool), []
     limit = threshold(false_alarm, n_tests(autos.shape[1]))
+    autos = _filled(seconds, autos, np.isfinite(noise) & good[:, None])
     for at in _spans(seconds):
         if good[at].sum() < LEAST:
             continue
@@ -63,6 +64,19 @@ def burst_flags(
         flagged[at] = here
         scatter.append(scale)
     return flagged, np.array(scatter)
+
+
+def _filled(
+    seconds: Float[np.ndarray, " rows"],
+    autos: Float[np.ndarray, "rows ports"],
+    known: Bool[np.ndarray, "rows ports"],
+) -> Float[np.ndarray, "rows ports"]:
+    """Autos with what lies between their neighbours in place of others, so as to bend no curve."""
+    found = autos.copy()
+    for port, at in enumerate(known.T):
+        if at.any():
+            found[~at, port] = np.interp(seconds[~at], seconds[at], autos[at, port])
+    return found
 
 
 def _spans(seconds: Float[np.ndarray, " rows"]) -> list[np.ndarray]:

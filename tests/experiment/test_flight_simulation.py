@@ -1,0 +1,193 @@
+"""From a sky to counts and back: what was simulated is what the reduction finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.experiment.flight_data import reduce_files
+from lusee_bayes.experiment.flight_simulation import simulate_flight
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.instrument.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED
+from lusee_bayes.instrument.flight.spectrometer import CHANNEL_MHZ
+from lusee_bayes.noise.radiometer import exact_blocks
+from lusee_bayes.runs.flight_run import run_simulate_flight
+
+FREQUENCIES = [10.0, 25.0]
+SMALL = ["lmax=4", f"frequencies_mhz={FREQUENCIES}", "flight={per_kelvin_v2_hz: 1e-21}"]
+AUTOS = [0, 7, 12, 15]
+
+
+def simulated(folder, *more, rows=8, step_s=1800.0, average_s=None):
+    """Sessions, reduced, and the table of what is in them."""
+    cycles = (rows + 0.5) * step_s / (27.321661 * 86400.0)
+    size = [f"observation.step_s={step_s}", f"observation.runs=[{{cycles: {cycles}}}]"]
+    files = run_simulate_flight(load_scenario("fiducial", [*SMALL, *size, *more]), folder)
+    assert files.n_spectra == rows
+    average = f"observation.average_s={'null' if average_s is None else average_s}"
+    reduced = reduce_files(list(files.sessions), load_scenario(str(files.scenario), [average]))
+    with np.load(folder / "truth.npz") as truth:
+        return reduced, dict(truth)
+
+
+def relative_error(reduced, truth):
+    """Of each product, in the mean of the autos."""
+    true = truth["visibility_v2_hz"]
+    level = true[:, AUTOS].mean(axis=1, keepdims=True)
+    return np.abs((reduced.values - true) / level)
+
+
+QUIET = "flight.simulated.radiometer=false"
+# what the spectrum does within a band of 1 MHz beyond a parabola is 6e-6 at 10 MHz
+EXACT = "flight.degree=4"
+STATES = [
+    [],
+    ["flight.simulated.navgf=2", "flight.bin_origin=edge"],
+    ["flight.simulated.navgf=3", "flight.simulated.levels=LMHM"],
+    ["flight.simulated.navgf=4", "flight.convention=conj(s_i) s_j"],
+    ["flight.simulated.levels=LLLL", "flight.simulated.kind=fits", "flight.bin_origin=edge"],
+    ["flight.simulated.layout=4", "flight.simulated.session_h=1.4"],
+    ["flight.simulated.switch_h=2.2", "flight.simulated.levels=HHHH"],
+    ["flight.simulated.clock=unknown", "flight.convention=conj(s_i) s_j"],
+]
+
+
+@pytest.mark.parametrize("changes", STATES, ids=lambda one: " ".join(one) or "plain")
+def test_visibilities_come_back(tmp_path, changes):
+    reduced, truth = simulated(tmp_path, QUIET, EXACT, *changes)
+    assert relative_error(reduced, truth).max() < 1e-6
+    assert (reduced.reason == USED).all()
+    levels = {"".join(one) for one in reduced.level}
+    assert levels == {"".join(one) for one in truth["level"]}
+    assert len(levels) == (2 if "switch" in str(changes) else 1)
+
+
+def test_another_sign_or_origin_is_seen(tmp_path):
+    made, _ = simulated(tmp_path, QUIET, rows=4)
+    scenario = load_scenario(str(tmp_path / "scenario.yaml"), ["observation.average_s=null"])
+    for change in ({"convention": "conj(s_i) s_j"}, {"bin_origin": "edge"}):
+        flight = scenario.flight.model_copy(update=change)
+        other = reduce_files(
+            [tmp_path / "session_000.h5"], scenario.model_copy(update={"flight": flight})
+        )
+        off = np.abs(other.values - made.values) / made.values[:, AUTOS].mean(axis=1, keepdims=True)
+        assert off.max() > 1e-3
+
+
+def test_times_and_windows_are_those_of_the_observation(tmp_path):
+    reduced, truth = simulated(tmp_path, "flight.simulated.clock=unknown", QUIET, step_s=42.0)
+    seconds = (reduced.observation.times.mjd - truth["mjd_utc"]) * 86400.0
+    assert np.abs(seconds).max() < 1e-4
+    np.testing.assert_allclose(reduced.observation.windows.live_s, 2**20 * 40e-6, rtol=1e-12)
+    assert truth["frames"] == 2**20
+
+
+def test_receiver_noise_is_that_of_the_frames_and_channels(tmp_path):
+    reduced, truth = simulated(tmp_path, rows=300, step_s=42.0)
+    whole = 0.0
+    for band, f in enumerate(FREQUENCIES):
+        true = truth["visibility_v2_hz"][band]
+        blocks = np.array(exact_blocks(true)) / reduced.n_averaged[band][:, None, None]
+        off = (reduced.values[band] - true).T
+        chi2 = np.einsum("rp,rp->r", off, np.linalg.solve(blocks, off[..., None])[..., 0])
+        kept = reduced.reason[band] == USED
+        assert kept.mean() > 0.99
+        z = (chi2[kept].sum() / 16.0 / kept.sum() - 1.0) * np.sqrt(8.0 * kept.sum())
+        assert abs(z) < 4.0, f
+        # the spread of all products in whitened coordinates, not their sum alone
+        white = np.linalg.solve(np.linalg.cholesky(blocks[kept]), off[kept][..., None])[..., 0]
+        spread = white.T @ white / kept.sum()
+        assert np.abs(spread - np.eye(16)).max() < 5.0 * np.sqrt(2.0 / kept.sum())
+        whole += chi2[kept].sum()
+    # a band of 40 channels and a parabola: less than 40 independent samples a frame
+    assert 0.3 * 40 < reduced.n_averaged.max() / truth["frames"] < 40.0
+
+
+DISTURBED = (
+    "flight.simulated={tones_mhz: [9.8, 24.7, 25.1], tone_share: 0.1, saturated_share: 0.03, "
+    "comb_share: 0.05, burst_every_h: 1.0, burst_s: 900, absent_share: 0.02}"
+)
+
+
+def test_disturbances_are_found_and_little_else(tmp_path):
+    reduced, truth = simulated(tmp_path, DISTURBED, "seed=4", rows=500, step_s=42.0, average_s=7200)
+    saturated, tone, comb = truth["saturated"], truth["tone"], truth["comb"]
+    burst = truth["burst"] & ~saturated
+    assert min(saturated.sum(), tone.sum(), comb.sum(), burst.sum()) > 8
+    mhz = np.arange(2048) * CHANNEL_MHZ
+    for band, f in enumerate(FREQUENCIES):
+        reason = reduced.reason[band]
+        np.testing.assert_array_equal(reason == SATURATED, saturated)
+        assert (reason[burst] == BURST).mean() >= 0.95
+        assert (reason[~burst & ~saturated] == BURST).mean() <= 1e-3
+        assert not np.isin(reason, [NO_DATA, COMB]).any()
+        within = np.abs(mhz - f) <= 0.5 + 1e-9
+        injected = (tone[:, None] & truth["tone_channel"][within]) | (
+            comb[:, None] & (np.arange(2048)[within] % 4 == 2)
+        )
+        flagged = np.rint(reduced.lines[band] * within.sum())
+        rows = ~saturated
+        expected = injected.sum(axis=1)
+        found = np.minimum(flagged, expected)[rows].sum() / expected[rows].sum()
+        others = np.maximum(flagged - expected, 0)[rows].sum() / (~injected[rows]).sum()
+        assert found >= 0.95
+        assert others <= 1e-3
+    # what is left agrees with the sky
+    bins = reduced.bin_of
+    n = reduced.values.shape[2]
+    for band in range(2):
+        kept = (reduced.reason[band] == USED).astype(float)
+        true = truth["visibility_v2_hz"][band][AUTOS]
+        mean = np.array([np.bincount(bins, kept * t, n) / np.bincount(bins, kept, n) for t in true])
+        z = (reduced.values[band][AUTOS] / mean - 1.0) * np.sqrt(reduced.n_averaged[band])
+        assert np.abs(z).max() < 4.5
+
+
+def test_products_that_are_absent_are_absent(tmp_path):
+    reduced, truth = simulated(tmp_path, "flight.simulated.absent_share=0.5", QUIET, EXACT, rows=12)
+    assert truth["absent"].any()
+    gone = np.isnan(reduced.values).sum(axis=1)
+    np.testing.assert_array_equal(gone[0], truth["absent"].sum(axis=1))
+    present = np.isfinite(reduced.values)
+    assert relative_error(reduced, truth)[present].max() < 1e-6
+
+
+def test_the_same_seed_makes_the_same_disturbances_and_noise(tmp_path):
+    one, first = simulated(tmp_path / "a", DISTURBED, rows=20)
+    two, second = simulated(tmp_path / "b", DISTURBED, rows=20)
+    np.testing.assert_array_equal(one.values, two.values)
+    for name, values in first.items():
+        np.testing.assert_array_equal(values, second[name])
+
+
+@pytest.mark.parametrize(
+    "changes, text",
+    [
+        (["flight=null"], "these beams know no volts"),
+        (["noise.radiometer.duty_cycle=0.5"], "leave out duty_cycle"),
+        (["flight.filter_taps=4"], "share no noise"),
+        (["observation.step_s=1e-5", "observation.runs=[{cycles: 1e-10}]"], "a frame of"),
+        (
+            ["observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]"],
+            "the turntable turns",
+        ),
+    ],
+)
+def test_what_makes_no_sessions_is_refused(changes, text):
+    with pytest.raises(InputError, match=text):
+        simulate_flight(load_scenario("fiducial", [*SMALL, *changes]))
+
+
+@pytest.mark.parametrize(
+    "change", ["navgf=5", "levels=MMMX", "levels=MMM", "layout=2", "saturated_share=0.9"]
+)
+def test_impossible_states_are_refused(change):
+    with pytest.raises(InputError):
+        load_scenario("fiducial", [*SMALL, "flight.simulated={}", f"flight.simulated.{change}"])
+
+
+@pytest.mark.parametrize("change", ["{layout: 4, kind: fits}", "{layout: 4, clock: unknown}"])
+def test_layouts_have_what_they_need(change):
+    with pytest.raises(InputError, match="layout"):
+        load_scenario("fiducial", [*SMALL, f"flight.simulated={change}"])
