@@ -20,11 +20,12 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.products import all_products, auto_indices, to_matrix, to_real
 
 INDEX = -2.5
-# below this, spectra are held
-LOWEST_MHZ = 1.0
-# beyond the known frequencies splines go on for about this much of the logarithm: longer than a
-# band, so that nothing bends within one
-BEYOND = 0.2
+# below this share of the lowest known frequency spectra are held: what would rise further there
+# would be rounded coarsely elsewhere
+HELD_BELOW = 0.5
+# beyond the known frequencies splines go on for this much of the logarithm, longer than a band, and
+# are then held; the larger the power, the less bends before
+BEYOND, POWER = 0.2, 8
 AUTOS = auto_indices()
 FIRST = np.array([p.i for p in all_products()])
 SECOND = np.array([p.j for p in all_products()])
@@ -61,13 +62,14 @@ class ChannelSpectra:
         channels_mhz : (channels,) array
         """
         nodes = np.log(nodes_mhz)
-        at = np.log(np.maximum(channels_mhz, LOWEST_MHZ))
+        at = np.log(np.maximum(channels_mhz, HELD_BELOW * nodes_mhz[0]))
         if len(nodes) == 1:
             ones = np.ones((len(at), 1))
             return cls(ones, INDEX * (at - nodes[0]), ones)
         spline = CubicSpline(nodes, np.eye(len(nodes)))
         inside = np.clip(at, nodes[0], nodes[-1])
-        held = inside + BEYOND * np.tanh((at - inside) / BEYOND)
+        beyond = (at - inside) / BEYOND
+        held = inside + BEYOND * beyond / (1.0 + beyond**POWER) ** (1.0 / POWER)
         values = spline(held)
         autos = values + (at - held)[:, None] * spline(inside, 1)
         return cls(autos, np.zeros(len(at)), values)

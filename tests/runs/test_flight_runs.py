@@ -1,0 +1,100 @@
+"""simulate --flight, and map its sessions: the whole chain, from the command line."""
+
+from __future__ import annotations
+
+import shlex
+
+import numpy as np
+import pytest
+import yaml
+
+from lusee_bayes.cli.main import main
+from lusee_bayes.instrument.flight.sessions import read_session
+from lusee_bayes.results.saved import open_results
+
+SET = [
+    "lmax=3",
+    "frequency_mhz=20",
+    "observation.step_s=900",
+    "observation.runs=[{cycles: 0.06}]",
+    "noise.radiometer.form=exact",
+    "flight={per_kelvin_v2_hz: 1e-21}",
+]
+
+
+def simulate(folder, *more):
+    options = [option for one in (*SET, *more) for option in ("--set", one)]
+    return main(["simulate", "fiducial", "--flight", "-q", "-o", str(folder), *options])
+
+
+def files_of(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+def test_a_map_of_simulated_sessions_has_the_sky_that_was_simulated(tmp_path, capsys):
+    folder = tmp_path / "flight"
+    more = ["flight.simulated={session_h: 12, clock: unknown, switch_h: 20, navgf: 2}"]
+    options = [option for one in (*SET, *more) for option in ("--set", one)]
+    assert main(["simulate", "fiducial", "--flight", "-o", str(folder), *options]) == 0
+    names = [f"session_{k:03d}.h5" for k in range(4)]
+    known = ["clock.json", "gains.nc", "manifest.json", "scenario.yaml", *names, "truth.npz"]
+    assert files_of(folder) == known
+    # the last line is the command that maps them
+    line = capsys.readouterr().out.strip().splitlines()[-1]
+    program, *arguments = shlex.split(line)
+    assert program == "lusee-bayes"
+    assert main([*arguments, "--truth", "-q", "-o", str(tmp_path / "map")]) == 0
+    found = open_results(tmp_path / "map")
+    off = found.mean - found.truth
+    chi2 = off @ np.linalg.solve(found.covariance, off)
+    assert abs(chi2 / len(off) - 1.0) < 4.0 * np.sqrt(2.0 / len(off))
+
+
+def test_fits_and_a_gain_table_of_ones_own(tmp_path):
+    first, second = tmp_path / "a", tmp_path / "b"
+    assert simulate(first) == 0
+    assert files_of(first)[0] == "gains.nc"
+    assert simulate(second, f"flight.gain_table={first / 'gains.nc'}",
+                    "flight.simulated={kind: fits}") == 0  # fmt: skip
+    assert "gains.nc" not in files_of(second) and "clock.json" not in files_of(second)
+    scenario = yaml.safe_load((second / "scenario.yaml").read_text())
+    assert scenario["flight"]["gain_table"] == str(first / "gains.nc")
+    assert scenario["flight"]["bin_origin"] == "centre"
+    assert scenario["observation"]["timestamp"] == "middle"
+    sessions = [read_session(first / "session_000.h5"), read_session(second / "session_000.fits")]
+    counts = []
+    for session in sessions:
+        with session.spectra() as read:
+            counts.append(read(0, 5))
+    np.testing.assert_array_equal(*counts)
+
+
+def test_files_of_an_earlier_simulation_do_not_stay(tmp_path):
+    assert simulate(tmp_path / "a", "flight.simulated={session_h: 12, clock: unknown}") == 0
+    assert simulate(tmp_path / "a", "flight.simulated={kind: fits}") == 0
+    names = [f"session_{k:03d}.fits" for k in range(2)]
+    assert files_of(tmp_path / "a") == [
+        "gains.nc", "manifest.json", "scenario.yaml", *names, "truth.npz"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "changes, text",
+    [
+        (["flight={}"], "these beams know no volts"),
+        (["flight.simulated={navgf: 5}"], "navgf"),
+        (["observation.step_s=1e-6", "observation.runs=[{cycles: 1e-11}]"], "a frame of"),
+        (["flight.gain_table=nowhere.nc"], "nowhere.nc"),
+    ],
+)
+def test_what_cannot_be_simulated_is_said_in_a_sentence(tmp_path, capsys, changes, text):
+    assert simulate(tmp_path / "a", *changes) == 2
+    assert text in capsys.readouterr().err
+    assert not (tmp_path / "a").exists() or not list((tmp_path / "a").iterdir())
+
+
+def test_a_file_is_no_folder_for_sessions(tmp_path, capsys):
+    (tmp_path / "a").write_text("kept")
+    assert simulate(tmp_path / "a") == 2
+    assert "is a file" in capsys.readouterr().err
+    assert (tmp_path / "a").read_text() == "kept"
