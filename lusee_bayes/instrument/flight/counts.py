@@ -81,7 +81,9 @@ class Counting:
         root = []
         for port in range(PORTS):
             q = self.table.strengths(self.levels[port], port, telemetry)
-            root.append(np.sqrt(self._basis[port, 0] + q @ self._basis[port, 1:]))
+            gain = self._basis[port, 0] + q @ self._basis[port, 1:]
+            # where a table has none, nothing is sent
+            root.append(np.sqrt(np.maximum(gain, 0.0)))
         averaging = AVERAGING[self.navgf]
         members = averaging.channels()
         found = np.empty((spectra.shape[1], len(spectra), averaging.n_bins))
