@@ -10,7 +10,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lusee_bayes.instrument.flight.outliers import outliers, robust_scale, threshold
+from lusee_bayes.instrument.flight.outliers import (
+    MAX_ROUNDS,
+    WORST,
+    distances,
+    outliers,
+    robust_scale,
+    threshold,
+)
 
 # a polynomial of this degree takes up what the sky does within four hours, to less than the noise
 # of a spectrum: 2e-5 of what ell = 47 has
@@ -99,11 +106,15 @@ def _one_span(
     )
     values = np.where(good[:, None], autos, 0.0).T[None]
     sigma = np.where(good[:, None], noise, 1.0).T[None]
-    # a first look, robustly, says how much noise there is
-    _, z = outliers(values, sigma, good[None], x, limit)
-    scale = np.array([robust_scale(z[:, p], good[None]) for p in range(autos.shape[1])])
+    # noise from spectrum to spectrum, which a burst changes at its ends alone
+    scale = _from_neighbours(values[0] / sigma[0], good)
+    kept = _without_the_highest(values, sigma * np.maximum(scale, 1.0)[:, None], good, x, limit)
+    # and about the curve
+    z = distances(values, sigma, good[None], kept[None], x)
+    about = np.array([robust_scale(z[:, p], kept[None]) for p in range(autos.shape[1])])
+    scale = np.maximum(scale, about)
     sigma = sigma * np.maximum(scale, 1.0)[None, :, None]
-    kept = good.copy()
+    kept = _with_what_fits(values, sigma, good, kept, x, limit)
     while kept.sum() >= LEAST // 2:
         out, z = outliers(values, sigma, kept[None], x, limit)
         found = out[0] | _stretches(z[0], kept & ~out[0], limit)
@@ -111,6 +122,52 @@ def _one_span(
             break
         kept &= ~found
     return good & ~kept, float(np.median(scale))
+
+
+def _from_neighbours(
+    z: Float[np.ndarray, "ports span"], good: Bool[np.ndarray, " span"]
+) -> Float[np.ndarray, " ports"]:
+    """Standard deviation of each port, by differences of one spectrum and the next."""
+    both = (good[1:] & good[:-1])[None]
+    steps = np.diff(z, axis=1) / np.sqrt(2.0)
+    return np.array([robust_scale(port[None], both) for port in steps])
+
+
+def _without_the_highest(
+    values: Float[np.ndarray, "1 ports span"],
+    sigma: Float[np.ndarray, "1 ports span"],
+    good: Bool[np.ndarray, " span"],
+    x: Float[np.ndarray, "span terms"],
+    limit: float,
+) -> Bool[np.ndarray, " span"]:
+    """Good spectra but those above the curve, which bursts pull up when they are long."""
+    kept = good.copy()
+    for _ in range(MAX_ROUNDS):
+        z = distances(values, sigma, good[None], kept[None], x)[0].max(axis=0)
+        above = np.where(kept, z, 0.0)
+        left = kept & ~((above > limit) & (above >= WORST * above.max()))
+        if (left == kept).all() or left.sum() < LEAST // 2:
+            break
+        kept = left
+    return kept
+
+
+def _with_what_fits(
+    values: Float[np.ndarray, "1 ports span"],
+    sigma: Float[np.ndarray, "1 ports span"],
+    good: Bool[np.ndarray, " span"],
+    kept: Bool[np.ndarray, " span"],
+    x: Float[np.ndarray, "span terms"],
+    limit: float,
+) -> Bool[np.ndarray, " span"]:
+    """Spectra that are kept, and the others that lie on the curve through them."""
+    for _ in range(MAX_ROUNDS):
+        z = np.abs(distances(values, sigma, good[None], kept[None], x)[0]).max(axis=0)
+        more = kept | (good & (z <= limit))
+        if (more == kept).all():
+            break
+        kept = more
+    return kept
 
 
 def _stretches(

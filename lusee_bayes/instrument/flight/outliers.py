@@ -65,7 +65,7 @@ def outliers(
         return good & ~kept, z
     active = np.arange(len(values))
     for _ in range(MAX_ROUNDS):
-        z[active] = _distances(values[active], noise[active], good[active], kept[active], basis)
+        z[active] = distances(values[active], noise[active], good[active], kept[active], basis)
         worst = np.abs(z[active]).max(axis=1)
         among = np.where(kept[active], worst, 0.0)
         most = among.max(axis=1, keepdims=True)
@@ -82,14 +82,27 @@ def outliers(
     return good & ~kept, z
 
 
-def _distances(
+def distances(
     values: Float[np.ndarray, "rows autos points"],
     noise: Float[np.ndarray, "rows autos points"],
     good: Bool[np.ndarray, "rows points"],
     kept: Bool[np.ndarray, "rows points"],
     basis: Float[np.ndarray, "points terms"],
 ) -> Float[np.ndarray, "rows autos points"]:
-    """From the curve through the points that are kept, with the curve's own uncertainty."""
+    """Return how far points are from the curve through some of them.
+
+    Parameters
+    ----------
+    values, noise, good, basis
+        As :func:`outliers`.
+    kept : (rows, points) array of bool
+        Those that the curve goes through.
+
+    Returns
+    -------
+    (rows, autos, points) array
+        In standard deviations, the curve's own uncertainty included; 0 where not good.
+    """
     terms = basis.shape[1]
     normal = np.einsum("rk,ka,kb->rab", kept.astype(float), basis, basis, optimize=True)
     normal[kept.sum(axis=1) <= terms] = np.eye(terms)
