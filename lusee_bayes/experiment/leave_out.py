@@ -1,9 +1,9 @@
-"""Times whose data do not fit what all others predict for them, found one after the other.
+"""Data that do not fit what all others predict for them, found one after the other.
 
 Every time is left out under a prior that is wide enough for any sky (:mod:`.linear.residuals`), so
-that neither the prior nor what only that time sees is held against it. The worst are flagged, what
-is left is fitted again, and so on, until none has a chi^2 that noise gives with less than the rate
-of false alarms.
+that neither the prior nor what only that time sees is held against it. The worst are flagged, or a
+single product of theirs without which the time fits; what is left is fitted again, and so on, until
+none has a chi^2 that noise gives with less than the rate of false alarms.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ MOST = 0.2
 
 @dataclass(frozen=True)
 class Fitting:
-    """Which times do not fit.
+    """Which data do not fit.
 
     Attributes
     ----------
-    flagged : (times,) array of bool
+    flagged : (products, times) array of bool
     rounds : int
     chi2 : (times,) array
         Of each time against its prediction by the others, before anything was flagged, over its
@@ -54,14 +54,19 @@ class Fitting:
         What is to be said; empty if there is nothing.
     """
 
-    flagged: Bool[np.ndarray, " times"]
+    flagged: Bool[np.ndarray, "products times"]
     rounds: int
     chi2: Float[np.ndarray, " times"]
     remark: str = ""
 
+    @property
+    def times(self) -> Bool[np.ndarray, " times"]:
+        """Times of which every product is flagged."""
+        return self.flagged.all(axis=0)
+
 
 def fitting(setup: Setup, data: Visibilities, false_alarm: float) -> Fitting:
-    """Find times that do not fit.
+    """Find data that do not fit.
 
     Parameters
     ----------
@@ -69,65 +74,114 @@ def fitting(setup: Setup, data: Visibilities, false_alarm: float) -> Fitting:
     data : Visibilities
         Measured.
     false_alarm : float
-        Chance that a time of noise alone is flagged.
+        Chance that a time of noise alone is flagged, or one of its products.
 
     Returns
     -------
     Fitting
         With nothing flagged, and a remark, if so many times do not fit that it is not them.
     """
-    n = data.layout.n_times
-    gone, nothing, before = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), np.zeros(n)
+    shape = (data.layout.n_products, data.layout.n_times)
+    gone, nothing, before = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool), None
     here = setup, data
     for rounds in range(1, MAX_ROUNDS + 1):
-        tail, ratio = _tails(*here)
-        if tail is None:
-            return Fitting(nothing, rounds, before, NOT_JUDGED)
-        if rounds == 1:
-            before = ratio
-        out = (tail < false_alarm) & (ratio >= 1.0 + WORST * (ratio.max() - 1.0))
+        found = _compared(*here)
+        if found is None:
+            return Fitting(nothing, rounds, np.zeros(shape[1]), NOT_JUDGED)
+        before = found.ratio if before is None else before
+        out = found.worst(false_alarm)
         if not out.any():
             return Fitting(gone, rounds, before, _remark(gone, false_alarm))
         gone |= out
-        if gone.sum() > max(MOST * n, 1.0):
+        if gone.any(axis=0).sum() > max(MOST * shape[1], 1.0):
             break
         here = without(setup, data, gone)
     return Fitting(nothing, rounds, before, TOO_MANY)
 
 
-def _remark(gone: Bool[np.ndarray, " times"], false_alarm: float) -> str:
-    if not gone.any():
+def _remark(gone: Bool[np.ndarray, "products times"], false_alarm: float) -> str:
+    whole, n = gone.all(axis=0), gone.shape[1]
+    single = int(gone[:, ~whole].sum())
+    parts = []
+    if whole.any():
+        parts.append(f"{int(whole.sum())} of {n} times")
+    if single:
+        parts.append(f"{single} single value" + ("s" if single > 1 else ""))
+    if not parts:
         return ""
-    n = len(gone)
     return (
-        f"{int(gone.sum())} of {n} times do not fit what the others predict, and are left out "
-        f"(noise alone would do so to {n * false_alarm:.2g})."
+        f"{' and '.join(parts)} do not fit what the others predict, and are left out (noise alone "
+        f"would do so to {2.0 * n * false_alarm:.2g})."
     )
 
 
-def _tails(
-    setup: Setup, data: Visibilities
-) -> tuple[Float[np.ndarray, " times"] | None, Float[np.ndarray, " times"]]:
-    """Probability of each time's chi^2 or more, and chi^2 over its mean; None if not known."""
+@dataclass(frozen=True)
+class _Compared:
+    """Times and data against their prediction by all others.
+
+    chi2, degrees : (times,) arrays, of each time, with its mean; degrees 0 where there is nothing
+    to compare with; z : (products, times) array, of each datum in standard deviations, or 0
+    """
+
+    chi2: Float[np.ndarray, " times"]
+    degrees: Float[np.ndarray, " times"]
+    z: Float[np.ndarray, "products times"]
+
+    @property
+    def ratio(self) -> Float[np.ndarray, " times"]:
+        return np.where(self.degrees > 0.0, self.chi2 / np.maximum(self.degrees, 0.5), 0.0)
+
+    def worst(self, false_alarm: float) -> Bool[np.ndarray, "products times"]:
+        """The worst of what stands out: whole times, or a value without which its time fits.
+
+        chi^2 of a time less z^2 of one of its data is that of its other data.
+        """
+        squares = self.z**2
+        most, product = squares.max(axis=0), squares.argmax(axis=0)
+        judged = self.degrees > 0.0
+        tail = _tail(self.chi2, self.degrees)
+        single = np.where(judged, special.chdtrc(1.0, most), 1.0) * len(squares)
+        out = (tail < false_alarm) | (single < false_alarm)
+        size = np.maximum(self.ratio, most / len(squares))
+        out &= size >= WORST * size.max()
+        rest = _tail(self.chi2 - most, self.degrees - 1.0)
+        alone = out & (self.degrees > 1.5) & (rest >= false_alarm)
+        found = np.broadcast_to(out & ~alone, squares.shape).copy()
+        found[product[alone], np.flatnonzero(alone)] = True
+        return found
+
+
+def _tail(
+    chi2: Float[np.ndarray, " times"], degrees: Float[np.ndarray, " times"]
+) -> Float[np.ndarray, " times"]:
+    """Probability of this chi^2 or more; 1 where there are no degrees of freedom."""
+    some = degrees > 0.0
+    found = special.chdtrc(np.where(some, degrees, 1.0), np.maximum(chi2, 0.0))
+    return np.where(some, found, 1.0)
+
+
+def _compared(setup: Setup, data: Visibilities) -> _Compared | None:
+    """Leave out every time; None if that is not possible."""
     model, posterior = on_host(_conditioned(setup, data))
     wide = _wide(posterior, model.n_data)
     left_out = leave_out(replace(model, prior=wide.prior), wide, data)
-    n = data.layout.n_times
     if left_out is None:
-        return None, np.ones(n)
+        return None
+    n = data.layout.n_times
     counts = np.bincount(data.layout.time, minlength=n)
     some = np.flatnonzero(counts)
     times = np.arange(n)
     missed = in_threads(lambda k: left_out.stretch(times == k), some.tolist())
-    found = np.array([m.chi2 for m in missed])
+    chi2, degrees = np.zeros(n), np.zeros(n)
+    chi2[some] = [m.chi2 for m in missed]
     new = np.array([m.directions for m in missed])
-    degrees = counts[some] - np.clip(new, 0.0, counts[some])
+    degrees[some] = counts[some] - np.clip(new, 0.0, counts[some])
     # where the others tell less than half a datum, there is nothing to compare with
-    judged = degrees > 0.5
-    tail, ratio = np.ones(n), np.zeros(n)
-    tail[some[judged]] = special.chdtrc(degrees[judged], found[judged])
-    ratio[some[judged]] = found[judged] / degrees[judged]
-    return tail, ratio
+    degrees[degrees < 0.5] = 0.0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        z = left_out.u / np.sqrt(left_out.inverse_diagonal)
+    known = np.asarray(data.layout.present) & np.isfinite(z) & (degrees > 0.0)
+    return _Compared(chi2, degrees, np.where(known, z, 0.0))
 
 
 def _conditioned(setup: Setup, data: Visibilities) -> tuple[LinearGaussian, Posterior]:
@@ -153,9 +207,9 @@ def _wide(posterior: Posterior, n_data: int) -> Posterior:
 
 
 def without(
-    setup: Setup, data: Visibilities, gone: Bool[np.ndarray, " times"]
+    setup: Setup, data: Visibilities, gone: Bool[np.ndarray, "products times"]
 ) -> tuple[Setup, Visibilities]:
-    """Setup and data without some times.
+    """Setup and data without some of the data.
 
     Raises
     ------

@@ -161,13 +161,13 @@ def _run_single(
 
 
 def _as_used(reduced: Reduced, experiment: Experiment) -> Reduced:
-    """Reduced spectra without the times that did not fit."""
+    """Reduced spectra without what did not fit."""
     if experiment.fitting is None or not experiment.fitting.flagged.any():
         return reduced
     band = reduced.band(experiment.scenario.frequency_mhz)
-    bins = np.zeros(reduced.values.shape[2], dtype=bool)
-    bins[reduced.bins_at(band)[experiment.fitting.flagged]] = True
-    return reduced.without(band, bins)
+    values = np.zeros(reduced.values.shape[1:], dtype=bool)
+    values[:, reduced.bins_at(band)] = experiment.fitting.flagged
+    return reduced.without(band, values)
 
 
 def _one_file(

@@ -70,7 +70,7 @@ def test_what_the_comb_spoils_and_nothing_else_is_left_out(mapped, truth):
     saturated = {(s, int(r)) for s, r in truth["saturated"]}
     names = [(s, int(r)) for s, r in zip(truth["session"], truth["row"], strict=True)]
     times = [name for name in names if name not in saturated]
-    flagged = [times[k] for k in np.flatnonzero(experiment.fitting.flagged)]
+    flagged = [times[k] for k in np.flatnonzero(experiment.fitting.times)]
     assert flagged == comb
     assert "3 of 124 times" in experiment.fitting.remark
 
@@ -164,7 +164,7 @@ def test_gains_that_are_off_are_found_and_the_map_holds(flight, monkeypatch):
     monkeypatch.setattr("lusee_bayes.experiment.flight_data.read_gain_table", off)
     known = scenario_of(flight, "flight.gain_std=0.01", "noise.gain_table={}")
     experiment = build(known, read_data(files(flight), known))
-    assert experiment.fitting.flagged.sum() == 3
+    assert experiment.fitting.times.sum() == 3
     found = infer(experiment)
     sky = np.asarray(experiment.setup.sky.modes)
     off_by = found.posterior.whiten(sky[None])[0]

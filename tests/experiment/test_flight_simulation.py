@@ -151,7 +151,7 @@ def test_bursts_of_an_hour_are_found_and_little_else(tmp_path):
         tmp_path, bursts, "seed=6", "frequencies_mhz=[10]", rows=674, step_s=42.0, average_s=7200
     )
     burst = truth["burst"]
-    print(burst.sum(), [burst[a:b].mean() for a,b in ((0,337),(337,674))])
+    print(burst.sum(), [burst[a:b].mean() for a, b in ((0, 337), (337, 674))])
     assert (reduced.reason[0][burst] == BURST).mean() >= 0.95
     assert (reduced.reason[0][~burst] == BURST).mean() <= 1e-3
 

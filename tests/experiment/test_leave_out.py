@@ -42,7 +42,7 @@ def test_clean_data_are_left_as_they_are(experiment):
         data = replace(experiment.data, data=np.asarray(signal) + noise)
         found = fitting(setup, data, FALSE_ALARM)
         assert found.remark == "" or found.flagged.any()
-        flagged += int(found.flagged.sum())
+        flagged += int(found.flagged.any(axis=0).sum())
     assert flagged <= 3
 
 
@@ -51,7 +51,8 @@ def test_clean_data_are_left_as_they_are(experiment):
 def test_bad_times_are_found(experiment, times, strength):
     data = with_bursts(experiment, times, strength)
     found = fitting(experiment.setup, data, FALSE_ALARM)
-    assert np.flatnonzero(found.flagged).tolist() == times
+    assert np.flatnonzero(found.times).tolist() == times
+    assert found.flagged.sum() == 16 * len(times)
     assert f"{len(times)} of 65 times" in found.remark
     # what is left is what clean data without these times are
     setup, kept = without(experiment.setup, data, found.flagged)
@@ -59,6 +60,18 @@ def test_bad_times_are_found(experiment, times, strength):
     assert setup.layout is setup.instrument.layout
     untouched = np.flatnonzero(~np.isin(data.layout.time, times))
     np.testing.assert_array_equal(kept.data, np.asarray(experiment.data.data)[untouched])
+
+
+def test_a_single_bad_value_is_found_alone(experiment):
+    """Of one product at one time: the other products of the time stay."""
+    data = experiment.data
+    std = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
+    bad = np.flatnonzero((data.layout.product == 9) & (data.layout.time == 31))
+    values = np.asarray(data.data).copy()
+    values[bad] += 40.0 * std[bad]
+    found = fitting(experiment.setup, replace(data, data=values), FALSE_ALARM)
+    assert np.argwhere(found.flagged).tolist() == [[9, 31]]
+    assert found.remark.startswith("1 single value")
 
 
 def test_noise_that_is_larger_than_said_is_not_the_times_fault(experiment):
@@ -76,5 +89,5 @@ def test_what_cannot_be_judged_is_said(experiment, monkeypatch):
 
 
 def test_not_all_times_can_go(experiment):
-    gone = np.ones(65, dtype=bool)
+    gone = np.ones((16, 65), dtype=bool)
     assert_refused(lambda: without(experiment.setup, experiment.data, gone))

@@ -271,9 +271,11 @@ def test_files_of_reduced_spectra_hold_all(reduced, tmp_path):
 
 
 def test_bins_that_do_not_fit_are_taken_out(reduced):
-    bins = np.zeros(reduced.values.shape[2], dtype=bool)
-    bins[[3, 108]] = True
-    less = reduced.without(0, bins)
+    gone = np.zeros(reduced.values.shape[1:], dtype=bool)
+    gone[:, [3, 108]] = True
+    gone[5, 7] = True
+    less = reduced.without(0, gone)
+    assert np.isnan(less.values[0, 5, 7])
     n_before, n_after = (one.at(10.0, np.ones(4)).layout.n_times for one in (reduced, less))
     assert n_after == n_before - 2
     assert (less.reason[0][[3, 108]] == NO_FIT).all()

@@ -257,21 +257,15 @@ class Reduced(Described):
             found += [(f"{level}{port} PC{r + 1}", std[r] * slope[r]) for r in range(len(std))]
         return found
 
-    def without(self, band: int, bins: Bool[np.ndarray, " bins"]) -> Reduced:
-        """Return the same without some bins of a band, which do not fit the map."""
+    def without(self, band: int, gone: Bool[np.ndarray, "products bins"]) -> Reduced:
+        """Return the same without some values of a band, which do not fit the map."""
         values, n_averaged, reason = self.values.copy(), self.n_averaged.copy(), self.reason.copy()
-        values[band][:, bins] = np.nan
+        values[band][gone] = np.nan
+        bins = ~np.isfinite(values[band]).any(axis=0)
         n_averaged[band, bins] = 0.0
-        gone = bins[self.bin_of] & (reason[band] == USED)
-        reason[band, gone] = NO_FIT
-        return Reduced(
-            **{
-                **self.__dict__,
-                "values": values,
-                "n_averaged": n_averaged,
-                "reason": reason,
-            }
-        )
+        reason[band, bins[self.bin_of] & (reason[band] == USED)] = NO_FIT
+        changed = {"values": values, "n_averaged": n_averaged, "reason": reason}
+        return Reduced(**{**self.__dict__, **changed})
 
 
 def _one_run_an_angle(observation: Observation) -> Observation:
