@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from lusee_bayes.instrument.flight.outliers import (
     MAX_ROUNDS,
     WORST,
+    curves,
     distances,
     outliers,
     robust_scale,
@@ -121,6 +122,7 @@ def _one_span(
         if not found.any():
             break
         kept &= ~found
+    kept = _with_what_fits(values, sigma, good, kept, x, limit)
     return good & ~kept, float(np.median(scale))
 
 
@@ -160,10 +162,15 @@ def _with_what_fits(
     x: Float[np.ndarray, "span terms"],
     limit: float,
 ) -> Bool[np.ndarray, " span"]:
-    """Spectra that are kept, and the others that lie on the curve through them."""
+    """Spectra that are kept, and others on the curve through them, alone and in stretches.
+
+    Where the curve is not known well, as at the ends of a span, they come back one after the other.
+    """
     for _ in range(MAX_ROUNDS):
-        z = np.abs(distances(values, sigma, good[None], kept[None], x)[0]).max(axis=0)
-        more = kept | (good & (z <= limit))
+        curve, _ = curves(values, kept[None], x)
+        z = ((values - curve) / sigma)[0]
+        more = good & ~kept & (np.abs(z).max(axis=0) <= limit)
+        more = kept | (more & ~_stretches(z, more, limit))
         if (more == kept).all():
             break
         kept = more

@@ -103,6 +103,24 @@ def distances(
     (rows, autos, points) array
         In standard deviations, the curve's own uncertainty included; 0 where not good.
     """
+    curve, leverage = curves(values, kept, basis)
+    own = np.where(kept, 1.0 - leverage, 1.0 + leverage)
+    scale = noise * np.sqrt(np.maximum(own, 1e-3))[:, None]
+    return np.where(good[:, None], (values - curve) / scale, 0.0)
+
+
+def curves(
+    values: Float[np.ndarray, "rows autos points"],
+    kept: Bool[np.ndarray, "rows points"],
+    basis: Float[np.ndarray, "points terms"],
+) -> tuple[Float[np.ndarray, "rows autos points"], Float[np.ndarray, "rows points"]]:
+    """Return the curve through some points, and its variance in units of that of a point.
+
+    Parameters
+    ----------
+    values, kept, basis
+        As :func:`distances`.
+    """
     terms = basis.shape[1]
     normal = np.einsum("rk,ka,kb->rab", kept.astype(float), basis, basis, optimize=True)
     normal[kept.sum(axis=1) <= terms] = np.eye(terms)
@@ -110,9 +128,7 @@ def distances(
     pulled = np.einsum("rpk,ka->rpa", np.where(kept[:, None], values, 0.0), basis)
     curve = np.einsum("rab,rpb,ka->rpk", inverse, pulled, basis, optimize=True)
     leverage = np.einsum("rab,ka,kb->rk", inverse, basis, basis, optimize=True)
-    own = np.where(kept, 1.0 - leverage, 1.0 + leverage)
-    scale = noise * np.sqrt(np.maximum(own, 1e-3))[:, None]
-    return np.where(good[:, None], (values - curve) / scale, 0.0)
+    return curve, leverage
 
 
 def robust_scale(
