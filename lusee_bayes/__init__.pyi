@@ -67,6 +67,7 @@ from .sampling.calibration import calibrate_sky as calibrate_sky
 from .sampling.distributions import CorrelatedNormal as CorrelatedNormal
 from .sampling.distributions import Marginal as Marginal
 from .sampling.distributions import SkyPrior as SkyPrior
+from .sampling.distributions import TimesStudentT as TimesStudentT
 from .sampling.evidence import estimate_evidence as estimate_evidence
 from .sampling.hmc import Sampler as Sampler
 from .sampling.hmc import sample as sample

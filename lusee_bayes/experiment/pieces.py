@@ -49,6 +49,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
         "instrument": free("noise.beam", lambda: embedded_instrument(setup)),
         "sources": free("sources", lambda: point_sources(setup)),
         "log_normal": lambda: log_normal_prior(setup),
+        "layout": lambda: data.layout,
     }
 
 

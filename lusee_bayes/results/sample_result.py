@@ -27,9 +27,11 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling.chains import Chains
 from lusee_bayes.sampling.checkpoints import Checkpoints
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree
+from lusee_bayes.sampling.distributions import TimesStudentT
 from lusee_bayes.sampling.hmc import Sampler, sample
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.program_checks import require_sampleable
+from lusee_bayes.sampling.program_sites import predicts
 from lusee_bayes.sampling.programs import Program
 from lusee_bayes.sampling.uncertainty import (
     INTERVAL,
@@ -239,9 +241,9 @@ def coordinates(
     latent: list[str],
 ) -> Whitening | None:
     """White coordinates for a program: those of the analytic posterior where it samples the sky
-    alone, the straight ones of a log-normal sky, else those about its mode. None if no mode is
-    found: warmup then learns scales."""
-    if latent == [SKY]:
+    alone, and data are Gaussian about it; the straight ones of a log-normal sky; else those about
+    its mode. None if no mode is found: warmup then learns scales."""
+    if latent == [SKY] and not predicts(program.model, arguments, TimesStudentT):
         return Whitening.of(posterior)
     if experiment.positive is not None:
         straight = experiment.positive.posterior.coordinates

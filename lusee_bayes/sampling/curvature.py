@@ -15,7 +15,7 @@ from numpyro import handlers
 from numpyro.infer.util import potential_energy
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.sampling.distributions import CorrelatedNormal
+from lusee_bayes.sampling.distributions import Prediction
 from lusee_bayes.sampling.whitening import Whitening
 
 # step of the differences that give the Hessian, in standard deviations
@@ -36,7 +36,7 @@ class Potential(eqx.Module):
     shapes : Whitening
         Names and shapes of the sites in x, and the chart of their coordinates.
     predicts : bool
-        Whether the program predicts the data at sites CorrelatedNormal, as d ~ N(f(x), N).
+        Whether the program predicts the data, at sites CorrelatedNormal or TimesStudentT.
     hold : tuple of str
         Sites that are held where they are.
     """
@@ -71,7 +71,15 @@ class Potential(eqx.Module):
         return potential_energy(self.program, (), self.arguments, values) - log_det
 
     def residual(self, x: Float[Array, " n"], still: bool = False) -> Float[Array, " data"]:
-        """Return L^-1 (d - f(x)) of all sites that predict, N = L L^T."""
+        """Return the residuals of all sites that predict, such as L^-1 (d - f(x)), N = L L^T."""
+        found = self._predictions(x, still)
+        return jnp.concatenate([fn.residual(value) for fn, value in found])
+
+    def misfit(self, x: Float[Array, " n"], still: bool = False) -> Float[Array, ""]:
+        """Return the misfit of all sites that predict, such as chi^2 / 2."""
+        return sum((fn.misfit(value) for fn, value in self._predictions(x, still)), jnp.zeros(()))
+
+    def _predictions(self, x: Float[Array, " n"], still: bool) -> list[tuple[Prediction, Array]]:
         values, _ = self.values(x, still)
 
         def place(site):
@@ -80,12 +88,11 @@ class Potential(eqx.Module):
             return None
 
         model = handlers.substitute(handlers.seed(self.program, 0), substitute_fn=place)
-        parts = []
-        for site in handlers.trace(model).get_trace(**self.arguments).values():
-            if site["type"] == "sample" and isinstance(site["fn"], CorrelatedNormal):
-                fn = site["fn"]
-                parts.append(fn.factor.whiten(site["value"] - fn.loc))
-        return jnp.concatenate(parts)
+        return [
+            (site["fn"], site["value"])
+            for site in handlers.trace(model).get_trace(**self.arguments).values()
+            if site["type"] == "sample" and isinstance(site["fn"], Prediction)
+        ]
 
     def slope(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """Return the gradient at x."""
@@ -109,7 +116,7 @@ class Potential(eqx.Module):
             return gradients[0], 0.5 * (slopes + slopes.T)
 
         def prior(x, still=False):
-            return self.value(x, still) - 0.5 * (self.residual(x, still) ** 2).sum()
+            return self.value(x, still) - self.misfit(x, still)
 
         columns = self._derivatives(self.residual, x)
         if self.shapes.chart is None:

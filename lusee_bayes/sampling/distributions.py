@@ -1,18 +1,25 @@
 """NumPyro pieces built on the package's objects, for use at sample sites.
 
 m ~ SkyPrior(S),    d ~ CorrelatedNormal(A m, N)
-d ~ Marginal(model)                                 the same with the sky integrated out
+                    d ~ TimesStudentT(A m, N, layout, nu)    the same with bad times
+d ~ Marginal(model)                                          the same with the sky integrated out
 """
 
 from __future__ import annotations
 
+from abc import abstractmethod
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import gammaln
 from jaxtyping import Float, PRNGKeyArray
 from numpyro import distributions as dist
 
 from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import require_positive
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, Factor
 from lusee_bayes.sky.priors import Prior
@@ -55,7 +62,22 @@ class SkyPrior(dist.Distribution):
         return -0.5 * (u**2).sum(-1) - self.prior.log_det() - self.prior.size * HALF_LOG_2PI
 
 
-class CorrelatedNormal(dist.Distribution):
+class Prediction(dist.Distribution):
+    """Data about a prediction: what a search for the mode needs to know besides ln p(d)."""
+
+    @abstractmethod
+    def misfit(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Compute the part of -ln p(d) that depends on d, of every row of an array."""
+
+    @abstractmethod
+    def residual(self, value: Float[Array, " data"]) -> Float[Array, " data"]:
+        """Compute r, with J^T r the gradient of the misfit by the prediction, J that of r.
+
+        J^T J is the misfit's curvature, as Gauss and Newton take it.
+        """
+
+
+class CorrelatedNormal(Prediction):
     """d ~ N(loc, N) for any covariance of the package; event (data,).
 
     Parameters
@@ -90,10 +112,17 @@ class CorrelatedNormal(dist.Distribution):
 
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute ln p(d | loc, N) of one data vector, or of every row of an array."""
-        n = self.loc.shape[0]
-        residual = (value - self.loc.reshape(*(1,) * (value.ndim - 1), -1)).reshape(-1, n)
-        squared = (self.factor.whiten(residual.T) ** 2).sum(0).reshape(value.shape[:-1])
-        return -0.5 * (squared + self.factor.log_det()) - n * HALF_LOG_2PI
+        constant = -0.5 * self.factor.log_det() - self.loc.shape[0] * HALF_LOG_2PI
+        return constant - self.misfit(value)
+
+    def misfit(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Compute chi^2 / 2, of every row of an array."""
+        white = _whitened(self.factor, value, self.loc)
+        return 0.5 * (white**2).sum(0).reshape(value.shape[:-1])
+
+    def residual(self, value: Float[Array, " data"]) -> Float[Array, " data"]:
+        """Compute L^-1 (d - loc), N = L L^T."""
+        return self.factor.whiten(value - self.loc)
 
     def leave_one_out(self, value: Float[Array, " data"]) -> Float[Array, " data"]:
         """Compute ln p(d_i | all other data) of every datum.
@@ -114,11 +143,128 @@ class CorrelatedNormal(dist.Distribution):
         return _leave_one_out(precise, (root**2).sum(0))
 
 
+def _whitened(
+    factor: Factor, value: Float[Array, "..."], loc: Float[Array, " data"]
+) -> Float[Array, "data rows"]:
+    """L^-1 (d - loc) of every row d of an array, N = L L^T."""
+    residual = value - loc.reshape(*(1,) * (value.ndim - 1), -1)
+    return factor.whiten(residual.reshape(-1, loc.shape[0]).T)
+
+
 def _leave_one_out(
     precise: Float[Array, " data"], diagonal: Float[Array, " data"]
 ) -> Float[Array, " data"]:
     """Log densities from P r and the diagonal of P."""
     return -0.5 * precise**2 / diagonal + 0.5 * jnp.log(diagonal) - HALF_LOG_2PI
+
+
+class TimesStudentT(Prediction):
+    """The data of every time t a multivariate Student-t about loc_t; event (data,).
+
+    ::
+
+        d_t ~ N(loc_t, N_t / w_t),    w_t ~ Gamma(nu / 2, nu / 2),    with w_t integrated out.
+
+    Times are independent of each other, and nu to infinity is CorrelatedNormal. N_t is the scale:
+    the covariance of d_t is nu / (nu - 2) N_t.
+
+    Parameters
+    ----------
+    loc : (data,) array
+        Centre, in K.
+    noise : Covariance or Factor
+        N, which must not couple different times: diagonal, or a block for each time. Where it is
+        fixed, give ``noise.factor()``, as in CorrelatedNormal.
+    layout : DataLayout
+        The product and the time of every datum.
+    nu : float or () array
+        Degrees of freedom.
+
+    Raises
+    ------
+    InputError
+        If N couples different times, if the layout has another number of data, or if nu is not
+        positive.
+
+    References
+    ----------
+    Lange, Little & Taylor 1989, J. Am. Stat. Assoc. 84, 881.
+    """
+
+    support = dist.constraints.real_vector
+    pytree_data_fields = ("factor", "layout", "loc", "nu")
+
+    def __init__(
+        self,
+        loc: Float[Array, " data"],
+        noise: Covariance | Factor,
+        layout: DataLayout,
+        nu: float | Float[Array, ""],
+        *,
+        validate_args: bool | None = None,
+    ):
+        require_positive("nu of the Student-t", nu)
+        if layout.size != loc.shape[0]:
+            raise InputError(f"the layout has {layout.size} data, the mean {loc.shape[0]}")
+        self.factor = noise.factor() if isinstance(noise, Covariance) else noise
+        if self.factor.couples_times:
+            raise InputError(
+                f"a Student-t for every time needs noise that couples no two times, not "
+                f"{type(noise).__name__}; leave what couples them (gains, beams, sources) out of N"
+            )
+        self.loc = loc
+        self.layout = layout
+        self.nu = nu
+        super().__init__(event_shape=loc.shape, validate_args=validate_args)
+
+    def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
+        """Data vectors, ``(*sample_shape, data)``, in K."""
+        n, layout = int(np.prod(sample_shape)), self.layout
+        of_normal, of_weight = jax.random.split(key)
+        z = jax.random.normal(of_normal, (layout.size, n), dtype=jnp.float64)
+        gamma = jax.random.gamma(of_weight, self.nu / 2.0, (layout.n_times, n), dtype=jnp.float64)
+        wider = jnp.sqrt(self.nu / 2.0 / gamma)
+        grid = jnp.broadcast_to(wider[None], (layout.n_products, *wider.shape))
+        draws = self.loc[:, None] + self.factor.colour(z) * layout.gather(grid)
+        return draws.T.reshape(*sample_shape, -1)
+
+    def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Compute ln p(d | loc, N, nu) of one data vector, or of every row of an array."""
+        n = self._data_of_times()
+        half = (self.nu + n) / 2.0
+        constant = (gammaln(half) - n * jnp.log(self.nu) / 2.0).sum()
+        constant = constant - self.layout.n_times * gammaln(self.nu / 2.0)
+        constant = constant - self.layout.size * 0.5 * np.log(np.pi) - 0.5 * self.factor.log_det()
+        return constant - self.misfit(value)
+
+    def misfit(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Compute the sum of (nu + n_t) / 2 ln(1 + chi^2_t / nu), of every row of an array."""
+        return jnp.log1p(self._chi2(value) / self.nu) @ (self.nu + self._data_of_times()) / 2.0
+
+    def residual(self, value: Float[Array, " data"]) -> Float[Array, " data"]:
+        """Compute sqrt(w_t) L^-1 (d - loc), N = L L^T, with the weights w_t held."""
+        held = jax.lax.stop_gradient(jnp.sqrt(self.weights(value)))
+        grid = jnp.broadcast_to(held[None], (self.layout.n_products, self.layout.n_times))
+        return self.layout.gather(grid) * self.factor.whiten(value - self.loc)
+
+    def weights(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Compute E[w_t | d, loc] = (nu + n_t) / (nu + chi^2_t) of n_t data, ``(..., times)``.
+
+        Parameters
+        ----------
+        value : (..., data) array
+            d, in K.
+        """
+        chi2, n = self._chi2(value), self._data_of_times()
+        return (self.nu + n).reshape(*(1,) * (chi2.ndim - 1), -1) / (self.nu + chi2)
+
+    def _data_of_times(self) -> Float[Array, " times"]:
+        return jnp.asarray(self.layout.present.sum(0), dtype=jnp.float64)
+
+    def _chi2(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Chi^2 of the data of every time, (..., times)."""
+        white = self.layout.scatter(_whitened(self.factor, value, self.loc))
+        return (white**2).sum(0).T.reshape(*value.shape[:-1], self.layout.n_times)
 
 
 class Marginal(dist.Distribution):

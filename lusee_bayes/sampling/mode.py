@@ -3,7 +3,8 @@
 The curvature is the Hessian where few sites are sampled (the sky integrated out). Where a
 program predicts the data at a site CorrelatedNormal, as d ~ N(f(x), N), it is that of Gauss and
 Newton, J^T N^-1 J plus that of the prior, J the derivative of f: for the sky and thousands of
-other unknowns at once. Both only serve as coordinates; the density sampled is the program's own.
+other unknowns at once. At a site TimesStudentT every time has its weight in N^-1. Both only serve
+as coordinates; the density sampled is the program's own.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling.curvature import Potential, root_of_inverse, without_held
-from lusee_bayes.sampling.distributions import HALF_LOG_2PI, CorrelatedNormal
+from lusee_bayes.sampling.distributions import HALF_LOG_2PI, Prediction
 from lusee_bayes.sampling.promotion import numpyro_promotion
 from lusee_bayes.sampling.whitening import Whitening
 from lusee_bayes.systematics.base import MOST_COLLAPSED
@@ -119,7 +120,8 @@ def laplace_approximation(
     Raises
     ------
     InputError
-        If the program has too many unknowns for an exact Hessian, and no site CorrelatedNormal.
+        If the program has too many unknowns for an exact Hessian, and no site CorrelatedNormal or
+        TimesStudentT.
     """
     arguments = dict(arguments)
     trace = _trace(program, arguments, start or {})
@@ -196,7 +198,7 @@ def _prior_scale(latent: dict) -> Float[Array, " n"]:
 
 def _predicts(trace: dict) -> bool:
     observed = [s for s in trace.values() if s["type"] == "sample" and s["is_observed"]]
-    return any(isinstance(site["fn"], CorrelatedNormal) for site in observed)
+    return any(isinstance(site["fn"], Prediction) for site in observed)
 
 
 @eqx.filter_jit

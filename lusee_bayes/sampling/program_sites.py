@@ -8,16 +8,16 @@ import equinox as eqx
 import jax
 from numpyro import handlers
 
-from lusee_bayes.sampling.distributions import CorrelatedNormal
+from lusee_bayes.sampling.distributions import Prediction
 from lusee_bayes.sampling.promotion import numpyro_promotion
 
 
-def predicts(program: Callable, arguments: dict) -> bool:
-    """Tell whether a program has a site CorrelatedNormal for its data.
+def predicts(program: Callable, arguments: dict, kind: type[Prediction] = Prediction) -> bool:
+    """Tell whether a program has a site CorrelatedNormal or TimesStudentT, or of one ``kind``.
 
     It then samples everything that they depend on, and its density needs matrix products only.
     """
-    return any(isinstance(site["fn"], CorrelatedNormal) for site in _sites(program, arguments))
+    return any(isinstance(site["fn"], kind) for site in _sites(program, arguments))
 
 
 def latent_sites(program: Callable, arguments: dict) -> list[str]:

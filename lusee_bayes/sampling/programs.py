@@ -36,7 +36,8 @@ PIECES: dict[str, Callable[[LinearGaussian], Any]] = {
     "fixed_noise": lambda model: model.noise.factor(),
 }
 
-# ... and of the experiment: the model without those that are to be sampled, and they themselves
+# ... and of the experiment: the model without those that are to be sampled, they themselves, and
+# the product and time of every datum
 EXPERIMENT_PIECES = (
     "gaussian",
     "systematics",
@@ -44,6 +45,7 @@ EXPERIMENT_PIECES = (
     "instrument",
     "sources",
     "log_normal",
+    "layout",
 )
 
 

@@ -83,7 +83,9 @@ def test_a_good_program_passes(tmp_path, pieces):
     assert check(path, pieces) == ["sky", "x.y-1"]
 
 
-@pytest.mark.parametrize("name", ["sky", "sky_marginal", "prior_amplitude", "spectrum_bands"])
+@pytest.mark.parametrize(
+    "name", ["sky", "sky_marginal", "prior_amplitude", "spectrum_bands", "student_t"]
+)
 def test_the_packages_programs_pass(name, pieces):
     assert check(name, pieces)
 

@@ -11,6 +11,7 @@ keep the structure. ``a + b`` tries whether either side can absorb the other.
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -30,7 +31,15 @@ class Factor(eqx.Module):
 
     L need not be triangular, and each kind of factor orders whitened entries as it likes: only L z
     of independent normals z, and products of whitened vectors with each other, have a meaning.
+
+    Attributes
+    ----------
+    couples_times : bool
+        Whether N may couple different times. If not, every whitened entry is made of data of its
+        own time.
     """
+
+    couples_times: ClassVar[bool] = True
 
     @abstractmethod
     def whiten(self, x: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, namespace
@@ -23,6 +25,7 @@ class DiagonalFactor(Factor):
         In K.
     """
 
+    couples_times: ClassVar[bool] = False
     sigma: Float[Array, " data"]
 
     def whiten(self, x):

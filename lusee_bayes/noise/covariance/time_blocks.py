@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 from jaxtyping import Float
 
@@ -27,6 +29,7 @@ class TimeBlockFactor(Factor):
     layout : DataLayout
     """
 
+    couples_times: ClassVar[bool] = False
     lower: Float[Array, "times products products"]
     layout: DataLayout
 
