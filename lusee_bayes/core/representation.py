@@ -49,3 +49,8 @@ def listed(names: tuple[str, ...], shown: int = 4) -> str:
     if len(names) <= 2 * shown:
         return ", ".join(names)
     return ", ".join([*names[:shown], "...", *names[-2:]])
+
+
+def counted(n: int, one: str, several: str = "") -> str:
+    """Return a number with its noun: 1 session, 2 sessions."""
+    return f"{n} {one if n == 1 else several or f'{one}s'}"

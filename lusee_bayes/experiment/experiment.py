@@ -99,10 +99,22 @@ def observed(
         return simulated(scenario, stages)
     setup = set_up(scenario, data, stages)
     std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
-    found = Experiment(setup, data, require_plausible(data, setup.signal, std))
+    doubts = (*require_plausible(data, setup.signal, std), *_about_gains(scenario, data))
+    found = Experiment(setup, data, doubts)
     for doubt in found.doubts:
         stages.say(f"  doubtful: {doubt}")
     return found
+
+
+def _about_gains(scenario: Scenario, data: Visibilities) -> tuple[str, ...]:
+    """Say that errors of the gains are known and not part of N, if so."""
+    known = data.calibration is not None and data.calibration.gain_names
+    if not known or scenario.noise.gain_table is not None:
+        return ()
+    return (
+        "The gains may be off by errors that are known (flight.gain_std, or the gain table's own) "
+        "and not part of N: give noise.gain_table={}.",
+    )
 
 
 def simulated(scenario: Scenario, stages: Stages | None = None) -> Experiment:

@@ -177,7 +177,8 @@ def _compared(setup: Setup, data: Visibilities) -> _Compared | None:
     new = np.array([m.directions for m in missed])
     degrees[some] = counts[some] - np.clip(new, 0.0, counts[some])
     # where the others tell less than half a datum, there is nothing to compare with
-    degrees[degrees < 0.5] = 0.0
+    told = np.isfinite(chi2) & (degrees >= 0.5)
+    chi2, degrees = np.where(told, chi2, 0.0), np.where(told, degrees, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         z = left_out.u / np.sqrt(left_out.inverse_diagonal)
     known = np.asarray(data.layout.present) & np.isfinite(z) & (degrees > 0.0)

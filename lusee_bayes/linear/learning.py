@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import checked_cholesky, inverse_from_cholesky
+from lusee_bayes.core.linalg import cholesky, inverse_from_cholesky
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.normal_scores import NormalScores
 from lusee_bayes.linear.posterior import Posterior
@@ -170,13 +170,26 @@ def _slope(
         deviation = deviation - prior.white_mean
     pull = prior.whiten_columns(deviation[None]).T
     found = here.member.forms(pull)[:, 0] - here.member.traces(expected)
-    root = checked_cholesky("what is known of the sky", known + ROUNDING * np.eye(len(known)))
+    root = _root(known)
     drawn = prior.whiten_columns((root @ rng.standard_normal((len(root), n))).T).T
     scores = here.member.forms(drawn)
     scores = scores - scores.mean(1, keepdims=True)
     curvature = scores @ scores.T / (n - 1.0)
     curvature[np.diag_indices(len(curvature))] += hyperprior.curvature(here.parameters)
     return found + hyperprior.gradient(here.parameters), curvature
+
+
+def _root(known: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n k"]:
+    """A root of a covariance with eigenvalues from 0 to 1.
+
+    Of data that are very precise, those near 0 are wrong by more than ``ROUNDING``; then what lies
+    outside of 0 to 1 is left out.
+    """
+    root = cholesky(known + ROUNDING * np.eye(len(known)))
+    if np.isfinite(np.diagonal(root)).all():
+        return np.tril(root)
+    values, vectors = np.linalg.eigh(known)
+    return vectors * np.sqrt(np.clip(values, 0.0, 1.0))
 
 
 def _learned(

@@ -31,7 +31,7 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from lusee_bayes.core.arrays import Array, on_host
 from lusee_bayes.core.harmonics import mode_numbers
@@ -52,6 +52,8 @@ from lusee_bayes.linear.stretches import (
 )
 from lusee_bayes.noise.covariance import LowRankUpdate
 
+# of a group that cannot be compared with all others
+NOT_TOLD = Missed(np.nan, np.nan, np.nan)
 # C^(1/2) A^T is kept up to this size (a month at lmax 47: 0.1 GB); it is made by so many times
 KEPT_BYTES, CHUNK = 2.5e8, 64
 # random directions for traces: a trace t is then good to sqrt(2 t / 200), at most a tenth of the
@@ -316,12 +318,17 @@ class StructuredLeftOut(LeftOut):
         ``log_det``: ln|D|.
         """
         rank, n = half.shape
+        wide = half if n <= rank else half.T
+        try:
+            root = cho_factor(np.eye(len(wide.T)) - wide.T @ wide)
+        except LinAlgError:
+            # all others know so little, and these so much, that 64 bits do not tell it from nothing
+            return NOT_TOLD
         if n <= rank:
-            root = cho_factor(np.eye(n) - half.T @ half)
             seen = half.T @ self._probed
             chi2, grown = b @ cho_solve(root, b), (seen * cho_solve(root, seen)).sum()
         else:
-            root, h = cho_factor(np.eye(rank) - half @ half.T), half @ b
+            h = half @ b
             chi2 = b @ b + h @ cho_solve(root, h)
             grown = (self._probed * cho_solve(root, self._probed)).sum() - (self._probed**2).sum()
         return Missed(float(outside + chi2), float(grown / PROBES), log_det + log_det_of(root[0]))

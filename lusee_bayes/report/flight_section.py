@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lusee_bayes.core.representation import counted
 from lusee_bayes.instrument.flight.reduced import REASONS, Reduced
 from lusee_bayes.instrument.flight.reduced_file import read_reduced
 from lusee_bayes.report import html
@@ -19,7 +20,8 @@ FIGURES = {
     ),
     "flight_waterfall": (
         "The 16 products over time, before and after flags",
-        "Products before (orange) and after flags (blue). Imaginary parts are below the diagonal.",
+        "Products after flags (blue), and before where something is flagged (orange). Imaginary "
+        "parts are below the diagonal.",
     ),
     "flight_calibration": (
         "Gain curves with their errors, and measured over expected noise by frequency",
@@ -66,12 +68,13 @@ def _sessions(reduced: Reduced) -> list[str]:
         )
         for one in reduced.sessions
     ]
-    length = "each spectrum on its own"
+    length = "bins of one spectrum each"
     if reduced.average_s is not None:
         length = f"bins of {reduced.average_s:g} s, which end where the gains change"
     return [
         html.paragraph(
-            f"{len(reduced.bin_of)} spectra of {len(rows)} sessions, in bands of "
+            f"{counted(len(reduced.bin_of), 'spectrum', 'spectra')} of "
+            f"{counted(len(rows), 'session')}, in bands of "
             f"{reduced.bandwidth_mhz:g} MHz and {length}."
         ),
         html.table(SESSION, rows),
@@ -99,7 +102,8 @@ def _flags(reduced: Reduced) -> list[str]:
         html.subsection("Flags and noise"),
         html.paragraph(
             "Shares of the spectra of each band. Scatter is over that of the radiometer equation: "
-            "1 where nothing else than noise is left."
+            "1 where nothing else than noise is left. In time, bursts are looked for, and scatter "
+            "is known, where four hours have 16 spectra or more."
         ),
         html.table(header, rows),
         *(

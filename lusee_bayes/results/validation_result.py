@@ -50,7 +50,7 @@ class ValidationResult:
         """The verdict, in one line."""
         checks = self.checks
         verdict = "passed" if self.passed else "FAILED"
-        return f"{verdict}: {sum(c.passed for c in checks)} of {len(checks)} checks"
+        return f"{verdict}: {sum(c.passed for c in checks)} of {len(checks)} checks hold"
 
     def as_markdown(self) -> str:
         """validation.md: the checks, how their thresholds come about, and coverage."""

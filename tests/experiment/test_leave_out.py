@@ -91,3 +91,12 @@ def test_what_cannot_be_judged_is_said(experiment, monkeypatch):
 def test_not_all_times_can_go(experiment):
     gone = np.ones((16, 65), dtype=bool)
     assert_refused(lambda: without(experiment.setup, experiment.data, gone))
+
+
+def test_precise_data_of_one_day_are_compared_or_not_but_nothing_fails():
+    """What only these data tell is beyond 64 bits: then they are not compared."""
+    changes = ["lmax=6", "observation.runs.0.cycles=0.03", "noise.radiometer.form=exact"]
+    few = build(load_scenario("fiducial", [*changes, "noise.radiometer.factor=1e-6"]))
+    found = fitting(few.setup, few.data, FALSE_ALARM)
+    assert not found.flagged.any()
+    assert np.isfinite(found.chi2).all()

@@ -123,4 +123,6 @@ def test_anchored_scenarios_name_the_same_files_in_any_folder(tmp_path, monkeypa
 def test_every_entry_that_names_a_file_is_known():
     keys = {entry.path.split(".")[-1] for entry in scenario_keys()}
     files = {key for key in keys if key == "file" or key.endswith("_file")}
-    assert files <= set(FILES) and set(FILES) - files == {"schedule", "template"}
+    assert files <= set(FILES) and set(FILES) - files == {
+        *("schedule", "template", "clock", "gain_table", "lines"),
+    }

@@ -1,6 +1,6 @@
 """Channels that hold something else than the sky: known lines, the calibrator's comb, and others.
 
-The calibrator sends a comb at 50 kHz + n 100 kHz, in every fourth channel from the second on
+The calibrator sends a comb at 50 kHz + n 100 kHz, in channels 2, 6, 10, ... counted from 0
 (coreloop's ``lusee_commands.h`` has the notch index 2 by default, for 50 + 100 n kHz), and the
 notch filter subtracts the mean of the same channels. Layout 3 does not say when either is on.
 So every spectrum is asked: the difference of these channels from their neighbours, over the whole

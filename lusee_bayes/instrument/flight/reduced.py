@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.representation import Described
+from lusee_bayes.core.representation import Described, counted
 from lusee_bayes.instrument.averaging import binned
 from lusee_bayes.instrument.beams.gridded import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.calibration import Calibration
@@ -128,9 +128,9 @@ class Reduced(Described):
         f = self.frequencies_mhz
         used = self.reason == USED
         return (
-            f"{len(self.bin_of)} spectra of {len(self.sessions)} sessions in "
-            f"{self.values.shape[2]} bins",
-            f"{len(f)} bands of {self.bandwidth_mhz:g} MHz at {f[0]:g} to {f[-1]:g} MHz",
+            f"{counted(len(self.bin_of), 'spectrum', 'spectra')} of "
+            f"{counted(len(self.sessions), 'session')} in {counted(self.values.shape[2], 'bin')}",
+            f"{counted(len(f), 'band')} of {self.bandwidth_mhz:g} MHz at {f[0]:g} to {f[-1]:g} MHz",
             f"{used.mean():.2%} of the spectra are used",
         )
 

@@ -17,7 +17,6 @@ from lusee_bayes.report.figures.drawing import BLUE, GREY, ORANGE, plain_ticks
 # Okabe and Ito's colours, which colour-blind readers tell apart
 LEVEL_COLOURS = {"L": "#56B4E9", "M": "#0072B2", "H": "#CC79A7"}
 PORT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-PORT_MARKS = ("o", "s", "^", "D")
 # columns of pixels of an image of flags
 COLUMNS = 800
 
@@ -56,7 +55,7 @@ def time_line(reduced: Reduced) -> Figure:
         ylim=(max(len(names), 1) - 0.5, -0.5),
         xlabel=f"days since {_first(reduced)} UTC",
     )
-    bottom.set_title("Spectra that are not used, in any band" if names else "Nothing is flagged")
+    bottom.set_title("Flagged in at least one band" if names else "Nothing is flagged")
     return figure
 
 
@@ -66,28 +65,34 @@ def waterfall(reduced: Reduced, band: int) -> Figure:
     panels = figure.subplots(4, 4, sharex=True)
     first = np.searchsorted(reduced.bin_of, np.arange(reduced.values.shape[2]))
     days = _days(reduced)[first]
+    n_bins = reduced.values.shape[2]
+    used_in_part = np.bincount(reduced.bin_of, reduced.reason[band] != USED, n_bins) > 0
     products = {label: k for k, label in enumerate(labels())}
     for product in all_products():
         # imaginary parts below the diagonal
         i, j = (product.i, product.j) if product.part == "R" else (product.j, product.i)
         axes: Axes = panels[i, j]
         number = products[product.label]
-        axes.plot(days, reduced.before[band, number], ".", ms=4, color=ORANGE, label="before")
-        axes.plot(days, reduced.values[band, number], ".", ms=3, color=BLUE, label="after")
         kept = reduced.values[band, number]
+        flagged = ~np.isfinite(kept) | used_in_part
+        axes.plot(days, kept, ".", ms=3, color=BLUE, label="after flags")
+        before = reduced.before[band, number]
+        axes.plot(
+            days[flagged], before[flagged], ".", ms=4, color=ORANGE, label="before, where flagged"
+        )
         low, high = _range(kept[np.isfinite(kept)])
         axes.set_ylim(low, high)
         axes.set_title(product.label, fontsize=9)
         plain_ticks(axes, 3)
-        axes.yaxis.set_major_formatter(lambda value, _: f"{value:.2g}")
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:.3g}")
     panels[0, 0].legend(frameon=False, fontsize=8)
     for axes in panels[-1]:
         axes.set_xlabel("days")
     for axes in panels[:, 0]:
         axes.set_ylabel("V²/Hz")
     figure.suptitle(
-        f"Products at {reduced.frequencies_mhz[band]:g} MHz before and after flags, since "
-        f"{_first(reduced)} UTC; values beyond the frame are flagged"
+        f"Products at {reduced.frequencies_mhz[band]:g} MHz since {_first(reduced)} UTC; values "
+        "beyond the frame are flagged"
     )
     return figure
 
@@ -118,7 +123,9 @@ def calibration(reduced: Reduced) -> Figure:
         left.axvline(f, color=GREY, lw=0.5, zorder=0)
     known = bool((curves.std > 0).any())
     left.set(xlabel="frequency [MHz]", ylabel="counts for 1 nV²/Hz")
-    left.set_title("Gains" + (", with one standard deviation" if known else ": no error is known"))
+    largest = float(np.nanmax(curves.std / curves.gain)) if known else 0.0
+    told = f"known to {largest:.2g} of themselves or better" if known else "no error is known"
+    left.set_title(f"Gains: {told}")
     left.legend(frameon=False, ncols=2, fontsize=8)
     right.axhline(1.0, color=GREY, lw=0.8)
     for values, colour, mark, name in (
