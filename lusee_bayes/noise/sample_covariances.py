@@ -2,7 +2,7 @@
 
 The mean of v v* over N independent samples of covariance T = L L* is T + L H L* / sqrt(N), where H
 is Hermitian and for large N Gaussian: real numbers of variance one on its diagonal, complex ones of
-<|h|^2> = 1 beside it. Its covariances are those of :func:`.exact_blocks`, divided by N.
+mean square one beside it. Its covariances are those of :func:`.exact_blocks`, divided by N.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""NumPyro pieces built on the package's objects, for use at sample sites.
+"""NumPyro pieces built on the package's objects, for use at sample sites. ::
 
-m ~ SkyPrior(S),    d ~ CorrelatedNormal(A m, N)
-                    d ~ TimesStudentT(A m, N, layout, nu)    the same with bad times
-d ~ Marginal(model)                                          the same with the sky integrated out
+    m ~ SkyPrior(S),    d ~ CorrelatedNormal(A m, N)
+                        d ~ TimesStudentT(A m, N, layout, nu)    the same with bad times
+    d ~ Marginal(model)                                          the sky integrated out
 """
 
 from __future__ import annotations

@@ -6,8 +6,11 @@ n / N). For white noise, ::
 
     <y_k(t) conj(y_k+d(t + s))> ~ c_d(s) = sum_n h(n) h(n - s N) exp(2 pi i d n / N),
 
-and the powers of two channels, averaged over many frames, have the covariance sum_s |c_d(s)|^2 of
-which c_0(0)^2 would be that of independent frames.
+and the powers of two channels, averaged over many frames, have the covariance ::
+
+    sum_s |c_d(s)|^2,
+
+of which c_0(0)^2 would be that of independent frames.
 """
 
 from __future__ import annotations
