@@ -1,8 +1,12 @@
-"""NumPyro pieces built on the package's objects, for use at sample sites. ::
+"""NumPyro pieces built on the package's objects, for use at sample sites.
+
+They say what is drawn of what, ::
 
     m ~ SkyPrior(S),    d ~ CorrelatedNormal(A m, N)
                         d ~ TimesStudentT(A m, N, layout, nu)    the same with bad times
     d ~ Marginal(model)                                          the sky integrated out
+
+with N of any structure.
 """
 
 from __future__ import annotations
