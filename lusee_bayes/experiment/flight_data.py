@@ -84,7 +84,7 @@ def recipe_of(scenario: Scenario) -> Recipe:
         )
     here = scenario.observation
     return Recipe(
-        _table(section),
+        gain_table_of(section),
         section.bin_origin,
         timestamp,
         scenario.frequencies_mhz or (scenario.frequency_mhz,),
@@ -140,6 +140,37 @@ def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
     return np.ascontiguousarray(circuit.per_kelvin.diagonal().real)
 
 
+def gain_table_of(section: FlightSection) -> GainTable:
+    """The gain table that a scenario names, with what it says of its errors.
+
+    Raises
+    ------
+    InputError
+        If the table cannot be read, or says itself what the scenario says of its components.
+    """
+    table = read_gain_table(section.gain_table, section.gain_model)
+    return with_component_std(table, section)
+
+
+def with_component_std(table: GainTable, section: FlightSection) -> GainTable:
+    """The same with the scenario's errors of the components, if it names any.
+
+    Raises
+    ------
+    InputError
+        If the table has some itself.
+    """
+    if section.component_std is None:
+        return table
+    if table.component_std is not None:
+        raise InputError(
+            f"{table.path} says by how much its components may be off, and so does "
+            "flight.component_std; leave that out"
+        )
+    std = np.broadcast_to(section.component_std, table.component.shape[:3]).copy()
+    return replace(table, component_std=std)
+
+
 def _section(scenario: Scenario) -> FlightSection:
     if scenario.flight is None:
         raise InputError(
@@ -148,18 +179,3 @@ def _section(scenario: Scenario) -> FlightSection:
             "bin_origin: centre}' (docs/howto/first_light.md)"
         )
     return scenario.flight
-
-
-def _table(section: FlightSection) -> GainTable:
-    table = read_gain_table(section.gain_table, section.gain_model)
-    if section.component_std is None:
-        return table
-    if table.component_std is not None:
-        raise InputError(
-            f"{table.path} says by how much its components may be off, and so does "
-            "flight.component_std; leave that out"
-        )
-    return replace(
-        table,
-        component_std=np.broadcast_to(section.component_std, (*table.component.shape[:3],)).copy(),
-    )

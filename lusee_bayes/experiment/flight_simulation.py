@@ -17,6 +17,7 @@ from jaxtyping import Float, Float32, Int
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.threads import in_threads, processors
+from lusee_bayes.experiment.flight_data import gain_table_of, with_component_std
 from lusee_bayes.experiment.flight_disturbances import SATURATED, Disturbances
 from lusee_bayes.experiment.flight_visibilities import spectra_observation, true_visibilities
 from lusee_bayes.experiment.scenario import Scenario
@@ -25,7 +26,7 @@ from lusee_bayes.instrument.correlations import CONVENTIONS
 from lusee_bayes.instrument.flight.channel_spectra import ChannelSpectra
 from lusee_bayes.instrument.flight.clock import DAY_S, Clock
 from lusee_bayes.instrument.flight.counts import Counting, bit_slices, rounded
-from lusee_bayes.instrument.flight.gain_files import read_gain_table
+from lusee_bayes.instrument.flight.gain_errors import draw_gains
 from lusee_bayes.instrument.flight.gain_table import GainTable
 from lusee_bayes.instrument.flight.session_layout import MJD_ZERO
 from lusee_bayes.instrument.flight.session_rows import SessionRows
@@ -77,6 +78,11 @@ class FlightSimulation:
         Without noise, in V^2/Hz.
     disturbances : Disturbances
     table : GainTable
+        By which the counts are to be divided.
+    gains : GainTable
+        By which they are multiplied: the table's, or drawn about it.
+    gain_errors : dict
+        What was drawn, in standard deviations, by names as M0 and M0 PC1.
     origin : {"centre", "edge"}
         What of channel k lies at k times 25 kHz.
     navg_shift : int
@@ -91,6 +97,8 @@ class FlightSimulation:
     visibilities: Float[np.ndarray, "nodes products rows"]
     disturbances: Disturbances
     table: GainTable
+    gains: GainTable
+    gain_errors: dict[str, float]
     origin: BinOrigin
     navg_shift: int
     clock: Clock
@@ -201,7 +209,7 @@ class FlightSimulation:
 
     def _counting(self, levels: str) -> Counting:
         sign = int(CONVENTIONS[flight_of(self.scenario).convention])
-        return Counting(self.table, levels, self.section.navgf, self.origin, sign)
+        return Counting(self.gains, levels, self.section.navgf, self.origin, sign)
 
     def _telemetry(self, rows: slice) -> Mapping[str, Float[np.ndarray, " _"]]:
         hours = self._hours[rows]
@@ -243,9 +251,7 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
             "longer observation.step_s (42 s in flight)"
         )
     shift = int(np.floor(np.log2(step_s / FRAME_S * (1.0 + 1e-12))))
-    table = synthetic_gains()
-    if flight.gain_table is not None:
-        table = read_gain_table(flight.gain_table, flight.gain_model)
+    table, gains, errors = _gains(scenario, flight)
     observation = spectra_observation(scenario, FRAME_S * 2.0**shift)
     origin = flight.bin_origin or "centre"
     nodes = np.array(scenario.frequencies_mhz or (scenario.frequency_mhz,))
@@ -262,10 +268,38 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
         visibilities,
         made,
         table,
+        gains,
+        errors,
         origin,
         shift,
         clock,
     )
+
+
+def _gains(
+    scenario: Scenario, flight: FlightSection
+) -> tuple[GainTable, GainTable, dict[str, float]]:
+    """The table, the gains of which it is the mean, and by how much they are off."""
+    if flight.gain_table is None:
+        table = with_component_std(synthetic_gains(), flight)
+    else:
+        table = gain_table_of(flight)
+    section = scenario.noise.gain_table
+    if section is None:
+        return table, table, {}
+    if section.std is not None:
+        raise InputError(
+            "noise.gain_table.std is for data without a gain table, and spectra have one; leave it "
+            "out and give flight.gain_std, the error of the gains of each level of each port"
+        )
+    if flight.gain_std is None and table.component_std is None:
+        raise InputError(
+            "noise.gain_table says that the gains are not exact, and nothing says by how much; "
+            "give flight.gain_std, or flight.component_std"
+        )
+    generator = np.random.default_rng([scenario.seed, 3])
+    gains, errors = draw_gains(table, flight.gain_std, generator)
+    return table, gains, errors
 
 
 def _require_own_noise(scenario: Scenario, flight: FlightSection) -> None:

@@ -70,6 +70,8 @@ def true_visibilities(
 ) -> Float[np.ndarray, "frequencies products times"]:
     """Return visibilities of the scenario's sky with the true instrument, in V^2/Hz.
 
+    Errors of the gain table are none of the instrument's: they are in the counts.
+
     Parameters
     ----------
     scenario : Scenario
@@ -83,6 +85,8 @@ def true_visibilities(
     InputError
         If the beams know no volts.
     """
+    known = scenario.noise.model_copy(update={"gain_table": None})
+    scenario = scenario.model_copy(update={"noise": known})
     channels = scenario.channels() or (scenario,)
     scales = [_scale(channel) for channel in channels]
     # what changes with time has to be drawn for all of it

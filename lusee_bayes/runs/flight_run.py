@@ -116,6 +116,8 @@ def _to_be_mapped(made: FlightSimulation, folder: Path) -> Scenario:
     flight, observation = flight_of(made.scenario), made.scenario.observation
     said = {
         "gain_table": flight.gain_table or str(folder / GAINS),
+        # a table that is written has its own
+        "component_std": flight.component_std if flight.gain_table else None,
         "bin_origin": made.origin,
         "clock": str(folder / CLOCK) if made.section.clock == "unknown" else None,
         "turntable_deg": made.observation.turntable_deg[0],
@@ -158,5 +160,7 @@ def _truth(made: FlightSimulation) -> dict[str, np.ndarray]:
         "frequency_mhz": made.frequencies_mhz,
         "visibility_v2_hz": made.visibilities,
         "frames": np.array(made.frames),
+        "gain_error_name": np.array(list(made.gain_errors), dtype=np.str_),
+        "gain_error": np.array(list(made.gain_errors.values())),
         **made.disturbances.truth(),
     }

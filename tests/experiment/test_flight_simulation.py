@@ -10,7 +10,10 @@ from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED
+from lusee_bayes.instrument.flight.sessions import read_session
 from lusee_bayes.instrument.flight.spectrometer import CHANNEL_MHZ
+from lusee_bayes.instrument.flight.synthetic_gains import synthetic_gains
+from lusee_bayes.instrument.products import all_products
 from lusee_bayes.noise.radiometer import exact_blocks
 from lusee_bayes.runs.flight_run import run_simulate_flight
 
@@ -202,3 +205,49 @@ def test_impossible_states_are_refused(change):
 def test_layouts_have_what_they_need(change):
     with pytest.raises(InputError, match="layout"):
         load_scenario("fiducial", [*SMALL, f"flight.simulated={change}"])
+
+
+def test_gains_are_off_as_they_are_said_to_be(tmp_path):
+    """By the table the values are those of gains that are off by what the truth says."""
+    off = "flight.gain_std=0.02", "flight.component_std=[0.01, 0.02]", "noise.gain_table={}"
+    reduced, truth = simulated(tmp_path, QUIET, EXACT, *off, rows=3, step_s=7200.0)
+    z = dict(zip(truth["gain_error_name"].tolist(), truth["gain_error"].tolist(), strict=True))
+    assert len(z) == 3 * 4 * 3
+    known, _ = simulated(tmp_path / "known", QUIET, EXACT, rows=3, step_s=7200.0)
+    seen, table = read_session(tmp_path / "session_000.h5").telemetry, synthetic_gains()
+    eps = np.empty((4, len(FREQUENCIES), 3))
+    for port in range(4):
+        basis = table.basis("M", port, np.array(FREQUENCIES))[..., None]
+        gain = basis[0] + np.einsum("nr,rfk->fn", table.strengths("M", port, seen), basis[1:])
+        parts = [s * z[f"M{port} PC{r + 1}"] * basis[1 + r] for r, s in enumerate((0.01, 0.02))]
+        eps[port] = 0.02 * z[f"M{port}"] + sum(parts) / gain
+    assert np.abs(eps).min() > 1e-4
+    assert np.abs(eps).max() > 0.01
+    for band in range(len(FREQUENCIES)):
+        for k, product in enumerate(all_products()):
+            ratio = np.sqrt((1.0 + eps[product.i, band]) * (1.0 + eps[product.j, band]))
+            level = np.abs(known.values[band, AUTOS]).mean()
+            off = reduced.values[band, k] - ratio * known.values[band, k]
+            # what eps does within the band beyond a polynomial of degree 4
+            assert np.abs(off).max() < 2e-6 * level
+    # and these are the slopes by which the map has them
+    gains = reduced.at(10.0, np.full(4, 1e-21)).calibration
+    slope = dict(zip(gains.gain_names, gains.gain_slope, strict=True))
+    for port in range(4):
+        names = [name for name in z if name.startswith(f"M{port}")]
+        found = sum(z[name] * slope[name] for name in names)
+        # the mean of log(f / 20 MHz) / 5 over the band is 1e-4 below that in its middle
+        np.testing.assert_allclose(found, eps[port, 0], rtol=0.0, atol=1e-5)
+
+
+REFUSED = [
+    (["noise.gain_table={}"], "nothing says by how much; give flight.gain_std"),
+    (["noise.gain_table={std: 0.01}"], "give flight.gain_std, the error of the gains"),
+    (["noise.gain_table={}", "flight.gain_std=0.9", "seed=2"], "was drawn below zero"),
+]
+
+
+@pytest.mark.parametrize(("changes", "told"), REFUSED)
+def test_gains_that_are_off_have_to_say_by_how_much(changes, told):
+    with pytest.raises(InputError, match=told):
+        simulate_flight(load_scenario("fiducial", [*SMALL, *changes]))

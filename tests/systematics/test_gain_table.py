@@ -24,6 +24,7 @@ from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.simulate import simulate, true_signal, true_values
 from lusee_bayes.experiment.terms import Around, pointed
+from lusee_bayes.experiment.terms.gain_table import table_errors
 from lusee_bayes.instrument.calibration import Calibration
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.linear.templates import template_amplitudes
@@ -419,6 +420,16 @@ def test_errors_that_nobody_says_and_errors_that_both_say(response_file):
     refused(
         both, r"say the errors of their gain table themselves; leave out noise\.gain_table\.std"
     )
+
+
+def test_without_a_table_each_port_is_off_as_the_levels_of_flight_files_are(response_file):
+    said = set_up(four_ports(response_file, "noise.gain_table={}", "flight={gain_std: 0.03}"))
+    slope = table_errors(said).slope
+    np.testing.assert_array_equal(slope, np.full((4, said.layout.n_times), 0.03))
+    own = set_up(four_ports(response_file, TABLE % "marginalised", "flight={gain_std: 0.03}"))
+    assert (table_errors(own).slope == 0.01).all()
+    wide = set_up(four_ports(response_file, "noise.gain_table={}", "flight={gain_std: 0.3}"))
+    refused(wide, r"flight\.gain_std is 0\.3, .* give a smaller noise\.gain_table\.std")
 
 
 def test_tables_that_are_hardly_known(response_file):

@@ -82,6 +82,15 @@ def table_errors(setup: Setup) -> TableErrors:
             "the data say the errors of their gain table themselves; leave out noise.gain_table.std"
         )
     if not named:
+        if std is None and setup.scenario.flight is not None:
+            # what it says of every level of every port: these data have one
+            std = setup.scenario.flight.gain_std
+            if std is not None and std > LARGEST:
+                raise InputError(
+                    f"flight.gain_std is {std:g}, and power gains that are off by more than "
+                    f"{LARGEST:g} of themselves are not modelled; give a smaller "
+                    "noise.gain_table.std for simulated data"
+                )
         if std is None:
             raise InputError(
                 "the data say nothing of a gain table; give noise.gain_table.std, the relative "
