@@ -11,6 +11,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -39,6 +40,8 @@ STORED = {
 }
 TFORM = re.compile(r"(\d*)([A-Z])")
 TRUE = ord("T")
+# what a computer reads at least
+PAGE = 4096
 
 
 @dataclass(frozen=True)
@@ -86,20 +89,27 @@ class Column:
         shape = (len(range(*slice(first, last).indices(self.shape[0]))), *self.shape[1:])
         if 0 in shape:
             return np.empty(shape, dtype=self.dtype)
-        cell = np.dtype(
-            {
-                "names": ["cell"],
-                "formats": [self.stored],
-                "offsets": [self.offset],
-                "itemsize": self.stride,
-            }
-        )
-        table = np.memmap(self.path, cell, "r", offset=self.start, shape=self.shape[:1])
-        return self._decoded(np.array(table["cell"][first:last])).reshape(shape)
+        return self._decoded(self._cells(first, first + shape[0])).reshape(shape)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         whole = self.rows(0, self.shape[0])
         return whole if dtype is None else whole.astype(dtype)
+
+    def _cells(self, first: int, last: int) -> np.ndarray:
+        size = self.stored.itemsize
+        with self.path.open("rb", buffering=0) as file:
+            if self.start + self.shape[0] * self.stride > os.fstat(file.fileno()).st_size:
+                raise ValueError("a table ends behind the end of the file")
+            if self.stride > PAGE and 2 * size < self.stride:
+                # next to spectra: these are not read
+                start = self.start + self.offset
+                places = (start + row * self.stride for row in range(first, last))
+                parts = b"".join(os.pread(file.fileno(), size, place) for place in places)
+                return np.frombuffer(parts, self.stored).copy()
+            row = {"names": ["cell"], "formats": [self.stored], "offsets": [self.offset]}
+            file.seek(self.start + first * self.stride)
+            rows = np.fromfile(file, np.dtype(row | {"itemsize": self.stride}), last - first)
+            return np.ascontiguousarray(rows["cell"])
 
     def _decoded(self, cells: np.ndarray) -> np.ndarray:
         if self.encoding == "utf8":
