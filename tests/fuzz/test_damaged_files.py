@@ -84,6 +84,7 @@ READERS = {
     "session.h5": (describe, read_spectra),
     "session_4.h5": (describe, read_spectra),
     "session.fits": (describe, read_spectra),
+    "session_4.fits": (describe, read_spectra),
     "reduced.nc": (describe, lambda path: read_reduced(path).at(25.0, np.ones(4))),
     "gains.nc": (describe, read_gain_table),
 }
@@ -134,7 +135,7 @@ def write_sessions(folder: Path) -> None:
     flight = "flight={per_kelvin_v2_hz: 1e-21, simulated: {layout: %d, kind: %s}}"
     size = ["observation.step_s=900", "observation.runs=[{cycles: 0.0012}]"]
     for layout, kind, name in ((3, "hdf5", "session.h5"), (4, "hdf5", "session_4.h5"),
-                               (3, "fits", "session.fits")):  # fmt: skip
+                               (4, "fits", "session_4.fits"), (3, "fits", "session.fits")):  # fmt: skip
         scenario = load_scenario("fiducial", ["lmax=2", *size, flight % (layout, kind)])
         made = run_simulate_flight(scenario, folder / name.replace(".", "_"))
         shutil.copy(made.sessions[0], folder / name)
