@@ -148,11 +148,14 @@ def test_every_encoding_is_decoded(tmp_path):
     about = {"cube": {"units": "K", "scale": np.float32(0.1), "names": np.array(["a", "bc"])}}
     others = {"other": np.arange(5, dtype=np.int32)}
     parts = {"LUSEEKND": "table-part"}
+    # rows of more than a page: what is next to the spectra is read without them
+    wide = {"data": np.arange(6000.0).reshape(3, 2, 1000), "later": np.arange(6).reshape(3, 2)}
     hdus = [
         (table("/one", ARRAYS, about), {"count": np.uint64(3), "text": "it's a 'µ' " + 200 * "x"}),
         (group("/one/two"), {"axes": np.array([[1, 2], [3, 4]], dtype=np.int16)}),
         (table("/one/two", others, LUSEEPRT=0, **parts), {}),
         (table("/one/two", {"more": np.arange(2.0)}, LUSEEPRT=1, **parts), {}),
+        (table("/wide", wide), {}),
     ]
     path = write(tmp_path / "all.fits", hdus)
     with opened(path) as found:
@@ -165,6 +168,9 @@ def test_every_encoding_is_decoded(tmp_path):
             assert expected.dtype.kind == "U" or values.dtype == expected.dtype, name
             np.testing.assert_array_equal(values, expected)
             np.testing.assert_array_equal(array.rows(1, 3), expected[1:3])
+        for name, expected in wide.items():
+            np.testing.assert_array_equal(tree.array(f"wide/{name}"), expected)
+            np.testing.assert_array_equal(tree.array(f"wide/{name}").rows(1, 3), expected[1:3])
         assert tree.attributes("") == {"quality": "clean"}
         assert tree.attributes("one")["count"] == 3
         assert tree.attributes("one")["text"] == "it's a 'µ' " + 200 * "x"
@@ -174,12 +180,12 @@ def test_every_encoding_is_decoded(tmp_path):
         np.testing.assert_array_equal(tree.attributes("one/two")["axes"], [[1, 2], [3, 4]])
         np.testing.assert_array_equal(tree.array("one/two/other"), np.arange(5))
         np.testing.assert_array_equal(tree.array("one/two/more"), [0.0, 1.0])
-        assert tree.names("") == ["one"]
+        assert tree.names("") == ["one", "wide"]
         assert set(tree.names("one")) == {*ARRAYS, "two"}
         assert tree.array("one/none") is None
         assert not tree.attributes("none")
     assert is_session(path)
-    with pytest.raises(InputError, match=r"has no spectra/data.*it has one"):
+    with pytest.raises(InputError, match=r"has no spectra/data.*it has one, wide"):
         read_session(path)
 
 
@@ -233,6 +239,36 @@ def test_a_session_is_the_same_in_hdf5_and_in_fits(hdf5, tmp_path):
                 assert [str(c) for c in a.columns] == [str(c) for c in b.columns]
                 for name in b.columns.names:
                     np.testing.assert_array_equal(a.data[name], b.data[name])
+
+
+# of luseepy's own files
+TYPES = {
+    "spectra/data": "float32",
+    "spectra/mjd_time_valid": "bool",
+    "spectra/navgf": "uint8",
+    "spectra/original_indices": "uint64",
+    "spectra/raw_seconds": "float64",
+    "spectra/unique_ids": "uint32",
+    "spectra/metadata/field_present/notch": "bool",
+    "spectra/metadata/fields/actual_gain/variant_000/data": "uint8",
+    "spectra/metadata/fields/actual_gain/variant_000/row_indices": "uint64",
+    "spectra/metadata/fields/adc_min/variant_000/data": "int64",
+    "spectra/metadata/fields/navg2_shift/variant_index": "int32",
+    "spectra/metadata/fields/requested_bitslice/variant_000/data": "uint8",
+    "telemetry/lusee_subsecs": "uint16",
+    "telemetry/mission_seconds": "uint32",
+    "telemetry/values": "float64",
+}
+
+
+def test_names_and_types_are_luseepys(hdf5):
+    with h5py.File(hdf5) as file:
+        assert {name: str(file[name].dtype) for name in TYPES} == TYPES
+        assert file.attrs["layout_version"].dtype == np.uint16
+        assert file["spectra"].attrs["count"].dtype == np.uint64
+        assert file["spectra/data"].attrs["bitslice_restored"].dtype == np.bool_
+        assert file["spectra/data"].attrs["bitslice_reference"].dtype == np.uint8
+        assert file["session_invariants"].attrs["software_version"].dtype == np.uint32
 
 
 def changed(path, change):

@@ -30,7 +30,7 @@ def some_rows(**changes):
     rng = np.random.default_rng(5)
     level = np.array([list("MMMM")] * 3 + [list("LMHL")] * 4)
     rows = SessionRows(
-        raw_s=2.3e7 + 42.0 * np.arange(N),
+        raw_s=2.3e7 + 0.7 + 42.0 * np.arange(N),
         navgf=np.full(N, 2),
         navg_shift=np.full(N, 20),
         level=level,

@@ -61,7 +61,7 @@ def write_groups(
     header["ATTRJSON"] = _json(_attributes(groups[""].attributes))
     _write_header(file, header)
     number = 1
-    for path in sorted((path for path in groups if path), key=lambda path: path.split("/")):
+    for path in sorted(path for path in groups if path):
         number += _write_group(file, number, path, groups[path], late.get(path))
 
 
