@@ -51,6 +51,7 @@ STATES = [
     ["flight.simulated.navgf=4", "flight.convention=conj(s_i) s_j"],
     ["flight.simulated.levels=LLLL", "flight.simulated.kind=fits", "flight.bin_origin=edge"],
     ["flight.simulated.layout=4", "flight.simulated.session_h=1.4"],
+    ["flight.simulated.layout=4", "flight.simulated.kind=fits", "flight.simulated.navgf=2"],
     ["flight.simulated.switch_h=2.2", "flight.simulated.levels=HHHH"],
     ["flight.simulated.clock=unknown", "flight.convention=conj(s_i) s_j"],
 ]
@@ -201,8 +202,9 @@ def test_impossible_states_are_refused(change):
         load_scenario("fiducial", [*SMALL, "flight.simulated={}", f"flight.simulated.{change}"])
 
 
-@pytest.mark.parametrize("change", ["{layout: 4, kind: fits}", "{layout: 4, clock: unknown}"])
-def test_layouts_have_what_they_need(change):
+@pytest.mark.parametrize("kind", ["hdf5", "fits"])
+def test_telemetry_of_layout_4_needs_a_clock(kind):
+    change = f"{{layout: 4, kind: {kind}, clock: unknown}}"
     with pytest.raises(InputError, match="layout"):
         load_scenario("fiducial", [*SMALL, f"flight.simulated={change}"])
 
