@@ -45,6 +45,80 @@ class Amplitudes:
         return np.sqrt(np.diagonal(self.covariance))
 
 
+@dataclass(frozen=True)
+class AmplitudesOfSky:
+    """Posterior of templates' amplitudes given the data and a sky, in prior standard deviations.
+
+    ::
+
+        mean = T^T N^-1 (d - offset - A m0) - P (m - m0),    covariance = 1 - T^T N^-1 T
+
+    of a sky m. Other data may tell of the sky, too, where they have amplitudes of their own: these
+    hold under any posterior of the sky.
+
+    Attributes
+    ----------
+    mean : (n,) array
+        Of the reference sky.
+    pull : (n, modes) array
+        P, in 1/K.
+    covariance : (n, n) array
+    reference : (modes,) array
+        The reference sky m0, in K.
+    """
+
+    mean: Float[np.ndarray, " n"]
+    pull: Float[np.ndarray, "n modes"]
+    covariance: Float[np.ndarray, "n n"]
+    reference: Float[np.ndarray, " modes"]
+
+    def integrated(
+        self, mean: Float[np.ndarray, " modes"], covariance: Float[np.ndarray, "modes modes"]
+    ) -> Amplitudes:
+        """Integrate a sky N(mean, covariance) out, in K and K^2: given any data besides."""
+        with_sky = -covariance @ self.pull.T
+        return Amplitudes(
+            self.mean - self.pull @ (mean - self.reference),
+            self.covariance - self.pull @ with_sky,
+            with_sky,
+        )
+
+
+def amplitudes_of_sky(
+    model: LinearGaussian,
+    reference: Float[Array, " modes"],
+    data: Float[Array, " data"],
+    templates: Float[Array, "data n"],
+) -> AmplitudesOfSky:
+    """Compute the posterior of templates' amplitudes given the sky.
+
+    Parameters
+    ----------
+    model : LinearGaussian
+        With ``templates @ templates.T`` in its noise.
+    reference : (modes,) array
+        A sky near the one that is meant, in K: differences from it keep their digits.
+    data : (data,) array
+        d, in K.
+    templates : (data, n) array
+        T, in K.
+
+    Raises
+    ------
+    InputError
+        If N is not positive definite.
+    """
+    model, reference, data, t = on_host((model, reference, data, templates))
+    solved = np.asarray(model.noise.factor().solve(t))
+    pull = np.stack([np.asarray(model.coupling.transpose_mv(column)) for column in solved.T])
+    return AmplitudesOfSky(
+        solved.T @ (data - np.asarray(model.predict(reference))),
+        pull,
+        np.eye(t.shape[1]) - t.T @ solved,
+        np.asarray(reference),
+    )
+
+
 def template_amplitudes(
     model: LinearGaussian,
     posterior: Posterior,
@@ -69,16 +143,9 @@ def template_amplitudes(
     InputError
         As :meth:`Posterior.covariance`, and if N is not positive definite.
     """
-    model, posterior, data, t = on_host((model, posterior, data, templates))
-    factor = model.noise.factor()
-    solved = np.asarray(factor.solve(t))
-    pulled = np.stack([np.asarray(model.coupling.transpose_mv(column)) for column in solved.T])
-    with_sky = -np.asarray(posterior.covariance()) @ pulled.T
-    return Amplitudes(
-        mean=solved.T @ (data - np.asarray(model.predict(posterior.mean))),
-        covariance=np.eye(t.shape[1]) - t.T @ solved - pulled @ with_sky,
-        with_sky=with_sky,
-    )
+    posterior = on_host(posterior)
+    found = amplitudes_of_sky(model, posterior.mean, data, templates)
+    return found.integrated(np.asarray(posterior.mean), np.asarray(posterior.covariance()))
 
 
 def weighted_residual(

@@ -24,7 +24,7 @@ from lusee_bayes.experiment.schema import FileSkySection
 from lusee_bayes.experiment.terms import beam_rms_difference
 from lusee_bayes.instrument.beams import HemisphereGrid, stokes_beam
 from lusee_bayes.paper.claims import FREQUENCIES, Cases, cross, frequency_case
-from lusee_bayes.results.channel import channel_of_posterior
+from lusee_bayes.results.map_channel import channel_of_posterior
 
 # by name: a scenario of the package and what differs from it; those after the frequencies are not
 # among the paper's figures, but its text speaks of them or they tell why a claim does not hold

@@ -11,6 +11,7 @@ from lusee_bayes.report import head, html
 from lusee_bayes.report.cube_explorer import cube_explorer
 from lusee_bayes.report.flight_section import SECTION, flight_section, is_flight
 from lusee_bayes.report.run_details import details
+from lusee_bayes.report.unknowns_section import cube_unknowns
 from lusee_bayes.results.cube_fit import N_TESTS
 from lusee_bayes.results.saved import (
     CHANNEL_SUMMARY,
@@ -90,6 +91,7 @@ def cube_page(folder: Path, name: str) -> str:
     parts["maps"].append(html.paragraph(_how(joint, summary.get("log_evidence"))))
     parts["spectra"] += _pulls(folder, summary)
     parts["chi2"] = [_tests(folder, summary), *parts["chi2"], _table(channels)]
+    parts["chi2"] += cube_unknowns(folder, summary)
     if "coverage" in channels[0]:
         parts["maps"].append(_coverage(folder, channels))
     sections = [*SECTIONS[:-2], SECTION, *SECTIONS[-2:]] if is_flight(folder) else SECTIONS

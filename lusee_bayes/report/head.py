@@ -65,10 +65,22 @@ def doubts(path: Path, found: Mapping[str, Any]) -> str:
     InputError
         If it is no list of sentences.
     """
-    told = found.get("doubts", [])
-    if not isinstance(told, list) or not all(isinstance(text, str) for text in told):
-        raise InputError(f"{path}: doubts is no list of texts; make the results anew")
+    told = sentences(path, found, "doubts")
     return "\n".join(html.paragraph(f"Doubtful: {text}", TENSE) for text in told)
+
+
+def sentences(path: Path, found: Mapping[str, Any], name: str) -> list[str]:
+    """The sentences that a run's figures hold under a name; none if they do not.
+
+    Raises
+    ------
+    InputError
+        If it is no list of sentences.
+    """
+    told = found.get(name, [])
+    if not isinstance(told, list) or not all(isinstance(text, str) for text in told):
+        raise InputError(f"{path}: {name} is no list of texts; make the results anew")
+    return told
 
 
 def about(folder: Path, channels: str) -> str:

@@ -15,8 +15,9 @@ from lusee_bayes.report.coverage_table import COVERAGE_HEADER, coverage_cells
 from lusee_bayes.report.explorer import explorer
 from lusee_bayes.report.flight_section import SECTION, flight_section, is_flight
 from lusee_bayes.report.run_details import details
+from lusee_bayes.report.unknowns_section import map_unknowns
 from lusee_bayes.results.finished_runs import FinishedRun
-from lusee_bayes.results.saved import COVERAGE, NULL_DIRECTION, POINTING, SOURCES, UNKNOWNS
+from lusee_bayes.results.saved import COVERAGE, POINTING, SOURCES
 
 NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "diagnostics.nc", "mean.fits", "std.fits")
 FIGURES = ("maps", "draws", "fidelity", "spectra", "data_vector", "residuals", "beams")
@@ -215,7 +216,7 @@ def _data(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
         bad = [f"{name} {cell[0]}" in marked for cell in cells]
         parts += [html.paragraph(f"{title}{note}"), html.table(header, cells, bad)]
     parts += _pointing(folder)
-    parts += _unknowns(folder, summary)
+    parts += map_unknowns(folder, summary)
     parts.append(
         _figure(
             folder,
@@ -251,25 +252,6 @@ def _pointing(folder: Path) -> list[str]:
             )
         )
     return [html.subsection("Clock and pointing"), *parts] if parts else []
-
-
-def _unknowns(folder: Path, summary: dict) -> list[str]:
-    """Receivers, ground and gain table, and what the data cannot tell, where the run has them."""
-    if not (folder / "unknowns.csv").is_file():
-        return []
-    table = read_table(folder / "unknowns.csv", UNKNOWNS)
-    cells = [
-        (name, unit or "relative", f"{value:.5g}", f"{std:.2g}", f"{prior:.5g}", f"{before:.2g}")
-        for name, unit, value, std, prior, before in zip(
-            *(table[name] for name in UNKNOWNS.variables), strict=True
-        )
-    ]
-    header = ("unknown", "unit", "found", "+-", "before the data", "+-")
-    null = entries(
-        folder / "summary.json", {"unknowns": [summary.get("unknowns")]}, "unknowns", NULL_DIRECTION
-    )[0]
-    parts = [html.subsection("Receivers, ground and gain table"), html.table(header, cells)]
-    return [*parts, html.paragraph(null["null_sentence"])] if null["null_sentence"] else parts
 
 
 def _group_row(found: xr.Dataset, row: int) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """The posterior over the sky at one frequency: what every kind of run has in common.
 
-A map is one channel, a cube several; samples and the paper's cases stand beside one. It is made
-here and nowhere else: of a posterior with its model, or of an information with its covariance.
+A map is one channel, a cube several; samples and the paper's cases stand beside one. It is made of
+an information with its covariance here, or of a posterior with its model (:mod:`.map_channel`).
 """
 
 from __future__ import annotations
@@ -16,21 +16,17 @@ from jaxtyping import Float, Shaped
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, power_spectrum
 from lusee_bayes.core.representation import Described, extent
-from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.plausibility import about_information
-from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.metrics import (
     correlation,
     ell_cross,
-    expected_chi2,
-    highest_altitude,
     signal_to_noise,
 )
 from lusee_bayes.linear.pixel_variance import pixel_std
 from lusee_bayes.results.coverage import Counts, Coverage
-from lusee_bayes.results.draws import deviations, doubts, posterior_draws, widths
 from lusee_bayes.results.observed import Observed
+from lusee_bayes.results.unknowns import UnknownsReport
 
 # numbers of a channel that a file keeps as attributes
 NUMBERS = (
@@ -87,6 +83,9 @@ class ChannelResult(Described):
         What is doubtful about measured data, a sentence each.
     coverage : tuple of Coverage
         How often error bars hold the truth, by latitude; empty where it is not known.
+    unknowns : UnknownsReport or None
+        Of receivers, ground and gain table, where the model has them. None for a map of its own,
+        which has it beside its channel.
     """
 
     frequency_mhz: float
@@ -112,6 +111,7 @@ class ChannelResult(Described):
     coverage: tuple[Coverage, ...] = ()
     instrument_chi2: float = np.nan
     instrument_chi2_expected: float = np.nan
+    unknowns: UnknownsReport | None = None
 
     def description(self) -> tuple[str, ...]:
         return (
@@ -193,7 +193,12 @@ class ChannelResult(Described):
         variables["pixel_std"] = (("pixel",), self.pixel_std)
         variables["highest_altitude"] = (("pixel",), self.highest_altitude)
         numbers = {name: getattr(self, name) for name in ("frequency_mhz", *NUMBERS)}
-        texts = {"doubts": self.doubts, "coverage": self.coverage_rows() or []}
+        unknowns = None if self.unknowns is None else self.unknowns.summary()
+        texts = {
+            "doubts": self.doubts,
+            "coverage": self.coverage_rows() or [],
+            "unknowns": unknowns,
+        }
         told = {name: json.dumps(value) for name, value in texts.items()}
         return xr.Dataset(variables, attrs={**numbers, **told})
 
@@ -204,72 +209,18 @@ class ChannelResult(Described):
         independent = arrays.pop("independent_mean", None)
         numbers = {name: float(dataset.attrs[name]) for name in NUMBERS}
         counts = {name: int(numbers.pop(name)) for name in ("n_data", "n_missing", "rounds")}
+        unknowns = json.loads(dataset.attrs["unknowns"])
         return cls(
             frequency_mhz=float(dataset.attrs["frequency_mhz"]),
             truth=arrays.pop("truth", None),
             independent=independent,
             doubts=tuple(json.loads(dataset.attrs["doubts"])),
             coverage=tuple(map(Coverage.from_row, json.loads(dataset.attrs["coverage"]))),
+            unknowns=None if unknowns is None else UnknownsReport.from_summary(unknowns),
             **arrays,
             **numbers,
             **counts,
         )
-
-
-def channel_of_posterior(
-    experiment: Experiment,
-    inference: Inference,
-    covariance: Float[np.ndarray, "modes modes"],
-    *,
-    n_draws: int = 0,
-    judged: Inference | None = None,
-) -> ChannelResult:
-    """The channel of a posterior over harmonic coefficients.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    inference : Inference
-        The posterior, and the model of the data.
-    covariance : (modes, modes) array
-        In K^2.
-    n_draws : int
-        How many draws of the posterior to keep.
-    judged : Inference, optional
-        The model that predicts the data and its posterior, where earlier data were there.
-    """
-    scenario, data, posterior = experiment.scenario, experiment.data, inference.posterior
-    judged, found = inference if judged is None else judged, ()
-    prior_variance = np.asarray(inference.model.prior.variance())
-    std, width = widths(experiment, covariance, scenario.map_nside)
-    fraction = np.divide(std**2, prior_variance, out=np.zeros(len(std)), where=prior_variance > 0)
-    mean, truth = np.asarray(posterior.mean), _array(data.truth)
-    if truth is not None:
-        found = Counts.of_pixels(width, truth - mean, deviations(experiment, posterior)).coverage()
-    return ChannelResult(
-        frequency_mhz=scenario.frequency_mhz,
-        mean=mean,
-        std=std,
-        prior_std=np.sqrt(prior_variance),
-        prior_fraction=mean_over_m(fraction),
-        pixel_std=width,
-        highest_altitude=highest_altitude(data.observation, scenario.map_nside),
-        draws=posterior_draws(experiment, posterior, n_draws),
-        truth=truth,
-        independent=None,
-        log_evidence=float(posterior.log_evidence),
-        information_bits=float(posterior.information_bits()),
-        chi2=float(inference.model.chi2(posterior.mean, data.data)),
-        chi2_expected=expected_chi2(judged.posterior, inference.model.n_data),
-        chi2_model=float(judged.model.chi2(judged.posterior.mean, data.data))
-        + float(judged.posterior.prior_chi2()),
-        refinement=float(posterior.refinement),
-        n_data=inference.model.n_data,
-        n_missing=data.n_missing,
-        rounds=inference.rounds,
-        doubts=(*doubts(experiment), *about_information(float(posterior.information_bits()))),
-        coverage=found,
-    )
 
 
 def channel_of_information(
@@ -313,7 +264,7 @@ def channel_of_information(
         covariance = spread.T @ spread / len(spread)
     else:
         expected = float(information.n_data - np.vdot(information.matrix, covariance))
-    std = np.sqrt(np.diagonal(np.asarray(covariance)))
+    std, unknowns = np.sqrt(np.diagonal(np.asarray(covariance))), observed.unknowns
     width, found = pixel_std(covariance, round(np.sqrt(observed.highest_altitude.size / 12))), ()
     if known_widths is not None:
         std, width = known_widths
@@ -343,6 +294,9 @@ def channel_of_information(
         coverage=found,
         instrument_chi2=observed.instrument.chi2,
         instrument_chi2_expected=observed.instrument.degrees,
+        unknowns=None
+        if unknowns is None
+        else unknowns.report(mean, covariance, joint=independent is not None),
     )
 
 

@@ -15,6 +15,7 @@ from lusee_bayes.linear.fit import ChiSquare
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.split import Split
 from lusee_bayes.results.observed import Observed
+from lusee_bayes.results.unknowns import Unknowns
 
 # numbers that a file keeps as attributes
 OF_INFORMATION = ("misfit", "log_det", "n_data")
@@ -45,7 +46,9 @@ class ChannelInformation:
         sky, posterior = np.asarray(experiment.setup.sky.modes), inference.posterior
         chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
         split = Split.of(posterior, chi2, inference.model.n_data)
-        return cls(information, Observed.of(experiment, inference.rounds, split.instrument), sky)
+        unknowns = Unknowns.of(experiment, inference, information.reference)
+        observed = Observed.of(experiment, inference.rounds, split.instrument, unknowns)
+        return cls(information, observed, sky)
 
     def to_dataset(self) -> xr.Dataset:
         """All of it, for :meth:`from_dataset`."""
@@ -66,7 +69,11 @@ class ChannelInformation:
         numbers = {name: float(getattr(information, name)) for name in OF_INFORMATION}
         numbers |= {name: getattr(observed, name) for name in OF_CHANNEL}
         numbers |= asdict(observed.instrument)
-        return xr.Dataset(variables, attrs={**numbers, "doubts": json.dumps(observed.doubts)})
+        found = xr.Dataset(variables, attrs={**numbers, "doubts": json.dumps(observed.doubts)})
+        if observed.unknowns is None:
+            return found
+        own = observed.unknowns.to_dataset()
+        return found.merge(own).assign_attrs(own.attrs)
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset) -> ChannelInformation:
@@ -87,5 +94,6 @@ class ChannelInformation:
             int(dataset.attrs["rounds"]),
             ChiSquare(float(dataset.attrs["chi2"]), float(dataset.attrs["degrees"])),
             tuple(json.loads(dataset.attrs["doubts"])),
+            Unknowns.from_dataset(dataset, arrays["reference"]),
         )
         return cls(information, observed, arrays["sky"])

@@ -21,6 +21,7 @@ from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.linear.fit import RULE, ChiSquare, Fit
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.cube_fit import ChannelFits
+from lusee_bayes.results.cube_unknowns import CubeUnknowns
 from lusee_bayes.results.joint_components import Components
 from lusee_bayes.results.prior_words import joint_prior_sentence
 from lusee_bayes.sky.landmarks import LANDMARKS
@@ -91,6 +92,11 @@ class CubeResult(Described):
         """Whether the data of all channels fit."""
         return self.fits().fit()
 
+    @cached_property
+    def unknowns(self) -> CubeUnknowns | None:
+        """Receivers, ground and gain table, where the model has them."""
+        return CubeUnknowns.of(self.channels)
+
     def verdict(self) -> str:
         """What the residuals say, in sentences."""
         return self.fit.text
@@ -118,7 +124,8 @@ class CubeResult(Described):
     def lines(self) -> list[str]:
         """What a terminal shows."""
         prior = [] if self.components is None else [self.prior_words()]
-        return [self.headline(), *prior, self.verdict(), RULE, *self.doubts()]
+        unknowns = [] if self.unknowns is None else self.unknowns.lines()
+        return [self.headline(), *prior, *unknowns, self.verdict(), RULE, *self.doubts()]
 
     def doubts(self) -> list[str]:
         """What is doubtful about the data, with the channel."""
@@ -184,6 +191,8 @@ class CubeResult(Described):
             known = {name: value for name, value in numbers.items() if not np.isnan(value)}
             if channel.coverage:
                 known["coverage"] = channel.coverage_rows()
+            if channel.unknowns is not None:
+                known["unknowns"] = channel.unknowns.summary()
             channels.append(
                 {"frequency_mhz": channel.frequency_mhz, "ell_cross": channel.ell_cross, **known}
             )
@@ -201,6 +210,7 @@ class CubeResult(Described):
                 for t in self.fits().tests()
             ],
             "pulls": self.pulls(),
+            "unknowns": [] if self.unknowns is None else self.unknowns.lines(),
             "channels": channels,
             "seconds": {name: round(s, 3) for name, s in self.seconds.items()},
             "peak_memory_gb": round(peak_memory_gb(), 3),

@@ -24,9 +24,10 @@ from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.linear.fit import LEVELS, RULE
 from lusee_bayes.linear.metrics import effective_resolution_deg
 from lusee_bayes.linear.updating import composed, deviation_model
-from lusee_bayes.results.channel import ChannelResult, channel_of_posterior
+from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.diagnostics import diagnostics
 from lusee_bayes.results.fluxes import flux_lines, flux_table
+from lusee_bayes.results.map_channel import channel_of_posterior
 from lusee_bayes.results.pointing import PointingReport, pointing_report
 from lusee_bayes.results.prior_words import prior_sentence, prior_summary
 from lusee_bayes.results.saved import JUDGED

@@ -11,6 +11,7 @@ from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.linear.fit import ChiSquare
 from lusee_bayes.linear.metrics import highest_altitude
 from lusee_bayes.results.draws import doubts
+from lusee_bayes.results.unknowns import Unknowns
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,8 @@ class Observed:
     instrument : ChiSquare
         What no sky explains of the channel's own data.
     doubts : tuple of str
+    unknowns : Unknowns or None
+        Receivers, ground and gain table, where the model has them.
     """
 
     frequency_mhz: float
@@ -38,9 +41,16 @@ class Observed:
     rounds: int
     instrument: ChiSquare
     doubts: tuple[str, ...] = ()
+    unknowns: Unknowns | None = None
 
     @classmethod
-    def of(cls, experiment: Experiment, rounds: int, instrument: ChiSquare) -> Observed:
+    def of(
+        cls,
+        experiment: Experiment,
+        rounds: int,
+        instrument: ChiSquare,
+        unknowns: Unknowns | None = None,
+    ) -> Observed:
         """Of an experiment, and what no sky explains of its data."""
         data, nside = experiment.data, experiment.scenario.map_nside
         return cls(
@@ -52,4 +62,5 @@ class Observed:
             rounds,
             instrument,
             doubts(experiment),
+            unknowns,
         )

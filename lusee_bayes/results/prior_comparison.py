@@ -17,8 +17,9 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.held_out import HeldOut, held_out
 from lusee_bayes.linear.importance import LogMean
 from lusee_bayes.linear.split import Split
-from lusee_bayes.results.channel import ChannelResult, channel_of_posterior
+from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.errors import errors_by_latitude, snr_at_some_ell
+from lusee_bayes.results.map_channel import channel_of_posterior
 from lusee_bayes.results.prior_table import prior_table
 from lusee_bayes.results.prior_words import prior_sentence
 

@@ -288,6 +288,10 @@ UNKNOWNS = Layout(
         "prior_std": Variable(("unknown",), low=0.0),
     },
 )
+CHANNEL_UNKNOWNS = Layout(
+    "receivers, ground and gain table of several frequencies",
+    {"frequency_mhz": Variable(("unknown",), low=0.0), **UNKNOWNS.variables},
+)
 NULL_DIRECTION = Layout(
     "what a map's data cannot tell of receivers, ground and gain table",
     attributes={"null_share": Attribute(low=0.0), "null_sentence": TEXT},

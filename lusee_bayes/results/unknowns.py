@@ -1,21 +1,34 @@
-"""Receivers, ground and gain table of a map: what the data tell of each, and what they cannot."""
+"""Receivers, ground and gain table of a map: what the data tell of each, and what they cannot.
+
+Of a joint posterior each channel has its own unknowns z ~ N(0, 1), and given the channel's sky m no
+other channel's data tell of them: p(z | all data) is p(z | m, d) with the joint posterior of m
+integrated out.
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import xarray as xr
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Array, on_host
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.simulate import true_values
-from lusee_bayes.linear.templates import Amplitudes, template_amplitudes
+from lusee_bayes.linear.templates import Amplitudes, AmplitudesOfSky, amplitudes_of_sky
 from lusee_bayes.results.null_direction import NullDirection
 from lusee_bayes.systematics import GainTable, LinearUnknowns
 
 # what these are called beside receivers and ground
 SKY, GAIN = "uniform sky", "common gain"
+# an unknown that keeps more of its prior's standard deviation is not told by the data
+UNTOLD = 0.9
 
 
 @dataclass(frozen=True)
@@ -26,33 +39,176 @@ class UnknownsReport:
     ----------
     table : DataFrame
         A row for each: unknown, unit, value, std, prior, prior_std and, if known, true.
-    null : NullDirection
+    null : NullDirection or None
+        None for a channel of a joint posterior, whose sky has no prior of its own.
     """
 
     table: pd.DataFrame
-    null: NullDirection
+    null: NullDirection | None
+
+    @property
+    def told(self) -> pd.Series:
+        """Whether the data tell each of them."""
+        return self.table["std"] <= UNTOLD * self.table["prior_std"]
 
     def lines(self) -> list[str]:
         """One line for every unknown, and the sentence of the null direction."""
         lines = []
-        for row in self.table.to_dict("records"):
+        for row, told in zip(self.table.to_dict("records"), self.told, strict=True):
             unit = f" {row['unit']}" if row["unit"] else ""
             text = f"{row['unknown']}: {row['value']:.4g} +- {row['std']:.2g}{unit}"
-            if row["std"] > 0.9 * row["prior_std"]:
+            if not told:
                 text += f", the prior's {row['prior_std']:.2g}: these data do not tell it"
             lines.append(text)
-        sentence = self.null.sentence()
+        sentence = self.null_sentence()
         return [*lines, sentence] if sentence else lines
 
-    def summary(self) -> dict[str, object]:
+    def null_sentence(self) -> str:
+        """What the data cannot tell; empty where they tell most of it, or it is not judged."""
+        return "" if self.null is None else self.null.sentence()
+
+    def summary(self) -> dict[str, Any]:
         """Entry of summary.json."""
+        found: dict[str, Any] = {"rows": self.table.to_dict("records")}
+        if self.null is None:
+            return found
         parts = dict(zip(self.null.names, self.null.weights.tolist(), strict=True))
-        return {
-            "rows": self.table.to_dict("records"),
+        return found | {
             "null_direction": parts,
             "null_share": self.null.share,
-            "null_sentence": self.null.sentence(),
+            "null_sentence": self.null_sentence(),
         }
+
+    @classmethod
+    def from_summary(cls, found: Mapping[str, Any]) -> UnknownsReport:
+        """The inverse of :meth:`summary`."""
+        null = None
+        if "null_direction" in found:
+            parts = found["null_direction"]
+            weights = np.array(list(parts.values()), dtype=np.float64)
+            null = NullDirection(tuple(parts), weights, found["null_share"])
+        return cls(pd.DataFrame(found["rows"]), null)
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """What some data tell of receivers, ground and gain table, given the sky.
+
+    Attributes
+    ----------
+    rows : tuple of dict
+        Of each: unknown, unit, prior, prior_std, ``expected`` (the prior mean in N) and, if known,
+        true.
+    amplitudes : AmplitudesOfSky
+        Of all of them, about ``expected``.
+    names : tuple of str
+        Of what may look like a uniform sky: powers and temperatures, and what all errors of gains
+        have in common.
+    parts : (parts, n) array
+        Of the latter one unit vector, since those of single ports and levels look like no sky.
+    sky_std : float
+        Prior standard deviation of the monopole, in K.
+    """
+
+    rows: tuple[dict[str, Any], ...]
+    amplitudes: AmplitudesOfSky
+    names: tuple[str, ...]
+    parts: Float[np.ndarray, "parts n"]
+    sky_std: float
+
+    @classmethod
+    def of(
+        cls, experiment: Experiment, found: Inference, reference: Float[Array, " modes"]
+    ) -> Unknowns | None:
+        """Of data and their model; None if that has no such unknowns.
+
+        Parameters
+        ----------
+        experiment : Experiment
+        found : Inference
+            Of these data alone.
+        reference : (modes,) array
+            A sky near its posterior mean, in K.
+        """
+        listed = [s for s in found.systematics if isinstance(s, (LinearUnknowns, GainTable))]
+        if not listed:
+            return None
+        columns = np.concatenate([np.asarray(s.columns) for s in listed], axis=1)
+        amplitudes = amplitudes_of_sky(found.model, reference, experiment.data.data, columns)
+        names, parts = _like_the_sky(listed)
+        sky_std = float(np.sqrt(np.asarray(found.model.prior.variance())[0]))
+        return cls(_rows(experiment, listed), amplitudes, names, parts, sky_std)
+
+    def report(
+        self,
+        mean: Float[np.ndarray, " modes"],
+        covariance: Float[np.ndarray, "modes modes"],
+        *,
+        joint: bool = False,
+    ) -> UnknownsReport:
+        """What is told of them with the sky integrated out.
+
+        Parameters
+        ----------
+        mean, covariance : (modes,) and (modes, modes) array
+            Posterior of the sky, in K and K^2.
+        joint : bool
+            It is also that of other data: no null direction is looked for.
+        """
+        told = self.amplitudes.integrated(np.asarray(mean), np.asarray(covariance))
+        rows = []
+        for row, z, std in zip(self.rows, told.mean.tolist(), told.std.tolist(), strict=True):
+            found = {
+                "unknown": row["unknown"],
+                "unit": row["unit"],
+                "value": row["expected"] + row["prior_std"] * z,
+                "std": row["prior_std"] * std,
+                "prior": row["prior"],
+                "prior_std": row["prior_std"],
+            }
+            rows.append(found | {"true": row["true"]} if "true" in row else found)
+        null = None if joint else self._null_direction(told, float(covariance[0, 0]))
+        return UnknownsReport(pd.DataFrame(rows), null)
+
+    def _null_direction(self, told: Amplitudes, variance: float) -> NullDirection:
+        mixed = self.parts @ told.with_sky[0] / self.sky_std
+        inner = self.parts @ told.covariance @ self.parts.T
+        sky = np.array([[variance / self.sky_std**2]])
+        blocks = np.block([[sky, mixed[None]], [mixed[:, None], inner]])
+        return NullDirection.of((SKY, *self.names), blocks)
+
+    def to_dataset(self) -> xr.Dataset:
+        """All of it but the reference sky, for :meth:`from_dataset`."""
+        return xr.Dataset(
+            {
+                "unknown_mean": ("unknown", self.amplitudes.mean),
+                "unknown_pull": (("unknown", "mode"), self.amplitudes.pull),
+                "unknown_covariance": (("unknown", "unknown_2"), self.amplitudes.covariance),
+                "unknown_parts": (("part", "unknown"), self.parts),
+            },
+            attrs={
+                "unknowns": json.dumps(self.rows),
+                "unknown_names": json.dumps(self.names),
+                "unknown_sky_std": self.sky_std,
+            },
+        )
+
+    @classmethod
+    def from_dataset(
+        cls, dataset: xr.Dataset, reference: Float[np.ndarray, " modes"]
+    ) -> Unknowns | None:
+        """The inverse of :meth:`to_dataset`; None if it has none."""
+        if "unknowns" not in dataset.attrs:
+            return None
+        names = ("mean", "pull", "covariance", "parts")
+        mean, pull, covariance, parts = (np.asarray(dataset[f"unknown_{name}"]) for name in names)
+        return cls(
+            tuple(json.loads(dataset.attrs["unknowns"])),
+            AmplitudesOfSky(mean, pull, covariance, reference),
+            tuple(json.loads(dataset.attrs["unknown_names"])),
+            parts,
+            float(dataset.attrs["unknown_sky_std"]),
+        )
 
 
 def unknowns_report(experiment: Experiment, found: Inference) -> UnknownsReport | None:
@@ -69,46 +225,47 @@ def unknowns_report(experiment: Experiment, found: Inference) -> UnknownsReport 
     UnknownsReport or None
         None if the model has no such unknowns.
     """
-    listed = [s for s in found.systematics if isinstance(s, (LinearUnknowns, GainTable))]
-    if not listed:
+    posterior = on_host(found.posterior)
+    unknowns = Unknowns.of(experiment, found, posterior.mean)
+    if unknowns is None:
         return None
-    columns = np.concatenate([np.asarray(s.columns) for s in listed], axis=1)
-    told = template_amplitudes(found.model, found.posterior, experiment.data.data, columns)
+    return unknowns.report(np.asarray(posterior.mean), np.asarray(posterior.covariance()))
+
+
+def _rows(
+    experiment: Experiment, listed: list[LinearUnknowns | GainTable]
+) -> tuple[dict[str, Any], ...]:
+    """Those of :class:`Unknowns`."""
     # of spectra, the sky behind them may be known, but not what the scenario would have drawn
     simulated = experiment.data.truth is not None and experiment.data.calibration is None
     truth = true_values(experiment.setup) if simulated else None
-    rows, at = [], 0
+    rows = []
     for systematic in listed:
         stds = np.asarray(systematic.stds)
-        own = slice(at, at + len(stds))
-        value = systematic.in_units(systematic.expected + told.mean[own])
+        expected = systematic.in_units(np.asarray(systematic.expected))
         prior = systematic.in_units(0.0 * stds)
         true = None if truth is None else systematic.true(truth)
-        for name, std, prior_std in zip(value, told.std[own] * stds, stds, strict=True):
+        for name, std in zip(expected, stds.tolist(), strict=True):
             row = {
                 "unknown": name,
                 "unit": systematic.unit,
-                "value": value[name],
-                "std": float(std),
+                "expected": expected[name],
                 "prior": prior[name],
-                "prior_std": float(prior_std),
+                "prior_std": std,
             }
             rows.append(row if true is None else row | {"true": true[name]})
-        at += len(stds)
-    return UnknownsReport(pd.DataFrame(rows), _null_direction(found, told, listed))
+    return tuple(rows)
 
 
-def _null_direction(
-    found: Inference, told: Amplitudes, listed: list[LinearUnknowns | GainTable]
-) -> NullDirection:
-    """That of the monopole, powers and temperatures, and what all errors of gains have in common.
-
-    Of the latter one unit vector, since those of single ports and levels look like no sky.
-    """
-    names, weights, at = [SKY], [], 0
+def _like_the_sky(
+    listed: list[LinearUnknowns | GainTable],
+) -> tuple[tuple[str, ...], Float[np.ndarray, "parts n"]]:
+    """Names and unit vectors of what may look like a uniform sky."""
+    names, weights, at = [], [], 0
+    every = np.eye(sum(len(systematic.names) for systematic in listed))
     for systematic in listed:
         n = len(systematic.names)
-        own = np.eye(len(told.mean))[at : at + n]
+        own = every[at : at + n]
         if isinstance(systematic, GainTable):
             names.append(GAIN)
             weights.append(systematic.common[None] @ own)
@@ -116,9 +273,4 @@ def _null_direction(
             names.extend(systematic.labels)
             weights.append(own)
         at += n
-    parts = np.concatenate(weights)
-    sky_std = float(np.sqrt(np.asarray(found.model.prior.variance())[0]))
-    sky = np.asarray(found.posterior.std())[0] / sky_std
-    mixed = parts @ told.with_sky[0] / sky_std
-    inner = parts @ told.covariance @ parts.T
-    return NullDirection.of(names, np.block([[sky**2, mixed[None]], [mixed[:, None], inner]]))
+    return tuple(names), np.concatenate(weights)

@@ -30,6 +30,7 @@ from lusee_bayes.report.figures import cube as cube_figures
 from lusee_bayes.report.figures import diagnostics as diagnostic_figures
 from lusee_bayes.report.figures import flight as flight_figures
 from lusee_bayes.report.figures.pointing import pointing_by_day
+from lusee_bayes.report.figures.unknowns import unknowns_by_frequency
 from lusee_bayes.results.channel_files import CHANNELS
 from lusee_bayes.results.cost import posterior_cost, require_fits, require_resources
 from lusee_bayes.results.cube import CubeResult
@@ -236,6 +237,12 @@ def _write_summary(result: MapResult | CubeResult, folder: Path) -> None:
     (folder / "summary.json").write_text(json.dumps(result.summary(), indent=2) + "\n")
 
 
+def _write_unknowns(result: MapResult | CubeResult, folder: Path) -> None:
+    result.unknowns.table.to_csv(folder / "unknowns.csv", index=False)
+
+
+UNKNOWNS = Output(_write_unknowns, wanted=lambda result: result.unknowns is not None)
+
 # what the folder of a map holds; a new file is one line here
 MAP = RunKind(
     "map",
@@ -254,12 +261,7 @@ MAP = RunKind(
             wanted=lambda result: result.fluxes is not None,
         ),
         Output(_write_offsets, wanted=lambda r: r.pointing and r.pointing.offsets is not None),
-        Output(
-            lambda result, folder: result.unknowns.table.to_csv(
-                folder / "unknowns.csv", index=False
-            ),
-            wanted=lambda result: result.unknowns is not None,
-        ),
+        UNKNOWNS,
         Output(_write_preferred, wanted=lambda result: result.pointing is not None),
         Output(
             lambda result, folder: write_diagnostics(result.diagnostics, folder / "diagnostics.nc")
@@ -293,6 +295,7 @@ CUBE = RunKind(
         ),
         Output(_write_cubes),
         Output(lambda result, folder: write_csv(folder / "spectra.csv", result.spectra())),
+        UNKNOWNS,
         Output(_write_reduced, wanted=lambda result: result.reduced is not None),
         Output(_write_scenario),
         Output(_write_summary),
@@ -302,6 +305,7 @@ CUBE = RunKind(
         "spectra": cube_figures.spectra,
         "fidelity": cube_figures.fidelity,
         "chi2": cube_figures.chi2,
+        "unknowns": lambda r: r.unknowns and unknowns_by_frequency(r.unknowns),
         "flight_time_line": lambda r: r.reduced and flight_figures.time_line(r.reduced),
         "flight_calibration": lambda r: r.reduced and flight_figures.calibration(r.reduced),
     },

@@ -34,7 +34,7 @@ from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.results import sample_result as results
-from lusee_bayes.results.channel import channel_of_posterior
+from lusee_bayes.results.map_channel import channel_of_posterior
 from lusee_bayes.results.sample_result import sample_result
 from lusee_bayes.runs import sample_run, validate_run
 from lusee_bayes.runs.folder import run_folder, write_run

@@ -1,0 +1,140 @@
+"""Receivers, ground and gain table of runs of several frequencies."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from experiments import four_ports
+from matplotlib.figure import Figure
+from reference_linear import white_posterior
+
+import lusee_bayes as lb
+from lusee_bayes.core.harmonics import per_mode
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.report.cube_page import FIGURES as CUBE_FIGURES
+from lusee_bayes.report.cube_page import cube_page
+from lusee_bayes.results import cube_channels
+from lusee_bayes.results.cube_channels import cube_result
+from lusee_bayes.results.unknowns import unknowns_report
+from lusee_bayes.runs import map_run
+
+RECEIVER, GROUND = "noise.receiver={power_k: 2000, slope: -2}", "noise.regolith={std_k: 30}"
+TABLE = "noise.gain_table={std: 0.01}"
+NUMBERS = ["value", "std", "prior", "prior_std", "true"]
+# rounding of two solutions of the same equations, in standard deviations: z is a difference of
+# data and prediction, 1e5 times the noise
+ROUNDING = 1e-5
+
+
+def cube_of(response_file, *overrides, frequencies="[15, 20]"):
+    return four_ports(response_file, *overrides, f"frequencies_mhz={frequencies}")
+
+
+def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch):
+    others = {name: lambda _: Figure() for name in CUBE_FIGURES}
+    drawn = {**others, "unknowns": map_run.CUBE.figures["unknowns"]}
+    monkeypatch.setattr(map_run, "CUBE", replace(map_run.CUBE, figures=drawn))
+    run = lb.run_map(cube_of(response_file, RECEIVER, GROUND, TABLE), tmp_path / "cube")
+    written = pd.read_csv(tmp_path / "cube" / "unknowns.csv", keep_default_na=False)
+    assert list(written)[:3] == ["frequency_mhz", "unknown", "unit"]
+    nulls = {}
+    for channel in run.result.scenario.channels():
+        experiment = build(channel)
+        expected = unknowns_report(experiment, infer(experiment))
+        nulls[channel.frequency_mhz] = expected.null
+        here = written[written["frequency_mhz"] == channel.frequency_mhz].reset_index(drop=True)
+        assert list(here["unknown"]) == list(expected.table["unknown"]) and len(here) == 9
+        off = (here["value"] - expected.table["value"]) / expected.table["std"]
+        assert np.abs(off).max() < ROUNDING
+        for name in NUMBERS[1:]:
+            np.testing.assert_allclose(here[name], expected.table[name], rtol=ROUNDING)
+        (found,) = (c for c in run.result.channels if c.frequency_mhz == channel.frequency_mhz)
+        assert found.unknowns.null.names == expected.null.names
+        assert found.unknowns.null.share == pytest.approx(expected.null.share, rel=ROUNDING)
+        np.testing.assert_allclose(found.unknowns.null.weights, expected.null.weights, atol=1e-4)
+    # the mean power of receivers goes with frequency
+    receivers = written[written["unknown"] == "receiver_0_k"]["prior"]
+    assert receivers.iloc[0] == pytest.approx(receivers.iloc[1] * (20.0 / 15.0) ** 2)
+    lines = run.result.lines()
+    untold = "Receivers, ground and gain table: the data do not tell regolith_k (at 2 of 2 frequenc"
+    (line,) = (line for line in lines if line.startswith(untold))
+    (sentence,) = (line for line in lines if line.startswith("One combination of what looks alike"))
+    worst = max(nulls, key=lambda frequency: nulls[frequency].share)
+    assert f"at 2 of 2 frequencies. At {worst:g} MHz ({nulls[worst].words()}, in" in sentence
+    page = cube_page(tmp_path / "cube", "a run")
+    assert line in page and sentence in page
+    assert "Powers of receivers" in page and "<td>15</td><td>regolith_k</td><td>K</td>" in page
+
+
+def test_a_resumed_run_has_them_too(response_file, tmp_path, monkeypatch):
+    scenario = cube_of(response_file, RECEIVER, GROUND)
+    whole = cube_result(scenario, tmp_path / "whole").unknowns
+    inform, done = cube_channels.inform, []
+
+    def once(experiment, *arguments):
+        if done:
+            raise KeyboardInterrupt
+        done.append(experiment.scenario.frequency_mhz)
+        return inform(experiment, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cube_channels, "inform", once)
+        with pytest.raises(KeyboardInterrupt):
+            cube_result(scenario, tmp_path / "resumed")
+    resumed = cube_result(scenario, tmp_path / "resumed").unknowns
+    assert len(done) == 1
+    pd.testing.assert_frame_equal(resumed.table, whole.table)
+    assert resumed.lines() == whole.lines()
+
+
+@pytest.mark.parametrize(
+    "solver", ["direct", pytest.param("conjugate_gradients", marks=pytest.mark.long)]
+)
+def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(
+    response_file, tmp_path, solver
+):
+    """Every sky and every unknown as one Gaussian in NumPy."""
+    spectral = f"spectral={{components: [power_law], solver: {solver}}}"
+    scenario = cube_of(
+        response_file, RECEIVER, GROUND, "joint=true", spectral, frequencies="[15, 20, 25]"
+    )
+    cube = cube_result(scenario, tmp_path)
+    prior = cube.components.prior
+    n_modes, n_own = 16, 5
+    stds = [np.sqrt(np.asarray(per_mode(c))) for c in (prior.spectra[0], *prior.residual)]
+    stds = np.concatenate([*stds, np.ones(3 * n_own)])
+    rows, noise, rest, tables = [], [], [], []
+    for number, channel in enumerate(scenario.channels()):
+        experiment = build(channel)
+        found = infer(experiment)
+        a = np.asarray(experiment.setup.coupling.dense())
+        t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
+        row = np.zeros((len(a), len(stds)))
+        row[:, :n_modes] = float(prior.mixing[number, 0]) * a
+        row[:, (1 + number) * n_modes : (2 + number) * n_modes] = a
+        row[:, 4 * n_modes + number * n_own : 4 * n_modes + (number + 1) * n_own] = t
+        rows.append(row)
+        noise.append(np.sqrt(np.asarray(radiometer(experiment.setup).diagonal())))
+        rest.append(np.asarray(experiment.data.data) - np.asarray(experiment.setup.offset))
+        tables.append(unknowns_report(experiment, found).table)
+    expected = white_posterior(
+        np.concatenate(rows), stds, np.concatenate(noise), np.concatenate(rest)
+    )
+    alone = pd.concat(tables, ignore_index=True)
+    table = cube.unknowns.table
+    scale, own = table["prior_std"].to_numpy(), slice(4 * n_modes, None)
+    std = scale * expected.std[own]
+    off = (table["value"] - table["prior"] - scale * expected.mean[own]) / std
+    assert np.abs(off).max() < (1e-4 if solver == "direct" else 1e-3)
+    # of 50 draws: a tenth each, and 15 of them
+    tolerance = 1e-4 if solver == "direct" else 0.4
+    np.testing.assert_allclose(table["std"], std, rtol=tolerance)
+    np.testing.assert_allclose(table["true"], alone["true"], rtol=1e-12)
+    # other channels do tell: the test would see a table of each channel's own data
+    assert (np.abs(table["value"] - alone["value"]) / std).max() > 0.05
+    assert all(channel.unknowns.null is None for channel in cube.channels)
