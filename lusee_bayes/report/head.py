@@ -65,10 +65,26 @@ def doubts(path: Path, found: Mapping[str, Any]) -> str:
     InputError
         If it is no list of sentences.
     """
-    told = found.get("doubts", [])
+    texts = _sentences(path, found, "doubts")
+    return "\n".join(html.paragraph(f"Doubtful: {text}", TENSE) for text in texts)
+
+
+def unmapped(path: Path, found: Mapping[str, Any]) -> str:
+    """Which channels could not be mapped, and why; nothing if a run's figures name none.
+
+    Raises
+    ------
+    InputError
+        If it is no list of sentences.
+    """
+    return "\n".join(html.paragraph(t, BAD) for t in _sentences(path, found, "unmapped"))
+
+
+def _sentences(path: Path, found: Mapping[str, Any], name: str) -> list[str]:
+    told = found.get(name, [])
     if not isinstance(told, list) or not all(isinstance(text, str) for text in told):
-        raise InputError(f"{path}: doubts is no list of texts; make the results anew")
-    return "\n".join(html.paragraph(f"Doubtful: {text}", TENSE) for text in told)
+        raise InputError(f"{path}: {name} is no list of texts; make the results anew")
+    return told
 
 
 def about(folder: Path, channels: str) -> str:
