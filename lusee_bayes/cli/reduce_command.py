@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes.cli.options import Clock, Frequencies, Overrides, Quiet, Verbose, load, say
+from lusee_bayes.cli.options import Clock, Force, Frequencies, Overrides, Quiet, Verbose, load, say
 from lusee_bayes.core.progress import Stages
 
 
@@ -21,6 +21,7 @@ def reduce_command(
     frequencies: Frequencies = None,
     clock: Clock = None,
     set_: Overrides | None = None,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -41,6 +42,8 @@ def reduce_command(
         (flight.clock).
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
+    force
+        Replace the file if it is there already.
     quiet
         Print nothing but errors.
     verbose
@@ -53,6 +56,7 @@ def reduce_command(
         load(scenario, set_, frequencies, flight__clock=clock),
         files,
         output,
+        replace=force,
         stages=Stages(console, verbose=verbose),
     )
     say(console, *run.lines(), f"{len(run.reduced.frequencies_mhz)} bands -> {output}")

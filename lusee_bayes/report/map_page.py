@@ -268,8 +268,11 @@ def _unknowns(folder: Path, summary: dict) -> list[str]:
     null = entries(
         folder / "summary.json", {"unknowns": [summary.get("unknowns")]}, "unknowns", NULL_DIRECTION
     )[0]
-    parts = [html.subsection("Receivers, ground and gain table"), html.table(header, cells)]
-    return [*parts, html.paragraph(null["null_sentence"])] if null["null_sentence"] else parts
+    # runs of older versions have no notes
+    notes = head.sentences(folder / "summary.json", null, "notes")
+    told = [sentence for sentence in (null["null_sentence"], *notes) if sentence]
+    title = html.subsection("Receivers, ground and gain table")
+    return [title, html.table(header, cells), *(html.paragraph(text) for text in told)]
 
 
 def _group_row(found: xr.Dataset, row: int) -> tuple[str, ...]:

@@ -211,6 +211,8 @@ def map_result(
         with stages("fluxes"):
             fluxes = flux_table(experiment, alone)
     unknowns = unknowns_report(experiment, alone)
+    if unknowns is not None and earlier is not None:
+        unknowns = replace(unknowns, onto=True)
     with stages("diagnostics"):
         page = diagnostics(experiment, found, judged, channel, covariance)
     pointing = None

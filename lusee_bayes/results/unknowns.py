@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
@@ -16,6 +17,8 @@ from lusee_bayes.systematics import GainTable, LinearUnknowns
 
 # what these are called beside receivers and ground
 SKY, GAIN = "uniform sky", "common gain"
+# what keeps so much of its prior's standard deviation is not told by the data
+KEPT = 0.9
 
 
 @dataclass(frozen=True)
@@ -27,22 +30,44 @@ class UnknownsReport:
     table : DataFrame
         A row for each: unknown, unit, value, std, prior, prior_std and, if known, true.
     null : NullDirection
+    common : float or None
+        Standard deviation of what all errors of gains have in common, over its prior's; None
+        without a gain table.
+    onto : bool
+        Whether the map is of earlier data, too, which the table is not of.
     """
 
     table: pd.DataFrame
     null: NullDirection
+    common: float | None = None
+    onto: bool = False
+
+    def notes(self) -> list[str]:
+        """What has to be known to read the table, a sentence each."""
+        found = []
+        if self.common is not None and self.common > KEPT:
+            found.append(
+                "The common gain of all ports keeps its prior (standard deviation "
+                f"{self.common:.2f} of the prior's): no sky of unknown brightness tells it."
+            )
+        if self.onto:
+            found.append(
+                "Receivers, ground and gains are what the new data alone tell of them; those of "
+                "the earlier data are in the folder that the map was made onto."
+            )
+        return found
 
     def lines(self) -> list[str]:
-        """One line for every unknown, and the sentence of the null direction."""
+        """One line for every unknown, the sentence of the null direction, and the notes."""
         lines = []
         for row in self.table.to_dict("records"):
             unit = f" {row['unit']}" if row["unit"] else ""
             text = f"{row['unknown']}: {row['value']:.4g} +- {row['std']:.2g}{unit}"
-            if row["std"] > 0.9 * row["prior_std"]:
+            if row["std"] > KEPT * row["prior_std"]:
                 text += f", the prior's {row['prior_std']:.2g}: these data do not tell it"
             lines.append(text)
         sentence = self.null.sentence()
-        return [*lines, sentence] if sentence else lines
+        return [*lines, *([sentence] if sentence else []), *self.notes()]
 
     def summary(self) -> dict[str, object]:
         """Entry of summary.json."""
@@ -52,6 +77,8 @@ class UnknownsReport:
             "null_direction": parts,
             "null_share": self.null.share,
             "null_sentence": self.null.sentence(),
+            "common_gain_std_share": self.common,
+            "notes": self.notes(),
         }
 
 
@@ -95,30 +122,41 @@ def unknowns_report(experiment: Experiment, found: Inference) -> UnknownsReport 
             }
             rows.append(row if true is None else row | {"true": true[name]})
         at += len(stds)
-    return UnknownsReport(pd.DataFrame(rows), _null_direction(found, told, listed))
+    parts = _named_parts(told, listed)
+    common = None
+    if GAIN in parts:
+        common = float(np.sqrt((parts[GAIN] @ told.covariance @ parts[GAIN].T).item()))
+    null = _null_direction(found, told, parts)
+    return UnknownsReport(pd.DataFrame(rows), null, common)
 
 
-def _null_direction(
-    found: Inference, told: Amplitudes, listed: list[LinearUnknowns | GainTable]
-) -> NullDirection:
-    """That of the monopole, powers and temperatures, and what all errors of gains have in common.
+def _named_parts(
+    told: Amplitudes, listed: list[LinearUnknowns | GainTable]
+) -> dict[str, Float[np.ndarray, "1 templates"]]:
+    """Directions of powers and temperatures, and of what all errors of gains have in common.
 
     Of the latter one unit vector, since those of single ports and levels look like no sky.
     """
-    names, weights, at = [SKY], [], 0
+    parts, at = {}, 0
     for systematic in listed:
         n = len(systematic.names)
         own = np.eye(len(told.mean))[at : at + n]
         if isinstance(systematic, GainTable):
-            names.append(GAIN)
-            weights.append(systematic.common[None] @ own)
+            parts[GAIN] = systematic.common[None] @ own
         else:
-            names.extend(systematic.labels)
-            weights.append(own)
+            parts |= {label: own[k : k + 1] for k, label in enumerate(systematic.labels)}
         at += n
-    parts = np.concatenate(weights)
+    return parts
+
+
+def _null_direction(
+    found: Inference, told: Amplitudes, parts: dict[str, Float[np.ndarray, "1 templates"]]
+) -> NullDirection:
+    """That of the monopole and these parts."""
+    along = np.concatenate(list(parts.values()))
     sky_std = float(np.sqrt(np.asarray(found.model.prior.variance())[0]))
     sky = np.asarray(found.posterior.std())[0] / sky_std
-    mixed = parts @ told.with_sky[0] / sky_std
-    inner = parts @ told.covariance @ parts.T
+    mixed = along @ told.with_sky[0] / sky_std
+    inner = along @ told.covariance @ along.T
+    names = (SKY, *parts)
     return NullDirection.of(names, np.block([[sky**2, mixed[None]], [mixed[:, None], inner]]))

@@ -141,6 +141,19 @@ def test_groups_and_single_data_by_hand(case):
     assert found.fit().text.startswith("Consistent: instrument and noise fit (p ")
 
 
+@pytest.mark.parametrize(
+    ("width", "said", "not_said"),
+    [(10.0, "error bars are too wide; a narrower prior", "what the prior allows"),
+     (0.1, "stronger than the prior expects, error bars are too narrow", "narrower prior")],
+)  # fmt: skip
+def test_a_prior_that_is_too_wide_is_told_from_one_that_is_too_narrow(width, said, not_said):
+    """The same data, under a prior ten times as wide as the sky's, and as narrow."""
+    model, data = simulated()
+    fit = judged(replace(model, prior=model.prior.widened(width)), data).fit()
+    assert fit.level == "unlike the prior"
+    assert said in fit.text and not_said not in fit.text
+
+
 def test_one_group_is_everything():
     model, data = simulated("observation.runs=[{cycles: 0.02}]")
     found = judged(model, data)

@@ -81,7 +81,11 @@ def test_the_prior_is_judged_apart():
     joint = fits(chi2, rest=(400.0, 200.0), joint=True).fit()
     assert joint.level == "unlike the prior" and "spectral.components" in joint.text
     assert fits(1.2 * chi2, rest=(400.0, 200.0)).fit().level == "does not fit"
-    assert fits(chi2, rest=(50.0, 200.0)).fit().level == "unlike the prior"
+    weak = fits(chi2, rest=(50.0, 200.0)).fit()
+    assert weak.level == "unlike the prior" and "skies are weaker" in weak.text
+    assert "too narrow" not in weak.text and "error bars are too wide" in weak.text
+    assert "too narrow" in strong.text and "weaker" not in strong.text.split("expects")[0]
+    assert "smaller spectral.residual" in fits(chi2, rest=(50.0, 200.0), joint=True).fit().text
     bound = fits(chi2, rest=(50.0, 200.0), bound=True, joint=True)
     assert bound.fit().level == "consistent" and "expected at most 200" in bound.fit().text
     assert fits(chi2, rest=(400.0, 200.0), bound=True).fit().level == "unlike the prior"
