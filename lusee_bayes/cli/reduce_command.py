@@ -49,6 +49,7 @@ def reduce_command(
     verbose
         Print the memory in use after every stage.
     """
+    from lusee_bayes.core.representation import counted
     from lusee_bayes.runs.reduce_run import run_reduce
 
     console = Console(quiet=quiet, soft_wrap=True)
@@ -59,4 +60,4 @@ def reduce_command(
         replace=force,
         stages=Stages(console, verbose=verbose),
     )
-    say(console, *run.lines(), f"{len(run.reduced.frequencies_mhz)} bands -> {output}")
+    say(console, *run.lines(), f"{counted(len(run.reduced.frequencies_mhz), 'band')} -> {output}")

@@ -122,7 +122,9 @@ class CubeResult(Described):
     def lines(self) -> list[str]:
         """What a terminal shows."""
         prior = [] if self.components is None else [self.prior_words()]
-        return [self.headline(), *prior, self.verdict(), RULE, *self.doubts(), *self.gaps()]
+        notes = () if self.reduced is None else self.reduced.notes()
+        told = [self.headline(), *prior, self.verdict(), RULE]
+        return [*told, *self.doubts(), *self.gaps(), *notes]
 
     def doubts(self) -> list[str]:
         """What is doubtful about the data, with the channel."""

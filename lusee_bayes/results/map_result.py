@@ -162,7 +162,8 @@ class MapResult(Described):
         offsets = [] if self.pointing is None else self.pointing.lines()
         unknowns = [] if self.unknowns is None else self.unknowns.lines()
         told = [prior_sentence(self.experiment), *fluxes, *offsets, *unknowns]
-        return [self.headline(), *told, self.verdict(), RULE, *self.channel.doubts]
+        notes = () if self.reduced is None else self.reduced.notes()
+        return [self.headline(), *told, self.verdict(), RULE, *self.channel.doubts, *notes]
 
 
 def map_result(

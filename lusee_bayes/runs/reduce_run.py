@@ -37,7 +37,7 @@ class ReduceRun:
 
 def reduced_lines(reduced: Reduced) -> list[str]:
     """What was flagged in each band, and how its noise compares with the radiometer's."""
-    lines = [reduced.description()[0]]
+    lines = [reduced.description()[0], *reduced.notes()]
     for band, frequency in enumerate(reduced.frequencies_mhz):
         parts = [f"{name} {share:.2%}" for name, share in reduced.shares(band).items()]
         noise = reduced.scatter[band]
