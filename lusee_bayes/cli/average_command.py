@@ -10,7 +10,7 @@ from rich.console import Console
 
 from lusee_bayes.cli.options import (
     Flag,
-    Force,
+    ForceFile,
     Overrides,
     Quiet,
     Verbose,
@@ -29,7 +29,7 @@ def average_command(
     scenario: str = "fiducial",
     set_: Overrides | None = None,
     no_information: Flag = False,
-    force: Force = False,
+    force: ForceFile = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -50,12 +50,6 @@ def average_command(
         key.path=value; overrides an entry of the scenario, as often as needed.
     no_information
         Leave out the information, which takes the memory and the time of two maps.
-    force
-        Replace the file if it is there already.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     from lusee_bayes.runs.average_run import run_average
 

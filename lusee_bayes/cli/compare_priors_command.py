@@ -65,12 +65,6 @@ def compare_priors_command(
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share out the priors;
         by default DASK_SCHEDULER_ADDRESS.
-    force
-        Replace results of another run in the folder.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     from lusee_bayes.cli.tables import priors_table
     from lusee_bayes.core.workers import open_engine

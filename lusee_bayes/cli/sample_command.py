@@ -72,12 +72,6 @@ def sample_command(
         its own, and their maps together in cubes. With --resume, finished ones are taken over.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
-    force
-        Replace results of another run in the folder.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.sample_run import default_program, run_sample

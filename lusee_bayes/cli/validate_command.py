@@ -82,12 +82,6 @@ def validate_command(
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share them out; by default
         DASK_SCHEDULER_ADDRESS.
-    force
-        Replace results of another run in the folder.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     if skies is not None and (data is not None or resume):
         raise InputError("--skies simulates its data, all at once; leave out --data and --resume")
