@@ -75,8 +75,10 @@ def test_a_clock_that_the_sessions_do_not_say_is_told_in_one_line(simulated, red
     # nothing to say where the session says it itself
     known = lb.load_scenario("fiducial", [*SET, "flight.simulated.clock=known"])
     made = run_simulate_flight(known, tmp_path)
-    both = reduce_files(list(made.sessions), lb.load_scenario(str(made.scenario)))
-    assert both.notes() == ()
+    clock = f"flight.clock={simulated[0].flight.clock}"
+    for given in ((), (clock,)):
+        both = reduce_files(list(made.sessions), lb.load_scenario(str(made.scenario), given))
+        assert both.notes() == ()
 
 
 def test_of_one_frequency_gains_are_points_with_error_bars(reduced):
