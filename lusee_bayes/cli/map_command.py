@@ -104,8 +104,7 @@ def map_command(
     )
     folder = output or default_folder(scenario)
     stages = Stages(console, verbose=verbose)
-    files = None if data is None else tuple(data)
-    given = {"data": files, "truth": truth, "onto": onto, "replace": force, "stages": stages}
+    given = {"data": data, "truth": truth, "onto": onto, "replace": force, "stages": stages}
     if resolved.frequencies_mhz:
         demand = demand_of_channels(resolved)
         with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:

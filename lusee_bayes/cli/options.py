@@ -57,7 +57,7 @@ Cluster = Annotated[str | None, Parameter(name="--cluster")]
 Flag = Annotated[bool, Parameter(negative="")]
 # one file of visibilities, or sessions of the spectrometer
 DataFiles = Annotated[
-    list[Path] | None, Parameter(name="--data", consume_multiple=True, negative="")
+    tuple[Path, ...] | None, Parameter(name="--data", consume_multiple=True, negative="")
 ]
 Clock = Annotated[
     str | None,
