@@ -51,9 +51,6 @@ def compare_priors_command(
     data
         Visibilities to map: a file, or sessions of the spectrometer, one or many; without them the
         scenario's own are simulated.
-    clock
-        Clock reference in JSON, for sessions that do not say which UTC their clock stands for
-        (flight.clock).
     truth
         The given data are of the scenario's own sky: count how often error bars hold it.
     priors

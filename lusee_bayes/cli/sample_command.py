@@ -58,9 +58,6 @@ def sample_command(
     data
         Visibilities to use: a file, or sessions of the spectrometer, one or many; without them the
         scenario's own are simulated.
-    clock
-        Clock reference in JSON, for sessions that do not say which UTC their clock stands for
-        (flight.clock).
     output
         Folder for the results; by default output/NAME-MODEL.
     resume

@@ -66,9 +66,6 @@ def validate_command(
     data
         Visibilities to use: a file, or sessions of the spectrometer, one or many; without them the
         scenario's own are simulated.
-    clock
-        Clock reference in JSON, for sessions that do not say which UTC their clock stands for
-        (flight.clock).
     output
         Folder for the results; by default output/NAME-validation, or NAME-skies.
     resume

@@ -69,7 +69,15 @@ def test_channels_that_stand_out_are_named():
     assert "2 of 46 channels stand out: 12 MHz" in text and "35 MHz" in text
     assert run.fit().level == "does not fit"
     # noise that is given too large is no fit either
-    assert fits(0.8 * chi2[:1]).fit().level == "does not fit"
+    quiet = fits(0.8 * chi2[:1]).fit()
+    assert quiet.level == "does not fit"
+    assert "noise is given too large" in quiet.text and "no sky explains" not in quiet.text
+    assert "no sky explains" in text and "too large" not in text
+    # one channel that is too loud, whatever the sum
+    loud = np.full(46, 4970.0)
+    loud[7] = 6000.0
+    assert loud.sum() < 46 * 5000.0
+    assert "no sky explains" in fits(loud).fit().text
 
 
 def test_the_prior_is_judged_apart():
