@@ -51,9 +51,6 @@ def compare_priors_command(
     data
         Visibilities to map: a file, or sessions of the spectrometer, one or many; without them the
         scenario's own are simulated.
-    clock
-        Clock reference in JSON, for sessions that do not say which UTC their clock stands for
-        (flight.clock).
     truth
         The given data are of the scenario's own sky: count how often error bars hold it.
     priors
@@ -72,12 +69,6 @@ def compare_priors_command(
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share out the priors;
         by default DASK_SCHEDULER_ADDRESS.
-    force
-        Replace results of another run in the folder.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     from lusee_bayes.cli.tables import priors_table
     from lusee_bayes.core.workers import open_engine

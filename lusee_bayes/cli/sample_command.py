@@ -58,9 +58,6 @@ def sample_command(
     data
         Visibilities to use: a file, or sessions of the spectrometer, one or many; without them the
         scenario's own are simulated.
-    clock
-        Clock reference in JSON, for sessions that do not say which UTC their clock stands for
-        (flight.clock).
     output
         Folder for the results; by default output/NAME-MODEL.
     resume
@@ -78,12 +75,6 @@ def sample_command(
         its own, and their maps together in cubes. With --resume, finished ones are taken over.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
-    force
-        Replace results of another run in the folder.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.sample_run import default_program, run_sample

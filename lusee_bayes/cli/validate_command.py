@@ -66,9 +66,6 @@ def validate_command(
     data
         Visibilities to use: a file, or sessions of the spectrometer, one or many; without them the
         scenario's own are simulated.
-    clock
-        Clock reference in JSON, for sessions that do not say which UTC their clock stands for
-        (flight.clock).
     output
         Folder for the results; by default output/NAME-validation, or NAME-skies.
     resume
@@ -89,12 +86,6 @@ def validate_command(
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share them out; by default
         DASK_SCHEDULER_ADDRESS.
-    force
-        Replace results of another run in the folder.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     if skies is not None and (data is not None or resume):
         raise InputError("--skies simulates its data, all at once; leave out --data and --resume")

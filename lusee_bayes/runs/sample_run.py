@@ -153,9 +153,10 @@ def _run_single(
 
 def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Path) -> None:
     scenario, results = sampled
+    frequencies = np.array(scenario.frequencies_mhz)
     for name in ("mean", "std"):
         pixels = np.stack([result.maps[name] for result in results])
-        write_cube(folder / f"{name}.fits", name, pixels, scenario)
+        write_cube(folder / f"{name}.fits", name, pixels, frequencies, scenario)
     (folder / "scenario.yaml").write_text(scenario.to_yaml())
 
 

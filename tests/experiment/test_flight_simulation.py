@@ -7,8 +7,10 @@ import pytest
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.flight_data import reduce_files
+from lusee_bayes.experiment.flight_disturbances import Disturbances
 from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.experiment.schema import FlightSimulatedSection
 from lusee_bayes.instrument.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED
 from lusee_bayes.instrument.flight.sessions import read_session
 from lusee_bayes.instrument.flight.spectrometer import CHANNEL_MHZ
@@ -192,6 +194,19 @@ def test_the_same_seed_makes_the_same_disturbances_and_noise(tmp_path):
 def test_what_makes_no_sessions_is_refused(changes, text):
     with pytest.raises(InputError, match=text):
         simulate_flight(load_scenario("fiducial", [*SMALL, *changes]))
+
+
+def test_a_tone_that_no_bin_holds_is_refused():
+    """Navgf 3 leaves out every fourth channel, the last of each bin."""
+
+    def drawn(channel):
+        section = FlightSimulatedSection(navgf=3, tones_mhz=(0.025 * channel,))
+        return Disturbances.drawn(section, np.arange(20.0), 3600.0, "centre", 1)
+
+    for channel in (1000, 1001, 1002):
+        assert np.flatnonzero(drawn(channel).tone_channel).tolist() == [channel]
+    with pytest.raises(InputError, match=r"channel 1003, which Navgf 3 leaves out.*25\.(05|1) MHz"):
+        drawn(1003)
 
 
 @pytest.mark.parametrize(

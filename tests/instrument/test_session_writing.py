@@ -69,7 +69,7 @@ def test_a_session_comes_back_from_its_file(tmp_path, kind, layout):
     assert is_session(path)
     found = read_session(path)
     assert (found.layout, found.kind) == (layout, kind.upper())
-    assert found.software == "775"
+    assert found.software == "0x307"
     assert (found.lon_deg, found.lat_deg) == (rows.lon_deg, rows.lat_deg)
     np.testing.assert_array_equal(found.raw_s, rows.raw_s)
     np.testing.assert_array_equal(found.navgf, rows.navgf)

@@ -163,9 +163,14 @@ def session_of(
         clock=clock,
         lon_deg=found.values["constants.lun_long_deg"],
         lat_deg=found.values["constants.lun_lat_deg"],
-        software=found.values.get("session_invariants.software_version", "unknown"),
+        software=_version(found.values.get("session_invariants.software_version", "unknown")),
         opener=opener,
     )
+
+
+def _version(text: str) -> str:
+    """A version of the flight software as it is written: 0x307 for the number 775."""
+    return f"{int(text):#x}" if text.isascii() and text.isdigit() else text
 
 
 def _clock(path: Path, found: Content) -> Clock | None:
