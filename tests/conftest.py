@@ -12,6 +12,9 @@ os.environ["XLA_FLAGS"] = " ".join(
         f"--xla_backend_optimization_level={os.environ.get('LUSEE_BAYES_TEST_XLA_LEVEL', '0')}",
     ]
 ).strip()
+# of healpy, whose threads wait for each other where other processes want the processors, too: a map
+# of NSIDE 8 then takes 25 us with one of them, and 900 us with two
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 # as the package says it, for what imports JAX before
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 

@@ -29,6 +29,8 @@ from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.linear.compact import read_compact
 from lusee_bayes.report.describe import describe
 from lusee_bayes.results.updatable import read_updatable
+from lusee_bayes.runs import folder as folder_module
+from lusee_bayes.runs import map_run
 from lusee_bayes.runs.flight_run import run_simulate_flight
 from lusee_bayes.sky import write_alms
 from lusee_bayes.testing import small_scenario
@@ -113,7 +115,11 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
     products = sampled_beams([20.0, 30.0], products=np.ones((2, 4, 48)))
     write_sampled_beams(folder / "sampled_products.nc", products)
     updatable = ["output={updatable: true, compact: true}"]
-    run = lb.run_map(small_scenario(*updatable, lmax=2), folder / "run")
+    with pytest.MonkeyPatch.context() as patch:
+        # neither figures nor a page, which take longer than the map
+        patch.setattr(map_run, "MAP", replace(map_run.MAP, figures={}))
+        patch.setattr(folder_module, "PAGES", {})
+        run = lb.run_map(small_scenario(*updatable, lmax=2), folder / "run")
     shutil.copy(run.folder / "posterior.nc", folder / "updatable.nc")
     shutil.copy(run.folder / "posterior_compact.npz", folder / "compact.npz")
     for name in ("posterior.nc", "diagnostics.nc"):

@@ -188,7 +188,7 @@ def test_evidence_integrates_to_one():
     model = LinearGaussian(jnp.array([[1.5]]), HarmonicPrior(jnp.array([2.0])), noise)
     solver = model.factorise()
     d = jnp.linspace(-25.0, 25.0, 501)  # 11 sigma, step 0.05 sigma: exact for a Gaussian
-    density = jnp.exp(jax.vmap(lambda x: solver.log_prob(x[None]))(d))
+    density = jnp.exp(jax.jit(jax.vmap(lambda x: solver.log_prob(x[None])))(d))
     assert float(jnp.trapezoid(density, d)) == pytest.approx(1.0, abs=1e-12)
 
 
@@ -202,7 +202,7 @@ def test_form_is_picked_from_the_sizes():
 
 def test_prior_predictive_draws_follow_the_evidence():
     model, _ = well_scaled(9, "blocks", offset=np.full(9, 2.0))
-    skies, data = jax.vmap(model.sample)(jax.random.split(jax.random.key(4), 20_000))
+    skies, data = jax.jit(jax.vmap(model.sample))(jax.random.split(jax.random.key(4), 20_000))
     a, s = np.asarray(model.coupling.dense()), np.diag(per_mode(SPECTRUM))
     k = a @ s @ a.T + np.asarray(model.noise.dense())
     joint = np.block([[s, s @ a.T], [a @ s, k]])
@@ -389,7 +389,7 @@ def test_one_factorisation_serves_many_data_vectors():
     model, d = well_scaled(30, "blocks")
     solver = model.factorise()
     many = jnp.stack([d, 2.0 * d, jnp.zeros(30)])
-    means = jax.vmap(lambda x: solver.condition(x).mean)(many)
+    means = jax.jit(jax.vmap(lambda x: solver.condition(x).mean))(many)
     for data, mean in zip(many, means, strict=True):
         np.testing.assert_allclose(mean, naive(model, data).mean, atol=WELL_SCALED)
 
@@ -507,7 +507,7 @@ def test_slopes_with_fewer_data_and_an_ell_without_power():
     a, s, n = model.coupling.dense(), np.diag(per_mode(spectrum)), model.noise.dense()
     a, n, added_n = np.asarray(a), np.asarray(n), np.diag(np.asarray(added))
     expected = log_prob_slope(a, s, n, np.asarray(d), 0 * s, added_n)
-    assert float(jax.jacfwd(value)(jnp.asarray(0.0))) == pytest.approx(expected, rel=1e-9)
+    assert float(jax.jit(jax.jacfwd(value))(jnp.asarray(0.0))) == pytest.approx(expected, rel=1e-9)
 
 
 def test_standard_deviations_are_right_or_refused():

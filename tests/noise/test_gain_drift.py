@@ -249,7 +249,7 @@ def test_derivatives_of_the_log_determinant():
         return (radiometer + drift.covariance(jnp.asarray(d), hours, layout, 5)).log_det()
 
     at = np.array([0.1, 10.0])  # sigma and correlation_h
-    slopes = jax.grad(value)(jnp.asarray(at))
+    slopes = jax.jit(jax.grad(value))(jnp.asarray(at))
     for k in range(2):
         step = 1e-4 * at * (np.arange(2) == k)
         up, down = (float(value(jnp.asarray(at + s))) for s in (step, -step))

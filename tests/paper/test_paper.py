@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import replace
+from functools import cache
 
 import healpy
 import matplotlib.image
@@ -197,6 +198,12 @@ def test_a_name_without_frequency_is_refused(tmp_path, name):
         paper.sky_frequency_mhz(tmp_path / "exp5MHz.hdf5")
 
 
+@cache
+def whole_paper():
+    """The scenarios of all cases: to be read."""
+    return paper.paper_scenarios()
+
+
 def synthetic(name: str, agrees: bool) -> xr.Dataset:
     """A case as the paper describes it, or one that contradicts every claim."""
     ell, rng = np.arange(48), np.random.default_rng(3)
@@ -223,7 +230,7 @@ def synthetic(name: str, agrees: bool) -> xr.Dataset:
     noise = np.full_like(data, np.sqrt(2) if name == "duty_cycle_50" else 1.0)
     n_data = {"three_cycles": 3, "half_cycle": 0.5}.get(name, 1) * 5232
     rms, products = 0.01 if "0.4" in name else 0.1, list(labels())
-    scenario = paper.paper_scenarios()[name].to_yaml()
+    scenario = whole_paper()[name].to_yaml()
     seen_at = frequency
     if not agrees:
         # fidelity: everything poor and nothing of it where the paper has it

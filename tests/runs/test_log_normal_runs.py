@@ -18,6 +18,7 @@ from lusee_bayes.core.harmonics import modes_to_map, n_modes
 from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.pieces import program_pieces
+from lusee_bayes.results.map_result import map_result
 from lusee_bayes.results.prior_words import prior_sentence
 from lusee_bayes.runs.sample_run import default_program
 from lusee_bayes.sampling.hmc import Sampler
@@ -58,11 +59,11 @@ def test_mean_covariance_and_evidence_are_those_of_laplace(run):
         off = data - dense @ sky.modes(u)
         return 0.5 * ((off**2 / noise).sum() + u @ u)
 
-    jacobian = np.asarray(jax.jacfwd(sky.modes)(white))
+    jacobian = np.asarray(jax.jit(jax.jacfwd(sky.modes))(white))
     seen = dense @ jacobian
     curvature = seen.T @ (seen / noise[:, None]) + np.eye(sky.size)
     # in standard deviations; the search stops at 1e-3
-    slope = np.asarray(jax.grad(energy)(white))
+    slope = np.asarray(jax.jit(jax.grad(energy))(white))
     assert np.sqrt(slope @ np.linalg.solve(curvature, slope)) < 2e-3
     covariance = jacobian @ np.linalg.solve(curvature, jacobian.T)
     std = np.sqrt(np.diag(covariance))
@@ -160,7 +161,7 @@ def test_what_it_cannot_do_is_said(run):
     with pytest.raises(InputError, match=r"set prior\.model=lognormal"):
         program_pieces(isotropic)["log_normal"]()
     with pytest.raises(InputError, match="a log-normal map cannot be updated"):
-        lb.run_map(run.result.scenario, run.folder.parent / "more", onto=run.folder)
+        map_result(run.result.experiment, onto=run.folder)
 
 
 @pytest.mark.long

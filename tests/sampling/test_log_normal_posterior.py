@@ -147,7 +147,7 @@ def test_the_gradient_vanishes_at_the_mode():
     def energy(u):
         return 0.5 * (given.chi2(sky.modes(u)) + u @ u)
 
-    slope = np.asarray(jax.grad(energy)(jnp.asarray(found.white)))
+    slope = np.asarray(jax.jit(jax.grad(energy))(jnp.asarray(found.white)))
     # H^-1 measures it in standard deviations
     assert np.linalg.norm(np.linalg.solve(found.lower, slope)) < 1e-3
 
@@ -164,15 +164,16 @@ def test_straight_coordinates_are_one_to_one_with_the_determinant_they_say(learn
     z = jax.random.normal(jax.random.key(3), (n,), dtype=jnp.float64)
     x = coordinates.mean + coordinates.root @ z
 
+    @jax.jit
     def flat(x):
         values, log_det = coordinates.to_values(x)
         return coordinates.join(values), log_det
 
     values, log_det = flat(x)
     assert float(jnp.abs(values - x).max()) > 1e-3
-    back = coordinates.from_values(coordinates.split(values))
+    back = jax.jit(lambda values: coordinates.from_values(coordinates.split(values)))(values)
     np.testing.assert_allclose(back, x, rtol=0, atol=1e-11)
-    derivative = jax.jacfwd(lambda x: flat(x)[0])(x)
+    derivative = jax.jit(jax.jacfwd(lambda x: flat(x)[0]))(x)
     # rounding errors of 1e-16 times a condition of 1e5
     assert float(log_det) == pytest.approx(np.linalg.slogdet(derivative)[1], abs=1e-8)
     assert (float(log_det) != 0.0) == learned
