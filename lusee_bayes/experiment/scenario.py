@@ -26,6 +26,7 @@ from lusee_bayes.experiment.schema import (
     GalaxySection,
     IsotropicPriorSection,
     LocalScalesPriorSection,
+    LogNormalPriorSection,
     MonopoleBeamSection,
     NoiseSection,
     ObservationSection,
@@ -149,11 +150,40 @@ class Scenario(Section):
             )
         return self
 
+    @model_validator(mode="after")
+    def _smooth_receivers_are_gaussian(self) -> Scenario:
+        if not self.ties_receivers:
+            return self
+        if self.joint:
+            raise ValueError(
+                "noise.receiver.smooth_octaves ties the receivers of channels that have a "
+                "posterior each; with joint, leave it out"
+            )
+        if isinstance(self.prior, LogNormalPriorSection):
+            raise ValueError(
+                "noise.receiver.smooth_octaves ties channels whose skies are Gaussian, not those "
+                "of prior.model=lognormal; leave it out, or take another prior"
+            )
+        return self
+
+    @property
+    def ties_receivers(self) -> bool:
+        """Whether receivers' powers of several frequencies are inferred as smooth spectra."""
+        receiver = self.noise.receiver
+        smooth = receiver is not None and receiver.smooth_octaves is not None
+        return smooth and receiver.treatment != "ignored" and bool(self.frequencies_mhz)
+
     def channels(self) -> tuple[Scenario, ...]:
         """The scenario of every channel; draws of each have a seed of their own, one further."""
         alone: dict[str, Any] = {"frequencies_mhz": (), "joint": False}
         if self.joint:  # theirs is the spectral prior, of the sky's own C_ell
             alone["prior"] = IsotropicPriorSection(spectrum="sky")
+        receiver = self.noise.receiver
+        if receiver is not None and receiver.smooth_octaves is not None:
+            # one function, of which each channel sees a value
+            seed = self.seed if receiver.smooth_seed is None else receiver.smooth_seed
+            shared = receiver.model_copy(update={"smooth_seed": seed})
+            alone["noise"] = self.noise.model_copy(update={"receiver": shared})
         return tuple(
             self.model_copy(update={**alone, "frequency_mhz": f, "seed": self.seed + number})
             for number, f in enumerate(self.frequencies_mhz)

@@ -83,6 +83,27 @@ class AmplitudesOfSky:
             with_sky,
         )
 
+    def given(
+        self, precision: Float[np.ndarray, "n n"], vector: Float[np.ndarray, " n"]
+    ) -> AmplitudesOfSky:
+        """Take in what is known of the amplitudes besides: exp(-z^T Q z / 2 + q^T z).
+
+        Parameters
+        ----------
+        precision : (n, n) array
+            Q.
+        vector : (n,) array
+            q.
+        """
+        kept = np.linalg.inv(np.eye(len(vector)) + self.covariance @ precision)
+        covariance = kept @ self.covariance
+        return AmplitudesOfSky(
+            self.mean + covariance @ (vector - precision @ self.mean),
+            kept @ self.pull,
+            covariance,
+            self.reference,
+        )
+
 
 def amplitudes_of_sky(
     model: LinearGaussian,

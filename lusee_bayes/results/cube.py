@@ -45,6 +45,8 @@ class CubeResult(Described):
         Why the other channels could not be mapped, by frequency in MHz.
     reduced : Reduced or None
         Of flight data: the spectra behind them.
+    tie_log_evidence : float
+        What smooth spectra of the receivers add to the sum of the channels' ln evidence.
     """
 
     scenario: Scenario
@@ -53,6 +55,7 @@ class CubeResult(Described):
     seconds: dict[str, float] = field(default_factory=dict)
     unmapped: dict[float, str] = field(default_factory=dict)
     reduced: Reduced | None = None
+    tie_log_evidence: float = 0.0
 
     def description(self) -> tuple[str, ...]:
         kind = "independent channel" if self.components is None else "joint channel"
@@ -99,7 +102,9 @@ class CubeResult(Described):
     @cached_property
     def unknowns(self) -> CubeUnknowns | None:
         """Receivers, ground and gain table, where the model has them."""
-        return CubeUnknowns.of(self.channels)
+        tied = self.scenario.ties_receivers
+        octaves = self.scenario.noise.receiver.smooth_octaves if tied else None
+        return CubeUnknowns.of(self.channels, octaves)
 
     def verdict(self) -> str:
         """What the residuals say, in sentences."""
@@ -108,6 +113,8 @@ class CubeResult(Described):
     def headline(self) -> str:
         """The few figures that matter, in one line."""
         kind = "each on its own" if self.components is None else "one posterior"
+        if self.scenario.ties_receivers:
+            kind = "each on its own but for smooth spectra of receivers"
         parts = [f"{counted(len(self.channels), 'frequency', 'frequencies')}, {kind}"]
         crosses = [c.ell_cross for c in self.channels if c.ell_cross is not None]
         if crosses:
@@ -145,7 +152,8 @@ class CubeResult(Described):
     def log_evidence(self) -> float | None:
         """ln p of all data; None where it is not known."""
         if self.components is None:
-            return float(np.sum([channel.log_evidence for channel in self.channels]))
+            alone = float(np.sum([channel.log_evidence for channel in self.channels]))
+            return alone + self.tie_log_evidence
         found = self.components.log_evidence
         return None if np.isnan(found) else found
 

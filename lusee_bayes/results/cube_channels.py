@@ -1,4 +1,4 @@
-"""The channels of a cube, each on its own or in one posterior; a stopped run goes on."""
+"""The channels of a cube, each on its own, tied, or in one posterior; a stopped run goes on."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ from lusee_bayes.results.joint_components import (
     is_iterative,
     solve_components,
 )
+from lusee_bayes.results.smooth_receivers import ChannelAlone, tie_receivers, write_tied_sky
 
 
 def cube_result(
@@ -48,8 +49,9 @@ def cube_result(
 ) -> CubeResult:
     """Work out all channels, going on from what an interrupted run has left in ``folder``.
 
-    A channel that cannot be mapped leaves the others as they are: it is named in the result, and a
-    joint posterior is that of the others.
+    Where receivers have smooth spectra, each channel is worked out alone, and then given what the
+    others tell of its receivers (:mod:`.smooth_receivers`). A channel that cannot be mapped leaves
+    the others as they are: it is named in the result, and a joint posterior is that of the others.
 
     Parameters
     ----------
@@ -83,7 +85,8 @@ def cube_result(
     channels = tuple(channel.anchored() for channel in scenario.channels())
     data = None if data is None else data.absolute()
     names = [names_of((channel,)) for channel in channels]
-    wanted = "information" if scenario.joint else "result"
+    tied = scenario.ties_receivers
+    wanted = "information" if scenario.joint else "alone" if tied else "result"
 
     def observe(channel: Scenario) -> None:
         if files.has(channel, wanted):
@@ -99,19 +102,29 @@ def cube_result(
             files.write(channel, wanted, known.to_dataset())
             return
         posterior = on_host(inference.posterior)
-        covariance = posterior.covariance()
+        mean, covariance = posterior.mean, posterior.covariance()
+        draws = posterior_draws(experiment, posterior, n_draws)
+        compared = None if known.observed.truth is None else deviations(experiment, posterior)
+        numbers = {
+            "log_evidence": float(posterior.log_evidence),
+            "information_bits": float(posterior.information_bits()),
+            "chi2_model": float(information.chi2(mean) + posterior.prior_chi2()),
+            "refinement": float(posterior.refinement),
+        }
+        if tied:
+            rest = np.zeros((0, len(mean))) if compared is None else compared
+            alone = ChannelAlone(known, mean, covariance, draws - mean, rest, numbers)
+            files.write(channel, wanted, alone.to_dataset())
+            return
         found = channel_of_information(
             known.observed,
             information,
-            posterior.mean,
+            mean,
             covariance,
-            posterior_draws(experiment, posterior, n_draws),
-            compared=None if known.observed.truth is None else deviations(experiment, posterior),
+            draws,
+            compared=compared,
             known_widths=widths(experiment, covariance, channel.map_nside),
-            log_evidence=float(posterior.log_evidence),
-            information_bits=float(posterior.information_bits()),
-            chi2_model=float(information.chi2(posterior.mean) + posterior.prior_chi2()),
-            refinement=float(posterior.refinement),
+            **numbers,
         )
         files.write(channel, wanted, found.to_dataset())
 
@@ -127,7 +140,16 @@ def cube_result(
     mapped = tuple(c for c in channels if c.frequency_mhz not in unmapped)
     if not mapped:
         raise InputError(f"no channel can be mapped: {_reasons(unmapped)}")
-    components = None
+    components, tie_log_evidence = None, 0.0
+    if tied:
+        receivers = tie_receivers(scenario, mapped, files)
+        tie_log_evidence = receivers.log_evidence
+
+        def write_tied(number: int) -> None:
+            write_tied_sky(number, mapped, receivers, files)
+
+        skies = Tasks(write_tied, range(len(mapped)), [names_of((c,)) for c in mapped])
+        engine.each(skies, stages, "smooth receivers")
     if scenario.joint:
         left = _without(unmapped, scenario)
         # coverage is compared with draws; after conjugate gradients with those that there are
@@ -143,7 +165,14 @@ def cube_result(
         skies = Tasks(write_sky, range(len(mapped)), [names_of((c,)) for c in mapped])
         engine.each(skies, stages, "joint skies")
     found = tuple(ChannelResult.from_dataset(files.read(c, "result")) for c in mapped)
-    return CubeResult(scenario, found, components, stages.seconds, unmapped)
+    return CubeResult(
+        scenario,
+        found,
+        components,
+        stages.seconds,
+        unmapped,
+        tie_log_evidence=tie_log_evidence,
+    )
 
 
 def _without(unmapped: dict[float, str], scenario: Scenario) -> Scenario:

@@ -20,15 +20,20 @@ class CubeUnknowns:
     ----------
     reports : dict of UnknownsReport
         By frequency in MHz.
+    octaves : float or None
+        Over which receivers' spectra are smooth; None where every frequency has its own power.
     """
 
     reports: dict[float, UnknownsReport]
+    octaves: float | None = None
 
     @classmethod
-    def of(cls, channels: Iterable[ChannelResult]) -> CubeUnknowns | None:
+    def of(
+        cls, channels: Iterable[ChannelResult], octaves: float | None = None
+    ) -> CubeUnknowns | None:
         """Of a run's channels; None if they have no such unknowns."""
         reports = {c.frequency_mhz: c.unknowns for c in channels if c.unknowns is not None}
-        return cls(reports) if reports else None
+        return cls(reports, octaves) if reports else None
 
     @property
     def table(self) -> pd.DataFrame:
@@ -47,8 +52,14 @@ class CubeUnknowns:
         counts = [f"{name} (at {k} of {n} frequencies)" for name, k in untold.items()]
         what = f"do not tell {', '.join(counts)}" if counts else "tell all of them"
         first = f"Receivers, ground and gain table: the data {what}."
+        found = [first]
+        if self.octaves is not None:
+            found.append(
+                f"Powers of receivers are smooth over {self.octaves:g} octaves: every channel is "
+                "given what the others tell of them."
+            )
         sentence = self._null_sentence()
-        return [first, sentence] if sentence else [first]
+        return [*found, sentence] if sentence else found
 
     def _null_sentence(self) -> str:
         """Of the channel whose data leave most open; empty where all tell most of it."""

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from lusee_bayes.experiment.schema.section import Positive, Section, Treatment
+from lusee_bayes.experiment.schema.section import Positive, Section, Seed, Treatment
 
 
 class ReceiverNoiseSection(Section):
@@ -24,6 +24,12 @@ class ReceiverNoiseSection(Section):
         Frequency at which the mean is the given power.
     relative_std : float
         Prior standard deviation of every port's own power over the mean.
+    smooth_octaves : float
+        What a port's power is off by is a smooth function of frequency, which forgets itself over
+        so many octaves; without it, every frequency has an error of its own.
+    smooth_seed : int
+        Seed of that function in simulated data; by default the scenario's. Channels of a run of
+        several frequencies have that of the run.
     treatment : {"marginalised", "sampled", "ignored"}
         Their covariance is added to N, the powers are sampled with the map, or the model takes
         all of them for the mean.
@@ -34,6 +40,8 @@ class ReceiverNoiseSection(Section):
     slope: Annotated[float, Field(ge=-10, le=10)] = 0.0
     reference_mhz: Positive = 10.0
     relative_std: Positive = 0.1
+    smooth_octaves: Positive | None = None
+    smooth_seed: Seed | None = None
     treatment: Treatment = "marginalised"
 
     @model_validator(mode="after")

@@ -1,0 +1,242 @@
+"""Receivers whose spectra are smooth: all channels' skies and receivers as one dense Gaussian."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from experiments import four_ports
+from reference_linear import Answer, white_posterior
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.simulate import true_values
+from lusee_bayes.results import cube_channels
+from lusee_bayes.results.cube_channels import cube_result
+
+FREQUENCIES, OCTAVES = np.array([15.0, 20.0, 22.0]), 0.4
+RECEIVER = (
+    f"noise.receiver={{power_k: 20000, slope: -2, relative_std: 0.5, smooth_octaves: {OCTAVES}}}"
+)
+GROUND = "noise.regolith={std_k: 2000}"
+# a tenth of the sky, so that the data leave something of the powers to the other channels
+NOISE = "noise.radiometer.factor=1e8"
+N_MODES, N_PORTS, N_OWN, N_DRAWS = 16, 4, 5, 2000
+# of conditions of 1e4 or so
+ROUNDING = 1e-10
+
+
+def cube_of(response_file, *overrides, frequencies="[15, 20, 22]"):
+    return four_ports(response_file, NOISE, *overrides, f"frequencies_mhz={frequencies}")
+
+
+def ties(frequencies) -> np.ndarray:
+    octaves = np.log2(frequencies[:, None] / frequencies[None])
+    return np.exp(-(octaves**2) / (2.0 * OCTAVES**2))
+
+
+@dataclass
+class Dense:
+    """All channels in one normal equation: skies, then receivers port by port, then grounds."""
+
+    couplings: list[np.ndarray]
+    templates: list[np.ndarray]
+    noise: list[np.ndarray]
+    rest: list[np.ndarray]
+    prior: list[np.ndarray]
+
+    @classmethod
+    def of(cls, scenario) -> Dense:
+        found = cls([], [], [], [], [])
+        for channel in scenario.channels():
+            experiment = build(channel)
+            setup = experiment.setup
+            columns = [np.asarray(s.columns) for s in infer(experiment).systematics]
+            found.couplings.append(np.asarray(setup.coupling.dense()))
+            found.templates.append(np.concatenate(columns, axis=1))
+            found.noise.append(np.sqrt(np.asarray(radiometer(setup).diagonal())))
+            found.rest.append(np.asarray(experiment.data.data) - np.asarray(setup.offset))
+            found.prior.append(np.sqrt(np.asarray(setup.prior.variance())))
+        return found
+
+    def solve(self, used: tuple[int, ...]) -> Answer:
+        """Given the data of some channels: a sky and five unknowns of every one."""
+        n = len(self.rest)
+        root = np.linalg.cholesky(ties(FREQUENCIES))
+        size = N_MODES + N_OWN
+        unmixed = np.zeros((n * size, n * size))
+        for k in range(n):
+            own = slice(k * size, k * size + N_MODES)
+            unmixed[own, own] = np.diag(self.prior[k])
+            unmixed[k * size + 20, k * size + 20] = 1.0
+            for j in range(n):
+                for port in range(N_PORTS):
+                    at = N_MODES + port
+                    unmixed[k * size + at, j * size + at] = root[k, j]
+        rows = []
+        for k in used:
+            row = np.zeros((len(self.rest[k]), n * size))
+            own = np.concatenate([self.couplings[k], self.templates[k]], axis=1)
+            row[:, k * size : (k + 1) * size] = own
+            rows.append(row)
+        noise = np.concatenate([self.noise[k] for k in used])
+        rest = np.concatenate([self.rest[k] for k in used])
+        white = white_posterior(np.concatenate(rows) @ unmixed, np.ones(n * size), noise, rest)
+        covariance = unmixed @ white.covariance @ unmixed.T
+        return Answer(unmixed @ white.mean, covariance, white.log_prob)
+
+
+@pytest.fixture(scope="module")
+def scenario(response_file):
+    return cube_of(response_file, RECEIVER, GROUND, f"output={{draws: {N_DRAWS}}}")
+
+
+@pytest.fixture(scope="module")
+def dense(scenario) -> Dense:
+    return Dense.of(scenario)
+
+
+@pytest.fixture(scope="module")
+def expected(dense) -> Answer:
+    return dense.solve((0, 1, 2))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("smooth")
+
+
+@pytest.fixture(scope="module")
+def cube(scenario, folder):
+    return cube_result(scenario, folder)
+
+
+def part(k: int, sky: bool = True) -> slice:
+    start = k * (N_MODES + N_OWN)
+    return slice(start, start + N_MODES) if sky else slice(start + N_MODES, start + 21)
+
+
+def test_skies_and_evidence_are_those_of_one_normal_equation(cube, dense, expected):
+    for k, channel in enumerate(cube.channels):
+        own = part(k)
+        assert np.abs((channel.mean - expected.mean[own]) / expected.std[own]).max() < ROUNDING
+        np.testing.assert_allclose(channel.std, expected.std[own], rtol=ROUNDING)
+        covariance = expected.covariance[own, own]
+        bits = np.log2(dense.prior[k]).sum() - 0.5 * np.linalg.slogdet(covariance)[1] / np.log(2)
+        assert channel.information_bits == pytest.approx(bits, abs=N_MODES * ROUNDING)
+    assert cube.log_evidence == pytest.approx(expected.log_prob, rel=ROUNDING)
+    alone = sum(channel.log_evidence for channel in cube.channels)
+    assert abs(cube.log_evidence - alone) > 0.1
+
+
+def test_chi2_is_about_what_the_others_tell_of_the_receivers(cube, dense, expected):
+    """N of a channel given the others' data: with the covariance that they leave to its five."""
+    for k, channel in enumerate(cube.channels):
+        others = dense.solve(tuple(j for j in range(3) if j != k))
+        t, a, z = dense.templates[k], dense.couplings[k], part(k, sky=False)
+        noise = np.diag(dense.noise[k] ** 2) + t @ others.covariance[z, z] @ t.T
+        rest = dense.rest[k] - t @ others.mean[z] - a @ expected.mean[part(k)]
+        chi2 = rest @ np.linalg.solve(noise, rest)
+        information = a.T @ np.linalg.solve(noise, a)
+        degrees = len(rest) - np.vdot(information, expected.covariance[part(k), part(k)])
+        assert channel.chi2 == pytest.approx(chi2, rel=ROUNDING)
+        assert channel.chi2_expected == pytest.approx(degrees, rel=ROUNDING)
+
+
+def test_receivers_and_ground_are_those_of_one_normal_equation(cube, expected):
+    for k, channel in enumerate(cube.channels):
+        table, own = channel.unknowns.table, part(k, sky=False)
+        scale = table["prior_std"].to_numpy()
+        z = (table["value"] - table["prior"]) / scale
+        assert list(table["unknown"]) == [*(f"receiver_{i}_k" for i in range(4)), "regolith_k"]
+        assert np.abs((z - expected.mean[own]) / expected.std[own]).max() < ROUNDING
+        np.testing.assert_allclose(table["std"] / scale, expected.std[own], rtol=ROUNDING)
+    assert any("smooth over 0.4 octaves" in line for line in cube.lines())
+
+
+def test_draws_are_of_all_channels_together(cube, expected):
+    """Covariances of white draws scatter by 1 / sqrt(n), their squares by sqrt(2 / n)."""
+    every = np.r_[part(0), part(1), part(2)]
+    lower = np.linalg.cholesky(expected.covariance[np.ix_(every, every)])
+    draws = np.concatenate([channel.draws for channel in cube.channels], axis=1)
+    assert draws.shape == (N_DRAWS, 48)
+    white = np.linalg.solve(lower, (draws - expected.mean[every]).T)
+    assert np.abs(white.mean(1)).max() < 4.5 / np.sqrt(N_DRAWS)
+    off = white @ white.T / N_DRAWS - np.eye(48)
+    assert np.abs(off - np.diag(np.diag(off))).max() < 5 / np.sqrt(N_DRAWS)
+    assert np.abs(np.diag(off)).max() < 5 * np.sqrt(2 / N_DRAWS)
+
+
+def test_other_channels_do_tell(dense, expected):
+    """So that the tests above would see each channel's own posterior."""
+    alone = dense.solve((1,))
+    assert (alone.std / expected.std)[part(1)].max() > 1.05
+    assert (np.abs(alone.mean - expected.mean) / expected.std)[part(1)].max() > 0.05
+
+
+def test_a_resumed_run_is_the_same(scenario, folder, cube, tmp_path, monkeypatch):
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    for frequency in (15, 22):
+        (tmp_path / "channels" / f"{frequency}.result.nc").unlink()
+    monkeypatch.setattr(cube_channels, "inform", None)
+    resumed = cube_result(scenario, tmp_path)
+    assert resumed.log_evidence == cube.log_evidence
+    for here, there in zip(resumed.channels, cube.channels, strict=True):
+        np.testing.assert_array_equal(here.draws, there.draws)
+        np.testing.assert_array_equal(here.mean, there.mean)
+        assert here.coverage == there.coverage != ()
+
+
+def test_simulated_receivers_have_the_covariance(response_file):
+    """Over seeds, ports and pairs of frequencies: products of normals scatter by 1 to sqrt 2."""
+    scenario = cube_of(response_file, RECEIVER)
+    setup, n_seeds = set_up(scenario.channels()[0]), 400
+    values = np.zeros((n_seeds, 3, N_PORTS))
+    for seed in range(n_seeds):
+        channels = scenario.model_copy(update={"seed": 10 * seed}).channels()
+        for k, channel in enumerate(channels):
+            truth = true_values(replace(setup, scenario=channel))
+            mean = 20000.0 * (channel.frequency_mhz / 10.0) ** -2
+            powers = np.array([truth[f"receiver_{port}_k"] for port in range(N_PORTS)])
+            values[seed, k] = (powers / mean - 1.0) / 0.5
+    flat = values.reshape(n_seeds, -1)
+    found = flat.T @ flat / n_seeds
+    wanted = np.kron(ties(FREQUENCIES), np.eye(N_PORTS))
+    assert np.abs(found - wanted).max() < 4.5 * np.sqrt(2 / n_seeds)
+    assert np.abs(flat.mean(0)).max() < 4.0 / np.sqrt(n_seeds)
+    # a smooth function: between 20 and 22 MHz, 0.1375 octaves apart, a third of what it varies by
+    steps = values[:, 1] - values[:, 2]
+    assert steps.var() == pytest.approx(2.0 * (1.0 - wanted[4, 8]), rel=4 * np.sqrt(2 / 1600))
+
+
+def test_seeds_of_simulated_receivers(response_file):
+    """A cube has one function; another seed, port or treatment of the scenario another, or not."""
+    scenario = cube_of(response_file, RECEIVER)
+    assert {c.noise.receiver.smooth_seed for c in scenario.channels()} == {scenario.seed}
+    assert len({c.seed for c in scenario.channels()}) == 3
+    plain = cube_of(response_file, "noise.receiver={power_k: 2000}")
+    assert all(c.noise == plain.noise for c in plain.channels())
+    one = four_ports(response_file, RECEIVER, "frequency_mhz=22")
+    last = scenario.channels()[2]
+    setup = set_up(last)
+    assert true_values(setup) == true_values(replace(setup, scenario=one))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("joint=true", "with joint, leave it out"),
+        ("prior={model: lognormal}", r"not those of prior\.model=lognormal"),
+        ("noise.receiver.smooth_octaves=0", "greater than 0"),
+    ],
+)
+def test_refused_in_one_sentence(response_file, override, message):
+    with pytest.raises(InputError, match=message) as caught:
+        cube_of(response_file, "spectral={components: [power_law]}", RECEIVER, override)
+    assert "\n" not in str(caught.value)
