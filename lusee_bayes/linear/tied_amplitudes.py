@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.templates import AmplitudesOfSky
 
@@ -87,11 +88,12 @@ def tie(
     white, z = np.zeros(root.shape[1]), np.zeros(mean.shape)
     for _ in range(1 + REFINEMENTS):
         pull = np.einsum("kij,kj->ki", told, mean - z) + z
-        left = root.T @ pull.ravel() - white
-        white = white + np.linalg.solve(lower.T, np.linalg.solve(lower, left))
+        left = (root.T @ pull.ravel() - white)[:, None]
+        step = solve_lower(lower, solve_lower(lower, left, transpose=False), transpose=True)
+        white = white + step[:, 0]
         z = (root @ white).reshape(mean.shape)
-    half = np.linalg.solve(lower, root.T).T.reshape(n_channels, n, -1)
-    draws = np.linalg.solve(lower.T, normals.T).T @ root.T
+    half = solve_lower(lower, root.T, transpose=False).T.reshape(n_channels, n, -1)
+    draws = solve_lower(lower, normals.T, transpose=True).T @ root.T
     off = mean - z
     quadratic = np.einsum("ki,kij,kj->", off, told, off) - (z**2).sum() + white @ white
     log_dets = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diagonal(lower)).sum()

@@ -66,7 +66,8 @@ class ChannelResult(Described):
     independent : (modes,) array or None
         Mean given this channel's data alone, where ``mean`` is given those of all.
     log_evidence, information_bits : float
-        NaN for a channel of a joint posterior, where only those of all channels are known.
+        NaN for a channel of a joint posterior, where only those of all channels are known. Where
+        receivers tie channels, ln p of the channel's own data alone.
     chi2, chi2_expected : float
         Of the residuals about the mean, and its mean if the model holds (NaN if not known).
     chi2_model : float
