@@ -21,7 +21,7 @@ def model(instrument, gaussian, data=None):
     values = {name: numpyro.sample(name, prior) for name, prior in values.items()}
     level = numpyro.sample("noise_level", dist.LogNormal(0.0, 0.5))
     gaussian = lb.LinearGaussian(
-        instrument.dense(values), gaussian.prior, gaussian.noise.scaled(level)
+        instrument.dense(values), gaussian.prior, gaussian.noise.scaled(level), gaussian.offset
     )
     numpyro.sample("data", lb.Marginal(gaussian), obs=data)
     return gaussian

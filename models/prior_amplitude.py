@@ -11,12 +11,12 @@ from numpyro import distributions as dist
 import lusee_bayes as lb
 
 
-def model(coupling, prior, noise, data=None):
+def model(coupling, offset, prior, noise, data=None):
     """``prior``: the spectrum that A = 1 and tilt = 0 stand for."""
     amplitude = numpyro.sample("amplitude", dist.LogNormal(0.0, 0.5))
     tilt = numpyro.sample("tilt", dist.Normal(0.0, 0.5))
     ell = jnp.arange(float(prior.spectrum.shape[0]))
     spectrum = prior.spectrum * amplitude * ((ell + 1.0) / 10.0) ** tilt
-    gaussian = lb.LinearGaussian(coupling, lb.HarmonicPrior(spectrum), noise)
+    gaussian = lb.LinearGaussian(coupling, lb.HarmonicPrior(spectrum), noise, offset)
     numpyro.sample("data", lb.Marginal(gaussian), obs=data)
     return gaussian

@@ -10,9 +10,9 @@ from numpyro import distributions as dist
 import lusee_bayes as lb
 
 
-def model(coupling, prior, noise, data=None):
+def model(coupling, offset, prior, noise, data=None):
     """``noise``: the covariance whose level is sampled as ``noise_level`` (variance ratio)."""
     level = numpyro.sample("noise_level", dist.LogNormal(0.0, 1.0))
-    gaussian = lb.LinearGaussian(coupling, prior, noise.scaled(level))
+    gaussian = lb.LinearGaussian(coupling, prior, noise.scaled(level), offset)
     numpyro.sample("data", lb.Marginal(gaussian), obs=data)
     return gaussian

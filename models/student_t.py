@@ -14,9 +14,11 @@ import lusee_bayes as lb
 FREEDOM = 4.0
 
 
-def model(gaussian, fixed_noise, layout, data=None):
-    """``fixed_noise``: N, which must not couple different times."""
+def model(gaussian, systematics, layout, data=None):
+    """``gaussian``: N without ``systematics``, which must not couple different times."""
+    for systematic in systematics:
+        gaussian = systematic.sampled(gaussian)
     sky = numpyro.sample("sky", lb.SkyPrior(gaussian.prior))
-    seen = lb.TimesStudentT(gaussian.predict(sky), fixed_noise, layout, FREEDOM)
+    seen = lb.TimesStudentT(gaussian.predict(sky), gaussian.noise, layout, FREEDOM)
     data = numpyro.sample("data", seen, obs=data)
     numpyro.deterministic("weight", seen.weights(data))

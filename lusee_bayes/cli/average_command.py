@@ -8,7 +8,16 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes.cli.options import Flag, Overrides, Quiet, Verbose, load, parse_duration, say
+from lusee_bayes.cli.options import (
+    Flag,
+    ForceFile,
+    Overrides,
+    Quiet,
+    Verbose,
+    load,
+    parse_duration,
+    say,
+)
 from lusee_bayes.core.progress import Stages
 
 
@@ -20,6 +29,7 @@ def average_command(
     scenario: str = "fiducial",
     set_: Overrides | None = None,
     no_information: Flag = False,
+    force: ForceFile = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -40,10 +50,6 @@ def average_command(
         key.path=value; overrides an entry of the scenario, as often as needed.
     no_information
         Leave out the information, which takes the memory and the time of two maps.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     from lusee_bayes.runs.average_run import run_average
 
@@ -54,6 +60,7 @@ def average_command(
         parse_duration(to),
         output,
         information=not no_information,
+        replace=force,
         stages=Stages(console, verbose=verbose),
     )
     say(console, *run.lines(), f"{run.averaged.layout.size} visibilities -> {output}")

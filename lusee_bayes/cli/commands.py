@@ -100,12 +100,13 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         ),
     ),
     "info": (
-        "Describe the contents of a file, or of a run's folder.",
+        "Describe the contents of files, or of runs' folders.",
         "",
         (
             "lusee-bayes info output/fiducial",
             "lusee-bayes info output/fiducial/posterior.nc",
             "lusee-bayes info beam.fits",
+            "lusee-bayes info session_*.h5",
         ),
     ),
     "keys": (

@@ -27,12 +27,6 @@ def compare_command(
         Results of map, two or more.
     output
         Folder for comparison.html, comparison.csv and the figures.
-    force
-        Replace results of another run in the folder.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     from lusee_bayes.cli.tables import comparison_table
     from lusee_bayes.results.finished_runs import evidence_caveat

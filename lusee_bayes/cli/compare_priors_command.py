@@ -7,7 +7,9 @@ from pathlib import Path
 from rich.console import Console
 
 from lusee_bayes.cli.options import (
+    Clock,
     Cluster,
+    DataFiles,
     Flag,
     Force,
     Number,
@@ -27,7 +29,8 @@ from lusee_bayes.core.progress import Stages
 def compare_priors_command(
     scenario: str,
     *,
-    data: Path | None = None,
+    data: DataFiles = None,
+    clock: Clock = None,
     truth: Flag = False,
     priors: str | None = None,
     draws: Number = 100,
@@ -46,7 +49,8 @@ def compare_priors_command(
     scenario
         A YAML file, or the name of a scenario of the package (fiducial, ...).
     data
-        Visibilities to map; without them the scenario's own are simulated.
+        Visibilities to map: a file, or sessions of the spectrometer, one or many; without them the
+        scenario's own are simulated.
     truth
         The given data are of the scenario's own sky: count how often error bars hold it.
     priors
@@ -65,12 +69,6 @@ def compare_priors_command(
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share out the priors;
         by default DASK_SCHEDULER_ADDRESS.
-    force
-        Replace results of another run in the folder.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     from lusee_bayes.cli.tables import priors_table
     from lusee_bayes.core.workers import open_engine
@@ -80,7 +78,7 @@ def compare_priors_command(
     from lusee_bayes.runs.compare_priors_run import run_compare_priors
 
     console = Console(quiet=quiet, soft_wrap=True)
-    resolved, stages = load(scenario, set_), Stages(console, verbose=verbose)
+    resolved, stages = load(scenario, set_, flight__clock=clock), Stages(console, verbose=verbose)
     names = None if priors is None else [n.strip() for n in priors.split(",") if n.strip()]
     demand = demand_of([posterior_cost(resolved)] * len(names or NAMED))
     with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:

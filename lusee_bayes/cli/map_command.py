@@ -57,9 +57,6 @@ def map_command(
     data
         Visibilities to map, of a file of simulate or reduce, a waterfall of luseepy, or sessions of
         its lusee.ingest, one or many; without them the scenario's own are simulated.
-    clock
-        Clock reference in JSON, for sessions that do not say which UTC their clock stands for
-        (flight.clock).
     truth
         The given data are of the scenario's own sky: compare the map with it.
     output
@@ -87,12 +84,6 @@ def map_command(
         default DASK_SCHEDULER_ADDRESS.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
-    force
-        Replace results of another run in the folder.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     from lusee_bayes.core.workers import open_engine
     from lusee_bayes.report.pages import REPORT
@@ -113,8 +104,7 @@ def map_command(
     )
     folder = output or default_folder(scenario)
     stages = Stages(console, verbose=verbose)
-    files = None if data is None else tuple(data)
-    given = {"data": files, "truth": truth, "onto": onto, "replace": force, "stages": stages}
+    given = {"data": data, "truth": truth, "onto": onto, "replace": force, "stages": stages}
     if resolved.frequencies_mhz:
         demand = demand_of_channels(resolved)
         with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:

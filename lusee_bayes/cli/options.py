@@ -19,10 +19,19 @@ if TYPE_CHECKING:
     from lusee_bayes.experiment.scenario import Scenario
 
 Overrides = Annotated[list[str], Parameter(name="--set", negative="")]
-Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")]
+Quiet = Annotated[
+    bool, Parameter(name=["--quiet", "-q"], negative="", help="Print nothing but errors.")
+]
 # 10,25 or 5:50:5
 Frequencies = Annotated[str | None, Parameter(name="--frequencies")]
-Verbose = Annotated[bool, Parameter(name=["--verbose", "-v"], negative="")]
+Verbose = Annotated[
+    bool,
+    Parameter(
+        name=["--verbose", "-v"],
+        negative="",
+        help="Print the memory in use after every stage.",
+    ),
+]
 
 
 def _whole(least: int) -> Callable[[object, Sequence[Token]], int]:
@@ -48,11 +57,25 @@ Cluster = Annotated[str | None, Parameter(name="--cluster")]
 Flag = Annotated[bool, Parameter(negative="")]
 # one file of visibilities, or sessions of the spectrometer
 DataFiles = Annotated[
-    list[Path] | None, Parameter(name="--data", consume_multiple=True, negative="")
+    tuple[Path, ...] | None, Parameter(name="--data", consume_multiple=True, negative="")
 ]
-Clock = Annotated[str | None, Parameter(name="--clock")]
+Clock = Annotated[
+    str | None,
+    Parameter(
+        name="--clock",
+        help="Clock reference in JSON, for sessions that do not say which UTC their clock stands "
+        "for (flight.clock).",
+    ),
+]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
-Force = Annotated[bool, Parameter(name="--force", negative="")]
+# to replace the results of a run, or a file
+Force = Annotated[
+    bool,
+    Parameter(name="--force", negative="", help="Replace results of another run in the folder."),
+]
+ForceFile = Annotated[
+    bool, Parameter(name="--force", negative="", help="Replace the file if it is there already.")
+]
 
 
 # a number and its unit

@@ -40,12 +40,6 @@ def paper_command(
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share out the cases; by
         default DASK_SCHEDULER_ADDRESS.
-    force
-        Replace results of another run in the folder.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     from lusee_bayes.core.workers import open_engine
     from lusee_bayes.paper.cases import paper_scenarios

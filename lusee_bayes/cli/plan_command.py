@@ -54,12 +54,6 @@ def plan_command(
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share out the variations; by
         default DASK_SCHEDULER_ADDRESS.
-    force
-        Replace results of another run in the folder.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     from lusee_bayes.cli.plan_variations import headline, variations_of
     from lusee_bayes.cli.tables import forecast_table

@@ -8,7 +8,16 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes.cli.options import Clock, Frequencies, Overrides, Quiet, Verbose, load, say
+from lusee_bayes.cli.options import (
+    Clock,
+    ForceFile,
+    Frequencies,
+    Overrides,
+    Quiet,
+    Verbose,
+    load,
+    say,
+)
 from lusee_bayes.core.progress import Stages
 
 
@@ -21,6 +30,7 @@ def reduce_command(
     frequencies: Frequencies = None,
     clock: Clock = None,
     set_: Overrides | None = None,
+    force: ForceFile = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -36,16 +46,10 @@ def reduce_command(
         The netCDF file to write, for map --data.
     frequencies
         Middles of the bands in MHz, as 10,25,30 or as first:last:step.
-    clock
-        Clock reference in JSON, for sessions that do not say which UTC their clock stands for
-        (flight.clock).
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
+    from lusee_bayes.core.representation import counted
     from lusee_bayes.runs.reduce_run import run_reduce
 
     console = Console(quiet=quiet, soft_wrap=True)
@@ -53,6 +57,7 @@ def reduce_command(
         load(scenario, set_, frequencies, flight__clock=clock),
         files,
         output,
+        replace=force,
         stages=Stages(console, verbose=verbose),
     )
-    say(console, *run.lines(), f"{len(run.reduced.frequencies_mhz)} bands -> {output}")
+    say(console, *run.lines(), f"{counted(len(run.reduced.frequencies_mhz), 'band')} -> {output}")

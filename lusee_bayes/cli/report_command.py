@@ -16,8 +16,6 @@ def report_command(folder: Path, *, quiet: Quiet = False) -> None:
     ----------
     folder
         Results of map, sample or validate.
-    quiet
-        Print nothing but errors.
     """
     from lusee_bayes.report.pages import write_report
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Literal
 
 from rich.console import Console
 
 from lusee_bayes.cli.options import (
+    Clock,
     Count,
+    DataFiles,
     Flag,
     Force,
     Frequencies,
@@ -28,7 +29,8 @@ def sample_command(
     scenario: str,
     *,
     model: str | None = None,
-    data: Path | None = None,
+    data: DataFiles = None,
+    clock: Clock = None,
     output: Output = None,
     resume: Flag = False,
     chains: Count = 4,
@@ -54,7 +56,8 @@ def sample_command(
         sky_marginal, gains, instrument, ...). By default systematics, where the scenario says that
         something is to be sampled, else sky.
     data
-        Visibilities to use; without them the scenario's own are simulated.
+        Visibilities to use: a file, or sessions of the spectrometer, one or many; without them the
+        scenario's own are simulated.
     output
         Folder for the results; by default output/NAME-MODEL.
     resume
@@ -72,12 +75,6 @@ def sample_command(
         its own, and their maps together in cubes. With --resume, finished ones are taken over.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
-    force
-        Replace results of another run in the folder.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.sample_run import default_program, run_sample
@@ -85,7 +82,7 @@ def sample_command(
     from lusee_bayes.sampling.programs import load_program
 
     console = Console(quiet=quiet, soft_wrap=True)
-    resolved = load(scenario, set_, frequencies)
+    resolved = load(scenario, set_, frequencies, flight__clock=clock)
     program = default_program(resolved) if model is None else load_program(model)
     sampler = Sampler(
         chains=chains, warmup=warmup, draws=draws, seed=resolved.seed, algorithm=algorithm

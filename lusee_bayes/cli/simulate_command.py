@@ -46,10 +46,6 @@ def simulate_command(
         Write sessions of the spectrometer, as they come from the lander (flight.simulated).
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     console = Console(quiet=quiet, soft_wrap=True)
     loaded, stages = load(scenario, set_), Stages(console, verbose=verbose)

@@ -9,8 +9,10 @@ from cyclopts import Parameter
 from rich.console import Console
 
 from lusee_bayes.cli.options import (
+    Clock,
     Cluster,
     Count,
+    DataFiles,
     Flag,
     Force,
     Number,
@@ -35,7 +37,8 @@ def validate_command(
     scenario: str,
     *,
     skies: Annotated[list[str] | None, Parameter(consume_multiple=True, negative="")] = None,
-    data: Path | None = None,
+    data: DataFiles = None,
+    clock: Clock = None,
     output: Output = None,
     resume: Flag = False,
     chains: Count = 4,
@@ -61,7 +64,8 @@ def validate_command(
         Skies to map with the scenario's prior and to compare with the error bars: files, or
         embedded, smooth and spotty with a seed, as in embedded:2. Nothing is sampled then.
     data
-        Visibilities to use; without them the scenario's own are simulated.
+        Visibilities to use: a file, or sessions of the spectrometer, one or many; without them the
+        scenario's own are simulated.
     output
         Folder for the results; by default output/NAME-validation, or NAME-skies.
     resume
@@ -82,12 +86,6 @@ def validate_command(
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share them out; by default
         DASK_SCHEDULER_ADDRESS.
-    force
-        Replace results of another run in the folder.
-    quiet
-        Print nothing but errors.
-    verbose
-        Print the memory in use after every stage.
     """
     if skies is not None and (data is not None or resume):
         raise InputError("--skies simulates its data, all at once; leave out --data and --resume")
@@ -100,7 +98,7 @@ def validate_command(
     from lusee_bayes.results.cost import demand_of, posterior_cost
 
     console = Console(quiet=quiet, soft_wrap=True)
-    resolved, stages = load(scenario, set_), Stages(console, verbose=verbose)
+    resolved, stages = load(scenario, set_, flight__clock=clock), Stages(console, verbose=verbose)
     if skies is not None:
         demand = demand_of([posterior_cost(resolved)] * max(1, len(skies)))
         with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:

@@ -68,6 +68,25 @@ def require_target(path: str | Path) -> None:
         require_folder(path.parent)
 
 
+def require_new(path: str | Path, *, replace: bool) -> None:
+    """As :func:`require_target`, for a file that another is only replaced by if that is asked for.
+
+    Parameters
+    ----------
+    path : path
+    replace : bool
+        Replace what is there.
+
+    Raises
+    ------
+    InputError
+        If something is there, unless ``replace``; as :func:`require_target`.
+    """
+    require_target(path)
+    if not replace and Path(path).exists():
+        raise InputError(f"'{path}' is there already; give -o another name, or --force")
+
+
 def _require_name(path: Path) -> None:
     if "\0" in str(path) or not str(path):
         raise InputError(f"'{path!s}' is no name of a file; give one without NUL characters")

@@ -9,7 +9,7 @@ import numpy as np
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.fits_files import is_fits
+from lusee_bayes.core.fits_files import image_names, is_fits
 from lusee_bayes.core.formats import format_of
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, require_file
@@ -24,6 +24,13 @@ from lusee_bayes.instrument.visibilities import HINT, Visibilities
 from lusee_bayes.instrument.visibilities_file import read_visibilities
 from lusee_bayes.instrument.waterfalls import Waterfall, read_waterfall
 from lusee_bayes.instrument.waterfalls.four_port import INTERPOLATIONS
+
+ACCEPTED = (
+    "visibilities (lusee-bayes simulate), a waterfall of luseepy, sessions of its lusee.ingest, or "
+    "spectra of lusee-bayes reduce"
+)
+# what luseepy's waterfalls have, and no other FITS file
+WATERFALL_IMAGES = {"combinations", "products"}
 
 # beams and data hold the impedances with 24 bits
 SAME_SCALE = 1e-5
@@ -93,6 +100,7 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
     if reduced is not None:
         return visibilities_of(reduced, scenario)
     path = files_of(data)[0]
+    _require_data(path)
     timestamp, average_s = scenario.observation.timestamp, scenario.observation.average_s
     if is_fits(path):
         data = _channel(path, scenario)
@@ -106,6 +114,18 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
         return data
     with naming(path):
         return averaged(data, average_s)
+
+
+def _require_data(path: Path) -> None:
+    """InputError for files that hold nothing to be mapped, with all that do."""
+    kind = format_of(path)
+    if is_fits(path):
+        known = bool(WATERFALL_IMAGES & set(image_names(path)))
+    else:
+        known = kind == formats.VISIBILITIES
+    if not known:
+        said = f" (its format is '{kind}')" if kind else ""
+        raise InputError(f"{path} holds nothing that can be mapped{said}; give {ACCEPTED}")
 
 
 def _own(path: Path, timestamp: Timestamp | None) -> Visibilities:

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.formats import format_of
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import FlightSection
@@ -42,14 +44,16 @@ def reduce_files(
     Raises
     ------
     InputError
-        If the scenario does not say what the files leave open, a file is given twice, or as
-        :func:`.read_session` and :func:`.reduce_sessions`.
+        If the scenario does not say what the files leave open, a file is given twice or reduced
+        already, or as :func:`.read_session` and :func:`.reduce_sessions`.
     """
     stages = stages or Stages()
     known = [Path(path).resolve() for path in paths]
     for k, path in enumerate(known):
         if path in known[:k]:
             raise InputError(f"'{paths[k]}' is given twice; give every session once")
+        if format_of(path) == formats.REDUCED:
+            raise InputError(f"'{paths[k]}' is reduced already; give it to lusee-bayes map --data")
     recipe = recipe_of(scenario)
     with stages("sessions"):
         sessions = [read_session(path) for path in paths]

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Shaped
 
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.schema import FlightSimulatedSection
 from lusee_bayes.instrument.flight.lines import COMB_FIRST, COMB_SPACING
 from lusee_bayes.instrument.flight.spectrometer import (
+    AVERAGING,
     CHANNEL_MHZ,
     FLIGHT_PRODUCTS,
     N_CHANNELS,
@@ -77,6 +79,11 @@ class Disturbances:
         origin : {"centre", "edge"}
             What of channel k lies at k times 25 kHz.
         seed : int
+
+        Raises
+        ------
+        InputError
+            If a tone is in a channel that no bin holds.
         """
         n, generator = len(hours), np.random.default_rng([seed, 1])
         level = np.array([list(section.levels)] * n, dtype="U1")
@@ -86,9 +93,7 @@ class Disturbances:
         for row in np.flatnonzero(_stretches(generator, n, section.absent_share, 1)):
             absent[row, generator.integers(len(FLIGHT_PRODUCTS))] = True
         saturated = _stretches(generator, n, section.saturated_share, 1)
-        tones = np.zeros(N_CHANNELS, dtype=bool)
-        for mhz in section.tones_mhz:
-            tones[np.abs(channel_mhz(origin) - mhz).argmin()] = True
+        tones = _tone_channels(section, origin)
         tone = _stretches(generator, n, section.tone_share if section.tones_mhz else 0.0, STRETCH)
         comb = _stretches(generator, n, section.comb_share, STRETCH)
         burst, phase = np.zeros(n, dtype=bool), np.zeros((n, PORTS))
@@ -137,6 +142,26 @@ class Disturbances:
         """Return the table of what is where."""
         names = ("level", "absent", "saturated", "tone", "tone_channel", "comb", "burst")
         return {name: getattr(self, name) for name in names}
+
+
+def _tone_channels(
+    section: FlightSimulatedSection, origin: BinOrigin
+) -> Bool[np.ndarray, " channels"]:
+    """The channels nearest to the tones. InputError if the averaging leaves one of them out."""
+    mhz, tones, kept = channel_mhz(origin), *(np.zeros(N_CHANNELS, dtype=bool) for _ in range(2))
+    kept[AVERAGING[section.navgf].channels()] = True
+    for tone_mhz in section.tones_mhz:
+        far = np.abs(mhz - tone_mhz)
+        channel = int(far.argmin())
+        if not kept[channel]:
+            there = mhz[np.where(kept, far, np.inf).argmin()]
+            raise InputError(
+                f"the tone at {tone_mhz:g} MHz is in channel {channel}, which Navgf "
+                f"{section.navgf} leaves out, so that no spectrum would have it; use {there:.6g} "
+                "MHz in flight.simulated.tones_mhz, or another flight.simulated.navgf"
+            )
+        tones[channel] = True
+    return tones
 
 
 def _stretches(

@@ -238,7 +238,7 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
     ------
     InputError
         If the beams know no volts, the scenario's samples are no spectra, the gain table cannot be
-        read, or the scenario has noise that no spectra have.
+        read, a tone is in no bin, or the scenario has noise that no spectra have.
     """
     stages = stages or Stages()
     flight = flight_of(scenario)
@@ -255,9 +255,9 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
     observation = spectra_observation(scenario, FRAME_S * 2.0**shift)
     origin = flight.bin_origin or "centre"
     nodes = np.array(scenario.frequencies_mhz or (scenario.frequency_mhz,))
-    visibilities = true_visibilities(scenario, observation, stages)
     hours = observation.hours
     made = Disturbances.drawn(section, hours - hours[0], step_s, origin, scenario.seed)
+    visibilities = true_visibilities(scenario, observation, stages)
     mjd = float(np.floor(observation.times[0].mjd)) - CLOCK_DAYS
     clock = Clock("the simulation", MJD_ZERO, mjd, "utc", CLOCK_S)
     return FlightSimulation(

@@ -37,8 +37,6 @@ from lusee_bayes.experiment.schema import (
     SourcesSection,
     SpectralSection,
 )
-from lusee_bayes.sky.positive_skies import check_fields
-from lusee_bayes.sky.spectral_prior import check_components
 
 # the scenarios that ship with the package
 FOLDER = resources.files("lusee_bayes.experiment") / "scenarios"
@@ -103,11 +101,8 @@ class Scenario(Section):
             raise ValueError("frequencies_mhz must grow from one to the next")
         if self.joint and not self.frequencies_mhz:
             raise ValueError("joint needs frequencies_mhz, the channels that share a posterior")
-        if self.joint and self.spectral.model == "components":
-            n = len(self.frequencies_mhz)
-            check_components(self.spectral.components, n, self.spectral.residual)
-        if self.joint and self.spectral.model == "positive":
-            check_fields(self.spectral.fields, len(self.frequencies_mhz))
+        if self.joint:
+            self.spectral.require_channels(len(self.frequencies_mhz))
         return self
 
     @field_validator("nside")

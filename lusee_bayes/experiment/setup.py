@@ -240,10 +240,16 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
     here, there = data.observation, scenario.observation
     east = (here.lon_deg - there.lon_deg + 180.0) % 360.0 - 180.0
     if max(abs(east), abs(here.lat_deg - there.lat_deg)) > SAME_SITE_DEG:
+        # luseepy writes a site of its own where it is told none
+        unsettled = (
+            ", or, where nobody has established the site in the sessions, --set "
+            "flight.site=scenario when they are reduced"
+        )
         raise InputError(
             f"the data were taken at longitude {here.lon_deg:g}, latitude {here.lat_deg:g} "
             f"degrees, the scenario's site is {there.lon_deg:g}, {there.lat_deg:g}; use --set "
             f"observation.lon_deg={here.lon_deg:.15g} --set observation.lat_deg={here.lat_deg:.15g}"
+            + ("" if data.calibration is None else unsettled)
         )
 
 

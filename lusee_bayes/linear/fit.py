@@ -47,6 +47,11 @@ class ChiSquare:
         """Probability of a chi^2 as far out on its side, if the model holds."""
         return two_sided(self.chi2, self.degrees)
 
+    @property
+    def too_small(self) -> bool:
+        """Whether it is below what is expected, where it stands out."""
+        return bool(self.chi2 < self.degrees)
+
     def words(self) -> str:
         """p, and chi^2 with what is expected of it."""
         return f"p {probability(self.p)}, {self.found()}"

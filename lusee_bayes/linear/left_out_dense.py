@@ -11,9 +11,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_solve
 
 from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.linalg import cholesky
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.linear.left_out import LeftOut, Missed, log_det_of
 from lusee_bayes.linear.model import LinearGaussian
@@ -38,7 +40,7 @@ class DenseLeftOut(LeftOut):
     Raises
     ------
     InputError
-        If the model cannot be factorised.
+        If the model cannot be factorised; by its methods, if a group is too precise for 64 bits.
     """
 
     def __init__(self, model: LinearGaussian, data: Float[Array, " data"], layout: DataLayout):
@@ -74,11 +76,20 @@ class DenseLeftOut(LeftOut):
         block = white.T @ white - inside.T @ inside
         where = (self._layout.product[index], self._layout.time[index])
         self.inverse_diagonal[where] = np.diagonal(block)
-        root = cho_factor(block)
+        if len(index) == len(self._u):
+            # nothing is left that could predict them
+            return Missed(np.nan, np.nan, np.nan)
+        lower = cholesky(block)
+        if not np.isfinite(np.diagonal(lower)).all():
+            raise InputError(
+                "the data are too precise to tell how a part of them differs from what the others "
+                "predict; use fewer data at once"
+            )
+        root = (lower, True)
         # of noise alone (K^-1 N K^-1)_ss is K_ss less that
         sky = inside.T @ inside - inside.T @ (self._gram @ inside)
         chi2 = self._u[index] @ cho_solve(root, self._u[index])
-        return Missed(float(chi2), float(np.trace(cho_solve(root, sky))), log_det_of(root[0]))
+        return Missed(float(chi2), float(np.trace(cho_solve(root, sky))), log_det_of(lower))
 
 
 @eqx.filter_jit

@@ -301,7 +301,11 @@ class StructuredLeftOut(LeftOut):
             np.einsum("kt,kta->a", pull, self._t),
         ]
         h = np.concatenate(h)
-        root = cho_factor(left, lower=True, overwrite_a=True)
+        try:
+            root = cho_factor(left, lower=True, overwrite_a=True)
+        except LinAlgError:
+            # as in :meth:`_between`
+            return NOT_TOLD
         grown = (self._probes * cho_solve(root, self._probes)).sum() - (self._probed**2).sum()
         log_det += log_det_of(root[0]) - log_det_of(self._lower) - log_det_of(self._q)
         return Missed(float(squared + h @ cho_solve(root, h)), float(grown / PROBES), log_det)

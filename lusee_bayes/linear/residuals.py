@@ -159,6 +159,16 @@ class Residuals:
         if level == "consistent":
             told = f"instrument and noise fit ({instrument}), and so does the prior ({prior})."
             return Fit(level, f"Consistent: {told}")
+        if level == "unlike the prior" and self.split.prior.too_small:
+            told = [
+                f"Unlike the prior: instrument and noise fit ({instrument}), but the sky is "
+                f"weaker, or closer to the prior's mean, than the prior expects ({prior}).",
+                *([strengths] if strengths else []),
+                "The prior is wider than the sky needs: where the sky is weaker than it expects, "
+                "error bars are too wide; a narrower prior would tell more (lusee-bayes "
+                "compare-priors).",
+            ]
+            return Fit(level, " ".join(told))
         if level == "unlike the prior":
             told = [
                 f"Unlike the prior: instrument and noise fit ({instrument}), but the sky is not "

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_json
+from lusee_bayes.core.representation import counted
 from lusee_bayes.linear.fit import stands_out
 from lusee_bayes.report import head, html
 from lusee_bayes.report.cube_explorer import cube_explorer
@@ -72,11 +73,10 @@ def cube_page(folder: Path, name: str) -> str:
     summary = read_json(folder / "summary.json", CUBE_SUMMARY)
     channels = entries(folder / "summary.json", summary, "channels", CHANNEL_SUMMARY)
     frequencies = [channel["frequency_mhz"] for channel in channels]
-    title = (
-        f"{name}: the sky at {len(frequencies)} frequencies, "
-        f"{frequencies[0]:g} to {frequencies[-1]:g} MHz"
-    )
-    channel_words = f"{len(channels)} channels, {frequencies[0]:g} to {frequencies[-1]:g} MHz"
+    band = f"{frequencies[0]:g} to {frequencies[-1]:g} MHz"
+    count = len(channels)
+    title = f"{name}: the sky at {counted(count, 'frequency', 'frequencies')}, {band}"
+    channel_words = f"{counted(count, 'channel')}, {band}"
     anchors = dict(zip(("maps", "spectra", "fidelity", "chi2"), SECTIONS, strict=False))
     parts = {
         name: [html.figure(folder / "figures" / f"{name}.png", *texts)]
@@ -101,6 +101,7 @@ def cube_page(folder: Path, name: str) -> str:
             html.contents(sections),
             head.verdict(summary["level"], summary["verdict"]),
             head.doubts(folder / "summary.json", summary),
+            head.unmapped(folder / "summary.json", summary),
             head.about(folder, channel_words),
             *(html.section(*anchors[name], *inside) for name, inside in parts.items()),
             *([flight_section(folder)] if is_flight(folder) else []),

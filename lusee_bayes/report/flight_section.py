@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -64,21 +66,35 @@ def _sessions(reduced: Reduced) -> list[str]:
             ", ".join(map(str, one["navgf"])),
             ", ".join(one["levels"]),
             one["software"],
-            one["clock"],
+            _clock(one),
         )
         for one in reduced.sessions
     ]
     length = "bins of one spectrum each"
     if reduced.average_s is not None:
         length = f"bins of {reduced.average_s:g} s, which end where the gains change"
+    # files of older versions do not say how they were reduced
+    seen = reduced.observation
+    site = f"longitude {seen.lon_deg:g}°, latitude {seen.lat_deg:g}°"
+    how = {**reduced.recipe, "site": f"{site}, {reduced.recipe.get('site', '')}".rstrip(", ")}
     return [
         html.paragraph(
             f"{counted(len(reduced.bin_of), 'spectrum', 'spectra')} of "
             f"{counted(len(rows), 'session')}, in bands of "
             f"{reduced.bandwidth_mhz:g} MHz and {length}."
         ),
+        html.definitions(list(how.items())),
         html.table(SESSION, rows),
+        *(html.paragraph(note) for note in reduced.notes()),
     ]
+
+
+def _clock(session: Mapping[str, Any]) -> str:
+    """Scale and rate of a session's clock, and where they are from."""
+    scale, rate = session.get("scale"), session.get("rate", 1.0)
+    parts = [scale.upper()] if scale else []
+    parts += [f"rate {rate:.12g}"] if rate != 1.0 else []
+    return ", ".join([*parts, f"of the {session['clock']}"])
 
 
 def _flags(reduced: Reduced) -> list[str]:

@@ -57,6 +57,20 @@ def verdict(level: str, text: str) -> str:
     return f"{html.paragraph(text, CLASSES[level])}\n{rule}"
 
 
+def sentences(path: Path, found: Mapping[str, Any], name: str) -> list[str]:
+    """Sentences of a run's figures; none if they do not have them.
+
+    Raises
+    ------
+    InputError
+        If it is no list of texts.
+    """
+    told = found.get(name, [])
+    if not isinstance(told, list) or not all(isinstance(text, str) for text in told):
+        raise InputError(f"{path}: {name} is no list of texts; make the results anew")
+    return told
+
+
 def doubts(path: Path, found: Mapping[str, Any]) -> str:
     """What is doubtful about the data, as a run's figures tell it; nothing if they do not.
 
@@ -69,18 +83,15 @@ def doubts(path: Path, found: Mapping[str, Any]) -> str:
     return "\n".join(html.paragraph(f"Doubtful: {text}", TENSE) for text in told)
 
 
-def sentences(path: Path, found: Mapping[str, Any], name: str) -> list[str]:
-    """The sentences that a run's figures hold under a name; none if they do not.
+def unmapped(path: Path, found: Mapping[str, Any]) -> str:
+    """Which channels could not be mapped, and why; nothing if a run's figures name none.
 
     Raises
     ------
     InputError
         If it is no list of sentences.
     """
-    told = found.get(name, [])
-    if not isinstance(told, list) or not all(isinstance(text, str) for text in told):
-        raise InputError(f"{path}: {name} is no list of texts; make the results anew")
-    return told
+    return "\n".join(html.paragraph(t, BAD) for t in sentences(path, found, "unmapped"))
 
 
 def about(folder: Path, channels: str) -> str:

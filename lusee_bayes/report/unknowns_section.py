@@ -25,8 +25,11 @@ def map_unknowns(folder: Path, summary: Mapping[str, Any]) -> list[str]:
     null = entries(
         folder / "summary.json", {"unknowns": [summary.get("unknowns")]}, "unknowns", NULL_DIRECTION
     )[0]
+    # runs of older versions have no notes
+    notes = head.sentences(folder / "summary.json", null, "notes")
+    told = [sentence for sentence in (null["null_sentence"], *notes) if sentence]
     parts = [html.subsection(TITLE), html.table(HEADER, _cells(table))]
-    return [*parts, html.paragraph(null["null_sentence"])] if null["null_sentence"] else parts
+    return [*parts, *map(html.paragraph, told)]
 
 
 def cube_unknowns(folder: Path, summary: Mapping[str, Any]) -> list[str]:

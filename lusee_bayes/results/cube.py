@@ -14,7 +14,7 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.harmonics import mode_numbers, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import peak_memory_gb
-from lusee_bayes.core.representation import Described, extent
+from lusee_bayes.core.representation import Described, counted, extent
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.flight.reduced import Reduced
@@ -34,12 +34,15 @@ class CubeResult(Described):
     Attributes
     ----------
     scenario : Scenario
-        Of several frequencies.
+        Of several frequencies, those that could not be mapped included.
     channels : tuple of ChannelResult
+        That could be mapped.
     components : Components or None
         The component maps that all channels share; None where each has a posterior of its own.
     seconds : dict
         By stage.
+    unmapped : dict
+        Why the other channels could not be mapped, by frequency in MHz.
     reduced : Reduced or None
         Of flight data: the spectra behind them.
     """
@@ -48,20 +51,21 @@ class CubeResult(Described):
     channels: tuple[ChannelResult, ...]
     components: Components | None
     seconds: dict[str, float] = field(default_factory=dict)
+    unmapped: dict[float, str] = field(default_factory=dict)
     reduced: Reduced | None = None
 
     def description(self) -> tuple[str, ...]:
-        kind = "independent" if self.components is None else "joint"
+        kind = "independent channel" if self.components is None else "joint channel"
         return (
-            f"{len(self.channels)} {kind} channels, {extent(self.frequencies_mhz, 'MHz')}, "
+            f"{counted(len(self.channels), kind)}, {extent(self.frequencies_mhz, 'MHz')}, "
             f"lmax = {self.scenario.lmax}",
             self.verdict(),
         )
 
     @property
     def frequencies_mhz(self) -> Float[np.ndarray, " channels"]:
-        """Of the channels."""
-        return np.array(self.scenario.frequencies_mhz)
+        """Of the channels that could be mapped."""
+        return np.array([channel.frequency_mhz for channel in self.channels])
 
     def stacked(self, name: str) -> np.ndarray | None:
         """An attribute of the channels, channels first; None where it is not known of all."""
@@ -104,7 +108,7 @@ class CubeResult(Described):
     def headline(self) -> str:
         """The few figures that matter, in one line."""
         kind = "each on its own" if self.components is None else "one posterior"
-        parts = [f"{len(self.channels)} frequencies, {kind}"]
+        parts = [f"{counted(len(self.channels), 'frequency', 'frequencies')}, {kind}"]
         crosses = [c.ell_cross for c in self.channels if c.ell_cross is not None]
         if crosses:
             parts.append(f"SNR < 1 first at ell {min(crosses)} to {max(crosses)}")
@@ -125,11 +129,17 @@ class CubeResult(Described):
         """What a terminal shows."""
         prior = [] if self.components is None else [self.prior_words()]
         unknowns = [] if self.unknowns is None else self.unknowns.lines()
-        return [self.headline(), *prior, *unknowns, self.verdict(), RULE, *self.doubts()]
+        notes = () if self.reduced is None else self.reduced.notes()
+        told = [self.headline(), *prior, *unknowns, self.verdict(), RULE]
+        return [*told, *self.doubts(), *self.gaps(), *notes]
 
     def doubts(self) -> list[str]:
         """What is doubtful about the data, with the channel."""
         return [f"{c.frequency_mhz:g} MHz: {d}" for c in self.channels for d in c.doubts]
+
+    def gaps(self) -> list[str]:
+        """Which channels could not be mapped, and why, a sentence each."""
+        return [f"Not mapped, {f:g} MHz: {reason}" for f, reason in self.unmapped.items()]
 
     @property
     def log_evidence(self) -> float | None:
@@ -198,6 +208,7 @@ class CubeResult(Described):
             )
         return {
             "frequencies_mhz": self.frequencies_mhz.tolist(),
+            "unmapped": self.gaps(),
             "joint": self._joint_summary(),
             "log_evidence": self.log_evidence,
             "n_data": sum(channel.n_data for channel in self.channels),
@@ -279,6 +290,7 @@ class CubeResult(Described):
                 "basis": "real orthonormal spherical harmonics, index ell^2 + ell + m",
                 "versions": json.dumps(versions()),
                 "scenario": scenario.to_yaml(),
+                **({"unmapped": "\n".join(self.gaps())} if self.unmapped else {}),
             },
         )
 

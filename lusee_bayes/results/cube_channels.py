@@ -48,6 +48,9 @@ def cube_result(
 ) -> CubeResult:
     """Work out all channels, going on from what an interrupted run has left in ``folder``.
 
+    A channel that cannot be mapped leaves the others as they are: it is named in the result, and a
+    joint posterior is that of the others.
+
     Parameters
     ----------
     scenario : Scenario
@@ -66,7 +69,8 @@ def cube_result(
     Raises
     ------
     InputError
-        For a scenario without frequencies, and as :func:`infer` for a channel.
+        For a scenario without frequencies, if no channel can be mapped, or if too few of them can
+        for a joint posterior.
     """
     engine, stages = engine or ThisProcess(), stages or Stages()
     engine.work_in(folder)
@@ -111,22 +115,53 @@ def cube_result(
         )
         files.write(channel, wanted, found.to_dataset())
 
-    engine.each(Tasks(observe, channels, names), stages, "channels")
+    def refusal(channel: Scenario) -> str:
+        try:
+            observe(channel)
+        except InputError as error:
+            return str(error)
+        return ""
+
+    refusals = engine.each(Tasks(refusal, channels, names), stages, "channels")
+    unmapped = {c.frequency_mhz: r for c, r in zip(channels, refusals, strict=True) if r}
+    mapped = tuple(c for c in channels if c.frequency_mhz not in unmapped)
+    if not mapped:
+        raise InputError(f"no channel can be mapped: {_reasons(unmapped)}")
     components = None
     if scenario.joint:
+        left = _without(unmapped, scenario)
         # coverage is compared with draws; after conjugate gradients with those that there are
         known = (data is None or truth) and not iterative
         n_solved = max(n_draws, N_DRAWS) if known else n_draws
-        components = solve_components(scenario, files, n_solved, engine, stages)
+        components = solve_components(left, files, n_solved, engine, stages)
         # for workers of other processes
         shared = on_host(components)
 
         def write_sky(number: int) -> None:
-            _write_joint_sky(number, channels, shared, scenario, files, n_draws)
+            _write_joint_sky(number, mapped, shared, scenario, files, n_draws)
 
-        engine.each(Tasks(write_sky, range(len(channels)), names), stages, "joint skies")
-    found = tuple(ChannelResult.from_dataset(files.read(c, "result")) for c in channels)
-    return CubeResult(scenario, found, components, stages.seconds)
+        skies = Tasks(write_sky, range(len(mapped)), [names_of((c,)) for c in mapped])
+        engine.each(skies, stages, "joint skies")
+    found = tuple(ChannelResult.from_dataset(files.read(c, "result")) for c in mapped)
+    return CubeResult(scenario, found, components, stages.seconds, unmapped)
+
+
+def _without(unmapped: dict[float, str], scenario: Scenario) -> Scenario:
+    """A joint scenario of the channels that can be mapped. InputError if these are too few."""
+    left = tuple(f for f in scenario.frequencies_mhz if f not in unmapped)
+    try:
+        scenario.spectral.require_channels(len(left))
+    except InputError as error:
+        raise InputError(f"{error}; not mapped: {_reasons(unmapped)}") from error
+    return scenario.model_copy(update={"frequencies_mhz": left})
+
+
+def _reasons(unmapped: dict[float, str]) -> str:
+    """Why channels cannot be mapped, each reason once."""
+    alike: dict[str, list[str]] = {}
+    for frequency, reason in unmapped.items():
+        alike.setdefault(reason, []).append(f"{frequency:g}")
+    return "; ".join(f"{', '.join(known)} MHz: {reason}" for reason, known in alike.items())
 
 
 def _write_joint_sky(

@@ -128,8 +128,8 @@ class ChannelFits:
             {
                 "consistent": "Consistent: instrument, noise and prior fit in all channels.",
                 "unlike the prior": "Unlike the prior: instrument and noise fit in all channels, "
-                "but the skies are not what the prior allows.",
-                "does not fit": "Does not fit: no sky explains the data of all channels.",
+                f"but the skies are {self._unlike()}.",
+                "does not fit": f"Does not fit: {self._misfit()}.",
             }[level]
         ]
         for test in tests:
@@ -149,9 +149,37 @@ class ChannelFits:
             told.append(f"{len(extremes)} of {len(p)} channels stand out: {names}.")
         return Fit(level, " ".join([*told, *self._advice(level)]))
 
+    def _too_quiet(self) -> bool:
+        """Whether all channels together, or the one furthest out if that is less probable, have
+        too small a chi^2.
+        """
+        parts = [ChiSquare(*pair) for pair in zip(self.chi2, self.degrees, strict=True)]
+        parts.append(ChiSquare(float(self.chi2.sum()), float(self.degrees.sum())))
+        return min(parts, key=lambda part: part.p).too_small
+
+    def _misfit(self) -> str:
+        """What is wrong with instrument or noise."""
+        if self._too_quiet():
+            return "the data scatter less about what a sky explains than the noise would have them"
+        return "no sky explains the data of all channels"
+
+    def _unlike(self) -> str:
+        """What the skies are where they are unlike the prior."""
+        if self.rest.too_small:
+            return "weaker, or closer to the prior's mean, than the prior expects"
+        return "not what the prior allows"
+
     def _advice(self, level: Level) -> list[str]:
+        if level == "does not fit" and self._too_quiet():
+            return ["The noise is given too large (noise.radiometer): error bars are too wide."]
         if level == "does not fit":
             return ["Map the channels that stand out one by one: products and days are judged."]
+        if level == "unlike the prior" and self.rest.too_small:
+            narrower = "smaller spectral.residual" if self.joint else "narrower prior"
+            return [
+                "The prior is wider than the skies need, and error bars are too wide: a "
+                f"{narrower} would tell more (compare the evidence)."
+            ]
         if level == "unlike the prior" and self.joint:
             return [
                 "Skies may not obey the spectral prior, and error bars be too small: compare the "

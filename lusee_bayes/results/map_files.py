@@ -77,15 +77,19 @@ def write_map(
 
 
 def write_cube(
-    path: Path, name: str, pixels: Float[np.ndarray, "frequencies pixels"], scenario: Scenario
+    path: Path,
+    name: str,
+    pixels: Float[np.ndarray, "frequencies pixels"],
+    frequencies_mhz: Float[np.ndarray, " frequencies"],
+    scenario: Scenario,
 ) -> None:
-    """Write maps of all of a scenario's frequencies in the layout of sky cubes (``sky.cubes``).
+    """Write maps of a scenario's frequencies in the layout of sky cubes (``sky.cubes``).
 
     One image (frequency, pixel), HEALPix RING, Galactic, K, float64; the frequencies, which its
     header can only give in even steps, are in a table behind it.
     """
     image = fits.PrimaryHDU(np.asarray(pixels, dtype=np.float64))
-    header, frequencies = image.header, np.array(scenario.frequencies_mhz)
+    header, frequencies = image.header, frequencies_mhz
     for key, value in cards(name, scenario).items():
         if key != "FREQ":
             header[key] = value

@@ -163,7 +163,8 @@ class MapResult(Described):
         offsets = [] if self.pointing is None else self.pointing.lines()
         unknowns = [] if self.unknowns is None else self.unknowns.lines()
         told = [prior_sentence(self.experiment), *fluxes, *offsets, *unknowns]
-        return [self.headline(), *told, self.verdict(), RULE, *self.channel.doubts]
+        notes = () if self.reduced is None else self.reduced.notes()
+        return [self.headline(), *told, self.verdict(), RULE, *self.channel.doubts, *notes]
 
 
 def map_result(
@@ -212,6 +213,8 @@ def map_result(
         with stages("fluxes"):
             fluxes = flux_table(experiment, alone)
     unknowns = unknowns_report(experiment, alone)
+    if unknowns is not None and earlier is not None:
+        unknowns = replace(unknowns, onto=True)
     with stages("diagnostics"):
         page = diagnostics(experiment, found, judged, channel, covariance)
     pointing = None

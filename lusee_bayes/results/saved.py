@@ -58,7 +58,13 @@ CUBE = Layout(
         "mean": Variable(("frequency", "mode")),
         "std": Variable(("frequency", "mode"), low=0.0),
     },
-    {"lmax": COUNT, "frame": TEXT, "versions": TEXT},
+    {
+        "lmax": COUNT,
+        "frame": TEXT,
+        "versions": TEXT,
+        # of a run whose channels could not all be mapped
+        "unmapped": Attribute("text", optional=True),
+    },
 )
 DIAGNOSTICS = Layout(
     "diagnostics of lusee-bayes map",

@@ -41,18 +41,40 @@ class UnknownsReport:
         A row for each: unknown, unit, value, std, prior, prior_std and, if known, true.
     null : NullDirection or None
         None for a channel of a joint posterior, whose sky has no prior of its own.
+    common : float or None
+        Standard deviation of what all errors of gains have in common, over its prior's; None
+        without a gain table.
+    onto : bool
+        Whether the map is of earlier data, too, which the table is not of.
     """
 
     table: pd.DataFrame
     null: NullDirection | None
+    common: float | None = None
+    onto: bool = False
 
     @property
     def told(self) -> pd.Series:
         """Whether the data tell each of them."""
         return self.table["std"] <= UNTOLD * self.table["prior_std"]
 
+    def notes(self) -> list[str]:
+        """What has to be known to read the table, a sentence each."""
+        found = []
+        if self.common is not None and self.common > UNTOLD:
+            found.append(
+                "The common gain of all ports keeps its prior (standard deviation "
+                f"{self.common:.2f} of the prior's): no sky of unknown brightness tells it."
+            )
+        if self.onto:
+            found.append(
+                "Receivers, ground and gains are what the new data alone tell of them; those of "
+                "the earlier data are in the folder that the map was made onto."
+            )
+        return found
+
     def lines(self) -> list[str]:
-        """One line for every unknown, and the sentence of the null direction."""
+        """One line for every unknown, the sentence of the null direction, and the notes."""
         lines = []
         for row, told in zip(self.table.to_dict("records"), self.told, strict=True):
             unit = f" {row['unit']}" if row["unit"] else ""
@@ -61,7 +83,7 @@ class UnknownsReport:
                 text += f", the prior's {row['prior_std']:.2g}: these data do not tell it"
             lines.append(text)
         sentence = self.null_sentence()
-        return [*lines, sentence] if sentence else lines
+        return [*lines, *([sentence] if sentence else []), *self.notes()]
 
     def null_sentence(self) -> str:
         """What the data cannot tell; empty where they tell most of it, or it is not judged."""
@@ -69,7 +91,11 @@ class UnknownsReport:
 
     def summary(self) -> dict[str, Any]:
         """Entry of summary.json."""
-        found: dict[str, Any] = {"rows": self.table.to_dict("records")}
+        found: dict[str, Any] = {
+            "rows": self.table.to_dict("records"),
+            "common_gain_std_share": self.common,
+            "notes": self.notes(),
+        }
         if self.null is None:
             return found
         parts = dict(zip(self.null.names, self.null.weights.tolist(), strict=True))
@@ -87,7 +113,7 @@ class UnknownsReport:
             parts = found["null_direction"]
             weights = np.array(list(parts.values()), dtype=np.float64)
             null = NullDirection(tuple(parts), weights, found["null_share"])
-        return cls(pd.DataFrame(found["rows"]), null)
+        return cls(pd.DataFrame(found["rows"]), null, found["common_gain_std_share"])
 
 
 @dataclass(frozen=True)
@@ -168,7 +194,11 @@ class Unknowns:
             }
             rows.append(found | {"true": row["true"]} if "true" in row else found)
         null = None if joint else self._null_direction(told, float(covariance[0, 0]))
-        return UnknownsReport(pd.DataFrame(rows), null)
+        common = None
+        if GAIN in self.names:
+            gain = self.parts[self.names.index(GAIN)]
+            common = float(np.sqrt(gain @ told.covariance @ gain))
+        return UnknownsReport(pd.DataFrame(rows), null, common)
 
     def _null_direction(self, told: Amplitudes, variance: float) -> NullDirection:
         mixed = self.parts @ told.with_sky[0] / self.sky_std

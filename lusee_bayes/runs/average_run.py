@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from lusee_bayes.core.destinations import require_target
+from lusee_bayes.core.destinations import require_new
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
@@ -69,6 +69,7 @@ def run_average(
     path: str | Path,
     *,
     information: bool = True,
+    replace: bool = False,
     stages: Stages | None = None,
 ) -> AverageRun:
     """Average data, write them whole or not at all, and work out what is lost.
@@ -86,17 +87,18 @@ def run_average(
         The netCDF file to write.
     information : bool
         Work out the information about the map, in the data and in their averages.
+    replace : bool
+        Replace a file that is there.
     stages : Stages, optional
         Told what is being done.
 
     Raises
     ------
     InputError
-        As :func:`.read_data` and :func:`.averaged`, and for a scenario that the data do not fit or
-        that needs more memory than there is.
+        As :func:`.read_data` and :func:`.averaged`, for a scenario that the data do not fit or that
+        needs more memory than there is, and if the file is there already, unless ``replace``.
     """
     stages, path = stages or Stages(), Path(path)
-    require_target(path)
     if path.suffix == ".fits":
         raise InputError(
             f"'{path}': averages have windows, for which luseepy's waterfalls have no room; give "
@@ -107,6 +109,7 @@ def run_average(
             f"'{path}': the averages would replace the data that they are made of; give -o "
             "another name"
         )
+    require_new(path, replace=replace)
     if scenario.frequencies_mhz:
         raise InputError(
             "averages are of one frequency; give a scenario with frequency_mhz and without "

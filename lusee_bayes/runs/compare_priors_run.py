@@ -10,7 +10,7 @@ from pathlib import Path
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.tables import write_csv
-from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import Experiment, observed, with_truth
 from lusee_bayes.experiment.learned_prior import about_sky, evidence_by_sampling, learned_prior
 from lusee_bayes.experiment.named_priors import named_priors
@@ -50,7 +50,7 @@ def run_compare_priors(
     folder: str | Path,
     priors: Sequence[str] | None = None,
     *,
-    data: Path | None = None,
+    data: Data | None = None,
     truth: bool = False,
     draws: int = DRAWS,
     name: str = "the scenario",
@@ -71,7 +71,7 @@ def run_compare_priors(
         Of the results.
     priors : sequence of str, optional
         Names (:func:`.named_priors`), two or more; by default all that can be.
-    data : Path, optional
+    data : Path or sequence of Path, optional
         Visibilities to map; without them the scenario's own are simulated.
     truth : bool
         The given data are of the scenario's own sky.

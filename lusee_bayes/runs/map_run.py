@@ -186,13 +186,14 @@ def _one_file(
 
 
 def _provenance_of_channels(scenario: Scenario, data: Data | None, cube: CubeResult) -> Provenance:
-    """Of the data of the first channel; all have the same times."""
+    """Of the data of the first channel that could be mapped; all have the same times."""
+    first = next(c for c in scenario.channels() if c.frequency_mhz not in cube.unmapped)
     if data is None:
         observation = scenario.observation.observation()
     elif cube.reduced is not None:
-        observation = visibilities_of(cube.reduced, scenario.channels()[0]).observation
+        observation = visibilities_of(cube.reduced, first).observation
     else:
-        observation = read_data(data, scenario.channels()[0]).observation
+        observation = read_data(data, first).observation
     known = cube.stacked("truth") is not None
     return Provenance.of(scenario, observation, data, known_sky=known)
 
@@ -226,7 +227,7 @@ def _write_preferred(result: MapResult, folder: Path) -> None:
 
 def _write_cubes(result: CubeResult, folder: Path) -> None:
     for name, pixels in result.maps().items():
-        write_cube(folder / f"{name}.fits", name, pixels, result.scenario)
+        write_cube(folder / f"{name}.fits", name, pixels, result.frequencies_mhz, result.scenario)
 
 
 def _write_scenario(result: MapResult | CubeResult, folder: Path) -> None:

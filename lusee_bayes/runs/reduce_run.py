@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lusee_bayes.core.destinations import require_target
+from lusee_bayes.core.destinations import require_new
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_data import reduce_files
@@ -37,7 +37,7 @@ class ReduceRun:
 
 def reduced_lines(reduced: Reduced) -> list[str]:
     """What was flagged in each band, and how its noise compares with the radiometer's."""
-    lines = [reduced.description()[0]]
+    lines = [reduced.description()[0], *reduced.notes()]
     for band, frequency in enumerate(reduced.frequencies_mhz):
         parts = [f"{name} {share:.2%}" for name, share in reduced.shares(band).items()]
         noise = reduced.scatter[band]
@@ -52,6 +52,7 @@ def run_reduce(
     files: Sequence[Path],
     path: str | Path,
     *,
+    replace: bool = False,
     stages: Stages | None = None,
 ) -> ReduceRun:
     """Reduce sessions to the scenario's frequencies, and write them whole or not at all.
@@ -63,18 +64,21 @@ def run_reduce(
         Sessions, in any order.
     path : path
         The netCDF file to write.
+    replace : bool
+        Replace a file that is there.
     stages : Stages, optional
         Told what is being done.
 
     Raises
     ------
     InputError
-        As :func:`.reduce_files`, and if the file would replace a session.
+        As :func:`.reduce_files`, if the file would replace a session, and if it is there already,
+        unless ``replace``.
     """
     stages, path = stages or Stages(), Path(path)
-    require_target(path)
     if path.resolve() in [Path(file).resolve() for file in files]:
         raise InputError(f"'{path}' is one of the sessions; give -o another name")
+    require_new(path, replace=replace)
     reduced = reduce_files(files, scenario, stages)
     with stages("file"):
         write_reduced(path, reduced, scenario.to_yaml())

@@ -10,7 +10,7 @@ import numpy as np
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.report.figures import chains as chain_figures
@@ -67,7 +67,7 @@ def run_sample(
     *,
     program: Program | None = None,
     sampler: Sampler | None = None,
-    data: Path | None = None,
+    data: Data | None = None,
     resume: bool = False,
     replace: bool = False,
     stages: Stages | None = None,
@@ -86,7 +86,7 @@ def run_sample(
         By default :func:`default_program`.
     sampler : Sampler, optional
         By default with the scenario's seed.
-    data : Path, optional
+    data : Path or sequence of Path, optional
         Visibilities to use; without them the scenario's own are simulated.
     resume : bool
         Go on with the unfinished run in the folder, or take over a finished one.
@@ -124,7 +124,7 @@ def run_sample(
         return SampleRun(results, place, [*(f for run in runs for f in run.files), *files])
 
 
-def sample_origin(scenario: Scenario, data: Path | None, program: Program) -> dict[str, str]:
+def sample_origin(scenario: Scenario, data: Data | None, program: Program) -> dict[str, str]:
     """What determines the draws of a program (:func:`.origin_of`)."""
     return origin_of(scenario, data, program=f"{program.name} ({program.digest[:12]})")
 
@@ -134,7 +134,7 @@ def _run_single(
     folder: Path,
     program: Program,
     sampler: Sampler,
-    data: Path | None,
+    data: Data | None,
     resume: bool,
     replace: bool,
     stages: Stages | None,
@@ -153,9 +153,10 @@ def _run_single(
 
 def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Path) -> None:
     scenario, results = sampled
+    frequencies = np.array(scenario.frequencies_mhz)
     for name in ("mean", "std"):
         pixels = np.stack([result.maps[name] for result in results])
-        write_cube(folder / f"{name}.fits", name, pixels, scenario)
+        write_cube(folder / f"{name}.fits", name, pixels, frequencies, scenario)
     (folder / "scenario.yaml").write_text(scenario.to_yaml())
 
 

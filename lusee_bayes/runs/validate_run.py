@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lusee_bayes.core.engine import Engine
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.report.figures import samples as sample_figures
@@ -41,7 +41,7 @@ def run_validate(
     name: str = "the scenario",
     sampler: Sampler | None = None,
     simulations: int = 500,
-    data: Path | None = None,
+    data: Data | None = None,
     resume: bool = False,
     engine: Engine | None = None,
     replace: bool = False,
@@ -62,7 +62,7 @@ def run_validate(
         By default with the scenario's seed.
     simulations : int
         Data sets for simulation-based calibration.
-    data : Path, optional
+    data : Path or sequence of Path, optional
         Visibilities to use; without them the scenario's own are simulated.
     resume : bool
         Go on with the unfinished run in the folder, or judge the finished one again.

@@ -214,7 +214,8 @@ class TimesStudentT(Prediction):
         if self.factor.couples_times:
             raise InputError(
                 f"a Student-t for every time needs noise that couples no two times, not "
-                f"{type(noise).__name__}; leave what couples them (gains, beams, sources) out of N"
+                f"{type(noise).__name__}; have what couples them (gains, receivers, sources) "
+                "sampled instead of marginalised, or leave it out"
             )
         self.loc = loc
         self.layout = layout

@@ -31,6 +31,7 @@ FOLDERS = (PACKAGE / "models", PACKAGE.parent / "models")
 # what a program's arguments may be called: pieces of the model with all systematics in N, ...
 PIECES: dict[str, Callable[[LinearGaussian], Any]] = {
     "coupling": lambda model: model.coupling,
+    "offset": lambda model: jnp.zeros(model.n_data) if model.offset is None else model.offset,
     "prior": lambda model: model.prior,
     "noise": lambda model: model.noise,
     "fixed_noise": lambda model: model.noise.factor(),
@@ -89,10 +90,17 @@ class Program:
         Raises
         ------
         InputError
-            If the program asks for a piece that is not there.
+            If the program asks for a piece that is not there, or for A alone where the data hold
+            more than the sky.
         """
-        found = {}
-        for name in inspect.signature(self.model).parameters:
+        found, names = {}, inspect.signature(self.model).parameters
+        if "coupling" in names and "offset" not in names and model.offset is not None:
+            raise InputError(
+                f"the program '{self.name}' asks for 'coupling' alone, and these data hold ground "
+                "or receivers besides the sky; add the argument 'offset', and coupling @ sky + "
+                "offset"
+            )
+        for name in names:
             if name in PIECES:
                 found[name] = PIECES[name](model)
             elif name != "data":

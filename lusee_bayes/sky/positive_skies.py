@@ -61,7 +61,8 @@ def check_fields(names: tuple[str, ...], n_channels: int) -> None:
             raise InputError(f"unknown field '{name}'; {nearest(name, FIELDS)}")
     if not names or n_channels < len(names):
         raise InputError(
-            f"{len(names)} fields of the logarithm need at least as many channels, got {n_channels}"
+            f"{len(names)} fields of the logarithm need at least as many channels, got "
+            f"{n_channels}; name fewer in spectral.fields, or give more frequencies"
         )
 
 

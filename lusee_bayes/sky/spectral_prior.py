@@ -55,12 +55,14 @@ def check_components(names: tuple[str, ...], n_channels: int, residual: float | 
             raise InputError(f"unknown component '{name}'; {nearest(name, SPECTRA)}")
     if not names or n_channels < len(names):
         raise InputError(
-            f"{len(names)} spectral components need at least as many channels, got {n_channels}"
+            f"{len(names)} spectral components need at least as many channels, got {n_channels}; "
+            "name fewer in spectral.components, or give more frequencies"
         )
     if residual is None and n_channels == len(names):
         raise InputError(
             f"{len(names)} spectral components fit the skies of {n_channels} channels "
-            "exactly, whatever these are; give a residual, or fewer components"
+            "exactly, whatever these are; give spectral.residual, name fewer in "
+            "spectral.components, or give more frequencies"
         )
 
 

@@ -7,8 +7,10 @@ import pytest
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.flight_data import reduce_files
+from lusee_bayes.experiment.flight_disturbances import Disturbances
 from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.experiment.schema import FlightSimulatedSection
 from lusee_bayes.instrument.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED
 from lusee_bayes.instrument.flight.sessions import read_session
 from lusee_bayes.instrument.flight.spectrometer import CHANNEL_MHZ
@@ -51,6 +53,7 @@ STATES = [
     ["flight.simulated.navgf=4", "flight.convention=conj(s_i) s_j"],
     ["flight.simulated.levels=LLLL", "flight.simulated.kind=fits", "flight.bin_origin=edge"],
     ["flight.simulated.layout=4", "flight.simulated.session_h=1.4"],
+    ["flight.simulated.layout=4", "flight.simulated.kind=fits", "flight.simulated.navgf=2"],
     ["flight.simulated.switch_h=2.2", "flight.simulated.levels=HHHH"],
     ["flight.simulated.clock=unknown", "flight.convention=conj(s_i) s_j"],
 ]
@@ -193,6 +196,19 @@ def test_what_makes_no_sessions_is_refused(changes, text):
         simulate_flight(load_scenario("fiducial", [*SMALL, *changes]))
 
 
+def test_a_tone_that_no_bin_holds_is_refused():
+    """Navgf 3 leaves out every fourth channel, the last of each bin."""
+
+    def drawn(channel):
+        section = FlightSimulatedSection(navgf=3, tones_mhz=(0.025 * channel,))
+        return Disturbances.drawn(section, np.arange(20.0), 3600.0, "centre", 1)
+
+    for channel in (1000, 1001, 1002):
+        assert np.flatnonzero(drawn(channel).tone_channel).tolist() == [channel]
+    with pytest.raises(InputError, match=r"channel 1003, which Navgf 3 leaves out.*25\.(05|1) MHz"):
+        drawn(1003)
+
+
 @pytest.mark.parametrize(
     "change", ["navgf=5", "levels=MMMX", "levels=MMM", "layout=2", "saturated_share=0.9"]
 )
@@ -201,8 +217,9 @@ def test_impossible_states_are_refused(change):
         load_scenario("fiducial", [*SMALL, "flight.simulated={}", f"flight.simulated.{change}"])
 
 
-@pytest.mark.parametrize("change", ["{layout: 4, kind: fits}", "{layout: 4, clock: unknown}"])
-def test_layouts_have_what_they_need(change):
+@pytest.mark.parametrize("kind", ["hdf5", "fits"])
+def test_telemetry_of_layout_4_needs_a_clock(kind):
+    change = f"{{layout: 4, kind: {kind}, clock: unknown}}"
     with pytest.raises(InputError, match="layout"):
         load_scenario("fiducial", [*SMALL, f"flight.simulated={change}"])
 

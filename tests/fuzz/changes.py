@@ -14,6 +14,8 @@ from astropy.io import fits
 from hypothesis import strategies as st
 
 FRACTION = st.floats(0.0, 1.0)
+# words of extensions that say what they hold
+OWN = ("TTYPE", "TUNIT", "EXTNAME", "ORDER", "LUSEE", "ATTRJSON", "COLJSON")
 VALUES = st.sampled_from(
     [
         *("", "text", "\uff11\uff12", "2027-13-45", "nan", 0, 1, -1, 3, 10**12, 2**63, True, False),
@@ -135,7 +137,7 @@ def change_fits(path: Path, change: tuple[Any, ...]) -> None:
             hdu.name = "OTHER"
         elif kind in ("attribute", "drop attribute", "value"):
             own = [k for k in hdus[0].header if not k.startswith(("SIMPLE", "BITPIX", "NAXIS"))]
-            own += [k for k in hdu.header if k.startswith(("TTYPE", "TUNIT", "EXTNAME", "ORDER"))]
+            own += [k for k in hdu.header if k.startswith(OWN)]
             if own:
                 key = own[int(fraction * 997) % len(own)]
                 owner = hdus[0] if key in hdus[0].header else hdu

@@ -86,6 +86,7 @@ READERS = {
     "session.h5": (describe, read_spectra),
     "session_4.h5": (describe, read_spectra),
     "session.fits": (describe, read_spectra),
+    "session_4.fits": (describe, read_spectra),
     "reduced.nc": (describe, lambda path: read_reduced(path).at(25.0, np.ones(4))),
     "gains.nc": (describe, read_gain_table),
 }
@@ -139,8 +140,8 @@ def write_sessions(folder: Path) -> None:
     """Three spectra in every layout, and what is made of them."""
     flight = "flight={per_kelvin_v2_hz: 1e-21, simulated: {layout: %d, kind: %s}}"
     size = ["observation.step_s=900", "observation.runs=[{cycles: 0.0012}]"]
-    for layout, kind, name in ((3, "hdf5", "session.h5"), (4, "hdf5", "session_4.h5"),
-                               (3, "fits", "session.fits")):  # fmt: skip
+    for name in ("session.h5", "session_4.h5", "session_4.fits", "session.fits"):
+        layout, kind = 4 if "4" in name else 3, "fits" if name.endswith("fits") else "hdf5"
         scenario = load_scenario("fiducial", ["lmax=2", *size, flight % (layout, kind)])
         made = run_simulate_flight(scenario, folder / name.replace(".", "_"))
         shutil.copy(made.sessions[0], folder / name)

@@ -158,6 +158,23 @@ def test_bursts_are_found(length, strength):
     assert found[~burst].mean() <= 1e-3
 
 
+def test_what_is_between_weak_bursts_stays():
+    """Twelve of 8 spectra at 4.5 sigma, in pairs 8 spectra apart.
+
+    A spectrum beside a burst goes with it where one auto's noise is beyond (3 - sqrt(8)) 4.5
+    sqrt(8) = 2.2 sigma: one is expected in all, and more than five are rare.
+    """
+    rng = np.random.default_rng(13)
+    t, values, noise = bands_in_time(rng)
+    burst = np.zeros(N, dtype=bool)
+    for start in np.arange(100, N - 100, 340):
+        burst[start : start + 8] = burst[start + 16 : start + 24] = True
+    values[burst] += 4.5 * noise[burst]
+    found, _ = burst_flags(t, values, noise, np.ones(N, dtype=bool), FALSE_ALARM)
+    assert found[burst].mean() >= 0.95
+    assert (found & ~burst).sum() <= 5
+
+
 def test_noise_that_is_larger_than_expected_is_no_burst():
     t, values, noise = bands_in_time(np.random.default_rng(12), noise=6e-4)
     found, scatter = burst_flags(t, values, noise / 3.0, np.ones(N, dtype=bool), FALSE_ALARM)

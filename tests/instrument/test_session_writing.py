@@ -23,14 +23,14 @@ from lusee_bayes.instrument.products import to_matrix, to_real
 
 N = 7
 CLOCK = Clock("test", 2400000.5, 61192.0, "utc", 1000.0)
-KINDS = [("hdf5", 3), ("hdf5", 4), ("fits", 3)]
+KINDS = [("hdf5", 3), ("hdf5", 4), ("fits", 3), ("fits", 4)]
 
 
 def some_rows(**changes):
     rng = np.random.default_rng(5)
     level = np.array([list("MMMM")] * 3 + [list("LMHL")] * 4)
     rows = SessionRows(
-        raw_s=2.3e7 + 42.0 * np.arange(N),
+        raw_s=2.3e7 + 0.7 + 42.0 * np.arange(N),
         navgf=np.full(N, 2),
         navg_shift=np.full(N, 20),
         level=level,
@@ -69,7 +69,7 @@ def test_a_session_comes_back_from_its_file(tmp_path, kind, layout):
     assert is_session(path)
     found = read_session(path)
     assert (found.layout, found.kind) == (layout, kind.upper())
-    assert found.software == "775"
+    assert found.software == "0x307"
     assert (found.lon_deg, found.lat_deg) == (rows.lon_deg, rows.lat_deg)
     np.testing.assert_array_equal(found.raw_s, rows.raw_s)
     np.testing.assert_array_equal(found.navgf, rows.navgf)
@@ -114,8 +114,8 @@ def test_what_is_no_session_leaves_nothing_behind(tmp_path, kind, blocks, text):
     with pytest.raises(InputError, match=text):
         write_session(tmp_path / "s", some_rows(), blocks, kind=kind)
     assert not list(tmp_path.iterdir())
-    with pytest.raises(InputError, match="not as fits of layout 4"):
-        write_session(tmp_path / "s", some_rows(), [], kind="fits", layout=4)
+    with pytest.raises(InputError, match="not as fits of layout 5"):
+        write_session(tmp_path / "s", some_rows(), [], kind="fits", layout=5)
 
 
 def test_chunks_of_a_long_session_stay_in_memory_until_they_are_read():

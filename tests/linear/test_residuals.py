@@ -13,6 +13,8 @@ from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.linear import residuals as residuals_module
+from lusee_bayes.linear.left_out_dense import DenseLeftOut
 from lusee_bayes.linear.residuals import residuals
 from lusee_bayes.linear.split import WIDER
 
@@ -141,6 +143,19 @@ def test_groups_and_single_data_by_hand(case):
     assert found.fit().text.startswith("Consistent: instrument and noise fit (p ")
 
 
+@pytest.mark.parametrize(
+    ("width", "said", "not_said"),
+    [(10.0, "error bars are too wide; a narrower prior", "what the prior allows"),
+     (0.1, "stronger than the prior expects, error bars are too narrow", "narrower prior")],
+)  # fmt: skip
+def test_a_prior_that_is_too_wide_is_told_from_one_that_is_too_narrow(width, said, not_said):
+    """The same data, under a prior ten times as wide as the sky's, and as narrow."""
+    model, data = simulated()
+    fit = judged(replace(model, prior=model.prior.widened(width)), data).fit()
+    assert fit.level == "unlike the prior"
+    assert said in fit.text and not_said not in fit.text
+
+
 def test_one_group_is_everything():
     model, data = simulated("observation.runs=[{cycles: 0.02}]")
     found = judged(model, data)
@@ -148,6 +163,19 @@ def test_one_group_is_everything():
     whole = found.split.instrument
     assert (angle.chi2, angle.degrees, angle.n) == (whole.chi2, whole.degrees, data.layout.size)
     assert np.isnan(angle.others_p)
+
+
+def test_precise_data_of_one_day_are_judged_by_product(monkeypatch):
+    """A as a matrix: K^-1 of all data, which nothing predicts, has no root in 64 bits."""
+    monkeypatch.setattr(
+        residuals_module, "leave_out", lambda m, _, d: DenseLeftOut(m, d.data, d.layout)
+    )
+    model, data = simulated("noise.radiometer.factor=1e-6", "observation.runs=[{cycles: 0.03}]")
+    found = judged(model, data)
+    assert found.level() == "consistent" and np.isfinite(found.z).all()
+    (day,) = found.days
+    assert day.n == data.layout.size and np.isnan(day.others_p)
+    assert len(found.compared()) == 16
 
 
 def corrupted(data, where, by):

@@ -69,7 +69,15 @@ def test_channels_that_stand_out_are_named():
     assert "2 of 46 channels stand out: 12 MHz" in text and "35 MHz" in text
     assert run.fit().level == "does not fit"
     # noise that is given too large is no fit either
-    assert fits(0.8 * chi2[:1]).fit().level == "does not fit"
+    quiet = fits(0.8 * chi2[:1]).fit()
+    assert quiet.level == "does not fit"
+    assert "noise is given too large" in quiet.text and "no sky explains" not in quiet.text
+    assert "no sky explains" in text and "too large" not in text
+    # one channel that is too loud, whatever the sum
+    loud = np.full(46, 4970.0)
+    loud[7] = 6000.0
+    assert loud.sum() < 46 * 5000.0
+    assert "no sky explains" in fits(loud).fit().text
 
 
 def test_the_prior_is_judged_apart():
@@ -81,7 +89,11 @@ def test_the_prior_is_judged_apart():
     joint = fits(chi2, rest=(400.0, 200.0), joint=True).fit()
     assert joint.level == "unlike the prior" and "spectral.components" in joint.text
     assert fits(1.2 * chi2, rest=(400.0, 200.0)).fit().level == "does not fit"
-    assert fits(chi2, rest=(50.0, 200.0)).fit().level == "unlike the prior"
+    weak = fits(chi2, rest=(50.0, 200.0)).fit()
+    assert weak.level == "unlike the prior" and "skies are weaker" in weak.text
+    assert "too narrow" not in weak.text and "error bars are too wide" in weak.text
+    assert "too narrow" in strong.text and "weaker" not in strong.text.split("expects")[0]
+    assert "smaller spectral.residual" in fits(chi2, rest=(50.0, 200.0), joint=True).fit().text
     bound = fits(chi2, rest=(50.0, 200.0), bound=True, joint=True)
     assert bound.fit().level == "consistent" and "expected at most 200" in bound.fit().text
     assert fits(chi2, rest=(400.0, 200.0), bound=True).fit().level == "unlike the prior"

@@ -78,6 +78,9 @@ def test_table_and_null_direction_are_those_of_the_joint_posterior(experiment):
     variances, directions = np.linalg.eigh(pick @ expected.covariance @ pick.T)
     assert report.null.share == pytest.approx(variances[-1], rel=1e-5)
     assert abs(report.null.weights @ directions[:, -1]) == pytest.approx(1.0, abs=1e-5)
+    assert report.common == pytest.approx(
+        np.sqrt(pick[6] @ expected.covariance @ pick[6]), rel=1e-5
+    )
     assert report.null.names == (
         "uniform sky", "receiver 0", "receiver 1", "receiver 2", "receiver 3", "regolith",
         "common gain",
@@ -110,6 +113,31 @@ def test_the_null_direction_in_words():
     assert null.sentence().endswith("it keeps 80% of its prior variance.")
     # nothing to say where the data tell most of it
     assert NullDirection.of(["uniform sky", "regolith"], 0.4 * np.eye(2)).sentence() == ""
+
+
+@pytest.mark.parametrize(("common", "told"), [(None, False), (0.5, False), (0.95, True)])
+def test_the_common_gain_is_told_where_it_keeps_its_prior(experiment, common, told):
+    report = replace(unknowns_report(experiment, infer(experiment)), common=common)
+    assert (
+        any("common gain of all ports keeps its prior" in line for line in report.lines()) == told
+    )
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_unknowns_of_a_map_onto_another_are_said_to_be_of_the_new_data(response_file, tmp_path):
+    """As numbers: those of these data mapped alone."""
+    first = four_ports(response_file, GROUND, "output.updatable=true")
+    lb.run_map(first, tmp_path / "first")
+    second = first.model_copy(update={"seed": 7})
+    alone = build(second)
+    run = lb.run_map(second, tmp_path / "both", onto=tmp_path / "first")
+    expected = unknowns_report(alone, infer(alone))
+    pd.testing.assert_frame_equal(run.result.unknowns.table, expected.table)
+    note = "what the new data alone tell"
+    assert any(note in line for line in run.result.lines())
+    assert note in map_page(tmp_path / "both", "both")
+    assert note not in map_page(tmp_path / "first", "first")
 
 
 def test_a_run_writes_them(experiment, tmp_path):

@@ -56,7 +56,7 @@ def test_what_is_lost_is_small_and_grows_with_the_square_of_the_length(path, tmp
     """The signal within a window is lost: a twelfth of its length squared, times the slopes."""
     lost = []
     for hours in (2, 4):
-        run = run_average(scenario(), path, 3600.0 * hours, tmp_path / "averaged.nc")
+        run = run_average(scenario(), path, 3600.0 * hours, tmp_path / f"{hours}.nc")
         fine, coarse = run.bits
         assert 0.0 < run.lost_bits < 0.01 * fine
         assert run.lost_bits == fine - coarse
@@ -89,11 +89,16 @@ def test_the_command_writes_averages_and_says_what_they_cost(path, tmp_path, cap
     assert f"160 visibilities -> {out}" in said
     found = read_visibilities(out)
     assert found.digest() == averaged(read_visibilities(path), 7200.0).digest()
+    assert main(["average", str(path), "--to", "4h", "-o", str(out), *given]) == 2
+    assert "is there already; give -o another name, or --force" in capsys.readouterr().err
     again = tmp_path / "again.nc"
     command = ["average", str(path), "--to", "120min", "-o", str(again), "--no-information"]
     assert main(command) == 0
     assert "information" not in capsys.readouterr().out
     assert read_visibilities(again).digest() == found.digest()
+    assert read_visibilities(out).digest() == found.digest()
+    assert main([*command[:3], "4h", *command[4:], "--force"]) == 0
+    assert read_visibilities(again).digest() != found.digest()
 
 
 def test_what_flags_cost_is_said(data, tmp_path):

@@ -8,6 +8,7 @@ import healpy
 import numpy as np
 import pytest
 import xarray as xr
+from astropy.io import fits
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core import workers
@@ -19,6 +20,7 @@ from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.terms import Around
 from lusee_bayes.linear.metrics import signal_to_noise
+from lusee_bayes.report import head
 from lusee_bayes.results import cube_channels
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
@@ -215,11 +217,80 @@ def test_measured_data_of_several_channels(tmp_path, capsys, numbers_alone):
     assert "truth" in posterior_of(tmp_path / "a")
     capsys.readouterr()
     for given, message in (
-        (["--frequencies", "20,40", *SMALL, *read], "40"),
+        (["--frequencies", "40,45", *SMALL, *read], "no channel can be mapped: 40 MHz: "),
         ([*THREE, "--data", tmp_path / "gone.fits"], "no data at"),
     ):
         assert run("map", "fiducial", *given, "-q", "-o", tmp_path / "b") == 2
         assert message in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def gap(tmp_path_factory):
+    """Data of three channels, of which that at 25 MHz has no usable value."""
+    path = tmp_path_factory.mktemp("gap") / "w.fits"
+    assert run("simulate", "fiducial", *THREE, "-o", path, "-q") == 0
+    with fits.open(path, mode="update") as file:
+        (cube,) = [hdu for hdu in file if hdu.data is not None and hdu.data.ndim == 3]
+        axis = cube.data.shape.index(3)
+        np.moveaxis(cube.data, axis, 0)[1] = np.nan
+    return path
+
+
+@pytest.mark.parametrize("joint", [[], ["joint=true", "spectral.components=[power_law]"]], ids=len)
+def test_a_channel_that_cannot_be_mapped_leaves_the_others_as_they_are(
+    gap, joint, tmp_path, numbers_alone, monkeypatch, capsys
+):
+    # those of a run of the other channels
+    whole = run_map(three(*joint, frequencies="[20, 30]"), tmp_path / "without", data=gap)
+    monkeypatch.setattr(folder_module, "PAGES", {"cube": lambda folder, _: head_of(folder)})
+    sets = [word for one in joint for word in ("--set", one)]
+    command = ["map", "fiducial", *THREE, *sets, "--data", gap, "-o", tmp_path / "with"]
+    assert run(*command) == 0
+    told = capsys.readouterr().out
+    got, expected = posterior_of(tmp_path / "with"), posterior_of(tmp_path / "without")
+    np.testing.assert_array_equal(got["frequency"], [20.0, 30.0])
+    for name in ("mean", "std", "prior_std"):
+        np.testing.assert_array_equal(got[name], expected[name])
+    np.testing.assert_array_equal(SkyCube.read(tmp_path / "with" / "mean.fits").frequencies_mhz,
+                                  [20.0, 30.0])  # fmt: skip
+    summary = json.loads((tmp_path / "with" / "summary.json").read_text())
+    assert summary["log_evidence"] == whole.result.log_evidence
+    (reason,) = summary["unmapped"]
+    assert reason.startswith("Not mapped, 25 MHz: ")
+    assert reason in told
+    assert run("info", tmp_path / "with" / "posterior.nc") == 0
+    assert reason in capsys.readouterr().out
+    assert reason in (tmp_path / "with" / "report.html").read_text()
+
+
+def head_of(folder):
+    """What a report says of channels that could not be mapped."""
+    return head.unmapped(folder / "summary.json", json.loads((folder / "summary.json").read_text()))
+
+
+def test_too_few_channels_for_a_joint_posterior_are_named(gap, tmp_path, numbers_alone):
+    components = ["joint=true", "spectral.components=[power_law, curvature]"]
+    with pytest.raises(InputError, match="spectral.components.*; not mapped: 25 MHz: "):
+        run_map(three(*components), tmp_path, data=gap)
+
+
+@pytest.mark.long
+def test_a_run_with_a_channel_that_cannot_be_mapped_goes_on(
+    gap, tmp_path, made, monkeypatch, numbers_alone
+):
+    inform = cube_channels.inform
+
+    def some(*arguments):
+        if made:
+            raise KeyboardInterrupt
+        return inform(*arguments)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(cube_channels, "inform", some)
+        run_map(three(), tmp_path, data=gap)
+    assert made == [20]
+    result = run_map(three(), tmp_path, data=gap).result
+    assert made == [20, 30] and list(result.unmapped) == [25.0]
 
 
 @pytest.mark.parametrize(

@@ -101,3 +101,58 @@ def test_a_file_is_no_folder_for_sessions(tmp_path, capsys):
     assert simulate(tmp_path / "a") == 2
     assert "is a file" in capsys.readouterr().err
     assert (tmp_path / "a").read_text() == "kept"
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """The folder of a session; to be read only."""
+    folder = tmp_path_factory.mktemp("flight") / "sessions"
+    assert simulate(folder) == 0
+    return folder
+
+
+def test_reduced_spectra_are_reduced_once_and_not_replaced_unasked(simulated, tmp_path, capsys):
+    out = tmp_path / "r.nc"
+    reduce = ["reduce", "-q", str(simulated / "scenario.yaml")]
+    session = str(simulated / "session_000.h5")
+    assert main([*reduce, session, "-o", str(out)]) == 0
+    out.write_bytes(b"kept")
+    assert main([*reduce, session, "-o", str(out)]) == 2
+    assert "is there already; give -o another name, or --force" in capsys.readouterr().err
+    assert out.read_bytes() == b"kept"
+    assert main([*reduce, session, "-o", str(out), "--force"]) == 0
+    assert main([*reduce, str(out), "-o", str(tmp_path / "x.nc")]) == 2
+    told = f"lusee-bayes: '{out}' is reduced already; give it to lusee-bayes map --data\n"
+    assert capsys.readouterr().err == told
+
+
+@pytest.mark.parametrize("name", ["gains.nc", "truth.npz", "scenario.yaml"])
+def test_what_can_be_mapped_is_said_of_a_file_that_cannot(simulated, tmp_path, capsys, name):
+    out = ["-q", "-o", str(tmp_path / "map")]
+    data = ["--data", str(simulated / name)]
+    assert main(["map", str(simulated / "scenario.yaml"), *data, *out]) == 2
+    error = capsys.readouterr().err
+    assert f"{name} holds nothing that can be mapped" in error
+    for kind in ("visibilities", "waterfall", "sessions", "reduce"):
+        assert kind in error
+
+
+def test_the_site_of_sessions_may_be_the_scenarios(simulated, tmp_path, capsys):
+    command = ["map", str(simulated / "scenario.yaml"), "--set", "observation.lat_deg=-20"]
+    command += ["--data", str(simulated / "session_000.h5"), "-q", "-o", str(tmp_path / "map")]
+    assert main(command) == 2
+    assert "flight.site=scenario" in capsys.readouterr().err
+
+
+def test_info_of_several_files_names_the_bad_one_and_shows_the_others(simulated, tmp_path, capsys):
+    bad = tmp_path / "bad.h5"
+    bad.write_text("nothing")
+    good = [simulated / "session_000.h5", simulated / "gains.nc"]
+    assert main(["info", str(good[0]), str(bad), str(good[1])]) == 2
+    told = capsys.readouterr()
+    parts = told.out.split("\n\n")
+    assert [part.startswith(f"{path}: ") for part, path in zip(parts, good, strict=True)] == [
+        True
+    ] * 2
+    assert told.err.startswith(f"lusee-bayes: {bad} ") and told.err.count("\n") == 1
+    assert main(["info", *map(str, good)]) == 0

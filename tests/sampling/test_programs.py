@@ -2,11 +2,14 @@
 
 import hashlib
 import sys
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpyro import handlers
+from numpyro.infer.util import log_density
 from reference_linear import assert_draws_follow, posterior, random_covariance
 
 import lusee_bayes as lb
@@ -18,6 +21,7 @@ from lusee_bayes.sampling.programs import (
     program_names,
     replicated_data,
 )
+from lusee_bayes.sampling.promotion import numpyro_promotion
 
 SPECTRUM = np.array([4.0, 1.0, 0.5])
 ELL_OF_MODE = np.repeat([0, 1, 2], [1, 3, 5])
@@ -230,6 +234,34 @@ def test_which_programs_have_integrated_the_sky_out(write, gaussian):
     assert is_collapsed(mine, mine.arguments(gaussian), data)
     kept = load_program(write(OFFSET_PROGRAM.replace("return gaussian", "return None")))
     assert not is_collapsed(kept, kept.arguments(gaussian), data)
+
+
+@pytest.mark.parametrize("name", ["sky", "sky_marginal", "prior_amplitude", "spectrum_bands"])
+def test_what_is_seen_without_a_sky_shifts_the_data(gaussian, name):
+    """p(d + offset | with an offset) = p(d | without), whatever the sites."""
+    program, offset = load_program(name), jnp.asarray(100.0 * OFFSET)
+    shifted = replace(gaussian, offset=offset)
+    data = gaussian.sample(jax.random.key(4))[1]
+    with numpyro_promotion():
+        seeded = handlers.seed(program.model, jax.random.key(5))
+        sites = handlers.trace(seeded).get_trace(**program.arguments(gaussian))
+        values = {k: v["value"] for k, v in sites.items() if k != "data"}
+        expected, _ = log_density(
+            program.model, (), program.arguments(gaussian) | {"data": data}, values
+        )
+        arguments = program.arguments(shifted)
+        found, _ = log_density(program.model, (), arguments | {"data": data + offset}, values)
+        other, _ = log_density(program.model, (), arguments | {"data": data}, values)
+    np.testing.assert_allclose(found, expected, rtol=1e-11)
+    assert abs(other - expected) > 1.0
+
+
+def test_a_program_that_would_forget_the_offset_is_refused(gaussian, write):
+    program = load_program(write("def model(coupling, data=None):\n    pass\n"))
+    program.arguments(gaussian)
+    with pytest.raises(lb.InputError, match="add the argument 'offset'") as error:
+        program.arguments(replace(gaussian, offset=jnp.asarray(OFFSET)))
+    assert_one_sentence(error, "'mine'")
 
 
 # --- draws from collapsed programs ----------------------------------------------------------------

@@ -7,15 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from experiments import program_arguments, small_experiment
+from experiments import four_ports, program_arguments, small_experiment
+from numpyro.infer.util import log_density
 from scipy import stats
 
 import lusee_bayes as lb
+from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.inference import infer
 from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.results.sample_result import coordinates, sample_result
 from lusee_bayes.sampling.hmc import Sampler, sample
 from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.sampling.promotion import numpyro_promotion
 from lusee_bayes.sampling.uncertainty import summary
 
 N_TIMES = 8
@@ -258,6 +262,33 @@ def test_draws_are_those_of_another_sampler(burst):
     assert rms((burst.skies.mean(0) - mean) / std) < 0.06
     assert rms((burst.skies.mean(0) - np.asarray(burst.good.mean)) / std) > 0.06
     assert (burst.skies.std(0) / std).mean() == pytest.approx(1.0, abs=0.015)
+
+
+def test_systematics_are_sampled_with_it(response_file):
+    """Receivers: every time is scipy's multivariate t about sky, ground and receivers."""
+    section = "noise.receiver={power_k: 800, relative_std: 0.1, treatment: sampled}"
+    experiment = build(four_ports(response_file, section))
+    arguments = program_arguments(PROGRAM, experiment)
+    gaussian, layout = arguments["gaussian"], experiment.data.layout
+    power = np.array([790.0, 805.0, 850.0, 700.0])
+    sites = {f"receiver_{k}_k": jnp.asarray(x) for k, x in enumerate(power)}
+    sky = gaussian.prior.sample(jax.random.key(1))
+    with numpyro_promotion():
+        found, trace = log_density(PROGRAM.model, (), arguments, {"sky": sky, **sites})
+    assert set(trace) == {"sky", "data", "weight", *sites}
+    # 800 K of every receiver, and the ground, are part of what is seen without a sky
+    more = np.zeros((layout.n_products, layout.n_times))
+    more[auto_indices(4)] = (power - 800.0)[:, None]
+    loc = np.asarray(gaussian.predict(sky)) + layout.gather(more)
+    data, dense = np.asarray(arguments["data"]), np.asarray(gaussian.noise.dense())
+    by_times = [np.flatnonzero(layout.time == t) for t in range(layout.n_times)]
+    seen = sum(
+        stats.multivariate_t(loc[at], dense[np.ix_(at, at)], df=NU).logpdf(data[at])
+        for at in by_times
+    )
+    prior = stats.norm(800.0, 80.0).logpdf(power).sum()
+    prior += stats.norm(0.0, np.sqrt(gaussian.prior.variance())).logpdf(sky).sum()
+    np.testing.assert_allclose(found, seen + prior, rtol=1e-9)
 
 
 @pytest.mark.long

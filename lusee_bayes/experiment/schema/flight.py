@@ -26,7 +26,8 @@ class FlightSection(Section):
         Standard deviations of the strengths of the two components of the gains, of each level of
         each port on its own, where the gain table does not have them.
     gain_std : float
-        Standard deviation of the power gain of each level of each port, relative, besides.
+        Standard deviation of the power gain of each level of each port, relative, besides; of each
+        port, if simulated with ``noise.gain_table`` as anything but sessions.
     bin_origin : {"centre", "edge"}
         What of channel k lies at k times 25 kHz. It is not settled, and has to be said.
     clock : str
@@ -54,7 +55,8 @@ class FlightSection(Section):
     false_alarm : float
         Chance that a value of pure noise is flagged, of each kind of test.
     leave_out : bool
-        Flag bins of time that do not fit what all others predict for them.
+        Flag bins of time, single values, products and days that do not fit what all others predict
+        for them.
     simulated : FlightSimulatedSection
         Sessions that are simulated, and what disturbs them.
     """

@@ -20,7 +20,7 @@ class FlightSimulatedSection(Section):
     layout : {3, 4}
         Of luseepy's ingest.
     kind : {"hdf5", "fits"}
-        Of file; FITS is of layout 3.
+        Of file.
     navgf : {1, 2, 3, 4}
         Averaging over channels.
     levels : str
@@ -79,8 +79,6 @@ class FlightSimulatedSection(Section):
 
     @model_validator(mode="after")
     def _layouts_have_what_they_need(self) -> FlightSimulatedSection:
-        if self.layout == 4 and self.kind == "fits":
-            raise ValueError("layout 4 is HDF5 here; use kind: hdf5, or layout: 3")
         if self.layout == 4 and self.clock == "unknown":
             raise ValueError(
                 "telemetry of layout 4 has a clock of its own, which nothing ties to the spectra "

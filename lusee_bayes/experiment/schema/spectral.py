@@ -8,7 +8,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from lusee_bayes.experiment.schema.section import Positive, Section
-from lusee_bayes.sky.spectral_prior import SpectralPrior
+from lusee_bayes.sky.positive_skies import check_fields
+from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components
 
 
 class SpectralSection(Section):
@@ -74,6 +75,13 @@ class SpectralSection(Section):
                 "positive skies are solved for directly, round by round; leave out spectral.solver"
             )
         return self
+
+    def require_channels(self, n: int) -> None:
+        """InputError for so few channels that they cannot share a posterior."""
+        if self.model == "components":
+            check_components(self.components, n, self.residual)
+        if self.model == "positive":
+            check_fields(self.fields, n)
 
     def prior(self, frequencies_mhz: np.ndarray, skies: np.ndarray) -> SpectralPrior:
         """The prior on linear skies of all channels; ``skies`` (channels, modes) model them."""

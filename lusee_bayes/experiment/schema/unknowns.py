@@ -66,7 +66,7 @@ class GainTableSection(Section):
     ----------
     std : float
         Prior standard deviation of every port's power gain, relative, where the data do not say
-        the errors of their table themselves.
+        the errors of their table themselves and ``flight.gain_std`` does not, either.
     treatment : {"marginalised", "sampled", "ignored"}
         Their covariance is added to N to first order about what the data tell, found in rounds;
         they are sampled with the map; or they are left out of the model.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import astropy.units as u
@@ -108,7 +109,8 @@ class Accumulated:
             np.array([_mean_abs(one) for one in off]),
             self.lines,
             gain_curves(line, recipe),
-            tuple(_origin(s) for s in line.sessions),
+            tuple(_origin(s, recipe) for s in line.sessions),
+            recipe.words(),
         )
 
     def put(
@@ -211,7 +213,8 @@ def _mean_abs(off: Float[np.ndarray, "ports bins"]) -> float:
     return float(np.abs(np.nanmean(off[known], axis=1)).max()) if known.any() else np.nan
 
 
-def _origin(session: Session) -> Mapping[str, Any]:
+def _origin(session: Session, recipe: Recipe) -> Mapping[str, Any]:
+    clock = recipe.clock or session.clock
     return {
         "file": str(session.path),
         "kind": session.kind,
@@ -224,6 +227,9 @@ def _origin(session: Session) -> Mapping[str, Any]:
         "saturated": int(session.saturated.sum()),
         "errors": int((session.errors != 0).sum()),
         "clock": "clock file" if session.clock is None else "session",
+        "clock_file": None if recipe.clock is None else Path(recipe.clock.source).name,
+        "scale": None if clock is None else clock.scale,
+        "rate": 1.0 if clock is None else clock.rate,
         "first_s": float(session.raw_s[0]),
         "last_s": float(session.raw_s[-1]),
     }

@@ -118,11 +118,15 @@ def _one_span(
     kept = _with_what_fits(values, sigma, good, kept, x, limit)
     while kept.sum() >= LEAST // 2:
         out, z = outliers(values, sigma, kept[None], x, limit)
-        found = out[0] | _stretches(z[0], kept & ~out[0], limit)
+        found = out[0] | _about_stretches(z[0], kept & ~out[0], limit)
         if not found.any():
             break
         kept &= ~found
     kept = _with_what_fits(values, sigma, good, kept, x, limit)
+    # what lies between spectra that are flagged, each of them far off
+    z = distances(values, sigma, good[None], kept[None], x)[0]
+    known = good & _curve_is_known(values, kept, x)
+    kept &= ~_stretches(z, kept | known, limit)
     return good & ~kept, float(np.median(scale))
 
 
@@ -170,26 +174,88 @@ def _with_what_fits(
         curve, _ = curves(values, kept[None], x)
         z = ((values - curve) / sigma)[0]
         more = good & ~kept & (np.abs(z).max(axis=0) <= limit)
-        more = kept | (more & ~_stretches(z, more, limit))
+        known = good & _curve_is_known(values, kept, x)
+        more = kept | (more & ~_stretches(z, kept | more | known, limit))
         if (more == kept).all():
             break
         kept = more
     return kept
 
 
-def _stretches(
+def _curve_is_known(
+    values: Float[np.ndarray, "1 ports span"],
+    kept: Bool[np.ndarray, " span"],
+    x: Float[np.ndarray, "span terms"],
+) -> Bool[np.ndarray, " span"]:
+    """Where the error of the curve, which a stretch has in common, is below its sum's noise."""
+    _, leverage = curves(values, kept[None], x)
+    return leverage[0] <= 1.0 / LENGTHS[-1]
+
+
+def _about_stretches(
     z: Float[np.ndarray, "ports span"], kept: Bool[np.ndarray, " span"], limit: float
 ) -> Bool[np.ndarray, " span"]:
-    """Those in stretches whose sum is beyond the limit."""
+    """All stretches whose sum is beyond the limit, and so more than is off."""
+    sums, counts = _sums(z, kept)
     found = np.zeros(len(kept), dtype=bool)
-    clean, one = np.where(kept, z, 0.0), kept.astype(float)
     for length in LENGTHS[1:]:
-        if length > len(kept) // 2:
-            break
-        window = np.ones(length)
-        count = np.convolve(one, window, "valid")
-        for port in clean:
-            total = np.convolve(port, window, "valid") / np.sqrt(np.maximum(count, 1.0))
-            for start in np.flatnonzero((np.abs(total) > limit) & (count > length / 2)):
+        if length <= len(kept) // 2:
+            for start in np.flatnonzero((_sizes_of(sums, counts, length) > limit).any(axis=0)):
                 found[start : start + length] = True
     return found & kept
+
+
+def _stretches(
+    z: Float[np.ndarray, "ports span"], good: Bool[np.ndarray, " span"], limit: float
+) -> Bool[np.ndarray, " span"]:
+    """Those in stretches whose sum is beyond the limit, the furthest first, and no more."""
+    left = good.copy()
+    lengths = [length for length in LENGTHS[1:] if length <= len(good) // 2]
+    while lengths:
+        sums, counts = _sums(z, left)
+        sizes = [_sizes_of(sums, counts, length) for length in lengths]
+        most = int(np.argmax([size.max() for size in sizes]))
+        if sizes[most].max() <= limit:
+            break
+        port, start = np.unravel_index(sizes[most].argmax(), sizes[most].shape)
+        ends = slice(start, start + lengths[most] + 1)
+        first, last = _part(sums[port, ends], counts[ends], limit)
+        left[start + first : start + last] = False
+    return good & ~left
+
+
+def _sums(
+    z: Float[np.ndarray, "ports span"], good: Bool[np.ndarray, " span"]
+) -> tuple[Float[np.ndarray, "ports ends"], Float[np.ndarray, " ends"]]:
+    """Of all before each spectrum, and their number."""
+    sums = np.cumsum(np.pad(np.where(good, z, 0.0), ((0, 0), (1, 0))), axis=1)
+    return sums, np.cumsum(np.pad(good, (1, 0)).astype(float))
+
+
+def _sizes_of(
+    sums: Float[np.ndarray, "ports ends"], counts: Float[np.ndarray, " ends"], length: int
+) -> Float[np.ndarray, "ports starts"]:
+    """By how much stretches of a length stand out; 0 where half of them are missing."""
+    n = counts[length:] - counts[:-length]
+    return _sizes(sums[:, length:] - sums[:, :-length], np.where(n > length / 2, n, np.inf))
+
+
+def _part(
+    sums: Float[np.ndarray, " ends"], counts: Float[np.ndarray, " ends"], limit: float
+) -> tuple[int, int]:
+    """First and last end of the part of a stretch that stands out most.
+
+    Not of two parts with a gap between them that fits, if they lower chi^2 by more than the limit
+    squared where each has a mean of its own: then the one of them that stands out more.
+    """
+    drop = np.triu(_sizes(sums - sums[:, None], counts - counts[:, None]) ** 2)
+    first, last = (int(k) for k in np.unravel_index(drop.argmax(), drop.shape))
+    apart = np.triu(drop[first, : last + 1, None] + drop[None, : last + 1, last], 1)
+    if apart.max() - drop[first, last] > limit**2:
+        left, right = (int(k) for k in np.unravel_index(apart.argmax(), apart.shape))
+        return (first, left) if drop[first, left] > drop[right, last] else (right, last)
+    return first, last
+
+
+def _sizes(total: Float[np.ndarray, "*n"], count: Float[np.ndarray, "..."]) -> np.ndarray:
+    return np.abs(total) / np.sqrt(np.maximum(count, 1.0))

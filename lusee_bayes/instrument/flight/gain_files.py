@@ -73,6 +73,7 @@ def read_gain_table(path: str | Path, model: str = "quadratic") -> GainTable:
         found["components"],
         found["coefficient"],
         found.get("component_std"),
+        "netCDF",
     )
 
 
@@ -111,6 +112,7 @@ def _read_folder(folder: Path, model: str) -> GainTable:
         np.array(arrays["mean"]),
         np.array(vectors),
         _coefficients(folder / COEFFICIENTS, model),
+        kind=f"luseepy's gain model, {model} coefficients",
     )
 
 

@@ -51,6 +51,8 @@ class GainTable:
         c_rk, in the order of phi.
     component_std : (levels, ports, components) array or None
         By how much the strengths q_r may be off; None if it is not known.
+    kind : str
+        How it was read, for reports.
     """
 
     path: str
@@ -59,6 +61,7 @@ class GainTable:
     component: Float[np.ndarray, "levels ports components anchors"]
     coefficient: Float[np.ndarray, "levels ports components terms"]
     component_std: Float[np.ndarray, "levels ports components"] | None = None
+    kind: str = "made"
 
     def __post_init__(self):
         lead = (len(LETTERS), PORTS)

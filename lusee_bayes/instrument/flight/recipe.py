@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from lusee_bayes.instrument.flight.clock import Clock
@@ -66,3 +67,15 @@ class Recipe:
     gain_std: float | None = None
     clock: Clock | None = None
     site: tuple[float, float] | None = None
+
+    def words(self) -> dict[str, str]:
+        """Return how sessions are reduced, a line for each choice."""
+        bin_part = {"centre": "centre", "edge": "lower edge"}[self.origin]
+        times = "instants" if self.timestamp == "instant" else f"{self.timestamp} of integrations"
+        return {
+            "gain table": f"{Path(self.table.path).name} ({self.table.kind})",
+            "frequencies": f"the {bin_part} of channel k is at k times 25 kHz",
+            "bands": f"polynomial of degree {self.degree} over {self.bandwidth_mhz:g} MHz",
+            "times": times,
+            "site": "of the scenario" if self.site else "of the sessions",
+        }

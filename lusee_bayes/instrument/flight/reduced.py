@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,8 @@ class Reduced(Described):
         Of the gains, for figures.
     sessions : tuple of mapping
         Where the spectra come from.
+    recipe : mapping of str to str
+        How they were reduced, in words; empty where an older file does not say it.
     """
 
     frequencies_mhz: Float[np.ndarray, " bands"]
@@ -123,15 +126,30 @@ class Reduced(Described):
     lines: Float32[np.ndarray, "bands rows"]
     curves: Curves
     sessions: tuple[Mapping[str, Any], ...]
+    recipe: Mapping[str, str] = field(default_factory=dict)
 
     def description(self) -> tuple[str, ...]:
         f = self.frequencies_mhz
         used = self.reason == USED
+        between = f"{f[0]:g} MHz" if len(f) == 1 else f"{f[0]:g} to {f[-1]:g} MHz"
         return (
             f"{counted(len(self.bin_of), 'spectrum', 'spectra')} of "
             f"{counted(len(self.sessions), 'session')} in {counted(self.values.shape[2], 'bin')}",
-            f"{counted(len(f), 'band')} of {self.bandwidth_mhz:g} MHz at {f[0]:g} to {f[-1]:g} MHz",
+            f"{counted(len(f), 'band')} of {self.bandwidth_mhz:g} MHz at {between}",
             f"{used.mean():.2%} of the spectra are used",
+        )
+
+    def notes(self) -> tuple[str, ...]:
+        """Return what has been taken from elsewhere than the sessions, a sentence each."""
+        told = [s for s in self.sessions if s["clock"] == "clock file" and s.get("clock_file")]
+        if not told:
+            return ()
+        who = Path(told[0]["file"]).name if len(told) == 1 else f"{len(told)} sessions"
+        verb = "does" if len(told) == 1 else "do"
+        return (
+            f"{who} {verb} not say which UTC the clock stands for: its scale "
+            f"({told[0]['scale'].upper()}) and epoch are those of the clock file "
+            f"{told[0]['clock_file']}.",
         )
 
     def band(self, frequency_mhz: float) -> int:

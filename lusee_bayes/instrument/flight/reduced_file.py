@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -65,6 +66,8 @@ LAYOUT = Layout(
         "average_s": Attribute(low=0.0, optional=True),
         "gain_std": Attribute(low=0.0, optional=True),
         "sessions": Attribute("text"),
+        # files of older versions do not say it
+        "recipe": Attribute("text", optional=True),
     },
 )
 
@@ -124,6 +127,7 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
             "step_s": seen.step_s,
             "bandwidth_mhz": reduced.bandwidth_mhz,
             "sessions": json.dumps([dict(one) for one in reduced.sessions]),
+            "recipe": json.dumps(dict(reduced.recipe)),
             "scenario": scenario,
             "lusee_bayes_version": __version__,
             **{name: value for name, value in numbers.items() if value is not None},
@@ -152,10 +156,13 @@ def read_reduced(path: str | Path) -> Reduced:
     here, said = found.arrays, found.values
     if tuple(map(str, here["product"])) != labels():
         raise InputError(f"{path} has other products than {', '.join(labels())}")
-    try:
-        sessions = json.loads(said["sessions"])
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: the attribute sessions is no JSON: {error}") from error
+    texts = {"sessions": said["sessions"], "recipe": said.get("recipe", "{}")}
+    told: dict[str, Any] = {}
+    for name, text in texts.items():
+        try:
+            told[name] = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise InputError(f"{path}: the attribute {name} is no JSON: {error}") from error
     windows = None
     with naming(path):
         if "window_start_s" in here and "window_end_s" in here:
@@ -193,5 +200,6 @@ def read_reduced(path: str | Path) -> Reduced:
         here["curvature"],
         here["line_share"].astype(np.float32),
         Curves(here["curve_mhz"], here["curve_gain"], here["curve_std"]),
-        tuple(sessions),
+        tuple(told["sessions"]),
+        told["recipe"],
     )

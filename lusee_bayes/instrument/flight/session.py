@@ -71,7 +71,7 @@ class Session(Described):
     lon_deg, lat_deg : float
         Of the site, as the file has it.
     software : str
-        Version of the flight software.
+        Version of the flight software, as 0x307.
     opener : callable
         Opens the file: a context manager that gives a :data:`Read`.
     """

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Shaped
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Unread, Variable
@@ -60,8 +60,34 @@ CLOCK_3 = {
     "constants.mjd_epoch_offset_days": Attribute(),
     "constants.time_scale": Attribute("text", optional=True),
 }
+NEWEST = 4
 LAYOUT_3 = Layout("a session of lusee.ingest, layout 3", ROWS, SITE | COUNTS | CLOCK_3)
 LAYOUT_4 = Layout("a session of lusee.ingest, layout 4", ROWS, SITE | COUNTS)
+
+
+def require_version(path: Path, version: Any) -> int:
+    """Return the version of a layout.
+
+    Raises
+    ------
+    InputError
+        If it is none that this package reads.
+    """
+    number = None if version is None else int(version)
+    if number is None:
+        raise InputError(
+            f"{path} has no layout_version: it is no session of luseepy's lusee.ingest"
+        )
+    if number < 3:
+        raise InputError(
+            f"{path} is of layout {number}, in which bit slices are not restored; ingest the "
+            "session again with luseepy, which writes layout 3 or newer"
+        )
+    if number > NEWEST:
+        raise InputError(
+            f"{path} is of layout {number}; this version reads 3 and {NEWEST}; get a newer one"
+        )
+    return number
 
 
 def session_of(
@@ -137,9 +163,14 @@ def session_of(
         clock=clock,
         lon_deg=found.values["constants.lun_long_deg"],
         lat_deg=found.values["constants.lun_lat_deg"],
-        software=found.values.get("session_invariants.software_version", "unknown"),
+        software=_version(found.values.get("session_invariants.software_version", "unknown")),
         opener=opener,
     )
+
+
+def _version(text: str) -> str:
+    """A version of the flight software as it is written: 0x307 for the number 775."""
+    return f"{int(text):#x}" if text.isascii() and text.isdigit() else text
 
 
 def _clock(path: Path, found: Content) -> Clock | None:
@@ -181,30 +212,3 @@ def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> Shaped[np.ndarr
     else:
         raise InputError(f"{path}: {name} holds {codes.dtype}, expected gain codes or letters")
     return levels
-
-
-def at_rows(
-    where: str,
-    raw_s: Float[np.ndarray, " rows"],
-    times_s: Float[np.ndarray, " times"],
-    values: Float[np.ndarray, " times"],
-) -> Float[np.ndarray, " rows"]:
-    """Interpolate telemetry linearly to the times of spectra, both of one clock.
-
-    Raises
-    ------
-    InputError
-        If the telemetry does not cover them: nothing is extrapolated.
-    """
-    order = np.argsort(times_s, kind="stable")
-    times_s, values = times_s[order], values[order]
-    good = np.isfinite(values)
-    times_s, values = times_s[good], values[good]
-    # a spectrum is longer than the telemetry's step, so that its ends may lack half a step
-    slack = 2.0 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
-    if not len(times_s) or raw_s[0] < times_s[0] - slack or raw_s[-1] > times_s[-1] + slack:
-        raise InputError(
-            f"{where} does not cover the spectra, so that their gain is not known; ingest the "
-            "session with its telemetry"
-        )
-    return np.interp(raw_s, times_s, values)

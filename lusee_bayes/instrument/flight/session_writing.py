@@ -18,7 +18,8 @@ from lusee_bayes.instrument.flight.session_rows import SessionRows
 from lusee_bayes.instrument.flight.session_writing_fits import write_fits_session
 from lusee_bayes.instrument.flight.session_writing_hdf5 import write_hdf5_session
 
-KINDS = {("hdf5", 3), ("hdf5", 4), ("fits", 3)}
+KINDS = ("hdf5", "fits")
+LAYOUTS = (3, 4)
 
 
 def write_session(
@@ -40,7 +41,6 @@ def write_session(
         in memory together. Fewer bins than 2048 are filled up with NaN.
     kind : {"hdf5", "fits"}
     layout : {3, 4}
-        FITS is of layout 3.
 
     Raises
     ------
@@ -48,15 +48,15 @@ def write_session(
         For another kind or layout, blocks that do not make up the rows, and a file that cannot be
         written.
     """
-    if (kind, layout) not in KINDS:
+    if kind not in KINDS or layout not in LAYOUTS:
         raise InputError(
-            f"sessions are written as hdf5 of layout 3 or 4, or as fits of layout 3, not as {kind} "
-            f"of layout {layout}"
+            f"sessions are written as hdf5 or fits of layout 3 or 4, not as {kind} of layout "
+            f"{layout}"
         )
     path = Path(path)
     with replacing(path) as partial:
         if kind == "fits":
-            write_fits_session(partial, rows, blocks)
+            write_fits_session(partial, rows, blocks, layout)
         else:
             write_hdf5_session(partial, rows, blocks, layout)
     return path

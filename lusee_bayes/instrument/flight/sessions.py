@@ -38,7 +38,7 @@ def read_session(path: str | Path) -> Session:
     Parameters
     ----------
     path : str or Path
-        HDF5 of layout 3 or 4, or FITS of layout 3.
+        HDF5 or FITS, of layout 3 or 4.
 
     Raises
     ------

@@ -25,6 +25,8 @@ def describe_reduced(path: Path) -> str:
         f"  {seen.times[0].isot[:19]} to {seen.times[-1].isot[:19]} UTC, longitude "
         f"{seen.lon_deg:g}, latitude {seen.lat_deg:g} degrees"
     )
+    lines += [f"  {name}: {text}" for name, text in reduced.recipe.items()]
+    lines += [f"  {note}" for note in reduced.notes()]
     for band, frequency in enumerate(reduced.frequencies_mhz):
         parts = [f"{name} {share:.2%}" for name, share in reduced.shares(band).items()]
         lines.append(f"  {frequency:g} MHz: {', '.join(parts)}")

@@ -46,6 +46,7 @@ def describe_posterior_cube(path: Path) -> str:
             f"frequencies from {frequencies[0]:g} to {frequencies[-1]:g} MHz, {kind}, "
             f"{attrs['frame']}",
             f"  mean temperature {temperature[0]:.6g} K to {temperature[-1]:.6g} K",
+            *(f"  {sentence}" for sentence in attrs.get("unmapped", "").splitlines()),
             f"  also holds: {', '.join(extra) or 'nothing else'}",
             f"  versions: {attrs['versions']}",
         ]

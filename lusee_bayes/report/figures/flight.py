@@ -98,10 +98,28 @@ def waterfall(reduced: Reduced, band: int) -> Figure:
 
 
 def calibration(reduced: Reduced) -> Figure:
-    """Draw the gains with their errors, and the noise found over the noise expected."""
+    """Draw the gains with their errors, and the noise found over the noise expected.
+
+    Of one band the gains at its frequency are points with error bars, and both kinds of scatter
+    have a place of their own.
+    """
     figure = Figure(figsize=(12, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
-    curves = reduced.curves
+    _gains(left, reduced)
+    if len(reduced.frequencies_mhz) == 1:
+        _scatter_of_one(right, reduced)
+    else:
+        _scatter(right, reduced)
+    right.axhline(1.0, color=GREY, lw=0.8)
+    right.set_ylabel("scatter over radiometer noise")
+    found = np.concatenate([reduced.line_scatter, reduced.scatter, [1.0]])
+    right.set_ylim(0.0, 1.3 * float(np.nanmax(found)))
+    right.set_title("Noise found over noise expected")
+    return figure
+
+
+def _gains(left: Axes, reduced: Reduced) -> None:
+    curves, alone = reduced.curves, len(reduced.frequencies_mhz) == 1
     for number, letter in enumerate(LETTERS):
         for port in range(curves.gain.shape[1]):
             gain, std = curves.gain[number, port], curves.std[number, port]
@@ -119,6 +137,10 @@ def calibration(reduced: Reduced) -> Figure:
             left.fill_between(
                 curves.frequencies_mhz, low, gain + std, color=line.get_color(), alpha=0.25, lw=0
             )
+            if alone:
+                f = reduced.frequencies_mhz
+                at, error = (np.interp(f, curves.frequencies_mhz, y) for y in (gain, std))
+                left.errorbar(f, at, error, fmt="o", ms=4, capsize=3, color=line.get_color())
     for f in reduced.frequencies_mhz:
         left.axvline(f, color=GREY, lw=0.5, zorder=0)
     known = bool((curves.std > 0).any())
@@ -127,7 +149,9 @@ def calibration(reduced: Reduced) -> Figure:
     told = f"known to {largest:.2g} of themselves or better" if known else "no error is known"
     left.set_title(f"Gains: {told}")
     left.legend(frameon=False, ncols=2, fontsize=8)
-    right.axhline(1.0, color=GREY, lw=0.8)
+
+
+def _scatter(right: Axes, reduced: Reduced) -> None:
     for values, colour, mark, name in (
         (reduced.line_scatter, BLUE, "o", "channels about a smooth spectrum"),
         (reduced.scatter, ORANGE, "s", "spectra about a smooth curve in time"),
@@ -136,13 +160,26 @@ def calibration(reduced: Reduced) -> Figure:
             right.plot(
                 reduced.frequencies_mhz, values, mark, color=colour, label=name, fillstyle="none"
             )
-    right.set(xlabel="frequency [MHz]", ylabel="scatter over radiometer noise")
-    found = np.concatenate([reduced.line_scatter, reduced.scatter, [1.0]])
-    right.set_ylim(0.0, 1.3 * float(np.nanmax(found)))
-    right.set_title("Noise found over noise expected")
+    right.set_xlabel("frequency [MHz]")
     if right.get_legend_handles_labels()[0]:
         right.legend(frameon=False, fontsize=8)
-    return figure
+
+
+def _scatter_of_one(right: Axes, reduced: Reduced) -> None:
+    kinds = (
+        (reduced.line_scatter, BLUE, "o", "channels about\na smooth spectrum"),
+        (reduced.scatter, ORANGE, "s", "spectra about\na smooth curve in time"),
+    )
+    for place, (values, colour, mark, _) in enumerate(kinds):
+        if np.isfinite(values[0]):
+            right.plot([place], values, mark, ms=8, color=colour)
+            right.annotate(
+                f"{values[0]:.3f}", (place, values[0]), (12, 8), textcoords="offset points"
+            )
+        else:
+            right.text(place, 0.5, "not known", ha="center", color=GREY)
+    right.set_xticks(range(len(kinds)), [kind[-1] for kind in kinds])
+    right.set_xlim(-0.6, len(kinds) - 0.4)
 
 
 def _days(reduced: Reduced) -> Float[np.ndarray, " rows"]:

@@ -9,6 +9,8 @@ from lusee_bayes.report.figures.drawing import BLUE, GREY, ORANGE
 from lusee_bayes.results.cube_unknowns import CubeUnknowns
 
 COLUMNS = 4
+# from where on a prior that changes with frequency hides what errors there are
+WIDE = 3.0
 
 
 def unknowns_by_frequency(unknowns: CubeUnknowns) -> Figure:
@@ -32,6 +34,8 @@ def unknowns_by_frequency(unknowns: CubeUnknowns) -> Figure:
         axes.xaxis.set_major_locator(MaxNLocator(5))
         unit = rows["unit"].iloc[0] or "relative"
         axes.set(title=name, xlabel="frequency [MHz]", ylabel=unit)
+        if prior.min() > 0.0 and prior.max() > WIDE * prior.min():
+            axes.set_yscale("log")
     for axes in panels[len(names) :]:
         axes.set_axis_off()
     handles, labels = panels[0].get_legend_handles_labels()

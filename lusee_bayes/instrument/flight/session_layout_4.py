@@ -1,0 +1,198 @@
+"""Layout 4 of ``lusee.ingest``, which HDF5 and FITS share.
+
+It has row-aligned metadata as a union of fields (``metadata/fields/NAME/variant_000/data``), raw
+telemetry on its own clock, and a clock reference in place of an MJD offset; all is brought to the
+names of layout 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from astropy.time import Time
+from jaxtyping import Float
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.layouts import Unread
+from lusee_bayes.instrument.flight.clock import SCALES, Clock
+from lusee_bayes.instrument.flight.session import TELEMETRY, Read, Session
+from lusee_bayes.instrument.flight.session_layout import META, session_of
+from lusee_bayes.instrument.times import unannounced_leap_seconds
+
+# names of layout 4 for those of layout 3
+FIELDS = {
+    "Navgf": "navgf",
+    "Navg1_shift": "navg1_shift",
+    "Navg2_shift": "navg2_shift",
+    **{
+        name: name
+        for name in (
+            "actual_bitslice",
+            "actual_gain",
+            "adc_min",
+            "adc_max",
+            "adc_invalid_count_min",
+            "adc_invalid_count_max",
+            "errors",
+            "weight",
+            "notch",
+        )
+    },
+}
+# ticks of the clock of the telemetry in a second
+TICKS = 65536
+
+
+@runtime_checkable
+class Tree(Protocol):
+    """Groups and arrays of a file of layout 4, by paths such as ``spectra/metadata/fields``."""
+
+    def attributes(self, path: str) -> Mapping[str, Any]:
+        """Return what a group or an array says of itself; nothing where there is none."""
+
+    def array(self, path: str) -> Unread | None:
+        """Return an array, not yet read, or None."""
+
+    def names(self, path: str) -> list[str]:
+        """Return the names of all groups and arrays of a group; "" is the whole file."""
+
+
+def session_of_4(
+    path: Path, kind: str, tree: Tree, opener: Callable[[], AbstractContextManager[Read]]
+) -> Session:
+    """Make a session of a file of layout 4.
+
+    Parameters
+    ----------
+    path : Path
+    kind : str
+        HDF5 or FITS.
+    tree : Tree
+    opener : callable
+        Opens the spectra.
+
+    Raises
+    ------
+    InputError
+        If something is missing or not as it should be.
+    """
+    cube = tree.array("spectra/data")
+    if cube is None:
+        raise InputError(
+            f"{path} has no spectra/data: the session holds no spectra (it has "
+            f"{', '.join(tree.names('')) or 'nothing'})"
+        )
+    values = {
+        f"{name}.{key}": value
+        for name in ("constants", "session_invariants", "spectra/data")
+        for key, value in tree.attributes(name).items()
+    }
+    arrays = {"spectra/data": cube, **_metadata(path, tree, cube.shape[0] if cube.shape else 0)}
+    if (raw_s := tree.array("spectra/raw_seconds")) is not None:
+        arrays["spectra/raw_times"] = raw_s
+    clock = _clock(path, tree)
+    if clock is not None and raw_s is not None:
+        arrays |= _telemetry(path, tree, clock, np.asarray(raw_s))
+    return session_of(path, 4, kind, arrays, values, clock, opener)
+
+
+def _metadata(path: Path, tree: Tree, n: int) -> dict[str, Unread]:
+    """Fields that all rows have, in one shape."""
+    found: dict[str, Unread] = {}
+    for ours, theirs in FIELDS.items():
+        values = tree.array(f"{META}/fields/{theirs}/variant_000/data")
+        if values is None:
+            continue
+        if tuple(values.shape)[:1] != (n,):
+            raise InputError(
+                f"{path}: {META}/fields/{theirs} is there in the shape {tuple(values.shape)} for "
+                f"{n} spectra, or has several shapes; ingest the session again"
+            )
+        found[f"{META}/{ours}"] = values
+    if (navgf := tree.array("spectra/navgf")) is not None:
+        found[f"{META}/Navgf"] = navgf
+    return found
+
+
+def _clock(path: Path, tree: Tree) -> Clock | None:
+    said = tree.attributes("clock_reference")
+    if not bool(said.get("available")):
+        return None
+    scale, text = (str(said[name]) for name in ("time_scale", "clock_reference_isot"))
+    if scale not in SCALES:
+        raise InputError(f"{path}: time_scale is '{scale}'; expected one of {', '.join(SCALES)}")
+    raw_s = _anchors(tree).get("spectrometer")
+    if raw_s is None:
+        return None
+    with unannounced_leap_seconds():
+        time = Time(text, format="isot", scale=scale)
+    return Clock(str(path), float(time.jd1), float(time.jd2), scale, raw_s)
+
+
+def _anchors(tree: Tree) -> dict[str, float]:
+    """What each clock showed at the reference."""
+    names = tree.array("clock_reference/clock_sources")
+    raw_s = tree.array("clock_reference/clock_reference_raw_seconds")
+    if names is None or raw_s is None:
+        return {}
+    values = np.asarray(raw_s, dtype=np.float64).tolist()
+    return dict(zip(np.asarray(names).tolist(), values, strict=True))
+
+
+def _telemetry(
+    path: Path, tree: Tree, clock: Clock, raw_s: Float[np.ndarray, " rows"]
+) -> dict[str, Unread]:
+    """Telemetry at the times of the spectra, where both clocks have a reference."""
+    anchor = _anchors(tree).get("dcb")
+    if anchor is None or "telemetry" not in tree.names(""):
+        return {}
+    parts = ("field_names", "mission_seconds", "lusee_subsecs", "values")
+    found = {name: tree.array(f"telemetry/{name}") for name in parts}
+    for name, array in found.items():
+        if array is None:
+            raise InputError(
+                f"{path}: telemetry has no {name} (it has "
+                f"{', '.join(tree.names('telemetry')) or 'nothing'}); ingest the session again "
+                "with luseepy's present version"
+            )
+    names = np.asarray(found["field_names"]).tolist()
+    seconds, ticks, values = (np.asarray(found[name], dtype=np.float64) for name in parts[1:])
+    times_s = seconds + ticks / TICKS - anchor + clock.raw_s
+    return {
+        f"telemetry/{name}": at_rows(
+            f"{path}: telemetry {name}", raw_s, times_s, values[:, names.index(name)]
+        )
+        for name in TELEMETRY
+        if name in names
+    }
+
+
+def at_rows(
+    where: str,
+    raw_s: Float[np.ndarray, " rows"],
+    times_s: Float[np.ndarray, " times"],
+    values: Float[np.ndarray, " times"],
+) -> Float[np.ndarray, " rows"]:
+    """Interpolate telemetry linearly to the times of spectra, both of one clock.
+
+    Raises
+    ------
+    InputError
+        If the telemetry does not cover them: nothing is extrapolated.
+    """
+    order = np.argsort(times_s, kind="stable")
+    times_s, values = times_s[order], values[order]
+    good = np.isfinite(values)
+    times_s, values = times_s[good], values[good]
+    # a spectrum is longer than the telemetry's step, so that its ends may lack half a step
+    slack = 2.0 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+    if not len(times_s) or raw_s[0] < times_s[0] - slack or raw_s[-1] > times_s[-1] + slack:
+        raise InputError(
+            f"{where} does not cover the spectra, so that their gain is not known; ingest the "
+            "session with its telemetry"
+        )
+    return np.interp(raw_s, times_s, values)
