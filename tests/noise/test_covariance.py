@@ -149,10 +149,10 @@ def test_contract_of_sums(first, second, small_blocks):
 @pytest.mark.parametrize(
     "kind",
     [
-        "banded",
+        "diagonal",
         *(
             pytest.param(k, marks=[pytest.mark.long, pytest.mark.essential])
-            for k in ("diagonal", "blocks", "dense")
+            for k in ("banded", "blocks", "dense")
         ),
     ],
 )
