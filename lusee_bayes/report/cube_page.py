@@ -88,7 +88,7 @@ def cube_page(folder: Path, name: str) -> str:
             folder / "summary.json", {"joint": [summary["joint"]]}, "joint", JOINT_SUMMARY
         )
     parts["maps"].insert(0, cube_explorer(folder, frequencies))
-    parts["maps"].append(html.paragraph(_how(joint, summary.get("log_evidence"))))
+    parts["maps"].append(html.paragraph(_how(joint, summary)))
     parts["spectra"] += _pulls(folder, summary)
     parts["chi2"] = [_tests(folder, summary), *parts["chi2"], _table(channels)]
     parts["chi2"] += cube_unknowns(folder, summary)
@@ -111,10 +111,12 @@ def cube_page(folder: Path, name: str) -> str:
     )
 
 
-def _how(joint: dict | None, evidence: float | None) -> str:
+def _how(joint: dict | None, summary: dict) -> str:
+    evidence = summary.get("log_evidence")
     known = "" if evidence is None else f" ln evidence {evidence:.1f}."
     if joint is None:
-        return f"Every channel has a posterior of its own.{known}"
+        tied = ", given what the others tell of its receivers" * summary.get("tied", False)
+        return f"Every channel has a posterior of its own{tied}.{known}"
     solver = joint["solver"]
     if joint["iterations"]:
         solver += f" ({joint['iterations']} iterations)"

@@ -218,6 +218,7 @@ class CubeResult(Described):
             "frequencies_mhz": self.frequencies_mhz.tolist(),
             "unmapped": self.gaps(),
             "joint": self._joint_summary(),
+            "tied": self.scenario.ties_receivers,
             "log_evidence": self.log_evidence,
             "n_data": sum(channel.n_data for channel in self.channels),
             "n_modes": len(self.channels[0].mean),
