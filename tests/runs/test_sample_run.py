@@ -625,7 +625,7 @@ def test_data_of_another_frequency_or_kind_are_refused(experiment, runs, tmp_pat
     assert run("sample", *SMALL, "-q", "-o", out, "--data", tmp_path / "data.nc") == 2
     assert_one_sentence(capsys, "the data are at 30.0 MHz, the scenario at 25.0")
     assert run("sample", *SMALL, "-q", "-o", out, "--data", runs[0] / "samples.nc") == 2
-    assert_one_sentence(capsys, "is not a file of visibilities", "lusee_bayes samples 1")
+    assert_one_sentence(capsys, "holds nothing that can be mapped", "lusee_bayes samples 1")
     assert not out.exists()
 
 
