@@ -27,11 +27,11 @@ from numpyro import distributions as dist
 import lusee_bayes as lb
 
 
-def model(coupling, prior, noise, data=None):
+def model(coupling, offset, prior, noise, data=None):
     """The noise level is known; the sky's is not."""
     amplitude = numpyro.sample("amplitude", dist.LogNormal(0.0, 0.5))
     prior = lb.HarmonicPrior(prior.spectrum * amplitude)
-    gaussian = lb.LinearGaussian(coupling, prior, noise)
+    gaussian = lb.LinearGaussian(coupling, prior, noise, offset)
     numpyro.sample("data", lb.Marginal(gaussian), obs=data)
     return gaussian
 '''
@@ -83,6 +83,7 @@ class Case:
     def arguments(self):
         return {
             "coupling": jnp.asarray(self.a),
+            "offset": jnp.zeros(len(self.a)),
             "prior": lb.HarmonicPrior(jnp.asarray(self.spectrum)),
             "noise": lb.DenseCovariance(jnp.asarray(self.n)),
         }

@@ -60,6 +60,7 @@ class Case:
         """What the program is called with; factors other than 1 make it a wrong one."""
         return {
             "coupling": jnp.asarray(self.a),
+            "offset": jnp.zeros(len(self.a)),
             "prior": lb.HarmonicPrior(jnp.asarray(base_factor * self.base)),
             "noise": lb.DenseCovariance(jnp.asarray(noise_factor * self.n)),
             "data": jnp.asarray(self.data),

@@ -26,6 +26,7 @@ from lusee_bayes.sampling.whitening import Whitening, whitened
 
 LMAX = 2
 N_DATA = 30
+NO_OFFSET = jnp.zeros(N_DATA)
 
 
 def program(name):
@@ -85,7 +86,7 @@ def test_priors_without_density_are_refused():
 
 
 def test_handlers_and_predictive(gaussian):
-    arguments = (gaussian.coupling, gaussian.prior, gaussian.noise.factor())
+    arguments = (gaussian.coupling, NO_OFFSET, gaussian.prior, gaussian.noise.factor())
     sky, data = gaussian.sample(jax.random.key(3))
     trace = handlers.trace(handlers.substitute(program("sky"), {"sky": sky})).get_trace(
         *arguments, data=data
@@ -110,9 +111,8 @@ def test_nuts_finds_the_analytic_posterior(gaussian):
         chain_method="vectorized", progress_bar=False,
     )  # fmt: skip
     with numpyro_promotion():
-        mcmc.run(
-            jax.random.key(6), gaussian.coupling, gaussian.prior, gaussian.noise.factor(), data=data
-        )
+        noise = gaussian.noise.factor()
+        mcmc.run(jax.random.key(6), gaussian.coupling, NO_OFFSET, gaussian.prior, noise, data=data)
     draws = np.asarray(mcmc.get_samples()["sky"])
     std = np.asarray(posterior.std())
     # NUTS makes at least a tenth of its 4000 draws count: 400 independent ones, 5 sigma
@@ -127,7 +127,8 @@ def test_the_marginal_program_finds_the_noise_level(gaussian):
     _, data = gaussian.sample(jax.random.key(7))
     mcmc = MCMC(NUTS(program("sky_marginal")), num_warmup=300, num_samples=2000, progress_bar=False)
     with numpyro_promotion():
-        mcmc.run(jax.random.key(8), gaussian.coupling, gaussian.prior, gaussian.noise, data=data)
+        arguments = (gaussian.coupling, NO_OFFSET, gaussian.prior, gaussian.noise)
+        mcmc.run(jax.random.key(8), *arguments, data=data)
     draws = np.asarray(mcmc.get_samples()["noise_level"])
     logs = np.linspace(-3.0, 3.0, 121)
 
@@ -150,12 +151,12 @@ def test_the_marginal_program_finds_the_noise_level(gaussian):
 # --- white coordinates ----------------------------------------------------------------------------
 
 
-def strong_sky(coupling, prior, fixed_noise, data=None):
+def strong_sky(coupling, offset, prior, fixed_noise, data=None):
     """A program whose prior, noise and coupling are not those that the whitening was made with."""
     amplitude = numpyro.sample("amplitude", dist.LogNormal(0.0, 0.5))
     scaled = lb.HarmonicPrior(prior.spectrum * amplitude)
     sky = numpyro.sample("sky", lb.SkyPrior(scaled))
-    seen = coupling @ sky
+    seen = coupling @ sky + offset
     numpyro.sample("data", lb.CorrelatedNormal(seen + 0.1 * seen**2, fixed_noise), obs=data)
 
 
@@ -171,6 +172,7 @@ def case(gaussian):
     _, data = gaussian.sample(jax.random.key(9))
     arguments = {
         "coupling": gaussian.coupling,
+        "offset": NO_OFFSET,
         "prior": gaussian.prior,
         "fixed_noise": gaussian.noise.factor(),
         "data": data,
@@ -296,7 +298,7 @@ def test_conditioning_on_z_fixes_the_sky(case, z):
 def test_an_observed_sky_is_not_whitened(case, z, how):
     arguments, whitening = case
 
-    def observed(coupling, prior, fixed_noise, data=None):
+    def observed(coupling, offset, prior, fixed_noise, data=None):
         numpyro.sample("sky", lb.SkyPrior(prior), obs=z)
 
     model = observed if how == "obs" else handlers.condition(program("sky"), {"sky": z})
