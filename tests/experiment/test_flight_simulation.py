@@ -150,6 +150,8 @@ def test_disturbances_are_found_and_little_else(tmp_path):
         assert np.abs(z).max() < 4.5
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_bursts_of_an_hour_are_found_and_little_else(tmp_path):
     """One is at the end of a span, where nothing holds the curve down."""
     bursts = "flight.simulated={burst_every_h: 2.0, burst_s: 3600, absent_share: 0.01}"
