@@ -35,7 +35,7 @@ def with_bursts(experiment, times, strength):
 
 
 def test_clean_data_are_left_as_they_are(experiment):
-    """65 times, 10 data sets: 0.13 false alarms of times and values are expected, 0.02 of groups."""
+    """65 times, 10 data sets: 0.13 false alarms of times and values are expected, 0.02 others."""
     setup, flagged = experiment.setup, 0
     for seed in range(10):
         noise = np.asarray(radiometer(setup).sample(jax.random.key(seed)))
