@@ -40,7 +40,14 @@ def test_polynomials_of_the_degree_are_exact_in_the_middle(navgf, degree, origin
     found, variance, further = band.values(spectra, np.broadcast_to(here, good.shape), good)
     np.testing.assert_allclose(found, 3.0, rtol=1e-12)
     np.testing.assert_allclose(further, 0.0, atol=1e-9)
-    assert np.isfinite(variance).all()
+    # of independent channels with noise in proportion to the spectrum, by the pseudo-inverse
+    powers = [
+        binned(averaging, (mhz - 10.0) ** k)[band.first : band.last] for k in range(degree + 1)
+    ]
+    for row, kept in enumerate(good):
+        weights = np.linalg.pinv(np.stack(powers, axis=1)[kept])[0]
+        expected = ((weights * here[kept] / 3.0) ** 2).sum() / averaging.members
+        assert variance[row] == pytest.approx(expected, rel=1e-9)
 
 
 def test_what_the_degree_leaves_out_is_told_by_two_more_powers():
