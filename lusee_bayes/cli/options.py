@@ -74,7 +74,7 @@ Force = Annotated[
     Parameter(name="--force", negative="", help="Replace results of another run in the folder."),
 ]
 ForceFile = Annotated[
-    bool, Parameter(name="--force", negative="", help="Replace the file if it is there already.")
+    bool, Parameter(name="--force", negative="", help="Replace what is there already.")
 ]
 
 

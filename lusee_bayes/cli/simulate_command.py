@@ -8,6 +8,7 @@ from rich.console import Console
 
 from lusee_bayes.cli.options import (
     Flag,
+    ForceFile,
     Frequencies,
     Output,
     Overrides,
@@ -26,6 +27,7 @@ def simulate_command(
     output: Output = None,
     frequencies: Frequencies = None,
     flight: Flag = False,
+    force: ForceFile = False,
     set_: Overrides | None = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -54,14 +56,16 @@ def simulate_command(
         from lusee_bayes.runs.flight_run import run_simulate_flight
 
         folder = output or Path("flight")
-        files = run_simulate_flight(loaded, folder, frequencies_mhz=channels, stages=stages)
+        files = run_simulate_flight(
+            loaded, folder, frequencies_mhz=channels, replace=force, stages=stages
+        )
         spectra = f"{files.n_spectra} spectra of {len(files.sessions)} sessions -> {folder}"
         say(console, spectra, files.command)
         return
     from lusee_bayes.runs.simulate_run import run_simulate
 
     output = output or Path("data.nc")
-    data = run_simulate(loaded, output, frequencies_mhz=channels, stages=stages)
+    data = run_simulate(loaded, output, frequencies_mhz=channels, replace=force, stages=stages)
     say(
         console,
         f"{sum(d.layout.size for d in data)} visibilities of {data[0].layout.n_products} products "

@@ -11,6 +11,7 @@ import numpy as np
 from astropy.time import Time
 
 from lusee_bayes.core.destinations import require_folder
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import transaction
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
@@ -52,6 +53,7 @@ def run_simulate_flight(
     folder: str | Path,
     *,
     frequencies_mhz: Sequence[float] = (),
+    replace: bool = False,
     stages: Stages | None = None,
 ) -> FlightFiles:
     """Simulate sessions, and write them with all that it takes to map them.
@@ -66,16 +68,19 @@ def run_simulate_flight(
         and the files no clock.
     frequencies_mhz : sequence of float
         In place of the scenario's.
+    replace : bool
+        Replace sessions that are in the folder already.
     stages : Stages, optional
         Told how far it is.
 
     Raises
     ------
     InputError
-        As :func:`.simulate_flight`, and if the folder cannot be written.
+        As :func:`.simulate_flight`, and if the folder holds sessions already, or cannot be written.
     """
     folder = Path(folder)
     require_folder(folder)
+    _require_no_sessions(folder, replace)
     stages = stages or Stages()
     if frequencies_mhz:
         scenario = scenario.model_copy(update={"frequencies_mhz": tuple(frequencies_mhz)})
@@ -100,6 +105,15 @@ def run_simulate_flight(
                 )
     paths = tuple(folder / name for name in names)
     return FlightFiles(paths, folder / SCENARIO, made.observation.n_times)
+
+
+def _require_no_sessions(folder: Path, replace: bool) -> None:
+    """InputError where simulated sessions would take the place of others."""
+    found = sorted(path.name for path in folder.glob("session_*"))
+    if found and not replace:
+        raise InputError(
+            f"'{folder}' holds sessions already ({found[0]}); give -o another folder, or --force"
+        )
 
 
 def _told(

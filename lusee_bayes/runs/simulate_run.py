@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lusee_bayes.core.destinations import require_target
+from lusee_bayes.core.destinations import require_new
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.experiment import Experiment, simulated
@@ -23,6 +23,7 @@ def run_simulate(
     path: str | Path,
     *,
     frequencies_mhz: Sequence[float] = (),
+    replace: bool = False,
     stages: Stages | None = None,
 ) -> list[Visibilities]:
     """Simulate the visibilities of a scenario, and write them whole or not at all.
@@ -35,6 +36,8 @@ def run_simulate(
     frequencies_mhz : sequence of float
         Channels of a waterfall; the noise of each has a seed of its own, one more than that of the
         channel before. None for the scenario's frequency alone.
+    replace : bool
+        Replace the file if it is there already.
     stages : Stages, optional
         Told what is being done.
 
@@ -46,11 +49,12 @@ def run_simulate(
     Raises
     ------
     InputError
-        For several channels in a netCDF file, and for what a waterfall cannot hold.
+        If the file is there already, for several channels in a netCDF file, and for what a
+        waterfall cannot hold.
     """
     path, channels = Path(path), (scenario,)
     stages = stages or Stages()
-    require_target(path)
+    require_new(path, replace=replace)
     if path.suffix == ".fits" and scenario.observation.window != "instant":
         raise InputError(f"{path}: {NO_ROOM}")
     require_fits(simulation_cost(scenario, max(1, len(frequencies_mhz))), scenario)

@@ -134,8 +134,8 @@ def test_simulated_and_mapped_between_the_responses_frequencies(luseepy, tmp_pat
 
     def simulate(*further):
         arguments = [a for o in (*beam, warm, *further) for a in ("--set", o)]
-        command = ["simulate", "fiducial", "-o", str(path), "--frequencies", f"{f!r},10", "--quiet"]
-        return main([*command, *arguments])
+        command = ["simulate", "fiducial", "-o", str(path), "--frequencies", f"{f!r},10", "-q"]
+        return main([*command, "--force", *arguments])
 
     assert simulate(f"beam.receiver={capacitor}") == 0
     scenario = lb.load_scenario("fiducial", [*beam, f"frequency_mhz={f!r}", warm])

@@ -24,8 +24,9 @@ SET = [
 ]
 
 
-def simulate(folder, *more):
+def simulate(folder, *more, force=False):
     options = [option for one in (*SET, *more) for option in ("--set", one)]
+    options += ["--force"] if force else []
     return main(["simulate", "fiducial", "--flight", "-q", "-o", str(folder), *options])
 
 
@@ -75,7 +76,7 @@ def test_fits_and_a_gain_table_of_ones_own(tmp_path):
 
 def test_files_of_an_earlier_simulation_do_not_stay(tmp_path):
     assert simulate(tmp_path / "a", "flight.simulated={session_h: 1, clock: unknown}") == 0
-    assert simulate(tmp_path / "a", "flight.simulated={kind: fits}") == 0
+    assert simulate(tmp_path / "a", "flight.simulated={kind: fits}", force=True) == 0
     assert files_of(tmp_path / "a") == [
         "gains.nc", "manifest.json", "scenario.yaml", "session_000.fits", "truth.npz"
     ]  # fmt: skip
@@ -109,6 +110,22 @@ def simulated(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flight") / "sessions"
     assert simulate(folder) == 0
     return folder
+
+
+def test_simulated_data_replace_nothing_unasked(simulated, tmp_path, capsys):
+    before = (simulated / "session_000.h5").read_bytes()
+    assert simulate(simulated) == 2
+    told = f"'{simulated}' holds sessions already (session_000.h5); give -o another folder, or"
+    assert told in capsys.readouterr().err
+    assert (simulated / "session_000.h5").read_bytes() == before
+    out = tmp_path / "data.nc"
+    out.write_bytes(b"mine")
+    command = ["simulate", "fiducial", "-q", "--set", "lmax=3"]
+    assert main([*command, "-o", str(out)]) == 2
+    assert "is there already; give -o another name, or --force" in capsys.readouterr().err
+    assert out.read_bytes() == b"mine"
+    assert main([*command, "-o", str(out), "--force"]) == 0
+    assert out.read_bytes() != b"mine"
 
 
 def test_reduced_spectra_are_reduced_once_and_not_replaced_unasked(simulated, tmp_path, capsys):
