@@ -15,6 +15,7 @@ from lusee_bayes.experiment.plausibility import require_plausible
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.simulate import simulate
+from lusee_bayes.experiment.terms import Around
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.learning import Learned
 from lusee_bayes.sampling.log_normal.learned import LearnedLogNormal
@@ -37,6 +38,8 @@ class Experiment(Described):
         How the setup's prior was learned; None for one that was given.
     fitting : Fitting or None
         Of flight data: the times that did not fit and are left out; None for other data.
+    around : Around or None
+        What N was built around when the prior was learned, in rounds; None for the data alone.
     """
 
     setup: Setup
@@ -44,6 +47,7 @@ class Experiment(Described):
     doubts: tuple[str, ...] = ()
     learned: Learned | None = None
     fitting: Fitting | None = None
+    around: Around | None = None
 
     def description(self) -> tuple[str, ...]:
         scenario = self.scenario
@@ -154,8 +158,8 @@ def _learned(experiment: Experiment, stages: Stages) -> Experiment:
     if experiment.setup.family is None:
         return experiment
     with stages("prior"):
-        setup, learned = with_learned_prior(experiment.setup, experiment.data)
-    return replace(experiment, setup=setup, learned=learned)
+        setup, learned, around = with_learned_prior(experiment.setup, experiment.data)
+    return replace(experiment, setup=setup, learned=learned, around=around)
 
 
 def with_truth(experiment: Experiment) -> Experiment:

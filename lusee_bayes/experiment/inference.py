@@ -24,7 +24,7 @@ def infer(experiment: Experiment) -> Inference:
     InputError
         As :func:`.settled`.
     """
-    return settled(experiment.setup, experiment.data)
+    return settled(experiment.setup, experiment.data, experiment.around)
 
 
 def inform(

@@ -11,28 +11,26 @@ from lusee_bayes.experiment.terms import (
     TERMS,
     Around,
     PointingTerm,
-    measured_visibilities,
+    noise_visibilities,
     pointed,
+    radiometer_about,
     table_factors,
 )
 from lusee_bayes.instrument.coupling import DenseCoupling
-from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise import radiometer_noise
 from lusee_bayes.noise.covariance import Covariance
 from lusee_bayes.systematics import Marginalised, Systematic
 
 
-def radiometer(setup: Setup, data: Visibilities | None = None) -> Covariance:
-    """Radiometer term of N, from the modelled sky or, if the scenario says so, ``data``; in K^2.
+def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
+    """Radiometer term of N, from the visibilities of :func:`.radiometer_about`; in K^2.
 
     Averages of spectra say themselves how many samples they are made of; other data have the
     scenario's bandwidth and duty cycle.
     """
     section = setup.scenario.noise.radiometer
-    visibilities = setup.signal
-    if section.temperature == "measured" and data is not None:
-        visibilities = measured_visibilities(data, setup.signal)
+    visibilities = noise_visibilities(setup, around or Around(), radiometer_about(setup))
     if setup.calibration is not None:
         return radiometer_noise(
             visibilities,
@@ -72,9 +70,9 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, S
     ]
 
 
-def base_model(setup: Setup, data: Visibilities | None = None) -> LinearGaussian:
+def base_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     """d = A m + background + n with radiometer noise only."""
-    noise = radiometer(setup, data)
+    noise = radiometer(setup, around)
     return on_device(LinearGaussian(setup.coupling, setup.prior, noise, setup.offset))
 
 
@@ -84,7 +82,7 @@ def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     Those that are to be sampled, too, to first order: what a Gaussian can say about them.
     """
     around = around or Around()
-    return marginalised(base_model(setup, around.data), systematics(setup, around))
+    return marginalised(base_model(setup, around), systematics(setup, around))
 
 
 def marginalised(model: LinearGaussian, found: Iterable[tuple[str, Systematic]]) -> LinearGaussian:
@@ -94,18 +92,14 @@ def marginalised(model: LinearGaussian, found: Iterable[tuple[str, Systematic]])
     return model
 
 
-def model_to_sample(
-    setup: Setup, data: Visibilities, around: Around | None = None
-) -> tuple[LinearGaussian, tuple[Systematic, ...]]:
+def model_to_sample(setup: Setup, around: Around) -> tuple[LinearGaussian, tuple[Systematic, ...]]:
     """The model before anything is sampled, and what is then to be applied to it.
-
-    Terms are built around the data, unless ``around`` says more.
 
     Systematics that are marginalised come in their place in the order, as sampled ones without a
     site.
     """
-    model, later = base_model(setup, data), []
-    for treatment, systematic in systematics(setup, around or Around(data)):
+    model, later = base_model(setup, around), []
+    for treatment, systematic in systematics(setup, around):
         if treatment == "sampled":
             later.append(systematic)
         elif later:

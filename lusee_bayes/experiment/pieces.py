@@ -10,7 +10,7 @@ from lusee_bayes.core.arrays import on_device
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import model_to_sample
-from lusee_bayes.experiment.rounds import first_order, settled
+from lusee_bayes.experiment.rounds import rebuilds, settled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import TERMS, Around, gain_drifts, point_sources
 from lusee_bayes.instrument.instrument import Instrument
@@ -37,15 +37,18 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
 
         return make
 
+    @cache
     def around() -> Around:
         # about none, large offsets are not described, and gains are those of other antennas
-        return settled(setup, data).around if first_order(setup) else Around(data)
+        if not rebuilds(setup):
+            return Around(data)
+        return settled(setup, data, experiment.around).around
 
-    to_sample = cache(lambda: model_to_sample(setup, data, around()))
+    to_sample = cache(lambda: model_to_sample(setup, around()))
     return {
         "gaussian": lambda: to_sample()[0],
         "systematics": lambda: to_sample()[1],
-        "gain_drifts": free("noise.gain", lambda: gain_drifts(setup, Around(data))),
+        "gain_drifts": free("noise.gain", lambda: gain_drifts(setup, around())),
         "instrument": free("noise.beam", lambda: embedded_instrument(setup)),
         "sources": free("sources", lambda: point_sources(setup)),
         "log_normal": lambda: log_normal_prior(setup),

@@ -8,10 +8,16 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, on_host
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.model import base_model, marginalised, radiometer, systematics
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.terms import TERMS, Around, Term, pointed
+from lusee_bayes.experiment.terms import (
+    TERMS,
+    Around,
+    Term,
+    gains_about,
+    pointed,
+    radiometer_about,
+)
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.freedom import data_freedom
@@ -51,6 +57,8 @@ class Inference:
         How often N was built.
     around : Around
         What it was built around.
+    unsettled : str
+        A sentence if the map still moves from round to round; empty otherwise.
     """
 
     model: LinearGaussian
@@ -58,6 +66,7 @@ class Inference:
     posterior: Posterior | None
     rounds: int
     around: Around
+    unsettled: str = ""
 
     @property
     def offsets(self) -> PointingOffsets | None:
@@ -70,7 +79,7 @@ class Inference:
         return tuple(s for s in self.systematics if isinstance(s, Expanded) and s.moves)
 
 
-def settled(setup: Setup, data: Visibilities) -> Inference:
+def settled(setup: Setup, data: Visibilities, start: Around | None = None) -> Inference:
     """Condition the model on data, in as many rounds as its N needs.
 
     One round, unless a term of N is built around what the data tell: the gains around the
@@ -83,18 +92,25 @@ def settled(setup: Setup, data: Visibilities) -> Inference:
     ----------
     setup : Setup
     data : Visibilities
+    start : Around, optional
+        What N is built around in the first round; by default the data.
+
+    Returns
+    -------
+    Inference
+        Of the last round. Where the map does not settle in 30 rounds, ``unsettled`` says so.
 
     Raises
     ------
     InputError
-        If N is not positive definite, or the map does not settle in 30 rounds.
+        If N is not positive definite.
     """
 
     def conditioned(around: Around, rounds: int) -> Inference:
         model, found = model_about(setup, around)
         return Inference(model, found, model.condition(data.data), rounds, around)
 
-    found = conditioned(Around(data, freedom=_freedom(setup, data)), 1)
+    found = conditioned(start or Around(data, freedom=_freedom(setup, data)), 1)
     if not rebuilds(setup):
         return found
     step = _Step()
@@ -103,20 +119,21 @@ def settled(setup: Setup, data: Visibilities) -> Inference:
         before, found = found, conditioned(around, rounds)
         if float(found.posterior.rms_shift_from(before.posterior)) < SETTLED * step.size:
             return found
-    remedies = []
+    moves = float(found.posterior.rms_shift_from(before.posterior))
+    remedies = [term.remedy for term in first_order(setup)]
     if rebuilds_gains(setup):
         remedies.append("noise.gain.visibilities=model")
-    remedies += [term.remedy for term in first_order(setup)]
-    raise InputError(
-        f"the map still moves after {MAX_ROUNDS} rounds of rebuilding N around it; use "
-        + ", and ".join(remedies)
+    unsettled = (
+        f"The map still moves by {moves:.2g} of its standard deviations after {MAX_ROUNDS} rounds "
+        "of rebuilding N around it"
     )
+    return replace(found, unsettled=f"{'; use '.join([unsettled, *remedies[:1]])}.")
 
 
 def model_about(setup: Setup, around: Around) -> tuple[LinearGaussian, tuple[Systematic, ...]]:
     """The full model, and the systematics in its N."""
     found = systematics(setup, around)
-    return marginalised(base_model(setup, around.data), found), tuple(s for _, s in found)
+    return marginalised(base_model(setup, around), found), tuple(s for _, s in found)
 
 
 @dataclass(frozen=True)
@@ -146,8 +163,8 @@ class _Step:
 def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]:
     """What the terms of N are built around next, given a posterior, and the step there."""
     visibilities, sky, values, seen = None, None, None, None
+    solved = weighted_residual(found.model, found.posterior, found.around.data.data)
     if found.moving:
-        solved = weighted_residual(found.model, found.posterior, found.around.data.data)
         told = [s.expected + np.asarray(s.columns).T @ solved for s in found.moving]
         centres = [np.asarray(s.centre) for s in found.moving]
         step = step.after(np.concatenate(told) - np.concatenate(centres))
@@ -160,8 +177,8 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
             else:
                 here = np.asarray(setup.sky.modes if found.around.sky is None else found.around.sky)
                 sky = here + step.size * (np.asarray(found.posterior.mean) - here)
-    if rebuilds_gains(setup):
-        visibilities = prediction(pointed(setup, values), found.posterior)
+    if rebuilds_visibilities(setup):
+        visibilities = prediction(pointed(setup, values), found, solved)
     around = replace(found.around, visibilities=visibilities, sky=sky, values=values, seen=seen)
     return around, step
 
@@ -175,7 +192,7 @@ def _freedom(setup: Setup, data: Visibilities) -> Float[np.ndarray, " data"] | N
     others = [(treatment, s) for treatment, s in found if not isinstance(s, GainTable)]
     if len(others) == len(found):
         return None
-    model = marginalised(base_model(setup, data), others)
+    model = marginalised(base_model(setup, Around(data)), others)
     columns = [np.zeros((model.n_data, 0))]
     columns += [np.asarray(s.columns) for _, s in others if isinstance(s, Templated)]
     columns += [np.asarray(s.templates()) for _, s in others if isinstance(s, PointSources)]
@@ -191,7 +208,7 @@ def _before_gains(
 ) -> Float[np.ndarray, " data"]:
     """What the data tell of the visibilities before the gains: less radiometer noise, and gains."""
     data = found.around.data
-    noise = np.asarray(on_host(radiometer(setup, data)).mv(solved))
+    noise = np.asarray(on_host(radiometer(setup, found.around)).mv(solved))
     return (np.asarray(data.data) - noise) / np.asarray(table.errors.factors(z))
 
 
@@ -220,7 +237,7 @@ def offset_posterior(
 
 def rebuilds(setup: Setup) -> bool:
     """Whether some term of N is built around what the data tell."""
-    return rebuilds_gains(setup) or bool(first_order(setup))
+    return rebuilds_visibilities(setup) or bool(first_order(setup))
 
 
 def first_order(setup: Setup) -> tuple[Term, ...]:
@@ -231,11 +248,33 @@ def first_order(setup: Setup) -> tuple[Term, ...]:
 def rebuilds_gains(setup: Setup) -> bool:
     """Whether the gain term is built around the posterior's own prediction."""
     gain = setup.scenario.noise.gain
-    return gain is not None and gain.treatment != "ignored" and gain.visibilities == "posterior"
+    return gain is not None and gain.treatment != "ignored" and gains_about(setup) == "posterior"
 
 
-def prediction(setup: Setup, posterior: Posterior) -> Float[Array, "products times"]:
-    """Visibilities of the mean map, with the sources' mean fluxes, at every time; in K."""
+def rebuilds_visibilities(setup: Setup) -> bool:
+    """Whether gains or radiometer noise are built around the posterior's own prediction."""
+    return rebuilds_gains(setup) or radiometer_about(setup) == "posterior"
+
+
+def prediction(
+    setup: Setup, found: Inference, solved: Float[np.ndarray, " data"]
+) -> Float[Array, "products times"]:
+    """Visibilities of the mean map, with all else that N holds but drifts and noise, in K.
+
+    Parameters
+    ----------
+    setup : Setup
+        Pointed as the data tell.
+    found : Inference
+    solved : (data,) array
+        N^-1 (d - A m), of the mean map.
+    """
     complete = CouplingMatrix.build(setup.beams, setup.pointing)
-    difference_of_skies = posterior.mean - setup.sky.modes
-    return setup.signal + complete.layout.scatter(complete @ difference_of_skies)
+    difference_of_skies = found.posterior.mean - setup.sky.modes
+    besides = np.zeros(len(solved))
+    for systematic in found.systematics:
+        if isinstance(systematic, Templated) and not isinstance(systematic, PointingOffsets):
+            columns = np.asarray(systematic.columns)
+            besides = besides + columns @ (columns.T @ solved)
+    grid = complete.layout.scatter(complete @ difference_of_skies)
+    return setup.signal + grid + setup.layout.scatter(besides)

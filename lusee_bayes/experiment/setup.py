@@ -68,6 +68,8 @@ class Setup:
         is given.
     calibration : Calibration or None
         Of data that are averages of a spectrometer's spectra; None for others.
+    measured : bool
+        Whether the data were given, so that their sky is not the modelled one.
     """
 
     scenario: Scenario
@@ -84,6 +86,7 @@ class Setup:
     receiver: Receiver | None = None
     family: PriorFamily | LogNormalPrior | None = None
     calibration: Calibration | None = None
+    measured: bool = False
 
     @property
     def pointing(self) -> Pointing:
@@ -204,6 +207,7 @@ def set_up(
         receiver,
         family,
         None if data is None else data.calibration,
+        data is not None,
     )
 
 

@@ -186,6 +186,25 @@ class Information(Described, eqx.Module):
         misfit = namespace(misfit).asarray(misfit)
         return replace(self, vector=self.vector - pulled, reference=sky, misfit=misfit)
 
+    def raised(self, factor: float) -> Information:
+        """The information of the same data under N times a factor; perturbations are dropped.
+
+        Parameters
+        ----------
+        factor : float
+            Of N, positive.
+        """
+        if factor == 1.0:
+            return self
+        return replace(
+            self,
+            matrix=self.matrix / factor,
+            vector=self.vector / factor,
+            misfit=self.misfit / factor,
+            log_det=self.log_det + self.n_data * np.log(factor),
+            perturbations=None,
+        )
+
     def chi2(self, sky: Float[Array, " modes"]) -> Float[Array, ""]:
         """Compute ``chi^2 = |L^-1 (d - A m - offset)|^2`` of a sky.
 

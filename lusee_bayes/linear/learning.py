@@ -10,7 +10,7 @@ know the hyperprior's tails (:mod:`.normal_scores`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -18,9 +18,12 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import cholesky, inverse_from_cholesky
+from lusee_bayes.linear.fit import ChiSquare, stands_out
 from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.metrics import expected_chi2
 from lusee_bayes.linear.normal_scores import NormalScores
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.linear.split import Split
 from lusee_bayes.sky.prior_family import Member, PriorFamily
 from lusee_bayes.sky.priors import Prior
 
@@ -36,6 +39,12 @@ SIMULATIONS, FINAL_SIMULATIONS = 200, 500
 # added to a covariance with eigenvalues from 0 to 1, of which a root is needed: those near 0 are
 # wrong by eps times the condition number of Lambda, up to 1e-5, and count for nothing
 ROUNDING = 1e-4
+# of the factor of N that data that do not fit demand: what is tried, one after the other
+HIGHER = np.array([1.0, 1e2, 1e4])
+
+
+class NotSettled(InputError):
+    """The most probable parameters of a prior were not found."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +64,10 @@ class Learned:
         ln p(d), with the sky and the parameters integrated out (Laplace).
     steps : int
         Steps that were taken.
+    noise_factor : float
+        Factor of N with which the parameters were learned; above 1 where the data do not fit.
+    settled : bool
+        Whether the parameters are learned; otherwise the prior is a fixed, wide one.
     """
 
     prior: Prior
@@ -63,6 +76,8 @@ class Learned:
     covariance: Float[np.ndarray, "parameters parameters"]
     log_evidence: float
     steps: int
+    noise_factor: float = field(default=1.0, kw_only=True)
+    settled: bool = field(default=True, kw_only=True)
 
     def as_rows(self) -> list[dict[str, float | str]]:
         """Name, value and standard deviation of the parameters that have a name."""
@@ -106,8 +121,10 @@ def learn(
 
     Raises
     ------
+    NotSettled
+        If the maximum is not found in 60 steps, or ln p falls along its own gradient.
     InputError
-        If S is not positive definite, or the maximum is not found in 60 steps.
+        If S is not positive definite.
     """
     rng, information = np.random.default_rng(seed), on_host(information)
     here = _at(family, information, family.hyperprior.start() if start is None else start)
@@ -120,10 +137,71 @@ def learn(
         if gain < SETTLED:
             return _learned(family, information, here, rng, steps)
         here = _uphill(family, information, here, step * min(1.0, LONGEST / np.abs(step).max()))
-    raise InputError(
+    raise NotSettled(
         f"the prior's parameters did not settle in {MAX_STEPS} steps: the next would still add "
-        f"{gain:.2g} to ln p (accepted: {SETTLED:g}); use prior.model=isotropic"
+        f"{gain:.2g} to ln p (accepted: {SETTLED:g})"
     )
+
+
+def learn_whatever_fits(
+    family: PriorFamily,
+    information: Information,
+    start: Float[np.ndarray, " parameters"] | None = None,
+    seed: int = 1,
+) -> Learned:
+    """Learn a prior as :func:`learn`, from data that no sky explains, too.
+
+    Under N, such data ask for a sky that is stronger by orders of magnitude, and ln p is rough. N
+    is raised to what the residual chi^2, which no sky can absorb, demands; where ln p does not
+    settle there, by 100 and 10,000 times that. The last resort is a fixed prior: the family's
+    before there are data, wide enough for the sky that the data ask for.
+
+    Parameters
+    ----------
+    family, information, start, seed
+        As for :func:`learn`.
+    """
+    information = on_host(information)
+    demanded = demanded_factor(information, family.expected())
+    for factor in demanded * HIGHER:
+        try:
+            found = learn(family, information.raised(factor), start, seed)
+        except InputError:
+            continue
+        return replace(found, noise_factor=float(factor))
+    return _fixed(family, information.raised(float(demanded * HIGHER[-1])))
+
+
+def demanded_factor(information: Information, prior: Prior) -> float:
+    """Factor of N that makes the residual chi^2 what is expected; 1 where it does not stand out.
+
+    Parameters
+    ----------
+    information : Information
+    prior : Prior
+        Before there are data, over the same modes.
+    """
+    n_data = float(information.n_data)
+    try:
+        posterior = information.posterior(prior)
+        chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
+        left = Split.of(posterior, chi2, n_data).instrument
+    except InputError:  # the data are too far from any sky for these numbers: rounding rules them
+        left = ChiSquare(float(information.misfit), n_data)
+    fits = left.too_small or not stands_out(left.p, 1)
+    return 1.0 if fits else left.chi2 / left.degrees
+
+
+def _fixed(family: PriorFamily, information: Information) -> Learned:
+    """The family's prior before there are data, as wide as the data ask for; see ``settled``."""
+    start, prior, n_data = family.hyperprior.start(), family.expected(), float(information.n_data)
+    posterior = information.posterior(prior)
+    known = n_data - expected_chi2(posterior, n_data)
+    width = max(1.0, np.sqrt(float(posterior.prior_chi2()) / max(known, 1.0)))
+    prior = prior.widened(width)
+    evidence = float(information.posterior(prior).log_evidence)
+    none = np.zeros((0, 0))
+    return Learned(prior, (), start[:0], none, evidence, 0, settled=False)
 
 
 def _at(
@@ -151,9 +229,8 @@ def _uphill(
         if there is not None and there.value >= here.value - SETTLED / 10.0:
             return there
         part /= 2.0
-    raise InputError(
-        "the prior's parameters do not settle: ln p falls along its own gradient, so that rounding "
-        "rules it; use prior.model=isotropic"
+    raise NotSettled(
+        "the prior's parameters do not settle: ln p falls along its own gradient by rounding"
     )
 
 

@@ -15,6 +15,7 @@ from lusee_bayes.experiment.schema.log_normal import LogNormalPriorSection
 from lusee_bayes.experiment.schema.noise import (
     BeamErrorSection,
     GainSection,
+    NoiseAbout,
     NoiseSection,
     RadiometerSection,
 )
@@ -61,6 +62,7 @@ __all__ = [
     "LogNormalPriorSection",
     "ModulatedPriorSection",
     "MonopoleBeamSection",
+    "NoiseAbout",
     "NoiseSection",
     "ObservationSection",
     "OutputSection",

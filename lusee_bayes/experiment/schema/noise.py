@@ -14,6 +14,9 @@ from lusee_bayes.experiment.schema.unknowns import (
     RegolithSection,
 )
 
+# visibilities that a term of N is built around: the modelled sky's, the data, or the map's own
+NoiseAbout = Literal["model", "measured", "posterior"]
+
 
 class RadiometerSection(Section):
     """Radiometer noise.
@@ -32,8 +35,10 @@ class RadiometerSection(Section):
     log_factor_std : float
         Prior standard deviation of ln of a further factor of the variance, where the level is not
         known. Simulated data hold one drawn from it, and it is sampled.
-    temperature : {"model", "measured"}
-        Visibilities that set the level: the modelled sky's, or the data themselves.
+    temperature : {"model", "measured", "posterior"}, optional
+        Visibilities that set the level: the modelled sky's, the data themselves, or the map's own
+        prediction, in rounds. By default the modelled sky's for simulated data, and for measured
+        ones the data themselves, unless their noise would bias the map; then the map's prediction.
     """
 
     form: Literal["paper", "exact"] = "paper"
@@ -41,7 +46,7 @@ class RadiometerSection(Section):
     duty_cycle: Annotated[float, Field(gt=0, le=1)] = 1.0
     factor: Positive = 1.0
     log_factor_std: Positive | None = None
-    temperature: Literal["model", "measured"] = "model"
+    temperature: NoiseAbout | None = None
 
 
 class GainSection(Section):
@@ -61,10 +66,10 @@ class GainSection(Section):
     treatment : {"marginalised", "sampled", "ignored"}
         Their covariance is added to N, they are sampled with the map, or they are left out of the
         model.
-    visibilities : {"model", "measured", "posterior"}
-        The d that the covariance is built around. ``measured`` data hold the drifts themselves,
-        which moves the map by about a standard deviation; ``posterior`` starts from them and
-        repeats with the map's prediction until the map stops moving, which corrects that.
+    visibilities : {"model", "measured", "posterior"}, optional
+        Visibilities that the covariance is built around: the modelled sky's; the data, whose own
+        drifts move the map by about a standard deviation; or the map's prediction, in rounds. By
+        default the modelled sky's for simulated data, and the map's prediction for measured ones.
     """
 
     sigma: Positive = 0.01
@@ -72,7 +77,7 @@ class GainSection(Section):
     log_sigma_std: Positive | None = None
     log_correlation_std: Annotated[float, Field(gt=0, le=1)] | None = None
     treatment: Treatment = "marginalised"
-    visibilities: Literal["model", "measured", "posterior"] = "model"
+    visibilities: NoiseAbout | None = None
 
     @model_validator(mode="after")
     def _scales_are_sampled(self) -> GainSection:

@@ -10,8 +10,13 @@ from lusee_bayes.experiment.terms.beam_error import (
     true_beams,
     true_instrument,
 )
-from lusee_bayes.experiment.terms.gain_drift import GainTerm, gain_drifts, measured_visibilities
+from lusee_bayes.experiment.terms.gain_drift import GainTerm, gain_drifts
 from lusee_bayes.experiment.terms.gain_table import GainTableTerm, table_factors
+from lusee_bayes.experiment.terms.noise_about import (
+    gains_about,
+    noise_visibilities,
+    radiometer_about,
+)
 from lusee_bayes.experiment.terms.noise_level import NoiseLevelTerm
 from lusee_bayes.experiment.terms.pointing import (
     PointingTerm,
@@ -50,11 +55,13 @@ __all__ = [
     "beam_directions",
     "beam_rms_difference",
     "gain_drifts",
-    "measured_visibilities",
+    "gains_about",
+    "noise_visibilities",
     "offsets_about",
     "point_sources",
     "pointed",
     "pointing_offsets",
+    "radiometer_about",
     "second_order",
     "table_factors",
     "true_beams",

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import jax
-import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import numpyro
 from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.experiment.terms.noise_about import gains_about, noise_visibilities
 from lusee_bayes.experiment.terms.term import Around, Term, Truth
-from lusee_bayes.instrument.gaps import without_gaps
-from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.noise import GainDrift, with_gains
 from lusee_bayes.systematics import GainDrifts, Systematic
 
@@ -58,39 +56,11 @@ def gain_drifts(setup: Setup, around: Around) -> GainDrifts:
     gain = setup.scenario.noise.gain
     if gain is None:
         raise InputError("the scenario has no noise.gain that could be sampled")
-    visibilities = around.visibilities
-    if visibilities is None:
-        measured = gain.visibilities != "model" and around.data is not None
-        visibilities = (
-            measured_visibilities(around.data, setup.signal) if measured else setup.signal
-        )
     return GainDrifts.of(
         GainDrift(gain.sigma, gain.correlation_h),
-        visibilities,
+        noise_visibilities(setup, around, gains_about(setup)),
         setup.observation.hours,
         setup.layout,
         gain.log_sigma_std,
         gain.log_correlation_std,
     )
-
-
-def measured_visibilities(
-    data: Visibilities, model: Float[Array, "products times"]
-) -> Float[Array, "products times"]:
-    """Visibilities that set a noise level: the measured ones, absent samples interpolated.
-
-    A time without any sample takes the model's (it enters nothing).
-
-    Raises
-    ------
-    InputError
-        If an auto was never measured, but other products of its port were.
-    """
-    some = data.layout.present.any(0)
-    try:
-        measured = without_gaps(data.layout.scatter(data.data), data.layout)
-    except InputError as error:
-        raise InputError(
-            f"{error}, or use noise.radiometer.temperature=model and noise.gain.visibilities=model"
-        ) from error
-    return np.where(some[None], measured, model)

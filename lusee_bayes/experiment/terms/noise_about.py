@@ -1,0 +1,124 @@
+"""The visibilities that radiometer noise and gain drifts are built around.
+
+Those of the modelled sky are right where it is the true one, as for simulated data. Measured
+visibilities hold their own noise: N is small where an auto came out low, and the map is pulled
+there. With n times of B tau samples each, and the exact covariance of p antennas' products, a
+common amplitude moves by up to 4 p sqrt(n / (B tau)) of its standard deviation. Drifts are not
+small, and stay in the measured visibilities. What neither troubles is the map's own prediction,
+in rounds (:mod:`lusee_bayes.experiment.rounds`).
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.experiment.schema import NoiseAbout
+from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.instrument.gaps import without_gaps
+from lusee_bayes.instrument.products import all_products, auto_indices
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
+
+# in standard deviations of a common amplitude
+HARMLESS_BIAS = 0.1
+
+
+class _Around(Protocol):
+    """What :class:`.Around` has of it."""
+
+    data: Visibilities | None
+    visibilities: Float[Array, "products times"] | None
+
+
+def radiometer_about(setup: Setup) -> NoiseAbout:
+    """Which visibilities set the level of the radiometer noise."""
+    chosen = setup.scenario.noise.radiometer.temperature
+    if chosen is not None:
+        return chosen
+    if not setup.measured:
+        return "model"
+    harmless = _has_autos(setup) and common_bias(setup) < HARMLESS_BIAS
+    return "measured" if harmless else _predicted(setup)
+
+
+def gains_about(setup: Setup) -> NoiseAbout:
+    """Which visibilities the covariance of gain drifts is built around."""
+    chosen = setup.scenario.noise.gain.visibilities
+    if chosen is not None:
+        return chosen
+    return _predicted(setup) if setup.measured else "model"
+
+
+def _predicted(setup: Setup) -> NoiseAbout:
+    """The map's prediction; a log-normal sky is found under one N, and has none."""
+    return "measured" if isinstance(setup.family, LogNormalPrior) else "posterior"
+
+
+def common_bias(setup: Setup) -> float:
+    """How far noise in measured visibilities moves a common amplitude, in standard deviations."""
+    section, observation = setup.scenario.noise.radiometer, setup.observation
+    if setup.calibration is not None:
+        samples = np.asarray(setup.calibration.n_averaged)
+    else:
+        samples = section.bandwidth_hz * section.duty_cycle * np.asarray(observation.live_s)
+    n_antennas = setup.beam_source.n_ports
+    ratio = section.factor * observation.n_times / float(np.median(samples))
+    return float(4.0 * n_antennas * np.sqrt(ratio))
+
+
+def _has_autos(setup: Setup) -> bool:
+    """Whether every port that was used has its auto somewhere."""
+    seen = np.asarray(setup.layout.present).any(1)
+    n = setup.beam_source.n_ports
+    used = {
+        port
+        for product, some in zip(all_products(n), seen, strict=True)
+        if some
+        for port in product[:2]
+    }
+    return all(seen[k] for port, k in enumerate(auto_indices(n)) if port in used)
+
+
+def noise_visibilities(
+    setup: Setup, around: _Around, about: NoiseAbout
+) -> Float[Array, "products times"]:
+    """The visibilities that a term of N is built around, in K.
+
+    Before there is a prediction it is the measured ones', or, if autos that noise depends on were
+    never measured, the modelled sky's.
+    """
+    if about == "model" or around.data is None:
+        return setup.signal
+    if about == "posterior" and around.visibilities is not None:
+        return around.visibilities
+    if about == "posterior" and not _has_autos(setup):
+        return setup.signal
+    return measured_visibilities(around.data, setup.signal)
+
+
+def measured_visibilities(
+    data: Visibilities, model: Float[Array, "products times"]
+) -> Float[Array, "products times"]:
+    """Visibilities that set a noise level: the measured ones, absent samples interpolated.
+
+    A time without any sample takes the model's (it enters nothing).
+
+    Raises
+    ------
+    InputError
+        If an auto was never measured, but other products of its port were.
+    """
+    some = data.layout.present.any(0)
+    try:
+        measured = without_gaps(data.layout.scatter(data.data), data.layout)
+    except InputError as error:
+        raise InputError(
+            f"{error}, or use noise.radiometer.temperature=posterior and "
+            "noise.gain.visibilities=posterior"
+        ) from error
+    return np.where(some[None], measured, model)

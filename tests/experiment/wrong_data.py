@@ -1,0 +1,249 @@
+"""Data with usual mistakes in them, of skies that are not the model's.
+
+Each is made with what was really so (another turntable angle, other antennas, another site ...), or
+by changing good data, and then says of itself what a scenario without the mistake expects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+
+from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.experiment.overrides import apply_override
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.setup import Setup, set_up
+from lusee_bayes.instrument.beams import ProductBeams
+from lusee_bayes.instrument.coupling import CouplingMatrix
+from lusee_bayes.instrument.products import labels
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.sky import Sky, SkySource
+from lusee_bayes.testing.skies import SmoothSky, SpottySky
+
+LABELS = labels(4)
+
+
+def scenario(lmax: int = 8, *overrides: str, frequency_mhz: float = 25.0) -> Scenario:
+    """One cycle of 110 samples with every default, at one turntable angle."""
+    sizes = {"frequency_mhz": frequency_mhz, "lmax": lmax, "observation.step_s": 21460.0}
+    return changed(Scenario(), *(f"{k}={v}" for k, v in sizes.items()), *overrides)
+
+
+def changed(scenario: Scenario, *overrides: str) -> Scenario:
+    """A scenario with other entries, ``key.path=value`` as on the command line."""
+    tree = scenario.model_dump(mode="json")
+    for override in overrides:
+        apply_override(tree, override)
+    return Scenario.model_validate(tree)
+
+
+@dataclass(frozen=True)
+class Mixed(SkySource):
+    """A smooth and a spotty sky, half and half: bright, positive, not the Galaxy."""
+
+    seed: int = 1
+
+    def at(self, frequency_mhz: float, lmax: int) -> Sky:
+        one, other = (s(self.seed).at(frequency_mhz, lmax) for s in (SmoothSky, SpottySky))
+        return Sky((one.modes + other.modes) / 2.0, float(frequency_mhz), "mixed sky")
+
+
+def measured(
+    truth: Scenario,
+    sky: Sky,
+    seed: int = 1,
+    *,
+    beams: Callable[[Setup], ProductBeams] = lambda setup: setup.beams,
+    distort: Callable[[Setup, np.ndarray], np.ndarray] = lambda setup, v: v,
+    seen_by: Scenario | None = None,
+    truth_known: bool = True,
+) -> Visibilities:
+    """Data that ``truth`` describes, of a sky, with their noise; dated as ``seen_by`` says.
+
+    The noise is that of the data's own visibilities.
+    """
+    setup = set_up(truth)
+    coupling = CouplingMatrix.build(beams(setup), setup.pointing)
+    signal = np.asarray(setup.layout.scatter(coupling @ sky.modes))
+    signal = signal + np.asarray(setup.background)[:, None]
+    signal = np.asarray(distort(setup, signal))
+    noise = radiometer(replace(setup, signal=signal)).sample(jax.random.key(seed))
+    nominal = setup if seen_by is None else set_up(seen_by)
+    return Visibilities(
+        np.asarray(setup.layout.gather(signal) + noise),
+        setup.layout,
+        nominal.observation,
+        (truth if seen_by is None else seen_by).frequency_mhz,
+        sky.modes if truth_known else None,
+    )
+
+
+def mixed_by(data: Visibilities, matrix: np.ndarray) -> Visibilities:
+    """Each time's products, mixed: ``matrix @ products``."""
+    return replace(data, data=np.asarray(data.layout.gather(matrix @ np.asarray(data.grid()))))
+
+
+def port_matrix(ports: list[int]) -> np.ndarray:
+    """Products of data whose port number i is labelled number k where ``ports[k] = i``."""
+    matrix = np.zeros((16, 16))
+    for row, label in enumerate(LABELS):
+        i, j = ports[int(label[0])], ports[int(label[1])]
+        sign = -1.0 if label[2] == "I" and i > j else 1.0
+        matrix[row, LABELS.index(f"{min(i, j)}{max(i, j)}{label[2]}")] = sign
+    return matrix
+
+
+def diagonal(**factors: float) -> np.ndarray:
+    """Products times factors, by their labels; keys begin with p."""
+    return np.diag([factors.get(f"p{label}", 1.0) for label in LABELS])
+
+
+def exchanged(one: str, other: str) -> np.ndarray:
+    order = list(range(16))
+    i, j = LABELS.index(one), LABELS.index(other)
+    order[i], order[j] = j, i
+    return np.eye(16)[order]
+
+
+def mirrored(setup: Setup) -> ProductBeams:
+    """Beams with azimuth counted the other way: phi to -phi."""
+    _, m = mode_numbers(setup.beams.lmax)
+    return replace(setup.beams, modes=np.asarray(setup.beams.modes) * np.where(m < 0, -1.0, 1.0))
+
+
+def from_north(setup: Setup) -> ProductBeams:
+    """Beams whose phi was counted from North towards East: phi to 90 degrees - phi."""
+    beams = np.asarray(mirrored(setup).modes)
+    ell, m = mode_numbers(setup.beams.lmax)
+    other = ell**2 + ell - m
+    c, s = np.cos(m * np.pi / 2.0), np.sin(m * np.pi / 2.0)
+    # f(phi) to f(phi - 90 degrees), in real harmonics
+    return replace(setup.beams, modes=c * beams + s * -beams[:, other] * 1.0)
+
+
+@dataclass(frozen=True)
+class Wrong:
+    """Wrong data: what is wrong, a word of the proposal that names it, and how to make them."""
+
+    name: str
+    cause: tuple[str, ...]
+    make: Callable[[Scenario, Sky, int], Visibilities]
+
+
+def _mix(matrix: np.ndarray) -> Callable[[Scenario, Sky, int], Visibilities]:
+    return lambda scenario, sky, seed: mixed_by(measured(scenario, sky, seed), matrix)
+
+
+def _other(*overrides: str) -> Callable[[Scenario, Sky, int], Visibilities]:
+    """Taken as the scenario with overrides says, dated as without them."""
+    return lambda scenario, sky, seed: measured(
+        changed(scenario, *overrides), sky, seed, seen_by=scenario
+    )
+
+
+def _beams(beams: Callable[[Setup], ProductBeams]) -> Callable[[Scenario, Sky, int], Visibilities]:
+    return lambda scenario, sky, seed: measured(scenario, sky, seed, beams=beams)
+
+
+def shifted_by(mhz: float) -> Callable[[Setup], ProductBeams]:
+    """Beams of a neighbouring channel."""
+    return lambda setup: setup.beam_source.beams(
+        setup.scenario.frequency_mhz + mhz, setup.scenario.lmax
+    )
+
+
+def _finer(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
+    """Of a sky with structure to lmax + 8."""
+    finer = changed(scenario, f"lmax={scenario.lmax + 8}")
+    whole = Mixed(seed).at(scenario.frequency_mhz, finer.lmax)
+    data = measured(finer, whole, seed, seen_by=scenario)
+    return replace(data, truth=whole.modes[: len(sky.modes)])
+
+
+def _reversed(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
+    data = measured(scenario, sky, seed)
+    return replace(data, data=np.asarray(data.layout.gather(np.asarray(data.grid())[:, ::-1])))
+
+
+def _one_time(factor: float, time: int) -> Callable[[Scenario, Sky, int], Visibilities]:
+    def make(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
+        data = measured(scenario, sky, seed)
+        grid = np.array(data.grid())
+        grid[:, time] *= factor
+        return replace(data, data=np.asarray(data.layout.gather(grid)))
+
+    return make
+
+
+def _noisier(factor: float) -> Callable[[Scenario, Sky, int], Visibilities]:
+    return _other(f"noise.radiometer.factor={factor}")
+
+
+def _constant(kelvin: float) -> Callable[[Scenario, Sky, int], Visibilities]:
+    autos = np.array([label[0] == label[1] for label in LABELS])
+
+    def make(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
+        return measured(scenario, sky, seed, distort=lambda _, v: v + kelvin * autos[:, None])
+
+    return make
+
+
+AUTOS = {f"p{label}": 1.1 for label in LABELS if label[0] == label[1]}
+PORT_2 = {f"p{x}": 1.03 ** (x[:2].count("2")) for x in LABELS}
+CONJUGATED = {f"p{x}": -1.0 for x in LABELS if x[2] == "I"}
+FLIPPED_1 = {f"p{x}": -1.0 for x in LABELS if x[:2].count("1") == 1}
+
+WRONG = (
+    Wrong("imaginary parts conjugated", ("conjugate",), _mix(diagonal(**CONJUGATED))),
+    Wrong("polarity of port 1", ("port 1", "sign"), _mix(diagonal(**FLIPPED_1))),
+    *(
+        Wrong(
+            f"ports {i} and {j} exchanged",
+            (f"ports {i} and {j}",),
+            _mix(port_matrix([{i: j, j: i}.get(k, k) for k in range(4)])),
+        )
+        for i, j in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+    ),
+    *(
+        Wrong(
+            f"ports turned by {n}",
+            (f"by {n} port",),
+            _mix(port_matrix([(k + n) % 4 for k in range(4)])),
+        )
+        for n in (1, 2, 3)
+    ),
+    *(
+        Wrong(
+            f"turntable at {angle}",
+            (f"turntable at {angle}", f"{(angle // 90)} port"),
+            _other(f"observation.runs.0.turntable_deg={angle}"),
+        )
+        for angle in (90, 180, 270)
+    ),
+    Wrong("turntable at -40", ("turntable",), _other("observation.runs.0.turntable_deg=-40")),
+    Wrong("mirrored beams", ("mirror", "ports 1 and 3"), _beams(mirrored)),
+    Wrong("azimuth from North", ("North", "ports"), _beams(from_north)),
+    Wrong("01R and 02R exchanged", ("01R and 02R",), _mix(exchanged("01R", "02R"))),
+    Wrong("03I and 12I exchanged", ("03I and 12I",), _mix(exchanged("03I", "12I"))),
+    Wrong("00 and 22 exchanged", ("00R and 22R",), _mix(exchanged("00R", "22R"))),
+    Wrong("autos 10 % too high", ("autos",), _mix(diagonal(**AUTOS))),
+    Wrong("02I 2 % too high", ("02I",), _mix(diagonal(p02I=1.02))),
+    Wrong("33R 1 % too high", ("33R",), _mix(diagonal(p33R=1.01))),
+    Wrong("13R has the other sign", ("13R",), _mix(diagonal(p13R=-1.0))),
+    Wrong("port 2 3 % too high", ("port 2",), _mix(diagonal(**PORT_2))),
+    Wrong("constant in the autos", ("constant",), _constant(200.0)),
+    Wrong("times reversed", ("reversed",), _reversed),
+    Wrong("one time 2 % too high", ("2027-01-",), _one_time(1.02, 37)),
+    Wrong("one time 50 % too low", ("2027-01-",), _one_time(0.5, 60)),
+    Wrong("latitude's sign", ("latitude",), _other("observation.lat_deg=23.814")),
+    Wrong("beams of 1 MHz more", ("frequency",), _beams(shifted_by(1.0))),
+    Wrong("beams of 1 MHz less", ("frequency",), _beams(shifted_by(-1.0))),
+    Wrong("noise 4 times as large", ("noise",), _noisier(4.0)),
+    Wrong("noise a quarter", ("noise",), _noisier(0.25)),
+    Wrong("lmax too small", ("lmax",), _finer),
+    Wrong("another height", ("height",), _other("beam.height_m=1.8")),
+)
