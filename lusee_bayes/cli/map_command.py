@@ -39,6 +39,7 @@ def map_command(
     compact: Flag = False,
     updatable: Flag = False,
     onto: Path | None = None,
+    diagnose: Flag = False,
     frequencies: Frequencies = None,
     joint: Flag = False,
     workers: Workers = None,
@@ -71,6 +72,9 @@ def map_command(
         Keep in posterior.nc what --onto needs (output.updatable).
     onto
         Folder of an updatable run: the data are added to those behind it.
+    diagnose
+        Try the usual mistakes (signs, exchanged ports, angles, clocks, ...) even if the data fit;
+        where they do not, they are tried anyway.
     frequencies
         Channels in MHz, as 10,25,30 or as first:last:step: a map of each, on its own. The same
         command continues an interrupted run.
@@ -105,6 +109,7 @@ def map_command(
     folder = output or default_folder(scenario)
     stages = Stages(console, verbose=verbose)
     given = {"data": data, "truth": truth, "onto": onto, "replace": force, "stages": stages}
+    given["diagnosed"] = diagnose
     if resolved.frequencies_mhz:
         demand = demand_of_channels(resolved)
         with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:

@@ -79,6 +79,11 @@ class Learned:
     noise_factor: float = field(default=1.0, kw_only=True)
     settled: bool = field(default=True, kw_only=True)
 
+    @property
+    def fits(self) -> bool:
+        """Whether the parameters were learned under the model's own N."""
+        return self.settled and self.noise_factor == 1.0
+
     def as_rows(self) -> list[dict[str, float | str]]:
         """Name, value and standard deviation of the parameters that have a name."""
         std = np.sqrt(np.diagonal(self.covariance))

@@ -36,11 +36,6 @@ DENSE_BYTES = 1.2e9
 # groups that stand out and are named in a sentence
 NAMED = 4
 HOURS_A_DAY = 24.0
-# where no group is to blame
-LOOK_AT = (
-    "Look at the noise level (noise.radiometer), at gains and beams, and at lmax: noise that was "
-    "given too large makes chi^2 too small."
-)
 
 
 @dataclass(frozen=True)
@@ -178,14 +173,17 @@ class Residuals:
                 "too wide where it is weaker: choose another prior (lusee-bayes compare-priors).",
             ]
             return Fit(level, " ".join(told))
-        return Fit(level, " ".join([f"Does not fit ({instrument}).", *self._blame()]))
+        small = self.split.instrument.too_small and not self.extremes()
+        why = "the noise is smaller than assumed" if small else "no sky explains these data"
+        told = f"Does not fit: {why} ({instrument}); do not trust the error bars."
+        return Fit(level, " ".join([told, *self._blame()]))
 
     def _blame(self) -> list[str]:
         """Which groups stand out, and what to leave out or to look at."""
         if not self.products:
             return [
                 "Products, days and turntable angles were not judged: the noise couples different "
-                "times, which would need the whole of A. " + LOOK_AT
+                "times, which would need the whole of A."
             ]
         parts, extremes, suspects = [], self.extremes(), self.suspects()
         if extremes:
@@ -206,7 +204,7 @@ class Residuals:
                     "data do not tell which."
                 )
         if not suspects:
-            parts.append(f"No single product, day or turntable angle is to blame. {LOOK_AT}")
+            parts.append("No single product, day or turntable angle is to blame.")
         return parts
 
 

@@ -17,7 +17,7 @@ from lusee_bayes.report.flight_section import SECTION, flight_section, is_flight
 from lusee_bayes.report.run_details import details
 from lusee_bayes.report.unknowns_section import map_unknowns
 from lusee_bayes.results.finished_runs import FinishedRun
-from lusee_bayes.results.saved import COVERAGE, POINTING, SOURCES
+from lusee_bayes.results.saved import COVERAGE, DIAGNOSIS, POINTING, SOURCES
 
 NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "diagnostics.nc", "mean.fits", "std.fits")
 FIGURES = ("maps", "draws", "fidelity", "spectra", "data_vector", "residuals", "beams")
@@ -215,6 +215,7 @@ def _data(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
         cells = [_group_row(found, int(row)) for row in rows]
         bad = [f"{name} {cell[0]}" in marked for cell in cells]
         parts += [html.paragraph(f"{title}{note}"), html.table(header, cells, bad)]
+    parts += _mistakes(folder, summary)
     parts += _pointing(folder)
     parts += map_unknowns(folder, summary)
     parts.append(
@@ -226,6 +227,34 @@ def _data(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
         )
     )
     return parts
+
+
+def _mistakes(folder: Path, summary: dict) -> list[str]:
+    """The usual mistakes that would explain the data, where they were tried."""
+    if summary.get("diagnosis") is None:
+        return []
+    found = entries(folder / "summary.json", summary, "diagnosis", DIAGNOSIS)
+    cells = [
+        (
+            row["mistake"],
+            row["remedy"],
+            f"{row['chi2']:.4g}",
+            f"{row['chi2_expected']:.0f}",
+            probability(row["p"]).removeprefix("= "),
+        )
+        for row in found
+    ]
+    header = ("mistake", "what to do", "chi² without it", "expected", "p")
+    text = (
+        "Signs, exchanged products and ports, angles, clocks, factors, constants, the noise level "
+        "and lmax were tried one by one. "
+    )
+    if cells:
+        text += "Those that would explain the data, the best first:"
+    else:
+        text += "The data fit with none of them, or need none."
+    parts = [html.subsection("Usual mistakes"), html.paragraph(text)]
+    return [*parts, *([html.table(header, cells)] if cells else [])]
 
 
 def _pointing(folder: Path) -> list[str]:

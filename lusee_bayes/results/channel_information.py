@@ -47,7 +47,7 @@ class ChannelInformation:
         chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
         split = Split.of(posterior, chi2, inference.model.n_data)
         unknowns = Unknowns.of(experiment, inference, information.reference)
-        observed = Observed.of(experiment, inference.rounds, split.instrument, unknowns)
+        observed = Observed.of(experiment, inference, split.instrument, unknowns)
         return cls(information, observed, sky)
 
     def to_dataset(self) -> xr.Dataset:

@@ -23,7 +23,7 @@ from lusee_bayes.core.lazy import healpy
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.linear.pixel_variance import prior_pixel_std
-from lusee_bayes.linear.residuals import residuals
+from lusee_bayes.linear.residuals import Residuals
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.diagnostics_file import group_variables
 from lusee_bayes.results.draws import pixel_draws
@@ -39,7 +39,7 @@ LARGEST_STEP = 127
 def diagnostics(
     experiment: Experiment,
     inference: Inference,
-    judged: Inference,
+    found: Residuals,
     channel: ChannelResult,
     covariance: Float[np.ndarray, "modes modes"],
 ) -> xr.Dataset:
@@ -50,8 +50,8 @@ def diagnostics(
     experiment : Experiment
     inference : Inference
         The model and its posterior, given all data.
-    judged : Inference
-        The model that predicts the data: given the earlier ones, where there are any.
+    found : Residuals
+        Of the data, in the model that predicts them.
     channel : ChannelResult
     covariance : (modes, modes) array
         Of the posterior, in K^2.
@@ -63,7 +63,6 @@ def diagnostics(
     """
     scenario, data = experiment.scenario, experiment.data
     posterior, nside, lmax = on_host(inference.posterior), channel.nside, experiment.scenario.lmax
-    found = residuals(judged.model, judged.posterior, data, channel.chi2_model)
     draws = pixel_draws(experiment, posterior, N_DRAWS, nside)
     prior = on_host(inference.model.prior)
     usual = 0.0 if prior.white_mean is None else prior.colour(prior.white_mean)

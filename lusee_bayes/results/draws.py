@@ -9,6 +9,7 @@ from jaxtyping import Float, PRNGKeyArray
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.parameter_draws import draws_with_parameters
 from lusee_bayes.linear.pixel_variance import pixel_std
@@ -35,7 +36,8 @@ def posterior_draws(
 ) -> Float[np.ndarray, "draws modes"]:
     """Draw the sky: positive ones under a log-normal prior, else Gaussian.
 
-    Where the prior was learned, its parameters are drawn, too (:mod:`.parameter_draws`).
+    Where the prior was learned, its parameters are drawn, too (:mod:`.parameter_draws`); not for
+    data that do not fit, which would not let them be uncertain.
 
     Parameters
     ----------
@@ -54,7 +56,7 @@ def posterior_draws(
     key = jax.random.fold_in(jax.random.key(experiment.scenario.seed), purpose)
     if experiment.positive is not None:
         return experiment.positive.drawn(key, n).skies
-    if experiment.learned is not None:
+    if experiment.learned is not None and experiment.learned.fits:
         family = experiment.setup.family
         return draws_with_parameters(family, experiment.learned, posterior, key, n)
     return np.asarray(on_host(posterior).sample(key, n))
@@ -106,7 +108,18 @@ def widths(
     return experiment.positive.std(), experiment.positive.pixel_std(of_pixels, nside)
 
 
-def doubts(experiment: Experiment) -> tuple[str, ...]:
-    """What is doubtful about an experiment's data, and about draws of its posterior."""
-    of_draws = () if experiment.positive is None else experiment.positive.doubts()
-    return (*experiment.doubts, *of_draws)
+def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
+    """What is doubtful about an experiment's data, its prior, its rounds and its draws."""
+    learned, found = experiment.learned, list(experiment.doubts)
+    if learned is not None and not learned.settled:
+        found.append(
+            "The prior is a fixed, wide one: its parameters do not settle, whatever the noise."
+        )
+    elif learned is not None and learned.noise_factor > 1.0:
+        found.append(
+            f"The prior was learned with N times {learned.noise_factor:.2g}, as the residual chi^2 "
+            "demands; the map has the scenario's N."
+        )
+    if inference.unsettled:
+        found.append(inference.unsettled)
+    return (*found, *(() if experiment.positive is None else experiment.positive.doubts()))

@@ -67,6 +67,9 @@ def channel_of_posterior(
         n_data=inference.model.n_data,
         n_missing=data.n_missing,
         rounds=inference.rounds,
-        doubts=(*doubts(experiment), *about_information(float(posterior.information_bits()))),
+        doubts=(
+            *doubts(experiment, inference),
+            *about_information(float(posterior.information_bits())),
+        ),
         coverage=found,
     )

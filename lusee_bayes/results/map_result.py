@@ -15,6 +15,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages, peak_memory_gb
 from lusee_bayes.core.representation import Described
 from lusee_bayes.core.version import versions
+from lusee_bayes.experiment.diagnosis import Diagnosis, diagnose
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.rounds import Inference
@@ -23,6 +24,7 @@ from lusee_bayes.experiment.terms import beam_rms_difference
 from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.linear.fit import LEVELS, RULE
 from lusee_bayes.linear.metrics import effective_resolution_deg
+from lusee_bayes.linear.residuals import residuals
 from lusee_bayes.linear.updating import composed, deviation_model
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.diagnostics import diagnostics
@@ -61,6 +63,8 @@ class MapResult(Described):
         Of all data behind the posterior.
     seconds : dict
         By stage.
+    diagnosis : Diagnosis or None
+        The usual mistakes that would explain the data, where they were tried.
     reduced : Reduced or None
         Of flight data: the spectra behind them.
     """
@@ -74,6 +78,7 @@ class MapResult(Described):
     pointing: PointingReport | None
     unknowns: UnknownsReport | None
     digests: tuple[str, ...]
+    diagnosis: Diagnosis | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     reduced: Reduced | None = None
 
@@ -114,6 +119,7 @@ class MapResult(Described):
             "level": self.diagnostics.attrs["level"],
             "verdict": self.verdict(),
             **{name: self.diagnostics.attrs[name] for name in JUDGED},
+            "diagnosis": None if self.diagnosis is None else self.diagnosis.rows(),
             "coverage": channel.coverage_rows(),
             "n_data": channel.n_data,
             "n_missing": channel.n_missing,
@@ -137,7 +143,7 @@ class MapResult(Described):
         return self.pointing.offsets.to_dict("records")
 
     def verdict(self) -> str:
-        """What the residuals say, in sentences."""
+        """Whether the data fit, and which usual mistakes would explain it if not."""
         return str(self.diagnostics.attrs["verdict"])
 
     def headline(self) -> str:
@@ -158,17 +164,21 @@ class MapResult(Described):
         return ", ".join(parts)
 
     def lines(self) -> list[str]:
-        """What a terminal shows: headline, fluxes, verdict with its rule."""
+        """What a terminal shows: the verdict first, then prior and unknowns, and the figures."""
         fluxes = [] if self.fluxes is None else flux_lines(self.fluxes)
         offsets = [] if self.pointing is None else self.pointing.lines()
         unknowns = [] if self.unknowns is None else self.unknowns.lines()
         told = [prior_sentence(self.experiment), *fluxes, *offsets, *unknowns]
         notes = () if self.reduced is None else self.reduced.notes()
-        return [self.headline(), *told, self.verdict(), RULE, *self.channel.doubts, *notes]
+        return [self.verdict(), *told, self.headline(), RULE, *self.channel.doubts, *notes]
 
 
 def map_result(
-    experiment: Experiment, *, onto: Path | None = None, stages: Stages | None = None
+    experiment: Experiment,
+    *,
+    onto: Path | None = None,
+    diagnosed: bool = False,
+    stages: Stages | None = None,
 ) -> MapResult:
     """Condition an experiment's model on its data, and work out the uncertainties.
 
@@ -177,6 +187,8 @@ def map_result(
     experiment : Experiment
     onto : Path, optional
         Folder of an updatable run, to whose data these are added.
+    diagnosed : bool
+        Try the usual mistakes even if the data fit.
     stages : Stages, optional
         Told what is being done.
 
@@ -216,13 +228,17 @@ def map_result(
     if unknowns is not None and earlier is not None:
         unknowns = replace(unknowns, onto=True)
     with stages("diagnostics"):
-        page = diagnostics(experiment, found, judged, channel, covariance)
-    pointing = None
+        left = residuals(judged.model, judged.posterior, data, channel.chi2_model)
+        page = diagnostics(experiment, found, left, channel, covariance)
+    pointing, diagnosis = None, None
+    if diagnosed or page.attrs["level"] == DOES_NOT_FIT:
+        with stages("usual mistakes"):
+            diagnosis = diagnose(experiment, alone, left)
+        page.attrs["verdict"] = " ".join([page.attrs["verdict"], *diagnosis.sentences()])
     if scenario.noise.pointing is not None or page.attrs["level"] == DOES_NOT_FIT:
         with stages("clock and pointing"):
             own = covariance if earlier is None else on_host(alone.posterior).covariance()
             pointing = pointing_report(experiment, alone, own)
-        page.attrs["verdict"] = f"{page.attrs['verdict']} {pointing.sentence()}".strip()
     return MapResult(
         experiment,
         found,
@@ -233,6 +249,7 @@ def map_result(
         pointing,
         unknowns,
         digests,
+        diagnosis,
         stages.seconds,
     )
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.linear.fit import ChiSquare
 from lusee_bayes.linear.metrics import highest_altitude
 from lusee_bayes.results.draws import doubts
@@ -47,7 +48,7 @@ class Observed:
     def of(
         cls,
         experiment: Experiment,
-        rounds: int,
+        inference: Inference,
         instrument: ChiSquare,
         unknowns: Unknowns | None = None,
     ) -> Observed:
@@ -59,8 +60,8 @@ class Observed:
             None if data.truth is None else np.asarray(data.truth),
             highest_altitude(data.observation, nside),
             data.n_missing,
-            rounds,
+            inference.rounds,
             instrument,
-            doubts(experiment),
+            doubts(experiment, inference),
             unknowns,
         )

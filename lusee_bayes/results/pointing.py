@@ -8,14 +8,12 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from lusee_bayes.core.lazy import special
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.rounds import Inference, offset_posterior
 from lusee_bayes.experiment.simulate import true_values
 from lusee_bayes.experiment.terms import offsets_about, second_order
-from lusee_bayes.instrument.pointing_offsets import kind_of, offset_names
-from lusee_bayes.linear.fit import FALSE_ALARM, probability
+from lusee_bayes.instrument.pointing_offsets import offset_names
 from lusee_bayes.linear.offset_tests import preferences
 from lusee_bayes.linear.residuals import HOURS_A_DAY
 
@@ -44,28 +42,6 @@ class PointingReport:
 
     offsets: pd.DataFrame | None
     preferred: pd.DataFrame
-
-    def sentence(self) -> str:
-        """Which offset would explain most, if any stands out; otherwise nothing."""
-        whole = self.preferred[self.preferred["first_day"] < 0].dropna()
-        if not len(whole):
-            return ""
-        best = whole.loc[whole["chi2_gain"].idxmax()]
-        p = float(special.chdtrc(1, best["chi2_gain"]))
-        if len(whole) * p >= FALSE_ALARM:
-            return ""
-        name = best["offset"]
-        remedy = f"give noise.pointing.{kind_of(name)}"
-        if self.offsets is not None and name in set(self.offsets["offset"]):
-            remedy = (
-                "noise.pointing has it; widen its prior, or set around=posterior or "
-                "treatment=sampled"
-            )
-        return (
-            f"Look at clock and pointing: {name} off by {best['value']:.3g} +- "
-            f"{best['std']:.2g} would lower chi^2 by {best['chi2_gain']:.0f} (p "
-            f"{probability(p)}); {remedy}."
-        )
 
     def lines(self) -> list[str]:
         """One line for every offset."""

@@ -148,6 +148,15 @@ JOINT_SUMMARY = Layout(
         "prior": Attribute("text", optional=True),
     },
 )
+DIAGNOSIS = Layout(
+    "a usual mistake",
+    attributes={
+        **dict.fromkeys(("mistake", "remedy"), TEXT),
+        **dict.fromkeys(("chi2", "chi2_expected"), NUMBER),
+        "p": Attribute(low=0.0, high=1.0),
+        "fits": Attribute("boolean"),
+    },
+)
 COVERAGE = Layout(
     "the coverage of a part of the sky",
     attributes={

@@ -78,6 +78,7 @@ def run_map(
     data: Data | None = None,
     truth: bool = False,
     onto: Path | None = None,
+    diagnosed: bool = False,
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
@@ -100,6 +101,8 @@ def run_map(
         The given data are of the scenario's own sky: compare the map with it.
     onto : Path, optional
         Folder of an updatable run, to whose data these are added.
+    diagnosed : bool
+        Try the usual mistakes in data and model even if the data fit.
     engine : Engine, optional
         What carries out the channels; by default this process.
     replace : bool
@@ -115,12 +118,13 @@ def run_map(
     stages = stages or Stages()
     require_marginal("a map", "use: lusee-bayes sample", scenario.samples)
     if not scenario.frequencies_mhz:
-        return _run_single(scenario, folder, data, truth, onto, replace, stages)
+        return _run_single(scenario, folder, data, truth, onto, diagnosed, replace, stages)
     output = scenario.output
     require_single_frequency("--covariance", output.covariance)
     require_single_frequency("--compact", output.compact)
     require_single_frequency("--updatable", output.updatable)
     require_single_frequency("--onto", onto is not None)
+    require_single_frequency("--diagnose", diagnosed)
     resume = "the same command continues from the finished channels"
     origin = origin_of(scenario, data, truth=truth or None)
     cost = posterior_cost(scenario)
@@ -140,6 +144,7 @@ def _run_single(
     data: Data | None,
     truth: bool,
     onto: Path | None,
+    diagnosed: bool,
     replace: bool,
     stages: Stages,
 ) -> MapRun:
@@ -154,7 +159,7 @@ def _run_single(
         experiment = build(scenario, measured, stages)
         if truth:
             experiment = with_truth(experiment)
-        result = map_result(experiment, onto=onto, stages=stages)
+        result = map_result(experiment, onto=onto, diagnosed=diagnosed, stages=stages)
         if reduced is not None:
             result = replace_fields(result, reduced=_as_used(reduced, experiment))
         provenance = Provenance.of_experiment(experiment, data)

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.core.rotations import turn_about_z
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.overrides import apply_override
 from lusee_bayes.experiment.scenario import Scenario
@@ -117,20 +118,16 @@ def mirrored(setup: Setup) -> ProductBeams:
 
 def from_north(setup: Setup) -> ProductBeams:
     """Beams whose phi was counted from North towards East: phi to 90 degrees - phi."""
-    beams = np.asarray(mirrored(setup).modes)
-    ell, m = mode_numbers(setup.beams.lmax)
-    other = ell**2 + ell - m
-    c, s = np.cos(m * np.pi / 2.0), np.sin(m * np.pi / 2.0)
-    # f(phi) to f(phi - 90 degrees), in real harmonics
-    return replace(setup.beams, modes=c * beams + s * -beams[:, other] * 1.0)
+    modes = turn_about_z(np.asarray(mirrored(setup).modes), np.pi / 2.0)
+    return replace(setup.beams, modes=np.asarray(modes))
 
 
 @dataclass(frozen=True)
 class Wrong:
-    """Wrong data: what is wrong, a word of the proposal that names it, and how to make them."""
+    """Wrong data: what is wrong, words of the proposal that names it, and how to make them."""
 
     name: str
-    cause: tuple[str, ...]
+    cause: str
     make: Callable[[Scenario, Sky, int], Visibilities]
 
 
@@ -162,6 +159,14 @@ def _finer(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
     whole = Mixed(seed).at(scenario.frequency_mhz, finer.lmax)
     data = measured(finer, whole, seed, seen_by=scenario)
     return replace(data, truth=whole.modes[: len(sky.modes)])
+
+
+def _opposite(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
+    """Taken at -20 degrees, dated as at 20."""
+    here, there = (
+        changed(scenario, f"observation.runs.0.turntable_deg={angle}") for angle in (-20, 20)
+    )
+    return measured(here, sky, seed, seen_by=there)
 
 
 def _reversed(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
@@ -198,12 +203,12 @@ CONJUGATED = {f"p{x}": -1.0 for x in LABELS if x[2] == "I"}
 FLIPPED_1 = {f"p{x}": -1.0 for x in LABELS if x[:2].count("1") == 1}
 
 WRONG = (
-    Wrong("imaginary parts conjugated", ("conjugate",), _mix(diagonal(**CONJUGATED))),
-    Wrong("polarity of port 1", ("port 1", "sign"), _mix(diagonal(**FLIPPED_1))),
+    Wrong("imaginary parts conjugated", "conjugated", _mix(diagonal(**CONJUGATED))),
+    Wrong("polarity of port 1", "port 1 have the other sign", _mix(diagonal(**FLIPPED_1))),
     *(
         Wrong(
             f"ports {i} and {j} exchanged",
-            (f"ports {i} and {j}",),
+            f"ports {i} and {j}",
             _mix(port_matrix([{i: j, j: i}.get(k, k) for k in range(4)])),
         )
         for i, j in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
@@ -211,7 +216,7 @@ WRONG = (
     *(
         Wrong(
             f"ports turned by {n}",
-            (f"by {n} port",),
+            f"ports are turned by {4 - n}",
             _mix(port_matrix([(k + n) % 4 for k in range(4)])),
         )
         for n in (1, 2, 3)
@@ -219,31 +224,50 @@ WRONG = (
     *(
         Wrong(
             f"turntable at {angle}",
-            (f"turntable at {angle}", f"{(angle // 90)} port"),
+            f"turned by {angle}",
             _other(f"observation.runs.0.turntable_deg={angle}"),
         )
         for angle in (90, 180, 270)
     ),
-    Wrong("turntable at -40", ("turntable",), _other("observation.runs.0.turntable_deg=-40")),
-    Wrong("mirrored beams", ("mirror", "ports 1 and 3"), _beams(mirrored)),
-    Wrong("azimuth from North", ("North", "ports"), _beams(from_north)),
-    Wrong("01R and 02R exchanged", ("01R and 02R",), _mix(exchanged("01R", "02R"))),
-    Wrong("03I and 12I exchanged", ("03I and 12I",), _mix(exchanged("03I", "12I"))),
-    Wrong("00 and 22 exchanged", ("00R and 22R",), _mix(exchanged("00R", "22R"))),
-    Wrong("autos 10 % too high", ("autos",), _mix(diagonal(**AUTOS))),
-    Wrong("02I 2 % too high", ("02I",), _mix(diagonal(p02I=1.02))),
-    Wrong("33R 1 % too high", ("33R",), _mix(diagonal(p33R=1.01))),
-    Wrong("13R has the other sign", ("13R",), _mix(diagonal(p13R=-1.0))),
-    Wrong("port 2 3 % too high", ("port 2",), _mix(diagonal(**PORT_2))),
-    Wrong("constant in the autos", ("constant",), _constant(200.0)),
-    Wrong("times reversed", ("reversed",), _reversed),
-    Wrong("one time 2 % too high", ("2027-01-",), _one_time(1.02, 37)),
-    Wrong("one time 50 % too low", ("2027-01-",), _one_time(0.5, 60)),
-    Wrong("latitude's sign", ("latitude",), _other("observation.lat_deg=23.814")),
-    Wrong("beams of 1 MHz more", ("frequency",), _beams(shifted_by(1.0))),
-    Wrong("beams of 1 MHz less", ("frequency",), _beams(shifted_by(-1.0))),
-    Wrong("noise 4 times as large", ("noise",), _noisier(4.0)),
-    Wrong("noise a quarter", ("noise",), _noisier(0.25)),
-    Wrong("lmax too small", ("lmax",), _finer),
-    Wrong("another height", ("height",), _other("beam.height_m=1.8")),
+    Wrong("sign of the turntable", "angles have the other sign", _opposite),
+    Wrong("mirrored beams", "mirrored", _beams(mirrored)),
+    Wrong("azimuth from North", "counted from North", _beams(from_north)),
+    Wrong("01R and 02R exchanged", "01R and 02R", _mix(exchanged("01R", "02R"))),
+    Wrong("03I and 12I exchanged", "03I and 12I", _mix(exchanged("03I", "12I"))),
+    Wrong("00 and 22 exchanged", "00R and 22R", _mix(exchanged("00R", "22R"))),
+    Wrong("autos 10 % too high", "every auto", _mix(diagonal(**AUTOS))),
+    Wrong("02I 2 % too high", "product 02I", _mix(diagonal(p02I=1.02))),
+    Wrong("33R 1 % too high", "product 33R", _mix(diagonal(p33R=1.01))),
+    Wrong("13R has the other sign", "product 13R", _mix(diagonal(p13R=-1.0))),
+    Wrong("port 2 3 % too high", "voltage of port 2", _mix(diagonal(**PORT_2))),
+    Wrong("constant in the autos", "constant", _constant(200.0)),
+    Wrong("times reversed", "reversed", _reversed),
+    Wrong("one time 2 % too high", "all products at 2027-01-", _one_time(1.02, 37)),
+    Wrong("one time 50 % too low", "all products at 2027-01-", _one_time(0.5, 60)),
+    Wrong("latitude's sign", "latitude", _other("observation.lat_deg=23.814")),
+    Wrong("beams of 1 MHz more", "neighbouring channel", _beams(shifted_by(1.0))),
+    Wrong("beams of 1 MHz less", "neighbouring channel", _beams(shifted_by(-1.0))),
+    Wrong("noise 4 times as large", "noise variance", _noisier(4.0)),
+    Wrong("noise a quarter", "noise variance", _noisier(0.25)),
+    Wrong("lmax too small", "beyond lmax", _finer),
+    Wrong("another height", "height", _other("beam.height_m=1.8")),
+)
+
+
+def _drifting(sigma: float) -> Callable[[Scenario, Sky, int], Visibilities]:
+    def distort(setup: Setup, visibilities: np.ndarray) -> np.ndarray:
+        gains = GainDrift(sigma, 10.0).sample(jax.random.key(5), setup.observation.hours)
+        return with_gains(visibilities, gains)
+
+    return lambda scenario, sky, seed: measured(scenario, sky, seed, distort=distort)
+
+
+# what is not in the table of usual mistakes
+UNMODELLED = (
+    Wrong("gain drifts of 1e-4", "", _drifting(1e-4)),
+    Wrong("gain drifts of 1e-2", "", _drifting(1e-2)),
+    Wrong("permittivity 5 % off", "", _other("beam.surface_permittivity=3.885")),
+    Wrong("arms 1 degree off", "", _other("beam.zenith_angle_deg=76")),
+    Wrong("three times the loss", "", _other("beam.loss_tangent=0.03")),
+    Wrong("beams of 0.2 MHz more", "", _beams(shifted_by(0.2))),
 )
