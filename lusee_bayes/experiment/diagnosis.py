@@ -24,7 +24,7 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import mean_over_m, n_modes
+from lusee_bayes.core.harmonics import lmax_of, mean_over_m, n_modes
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.mistakes import (
@@ -54,10 +54,10 @@ from lusee_bayes.linear.split import WIDER, with_sky
 from lusee_bayes.sky.priors import HarmonicPrior
 
 # changes of the model are compared up to this ell
-SCREENED_LMAX = 20
+SCREENED_LMAX = 12
 # computed as the scenario has it: so many of the data and of the model, the best first, that leave
 # less than this share of what is too much
-TRIED, PROMISING = 4, 0.5
+TRIED, PROMISING = 3, 0.5
 # where nothing makes the data fit, those are listed that leave less than this share
 EXPLAINED = 0.03
 # two mistakes are one for these antennas if their chi^2 differ by less, relative
@@ -67,7 +67,7 @@ TIMES = 32
 # lmax is tried with so many more
 MORE_ELLS = 8
 # offsets are solved for from so many degrees on either side, in steps that shrink
-OFFSETS, REACHES = ("turntable_deg", "tilt_east_deg", "tilt_north_deg"), (4.0, 1.0, 0.25)
+OFFSETS, REACHES = ("turntable_deg", "tilt_east_deg", "tilt_north_deg"), (4.0, 0.5)
 # of white noise, sums over neighbouring times are within so many standard deviations
 WHITE = 5.0
 
@@ -163,10 +163,11 @@ class _Data:
     model: LinearGaussian
     spectrum: Float[np.ndarray, " ells"]
 
-    def wide(self, coupling: Coupling, lmax: int) -> tuple[ChiSquare, Posterior]:
+    def wide(self, coupling: Coupling) -> tuple[ChiSquare, Posterior]:
         """Residual chi^2, and the posterior under the wide prior."""
-        more = max(0, lmax + 1 - len(self.spectrum))
-        spectrum = np.pad(self.spectrum, (0, more), mode="edge")[: lmax + 1]
+        n_ells = lmax_of(coupling.shape[1]) + 1
+        more = max(0, n_ells - len(self.spectrum))
+        spectrum = np.pad(self.spectrum, (0, more), mode="edge")[:n_ells]
         information, posterior = Information.of(
             coupling,
             HarmonicPrior(spectrum),
@@ -179,12 +180,19 @@ class _Data:
         degrees = n - with_sky(n - expected_chi2(posterior, n))
         return ChiSquare(chi2, float(degrees)), posterior
 
-    def under(self, beams: ProductBeams, observation: Observation, lmax: int) -> ChiSquare:
-        """Residual chi^2 with other beams or another observation, up to some ell."""
+    def under(self, beams: ProductBeams, observation: Observation, pointing: Pointing) -> ChiSquare:
+        """Residual chi^2 with other beams or another observation.
+
+        ``pointing`` is that of the data's own observation, up to the ell that counts.
+        """
+        lmax = len(pointing.pole_from_galactic.blocks) - 1
+        if (observation.times == self.setup.observation.times).all():
+            pointing = pointing.placed(observation)
+        else:
+            pointing = Pointing.of(observation, lmax)
         modes = np.asarray(beams.modes)[:, : n_modes(lmax)]
         beams = ProductBeams(modes, beams.frequency_mhz)
-        coupling = CouplingMatrix.build(beams, Pointing.of(observation, lmax), self.data.layout)
-        return self.wide(coupling, lmax)[0]
+        return self.wide(CouplingMatrix.build(beams, pointing, self.data.layout))[0]
 
     def without(self, mistake: DataMistake) -> ChiSquare:
         """Residual chi^2 of the data without a mistake, with N for them."""
@@ -195,11 +203,7 @@ class _Data:
             model = on_host(full_model(self.setup, Around(data)))
         except InputError:  # without it, some auto is not positive
             return ChiSquare(np.inf, float(layout.size))
-        return replace(self, data=data, model=model).wide(model.coupling, self.lmax)[0]
-
-    @property
-    def lmax(self) -> int:
-        return self.setup.scenario.lmax
+        return replace(self, data=data, model=model).wide(model.coupling)[0]
 
 
 def diagnose(experiment: Experiment, inference: Inference, found: Residuals) -> Diagnosis:
@@ -219,7 +223,7 @@ def diagnose(experiment: Experiment, inference: Inference, found: Residuals) -> 
     """
     setup, data = experiment.setup, experiment.data
     here = _Data(setup, data, on_host(inference.model), _any_sky(setup, data))
-    base, posterior = here.wide(here.model.coupling, here.lmax)
+    base, posterior = here.wide(here.model.coupling)
 
     def best(tried: Sequence[tuple[float, object]], whole: ChiSquare) -> list:
         """The most promising, by chi^2."""
@@ -229,20 +233,21 @@ def diagnose(experiment: Experiment, inference: Inference, found: Residuals) -> 
 
     of_data = list(_Mixed.of(here, posterior).tried())
     proposals = [Proposal(m.words, m.remedy, here.without(m)) for m in best(of_data, base)]
-    lmax = min(SCREENED_LMAX, here.lmax)
+    low = Pointing.of(setup.observation, min(SCREENED_LMAX, setup.scenario.lmax))
     known = list(model_mistakes(setup))
-    screened = [here.under(m.beams, m.observation, lmax).chi2 for m in known]
-    whole = here.under(setup.beams, setup.observation, lmax)
-    of_model = [*zip(screened, known, strict=True), *_offsets(here, lmax)]
+    screened = [here.under(m.beams, m.observation, low).chi2 for m in known]
+    whole = here.under(setup.beams, setup.observation, low)
+    of_model = [*zip(screened, known, strict=True), *_offsets(here, low)]
     proposals += [
-        Proposal(m.words, m.remedy, here.under(m.beams, m.observation, here.lmax))
+        Proposal(m.words, m.remedy, here.under(m.beams, m.observation, setup.pointing))
         for m in best(of_model, whole)
     ]
-    proposals += [*_finer(here), *_noise_level(found, data)]
-    proposals.sort(key=lambda one: one.excess)
-    fitting = [one for one in proposals if one.fits]
     excess = EXPLAINED * abs(base.chi2 - base.degrees)
-    listed = fitting or [one for one in proposals if one.excess < excess]
+    nearly = [one for one in proposals if one.excess < excess]
+    # these always absorb some of what is wrong, and count only if they absorb all of it
+    proposals += [*_finer(here), *_noise_level(found, data)]
+    listed = [one for one in proposals if one.fits] or nearly
+    listed.sort(key=lambda one: one.excess)
     return Diagnosis(base, tuple(_merged(listed)), len(of_data) + len(of_model) + 2)
 
 
@@ -279,16 +284,16 @@ def _filled(data: Visibilities) -> Float[np.ndarray, "products times"]:
 
 def _finer(here: _Data) -> Iterator[Proposal]:
     """A map of more ells."""
-    setup, lmax = here.setup, here.lmax + MORE_ELLS
+    setup, lmax = here.setup, here.setup.scenario.lmax + MORE_ELLS
     try:
         beams = setup.beam_source.beams(setup.scenario.frequency_mhz, lmax)
     except InputError:  # a file's beams end before
         return
-    chi2 = here.under(beams, setup.observation, lmax)
+    chi2 = here.under(beams, setup.observation, Pointing.of(setup.observation, lmax))
     yield Proposal("the sky has structure beyond lmax", f"use --set lmax={lmax}", chi2)
 
 
-def _offsets(here: _Data, lmax: int) -> Iterator[tuple[float, ModelMistake]]:
+def _offsets(here: _Data, low: Pointing) -> Iterator[tuple[float, ModelMistake]]:
     """Angles that are off by what fits best: by parabolas through three values, ever closer."""
     setup = here.setup
     for name in offset_names(OFFSETS, setup.observation.n_runs):
@@ -299,7 +304,7 @@ def _offsets(here: _Data, lmax: int) -> Iterator[tuple[float, ModelMistake]]:
         value, chi2 = 0.0, np.inf
         for reach in REACHES:
             values = value + reach * np.array([-1.0, 0.0, 1.0])
-            seen = [here.under(setup.beams, shifted(v), lmax).chi2 for v in values]
+            seen = [here.under(setup.beams, shifted(v), low).chi2 for v in values]
             curvature = seen[0] - 2.0 * seen[1] + seen[2]
             if curvature > 0.0:
                 value += reach * np.clip(0.5 * (seen[0] - seen[2]) / curvature, -3.0, 3.0)

@@ -22,6 +22,7 @@ from lusee_bayes.instrument.beams import ProductBeams
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.products import labels
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.noise import GainDrift, with_gains
 from lusee_bayes.sky import Sky, SkySource
 from lusee_bayes.testing.skies import SmoothSky, SpottySky
 
