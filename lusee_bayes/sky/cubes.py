@@ -23,9 +23,9 @@ LAYOUT = Layout(
     "sky maps of many frequencies: an image (frequency, pixel)",
     {"maps": Variable(("frequency", "pixel"), unit="K")},
     {
-        "FREQ_START": Attribute(low=0.0, high=1e6, unit="MHz"),
-        "FREQ_END": Attribute(low=0.0, high=1e6, unit="MHz"),
-        "FREQ_STEP": Attribute(low=1e-6, high=1e6, unit="MHz"),
+        "FREQ_START": Attribute(low=0.0, unit="MHz"),
+        "FREQ_END": Attribute(low=0.0, unit="MHz"),
+        "FREQ_STEP": Attribute(low=1e-6, unit="MHz"),
     },
 )
 

@@ -1,7 +1,9 @@
 """Mission clocks: which UTC they stand for, and what contradicts them."""
 
 import json
+import re
 from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -128,3 +130,11 @@ def test_a_clock_file_that_is_no_json_is_refused(tmp_path):
     path.write_text("{")
     assert_refused(lambda: read_clock(path))
     assert_refused(lambda: read_clock(tmp_path / "absent.json"))
+
+
+def test_the_clock_files_of_the_documentation_are_read(tmp_path):
+    page = Path(__file__).parents[2] / "docs" / "howto" / "first_light.md"
+    known, corrected = re.findall(r"```json\n(.*?)```", page.read_text(), flags=re.DOTALL)
+    for text in (known, corrected):
+        (tmp_path / "clock.json").write_text(text)
+        assert read_clock(tmp_path / "clock.json").rate == 1.000001

@@ -70,7 +70,7 @@ def test_cubes_that_cannot_be_used(tmp_path, maps):
     with pytest.raises(InputError, match="767 values are not a HEALPix map"):
         SkyCube.read(write_cube(tmp_path / "odd.fits", maps[:, :-1]))
     with pytest.raises(InputError, match="is this Hz"):
-        SkyCube.read(write_cube(tmp_path / "hz.fits", maps, start=1e5, step=1e4))
+        SkyCube.read(write_cube(tmp_path / "hz.fits", maps, start=1e6, step=1e6))
     for unit, factor in (("mK", 1e-3), ("K", 1.0)):
         path = write_cube(tmp_path / f"{unit}.fits", maps)
         fits.setval(path, "BUNIT", value=unit)
