@@ -19,6 +19,8 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "m": {"m": 1.0},
     "d": {"d": 1.0},
 }
+# what software writes that was not given a word or a unit, in lower case
+UNSTATED = ("", "unknown", "unspecified", "none")
 # LuSEE-Night ends at 50 MHz; what is larger was meant in Hz or kHz
 LARGEST_MHZ = 1000.0
 NOT_HZ = f"expected at most {LARGEST_MHZ:g} MHz; is this Hz? Divide by 1e6"
@@ -34,7 +36,7 @@ def factor_to(where: str, unit: str, stated: Any) -> float:
     unit : str
         The package's, of :data:`UNITS`; empty for a quantity without one.
     stated : object
-        The file's; None or blank if it states none: then it is the package's.
+        The file's; None or one of :data:`UNSTATED` if it states none: then it is the package's.
 
     Raises
     ------
@@ -43,12 +45,12 @@ def factor_to(where: str, unit: str, stated: Any) -> float:
     """
     stated = stated.decode(errors="replace") if isinstance(stated, bytes) else stated
     text = "" if stated is None else str(stated).strip()
-    if not unit or not text:
+    if not unit or text.lower() in UNSTATED:
         return 1.0
     if text not in UNITS[unit]:
         raise InputError(
-            f"{where} has the unit '{text}', expected {unit} (or {', '.join(UNITS[unit])}); "
-            "convert it, and correct the unit"
+            f"{where} has the unit '{text}', expected one of {', '.join(UNITS[unit])}; convert it, "
+            "and correct the unit"
         )
     return UNITS[unit][text]
 

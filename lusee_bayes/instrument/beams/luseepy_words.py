@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.units import UNSTATED
 
-UNSTATED = ("", "unknown", "unspecified", "none")
 # what this package assumes of the images, in lower case
 CONVENTIONS: Mapping[str, str] = {
     "TIMECONV": "e+jwt",
