@@ -7,6 +7,7 @@ used. Whatever is wrong becomes one sentence with the name of the file.
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -299,9 +300,10 @@ def _checked_value(where: str, value: Any, declared: Attribute) -> Any:
         text = _text(where, value)
         _require_choice(where, text, declared.choices)
         return text
-    number = np.asarray(value)
+    # lists of lists of different lengths are no array
+    number = np.asarray(None if isinstance(value, list) else value)
     if number.ndim or number.dtype.kind not in KINDS[declared.kind][0]:
-        raise InputError(f"{where} is {value!r}, expected {_one(declared.kind)}")
+        raise InputError(f"{where} is {reprlib.repr(value)}, expected {_one(declared.kind)}")
     if declared.kind == "boolean":
         return bool(number)
     finite = np.isfinite(number) and abs(number) <= LARGEST
