@@ -63,8 +63,8 @@ Clock = Annotated[
     str | None,
     Parameter(
         name="--clock",
-        help="Clock reference in JSON, for sessions that do not say which UTC their clock stands "
-        "for (flight.clock).",
+        help="Clock reference in JSON, for sessions with no absolute time, or to correct the UTC "
+        "that they state (flight.clock).",
     ),
 ]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]

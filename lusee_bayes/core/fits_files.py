@@ -60,7 +60,7 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
     """Read images, columns of tables and words of the primary header.
 
     Variables are images by their names, or columns as ``table.column``; upper and lower case are
-    the same. Attributes are words of the primary header.
+    the same. Attributes are words of the primary header. Units are BUNIT and TUNITn.
 
     Parameters
     ----------
@@ -79,17 +79,23 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
         If the file is missing or damaged, or not as declared.
     """
     with opened(path, layout.what, hint) as hdus:
-        there: dict[str, Any] = {}
-        for hdu in hdus:
-            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
-                for number, name in enumerate(hdu.columns.names):
-                    there[f"{hdu.name}.{name}".lower()] = hdu.data.field(number)
-            elif hdu.header.get("NAXIS", 0):
-                there[hdu.name.lower()] = _Image(hdu)
-        declared = {name.lower(): name for name in layout.variables}
-        arrays = {declared.get(name, name): array for name, array in there.items()}
+        arrays: dict[str, Any] = {}
         words = hdus[0].header
         said = {key: words[key] for key in words if key and not key.startswith(STRUCTURE)}
+        declared = {name.lower(): name for name in layout.variables}
+
+        def put(name: str, array: Any, unit: str | None) -> None:
+            name = declared.get(name.lower(), name.lower())
+            arrays[name] = array
+            if unit is not None:
+                said[f"{name}.units"] = unit
+
+        for hdu in hdus:
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
+                for number, column in enumerate(hdu.columns):
+                    put(f"{hdu.name}.{column.name}", hdu.data.field(number), column.unit)
+            elif hdu.header.get("NAXIS", 0):
+                put(hdu.name, _Image(hdu), hdu.header.get("BUNIT"))
         return layout.checked(path, arrays, said)
 
 

@@ -7,6 +7,7 @@ used. Whatever is wrong becomes one sentence with the name of the file.
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.memory import gigabytes, memory_limit
+from lusee_bayes.core.units import factor_to, require_mhz
 
 Kind = Literal["real", "complex", "integer", "boolean", "text", "word", "time"]
 # numpy's kinds of dtypes that each takes, and what it becomes
@@ -72,6 +74,9 @@ class Variable:
         All texts that may be there; any, if there are none.
     optional : bool
         Whether it may be absent.
+    unit : str
+        The package's unit, of :data:`.UNITS`. Numbers are converted from the unit that the file
+        states, if it states one.
     """
 
     dims: Sequence[str | int]
@@ -83,6 +88,7 @@ class Variable:
     grows: bool = False
     choices: Sequence[str] = ()
     optional: bool = False
+    unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -99,6 +105,8 @@ class Attribute:
         All texts that it may be; any, if there are none.
     optional : bool
         Whether it may be absent.
+    unit : str
+        "MHz" of a frequency.
     """
 
     kind: Kind = "real"
@@ -106,6 +114,7 @@ class Attribute:
     high: float = np.inf
     choices: Sequence[str] = ()
     optional: bool = False
+    unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -158,7 +167,7 @@ class Layout:
         arrays : mapping of str to array
             What is there; numpy.asarray reads it.
         values : mapping of str to object
-            Likewise, read.
+            Likewise, read; ``NAME.units`` is what the file states as the unit of an array.
 
         Returns
         -------
@@ -187,8 +196,14 @@ class Layout:
                 f"{path} says that it holds {gigabytes(n_bytes)} of numbers; this machine has "
                 f"{gigabytes(memory_limit())} of memory"
             )
+        factors = {
+            name: factor_to(f"{path}: {name}", declared.unit, values.get(f"{name}.units"))
+            for name, declared in here.items()
+        }
         read = {
-            name: _checked_array(f"{path}: {name}", np.asarray(arrays[name]), declared)
+            name: _checked_array(
+                f"{path}: {name}", np.asarray(arrays[name]), declared, factors[name]
+            )
             for name, declared in here.items()
         }
         return Content(read, found, sizes, frozenset(map(str, arrays)))
@@ -229,7 +244,7 @@ def _require_dims(
     sizes.update({d: n for d, n in zip(declared.dims, shape, strict=True) if isinstance(d, str)})
 
 
-def _checked_array(where: str, values: np.ndarray, declared: Variable) -> np.ndarray:
+def _checked_array(where: str, values: np.ndarray, declared: Variable, factor: float) -> np.ndarray:
     if declared.kind == "text":
         texts = np.array([_text(where, x) for x in values.ravel()]).reshape(values.shape)
         for text in texts.ravel():
@@ -245,6 +260,7 @@ def _checked_array(where: str, values: np.ndarray, declared: Variable) -> np.nda
     values = np.ascontiguousarray(values, dtype=KINDS[declared.kind][1])
     if declared.kind == "boolean":
         return values
+    values = values if factor == 1.0 else values * factor
     parts = (values.real, values.imag) if declared.kind == "complex" else (values,)
     large = np.logical_or.reduce([np.isfinite(p) & (np.abs(p) > LARGEST) for p in parts])
     _require_none(where, values, large, f"a number beyond {LARGEST:g}")
@@ -256,6 +272,8 @@ def _checked_array(where: str, values: np.ndarray, declared: Variable) -> np.nda
         return values
     outside = (values < declared.low) | (values > declared.high)
     _require_none(where, values, outside, f"a value outside {declared.low:g} to {declared.high:g}")
+    if declared.unit == "MHz":
+        require_mhz(where, values)
     if declared.grows and not (np.diff(values) > 0).all():
         place = int(np.flatnonzero(~(np.diff(values) > 0))[0])
         raise InputError(
@@ -282,9 +300,10 @@ def _checked_value(where: str, value: Any, declared: Attribute) -> Any:
         text = _text(where, value)
         _require_choice(where, text, declared.choices)
         return text
-    number = np.asarray(value)
+    # lists of lists of different lengths are no array
+    number = np.asarray(None if isinstance(value, list) else value)
     if number.ndim or number.dtype.kind not in KINDS[declared.kind][0]:
-        raise InputError(f"{where} is {value!r}, expected {_one(declared.kind)}")
+        raise InputError(f"{where} is {reprlib.repr(value)}, expected {_one(declared.kind)}")
     if declared.kind == "boolean":
         return bool(number)
     finite = np.isfinite(number) and abs(number) <= LARGEST
@@ -294,6 +313,8 @@ def _checked_value(where: str, value: Any, declared: Attribute) -> Any:
         raise InputError(
             f"{where} is {value!r}, expected {_one(declared.kind)}{limits if limited else ''}"
         )
+    if declared.unit == "MHz":
+        require_mhz(where, number)
     return int(number) if declared.kind == "integer" else float(number)
 
 

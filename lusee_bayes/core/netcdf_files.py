@@ -21,6 +21,7 @@ def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") 
     """Read one of the package's own files.
 
     Dimensions are told by their names: an array whose dimensions are in another order is turned.
+    Attributes of a variable are those of the file by the name ``variable.attribute``.
 
     Parameters
     ----------
@@ -104,4 +105,5 @@ def _checked(path: str | Path, dataset: xr.Dataset, layout: Layout) -> Content:
             array = array.transpose(*dims)
         variable = array.variable
         arrays[name] = _decoded(dataset, name, variable) if declared.kind == "time" else variable
-    return layout.checked(path, arrays, dataset.attrs)
+    said = {f"{name}.{key}": v for name, one in arrays.items() for key, v in one.attrs.items()}
+    return layout.checked(path, arrays, said | dataset.attrs)

@@ -27,6 +27,8 @@ from lusee_bayes.instrument.times import unannounced_leap_seconds
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.windows import ROUNDING_S, Windows
 
+# the sky turns once in 27 days: a longer mean is a slip, of units for instance
+LONGEST_S = 30.0 * 86400.0
 # a product that is present for less of a bin's live time is left out of the bin
 LEAST_SHARE = 0.5
 
@@ -53,7 +55,8 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
     Raises
     ------
     InputError
-        For instants, for bins that are shorter than the samples, and if nothing is left.
+        For instants, for bins that are shorter than the samples or longer than 30 days, and if
+        nothing is left.
     """
     require_positive("the time to average over, in seconds,", to_s)
     observation = data.observation
@@ -109,7 +112,17 @@ def bins_of(
         Start and end of every sample, in seconds from its time.
     to_s : float
         Length of the bins, in seconds.
+
+    Raises
+    ------
+    InputError
+        For bins of more than 30 days.
     """
+    if to_s > LONGEST_S:
+        raise InputError(
+            f"the data are to be averaged over {to_s:g} s, {to_s / 86400.0:g} days; give at most "
+            f"{LONGEST_S / 86400.0:g} days, in which the Moon turns once"
+        )
     seconds = _seconds(observation)
     start, end = seconds + bounds_s[:, 0], seconds + bounds_s[:, 1]
     origin = start[np.searchsorted(observation.run, observation.run)]

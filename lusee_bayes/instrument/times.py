@@ -15,9 +15,14 @@ import numpy as np
 from astropy.time import Time
 from jaxtyping import Float, Shaped
 
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.layouts import Attribute, Content
 
 EPHEMERIS_YEARS = (1900, 2050)
+# scales of time that files may state
+SCALES = ("utc", "tai", "tt", "tdb")
+# what a file of Julian dates in two parts, jd1 and jd2, may state of them
+JD_SCALES = {name: Attribute("text", optional=True) for name in ("jd1.scale", "jd2.scale")}
 EPOCH, CENTURIES = np.datetime64("2000-01-01"), np.timedelta64(100_000, "D")
 
 
@@ -89,6 +94,30 @@ def utc_of(
     require_ephemeris(jd1 + jd2)
     with unannounced_leap_seconds():
         return Time(jd1, jd2, format="jd", scale=scale).utc
+
+
+def scale_of(name: str, stated: str) -> str:
+    """Return a scale of time that a file states as ``name``. InputError if it is not known."""
+    scale = stated.strip().lower()
+    if scale not in SCALES:
+        raise InputError(f"{name} is '{stated}'; {nearest(scale, SCALES)}")
+    return scale
+
+
+def utc_of_jd(found: Content) -> Time:
+    """Return times of a file's ``jd1`` and ``jd2``, in UTC.
+
+    They are in the scale that the file states (:data:`JD_SCALES`), or in UTC.
+
+    Raises
+    ------
+    InputError
+        If the scale is not known or differs between the two, and as :func:`utc_of`.
+    """
+    scales = {scale_of(n, found.values[n]) for n in JD_SCALES if n in found.values} or {"utc"}
+    if len(scales) > 1:
+        raise InputError(f"jd1 and jd2 have different scales, {' and '.join(sorted(scales))}")
+    return utc_of(found.arrays["jd1"], found.arrays["jd2"], scales.pop())
 
 
 def utc_of_datetimes(times: Shaped[np.ndarray, "*shape"]) -> Time:

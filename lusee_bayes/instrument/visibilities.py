@@ -18,6 +18,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.harmonics import lmax_of
 from lusee_bayes.core.representation import Described, extent, listed
+from lusee_bayes.core.units import require_mhz
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument import window_variables
 from lusee_bayes.instrument.beams.receiver import MeasuredReceiver
@@ -154,6 +155,7 @@ class Visibilities(Described):
                 f"there are {len(utc)} times for data of {values.shape[1]} times (their first axis)"
             )
         require_positive("frequency_mhz", frequency_mhz)
+        require_mhz("frequency_mhz", frequency_mhz)
         lon_deg, lat_deg = site_of(site)
         run, angles = runs_of(turntable_deg, len(utc))
         live_s = None if live_s is None else numbers_of_times("live_s", live_s, len(utc))

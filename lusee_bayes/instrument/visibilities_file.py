@@ -16,7 +16,7 @@ from lusee_bayes.instrument.beams.receiver import MeasuredReceiver
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import labels
-from lusee_bayes.instrument.times import utc_of
+from lusee_bayes.instrument.times import JD_SCALES, utc_of_jd
 from lusee_bayes.instrument.visibilities import HINT, LOADS, Visibilities
 from lusee_bayes.instrument.window_variables import ATTRIBUTES, VARIABLES, read_windows
 
@@ -25,24 +25,27 @@ LAYOUT = Layout(
     "visibilities",
     {
         "product": Variable(("product",), "text"),
-        "visibility": Variable(("product", "time"), finite=False),
+        "visibility": Variable(("product", "time"), finite=False, unit="K"),
         "flag": Variable(("product", "time"), "boolean"),
         "jd1": Variable(("time",)),
         "jd2": Variable(("time",)),
         "run": Variable(("time",), "integer", low=0.0),
         "turntable_deg": Variable(("run_number",)),
         **VARIABLES,
-        "truth": Variable(("mode",), optional=True),
+        "truth": Variable(("mode",), optional=True, unit="K"),
         # the receivers' loads ZL, where they are known
-        "load_frequency_mhz": Variable(("load_frequency",), low=0.0, grows=True, optional=True),
+        "load_frequency_mhz": Variable(
+            ("load_frequency",), low=0.0, grows=True, optional=True, unit="MHz"
+        ),
         **{name: Variable(("load_frequency", "port", "port_2"), optional=True) for name in LOADS},
     },
     {
-        "frequency_mhz": Attribute(low=0.0),
+        "frequency_mhz": Attribute(low=0.0, unit="MHz"),
         "lon_deg": Attribute(low=-360.0, high=360.0),
         "lat_deg": Attribute(low=-90.0, high=90.0),
         "step_s": Attribute(low=0.0),
         **ATTRIBUTES,
+        **JD_SCALES,
     },
 )
 
@@ -82,7 +85,7 @@ def read_visibilities(path: str | Path) -> Visibilities:
         )
     with naming(path):
         layout = DataLayout.from_flags(flags)
-        utc = utc_of(here["jd1"], here["jd2"])
+        utc = utc_of_jd(found)
         times, windows, says_window = read_windows(found, utc)
         observation = Observation(
             found.values["lon_deg"],

@@ -72,14 +72,19 @@ def run_reduce(
     Raises
     ------
     InputError
-        As :func:`.reduce_files`, if the file would replace a session, and if it is there already,
-        unless ``replace``.
+        As :func:`.reduce_files`, if the file would replace a session, if it is there already,
+        unless ``replace``, and if the sessions have no number in any band.
     """
     stages, path = stages or Stages(), Path(path)
     if path.resolve() in [Path(file).resolve() for file in files]:
         raise InputError(f"'{path}' is one of the sessions; give -o another name")
     require_new(path, replace=replace)
     reduced = reduce_files(files, scenario, stages)
+    if np.isnan(reduced.before).all():
+        raise InputError(
+            f"nothing to reduce: all {len(reduced.bin_of)} spectra of {', '.join(map(str, files))} "
+            "are NaN in every band; check the sessions, and the frequencies of the scenario"
+        )
     with stages("file"):
         write_reduced(path, reduced, scenario.to_yaml())
     return ReduceRun(reduced, path)

@@ -29,14 +29,14 @@ TABLE = Layout(
     "coefficients, as healpy.write_alm writes them",
     {
         "index": Variable(("coefficient",), "integer", low=1.0),
-        "real": Variable(("coefficient",)),
-        "imag": Variable(("coefficient",)),
+        "real": Variable(("coefficient",), unit="K"),
+        "imag": Variable(("coefficient",), unit="K"),
     },
 )
 NPZ = Layout(
     "coefficients: freq (MHz) and alm (frequency, coefficient)",
     {
-        "freq": Variable(("freq",), low=0.0),
+        "freq": Variable(("freq",), low=0.0, unit="MHz"),
         "alm": Variable(("freq", "coefficient"), "complex"),
     },
 )
@@ -173,7 +173,8 @@ def _read_fits(path: Path) -> np.ndarray:
     with opened(path, "coefficients") as hdus:
         table = next(hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU))
         columns = {name: table.data.field(name) for name in COLUMNS}
-        found = TABLE.checked(path, columns, {}).arrays
+        units = {f"{one.name.lower()}.units": one.unit for one in table.columns}
+        found = TABLE.checked(path, columns, units).arrays
     index, real, imag = (found[name] for name in COLUMNS)
     # what does not fit into memory, or is written twice, fills no lmax either
     if index.max() > LARGEST_LMAX**2 or len(set(index.tolist())) < len(index):

@@ -21,11 +21,11 @@ from lusee_bayes.sky.files import SkyFile, modes_of_map
 STEPS = ("FREQ_START", "FREQ_END", "FREQ_STEP")
 LAYOUT = Layout(
     "sky maps of many frequencies: an image (frequency, pixel)",
-    {"maps": Variable(("frequency", "pixel"))},
+    {"maps": Variable(("frequency", "pixel"), unit="K")},
     {
-        "FREQ_START": Attribute(low=0.0, high=1e6),
-        "FREQ_END": Attribute(low=0.0, high=1e6),
-        "FREQ_STEP": Attribute(low=1e-6, high=1e6),
+        "FREQ_START": Attribute(low=0.0, unit="MHz"),
+        "FREQ_END": Attribute(low=0.0, unit="MHz"),
+        "FREQ_STEP": Attribute(low=1e-6, unit="MHz"),
     },
 )
 
@@ -67,7 +67,8 @@ class SkyCube(SkyFile):
         """
         with opened(path, "sky maps of many frequencies") as hdus:
             there = {} if hdus[0].data is None else {"maps": hdus[0].data}
-            found = LAYOUT.checked(path, there, dict(hdus[0].header))
+            header = dict(hdus[0].header)
+            found = LAYOUT.checked(path, there, header | {"maps.units": header.get("BUNIT")})
         start, end, step = (found.values[key] for key in STEPS)
         pixels = found.arrays["maps"]
         count = round((end - start) / step) + 1

@@ -94,7 +94,7 @@ def _nside(n_pixels: int) -> int:
 
 
 def _layout(name: str) -> Layout:
-    return Layout("a HEALPix sky map", {name: Variable(("pixel",))})
+    return Layout("a HEALPix sky map", {name: Variable(("pixel",), unit="K")})
 
 
 def _read_hdf5(path: Path, dataset: str) -> np.ndarray:
@@ -106,7 +106,8 @@ def _read_hdf5(path: Path, dataset: str) -> np.ndarray:
                 f"{path} has no dataset '{dataset}' (it has {', '.join(sorted(names))}); "
                 f"{nearest(dataset, names)} Set sky.dataset"
             )
-        return _layout(dataset).checked(path, {dataset: file[dataset]}, {}).arrays[dataset]
+        units = {f"{dataset}.units": file[dataset].attrs.get("units")}
+        return _layout(dataset).checked(path, {dataset: file[dataset]}, units).arrays[dataset]
 
 
 def _read_fits(path: Path) -> np.ndarray:

@@ -32,7 +32,7 @@ from lusee_bayes.sky.source import GalaxySource, read_sky_file
 POSTERIOR = Layout(
     "a posterior of lusee-bayes map",
     {"mean": Variable(("mode",))},
-    {"frequency_mhz": Attribute(low=0.0)},
+    {"frequency_mhz": Attribute(low=0.0, unit="MHz")},
 )
 # of the grid: what it does not resolve of a template folds back into its coefficients
 LEAST_BAND = 128

@@ -56,7 +56,9 @@ def test_what_is_not_as_declared_is_said(changes, message):
         LAYOUT.checked("x", arrays(**changes), {"step": 2.0})
 
 
-@pytest.mark.parametrize("step", ["two", np.nan, 0.0, [1.0, 2.0], None, True])
+@pytest.mark.parametrize(
+    "step", ["two", np.nan, 0.0, [1.0, 2.0], [[1], [1, 2]], None, True, 10**400]
+)
 def test_attributes_are_checked(step):
     with pytest.raises(InputError, match="step"):
         LAYOUT.checked("x", arrays(), {} if step is None else {"step": step})

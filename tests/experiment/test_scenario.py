@@ -66,6 +66,8 @@ def test_scientific_notation_without_a_sign_is_a_number(tmp_path):
         ("noise.radiometer.bandwidth_hz=-1", "bandwidth_hz is -1, but .*greater than 0"),
         ("noise.radiometer.duty_cycle=1.5", "duty_cycle is 1.5, but .*less than or equal to 1"),
         ("frequency_mhz=60", "frequency_mhz is 60, but .*less than or equal to 50"),
+        ("frequency_mhz=2.5e7", "frequency_mhz is 25000000.0, but .*is this Hz"),
+        ("spectral.reference_mhz=2e7", "reference_mhz is 20000000.0, but .*is this Hz"),
         ("lmax=many", "lmax is 'many', but .*integer"),
         ("seed", "--set takes key.path=value, got 'seed'"),
         ("observation.runs.3.cycles=1", "'3' is not one of the entries 0..0"),

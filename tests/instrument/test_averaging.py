@@ -238,6 +238,7 @@ def test_a_run_of_which_nothing_remains_is_gone():
     [
         ("instant", 3600.0, "the samples are instants, which have no mean over a time"),
         ("mean", 300.0, "over 300 s, which is shorter than their samples of 600 s"),
+        ("mean", 1e9 * 86400.0, "give at most 30 days"),
         ("mean", 0.0, "the time to average over, in seconds, must be positive"),
         ("mean", np.nan, "the time to average over, in seconds, must be positive"),
     ],

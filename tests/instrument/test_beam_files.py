@@ -317,6 +317,8 @@ def break_gain(images):
         ({"change": break_numbers}, "EPhi_real"),
         ({"change": break_gain}, r"gain_conv has shape \(4,\), expected 5 \(freq\)"),
         ({"header": {"THETA_MAX": 180.0}}, "theta 0 to 180"),
+        ({"header": {"TIMECONV": "e-iwt"}}, "TIMECONV"),
+        ({"change": lambda images: images["freq"].__imul__(1e6)}, "is this Hz"),
     ],
 )
 def test_files_that_cannot_be_used(tmp_path, options, message):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.interpolate import CubicSpline
 
 from lusee_bayes.core.errors import InputError
@@ -97,6 +98,26 @@ def test_luseepys_folder_and_own_file_hold_the_same(tmp_path, model):
         for name in ("anchor_mhz", "mean", "component", "coefficient"):
             np.testing.assert_array_equal(getattr(found, name), getattr(made, name))
     np.testing.assert_array_equal(read_gain_table(own).component_std, made.component_std)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [({"mean": 0.0}, "gain"), ({"mean": -1.0}, "gain"), ({"anchor_mhz": 1e6}, "is this Hz")],
+)
+def test_gains_are_positive_and_their_frequencies_in_mhz(tmp_path, changes, words):
+    """In luseepy's folder as in a file of the package."""
+    made = table()
+    folder, own = write_folder(tmp_path / "gain", made), write_gain_table(tmp_path / "g.nc", made)
+    ((name, factor),) = changes.items()
+    path = folder / f"M2_{'mean' if name == 'mean' else 'freqs'}.npy"
+    np.save(path, factor * np.load(path))
+    with xr.open_dataset(own, engine="h5netcdf") as file:
+        found = file.load()
+    found[name][1, 2] *= factor
+    found.to_netcdf(own, engine="h5netcdf")
+    for one in (folder, own):
+        with pytest.raises(InputError, match=words):
+            read_gain_table(one)
 
 
 def test_telemetry_has_to_be_there():

@@ -145,6 +145,7 @@ WRONG = [
     ("spectra/raw_times", lambda x: x[::-1]),
     ("spectra/raw_times", lambda x: np.append(x[:-1], np.nan)),
     ("spectra/raw_times", lambda x: x[:-1]),
+    ("spectra/mjd_times", lambda x: x + 1.0),
     ("spectra/metadata/Navgf", lambda x: x + 6),
     ("spectra/metadata/actual_gain", lambda x: x[:, :3]),
     ("spectra/metadata/actual_gain", lambda x: x.astype(float)),

@@ -123,6 +123,18 @@ def test_there_is_no_room_for_windows(luseepy, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("image", "word", "value"),
+    [(0, "BUNIT", "K"), (0, "TIMEUNIT", "s"), (0, "TIMESYS", "local"), ("ZL_real", "BUNIT", "S")],
+)
+def test_words_that_contradict_the_layout_are_refused(luseepy, tmp_path, image, word, value):
+    with fits.open(luseepy[1]) as hdus:
+        hdus[image].header[word] = value
+        hdus.writeto(tmp_path / "w.fits")
+    with pytest.raises(InputError, match=f"{word}|unit"):
+        read_waterfall(tmp_path / "w.fits")
+
+
 @pytest.mark.essential
 def test_simulated_and_mapped_between_the_responses_frequencies(luseepy, tmp_path):
     """14.5 MHz / 3, a Moon of many digits, other receivers, which nothing but the data say."""

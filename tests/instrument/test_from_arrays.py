@@ -157,6 +157,7 @@ def test_angles_are_runs_and_sites_are_places(tmp_path):
         ({"site": (0.0, 95.0)}, "lat_deg"),
         ({"turntable_deg": [0.0, 1.0]}, "one for each of 5 times"),
         ({"frequency_mhz": -1.0}, "frequency_mhz must be positive"),
+        ({"frequency_mhz": 25e6}, "is this Hz"),
         ({"data": columns(PAIRS)[:1], "times": TIMES[:1]}, "give step_s"),
     ],
 )

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from astropy.io import fits
-from fits_files import write_images
+from fits_files import write_images, write_response
 from reference import hemisphere, real_harmonics
 from scipy.constants import Boltzmann, c, physical_constants
 
@@ -450,3 +450,46 @@ def test_the_map_from_luseepys_four_ports(luseepy, tmp_path, test_data):
     summary = json.loads((out / "summary.json").read_text())
     # noiseless but for luseepy's single precision
     assert summary["chi2"] < 0.01 * summary["chi2_expected"]
+
+
+# --- what headers state -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        {"TIMECONV": "e-jwt"},
+        {"COORDSYS": "celestial"},
+        {"THETADEF": "elevation"},
+        {"PHIDEF": "azimuth-from-north"},
+        {"OMEGADEF": "propagation-direction"},
+        {"POLBASIS": "ludwig-3"},
+        {"PORTS": "0132"},
+        {"CANONICAL": "E[V/m],peak"},
+        {"INPUT_KIND": "loaded"},
+        {"FIELD_KIND": "rE"},
+        {"FIELD_UNIT": "V/m"},
+        {"FIELD_UNIT": "m", "NORM_KIND": "current"},
+        {"NORM_KIND": "guessed"},
+        {"BUNIT": "V"},
+    ],
+    ids=str,
+)
+def test_headers_that_contradict_the_reader_are_refused(tmp_path, words):
+    path = write_response(tmp_path / "response.fits")
+    for key, value in words.items():
+        fits.setval(path, f"HIERARCH {key}", value=value)
+    with pytest.raises(InputError, match="|".join([*words, "unit"])) as refused:
+        read_beam(path)
+    assert "expected" in str(refused.value) or "known" in str(refused.value)
+
+
+def test_headers_that_state_what_the_reader_assumes_are_read(luseepy, tmp_path):
+    """luseepy's own words, those of a converted simulation, and those that it was not given."""
+    assert luseepy[0].n_phi == 180
+    path = write_response(tmp_path / "response.fits")
+    converted = {"NORM_KIND": "vsource", "INPUT_KIND": "embedded", "FIELD_UNIT": "V"}
+    for words in (converted, dict.fromkeys(converted, "UNKNOWN")):
+        for key, value in words.items():
+            fits.setval(path, f"HIERARCH {key}", value=value)
+        read_beam(path)

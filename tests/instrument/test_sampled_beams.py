@@ -282,7 +282,7 @@ def test_what_cannot_be_computed_is_refused():
         sampled_beams([20.0, 10.0], products=np.zeros((2, 16, 48)))
 
 
-@pytest.mark.parametrize("change", ["no e_phi", "cut", "no absolute", "text"])
+@pytest.mark.parametrize("change", ["no e_phi", "cut", "no absolute", "text", "Hz"])
 @pytest.mark.parametrize("suffix", ["nc", "fits"])
 def test_damaged_files_are_refused(tmp_path, change, suffix):
     path = tmp_path / f"mine.{suffix}"
@@ -295,6 +295,8 @@ def test_damaged_files_are_refused(tmp_path, change, suffix):
                 del hdus["E_PHI_IMAG"]
             elif change == "no absolute":
                 del hdus[0].header["ABSOLUTE"]
+            elif change == "Hz":
+                hdus["FREQUENCY_MHZ"].data *= 1e6
             else:
                 hdus[0].header["ABSOLUTE"] = "yes"
             hdus.writeto(path, overwrite=True)
@@ -305,6 +307,8 @@ def test_damaged_files_are_refused(tmp_path, change, suffix):
             found = found.drop_vars("e_phi_imag")
         elif change == "no absolute":
             del found.attrs["absolute"]
+        elif change == "Hz":
+            found["frequency_mhz"] = 1e6 * found["frequency_mhz"]
         else:
             found.attrs["absolute"] = "yes"
         found.to_netcdf(path, engine="h5netcdf")

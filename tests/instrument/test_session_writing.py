@@ -91,6 +91,23 @@ def test_a_session_comes_back_from_its_file(tmp_path, kind, layout):
         np.testing.assert_array_equal(read(3, 5), counts[3:5])
 
 
+FIELDS = "spectra/metadata/fields"
+CONTRADICTIONS = [
+    ("spectra/raw_time_valid", False),
+    (f"{FIELDS}/adc_min/variant_000/row_indices", 10**6),
+    (f"{FIELDS}/navgf/variant_000/data", 1),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), CONTRADICTIONS)
+def test_layout_4_that_contradicts_itself_is_refused(tmp_path, name, value):
+    path = write_session(tmp_path / "s", some_rows(), [some_counts()], layout=4)
+    with h5py.File(path, "a") as file:
+        file[name][...] = value
+    with pytest.raises(InputError, match="raw_time_valid|row_indices|navgf"):
+        read_session(path)
+
+
 @pytest.mark.parametrize("kind", ["hdf5", "fits"])
 def test_bins_that_are_not_there_are_nan_and_a_clock_may_be_unknown(tmp_path, kind):
     path = write_session(tmp_path / "s", some_rows(clock=None), [some_counts(512)], kind=kind)

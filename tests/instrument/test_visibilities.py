@@ -82,6 +82,11 @@ def nan(dataset):
             "has products 00R, 10R",
         ),
         (lambda d: d.attrs.update(step_s=-1.0), "step_s is -1.0, expected a number from 0"),
+        (lambda d: d.attrs.update(frequency_mhz=25e6), "is this Hz"),
+        (lambda d: d["visibility"].attrs.update(units="V^2/Hz"), "unit"),
+        (lambda d: d["visibility"].attrs.update(units="Jy"), "unit"),
+        (lambda d: d["jd1"].attrs.update(scale="lunar"), "scale"),
+        (lambda d: d["jd2"].attrs.update(scale="tt"), "different scales"),
     ],
 )
 def test_bad_files_are_refused(data, tmp_path, change, message):
@@ -89,6 +94,24 @@ def test_bad_files_are_refused(data, tmp_path, change, message):
     altered(change)(data, path)
     with pytest.raises(InputError, match=message):
         read_visibilities(path)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mK", 1e-3), ("kK", 1e3), ("", 1.0)])
+def test_temperatures_in_other_units_are_converted(data, tmp_path, unit, factor):
+    path = tmp_path / "other.nc"
+    altered(lambda d: d["visibility"].attrs.update(units=unit))(data, path)
+    np.testing.assert_allclose(read_visibilities(path).data, factor * data.data, rtol=1e-15)
+
+
+# TAI - UTC is 37 s since 2017, TT - TAI 32.184 s, TDB - TT less than 2 ms
+@pytest.mark.parametrize(
+    ("scale", "s"), [("UTC", 0.0), ("tai", 37.0), ("TT", 69.184), ("tdb", 69.184)]
+)
+def test_times_in_other_scales_are_brought_to_utc(data, tmp_path, scale, s):
+    path = tmp_path / "other.nc"
+    altered(lambda d: [d[k].attrs.update(scale=scale) for k in ("jd1", "jd2")] and d)(data, path)
+    moved = (data.observation.times - read_visibilities(path).observation.times).sec
+    np.testing.assert_allclose(moved, s, rtol=0, atol=2e-3)
 
 
 def test_other_files_are_refused(tmp_path):

@@ -116,10 +116,17 @@ def test_any_subset_and_order_of_products(tmp_path):
 
 def test_gaps_are_missing_samples_and_counted(tmp_path):
     data = 100.0 + np.zeros((12, 16, 2))
-    data[3, :, 0], data[5, 7, 0], data[6, 7, 0] = np.nan, np.inf, -np.inf
+    data[3, :, 0], data[5:7, 7, 0] = np.nan, np.nan
     waterfall = read_waterfall(write(tmp_path / "w.fits", data))
     assert (waterfall.at(10.0).n_missing, waterfall.at(20.0).n_missing) == (18, 0)
-    assert "16 samples missing" in describe(tmp_path / "w.fits")
+    assert "18 samples missing" in describe(tmp_path / "w.fits")
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mK", 1e-3), ("K", 1.0), ("kK", 1e3)])
+def test_temperatures_in_other_units_are_converted(tmp_path, unit, factor):
+    given = [read_waterfall(write(tmp_path / "k.fits"))]
+    given.append(read_waterfall(write(tmp_path / "u.fits", header=HEADER | {"BUNIT": unit})))
+    np.testing.assert_allclose(given[1].grid, factor * given[0].grid, rtol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -135,6 +142,9 @@ def test_gaps_are_missing_samples_and_counted(tmp_path):
         ({"pairs": [[0, 0], [0, 4]]}, "combinations holds a value outside 0 to 3: 4"),
         ({"pairs": [[0, 1], [1, 0]]}, "the same pair of ports twice"),
         ({"data": np.zeros((12, 15, 2))}, r"data has 15 products, expected 16"),
+        ({"data": np.full((12, 16, 2), np.inf)}, "infinity"),
+        ({"frequencies": (10e6, 20e6)}, "is this Hz"),
+        ({"header": HEADER | {"BUNIT": "V^2/Hz"}}, "unit 'V.2/Hz'"),
         (
             {"header": HEADER | {"DELTAT_SEC": -7200.0}},
             "DELTAT_SEC is -7200.0, expected",
@@ -399,7 +409,7 @@ twice = np.array([[2461000.0, 0.5], [2461000.0, 0.5], [2461000.0, 0.6]])
         ),
         ({"header": {"BUNIT": "K"}}, r"BUNIT is 'K'; known: V\^2/Hz"),
         ({"header": {"TMOON_K": None}}, "has no TMOON_K"),
-        ({"header": {"TIMESYS": "LOCAL"}}, "TIMESYS is LOCAL"),
+        ({"header": {"TIMESYS": "LOCAL"}}, "TIMESYS is 'LOCAL'"),
         ({"images": {"time": np.arange(5.0)}}, r"time has shape \(5,\), expected time x 2"),
         ({"images": {"time": backwards, "data": np.ones((3, 2, 2))}}, "times must grow"),
         ({"images": {"time": twice, "data": np.ones((3, 2, 2))}}, "times must grow"),

@@ -91,6 +91,9 @@ def test_the_command_writes_averages_and_says_what_they_cost(path, tmp_path, cap
     assert found.digest() == averaged(read_visibilities(path), 7200.0).digest()
     assert main(["average", str(path), "--to", "4h", "-o", str(out), *given]) == 2
     assert "is there already; give -o another name, or --force" in capsys.readouterr().err
+    long = tmp_path / "long.nc"
+    assert main(["average", str(path), "--to", "1e9d", "-o", str(long), *given]) == 2
+    assert "days" in capsys.readouterr().err and not long.exists()
     again = tmp_path / "again.nc"
     command = ["average", str(path), "--to", "120min", "-o", str(again), "--no-information"]
     assert main(command) == 0

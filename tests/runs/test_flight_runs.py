@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -87,6 +89,7 @@ def test_files_of_an_earlier_simulation_do_not_stay(tmp_path):
     [
         (["flight={}"], "these beams know no volts"),
         (["flight.simulated={navgf: 5}"], "navgf"),
+        (["flight.simulated={burst_every_h: 1e-9}"], "burst_every_h"),
         (["observation.step_s=1e-6", "observation.runs=[{cycles: 1e-11}]"], "a frame of"),
         (["flight.gain_table=nowhere.nc"], "nowhere.nc"),
     ],
@@ -152,6 +155,15 @@ def test_what_can_be_mapped_is_said_of_a_file_that_cannot(simulated, tmp_path, c
     assert f"{name} holds nothing that can be mapped" in error
     for kind in ("visibilities", "waterfall", "sessions", "reduce"):
         assert kind in error
+
+
+def test_sessions_without_a_number_are_refused(simulated, tmp_path, capsys):
+    empty, out = tmp_path / "empty.h5", tmp_path / "out.nc"
+    shutil.copy(simulated / "session_000.h5", empty)
+    with h5py.File(empty, "a") as file:
+        file["spectra/data"][...] = np.nan
+    assert main(["reduce", "-q", str(simulated / "scenario.yaml"), str(empty), "-o", str(out)]) == 2
+    assert "NaN" in capsys.readouterr().err and not out.exists()
 
 
 def test_the_site_of_sessions_may_be_the_scenarios(simulated, tmp_path, capsys):

@@ -69,6 +69,15 @@ def test_cubes_that_cannot_be_used(tmp_path, maps):
         SkyCube.read(write_cube(tmp_path / "long.fits", maps, end=60))
     with pytest.raises(InputError, match="767 values are not a HEALPix map"):
         SkyCube.read(write_cube(tmp_path / "odd.fits", maps[:, :-1]))
+    with pytest.raises(InputError, match="is this Hz"):
+        SkyCube.read(write_cube(tmp_path / "hz.fits", maps, start=1e6, step=1e6))
+    for unit, factor in (("mK", 1e-3), ("K", 1.0)):
+        path = write_cube(tmp_path / f"{unit}.fits", maps)
+        fits.setval(path, "BUNIT", value=unit)
+        np.testing.assert_allclose(SkyCube.read(path).pixels, factor * maps, rtol=1e-15)
+    fits.setval(path, "BUNIT", value="MJy/sr")
+    with pytest.raises(InputError, match="unit 'MJy/sr'"):
+        SkyCube.read(path)
     holes = maps.copy()
     holes[3, 5] = np.nan
     with pytest.raises(InputError, match="NaN or infinity"):

@@ -31,7 +31,8 @@ class FlightSection(Section):
     bin_origin : {"centre", "edge"}
         What of channel k lies at k times 25 kHz. It is not settled, and has to be said.
     clock : str
-        Clock reference in JSON, for files that do not say which UTC their clock stands for.
+        Clock reference in JSON, for files with no absolute time, or to correct the UTC that they
+        state.
     site : {"file", "scenario"}
         Whose site counts: luseepy writes one that nobody has established if it is told none.
     bandwidth_hz : float

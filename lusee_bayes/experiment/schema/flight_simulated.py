@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from lusee_bayes.experiment.schema.section import Frequency, Positive, Section
+from lusee_bayes.experiment.schema.section import LARGEST, Frequency, Positive, Section
 
 Share = Annotated[float, Field(ge=0, le=0.5)]
 Levels = Annotated[str, Field(pattern="^[LMH]{4}$")]
@@ -73,7 +73,8 @@ class FlightSimulatedSection(Section):
     tone_factor: Positive = 30.0
     comb_share: Share = 0.0
     comb_factor: Positive = 3.0
-    burst_every_h: Positive | None = None
+    # a month with a burst every 4 s takes 10 s to draw
+    burst_every_h: Annotated[float, Field(ge=1e-3, le=LARGEST)] | None = None
     burst_s: Positive = 600.0
     burst_factor: Positive = 30.0
 

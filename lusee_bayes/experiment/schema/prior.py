@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.schema.log_normal import LogNormalPriorSection
-from lusee_bayes.experiment.schema.section import Positive, Section, without_other_kinds
+from lusee_bayes.experiment.schema.section import Megahertz, Positive, Section, without_other_kinds
 from lusee_bayes.experiment.schema.template import LEARNED, TemplateSection
 from lusee_bayes.sky import BRIGHT_SOURCES, Sky
 from lusee_bayes.sky.isotropic_family import IsotropicFamily
@@ -65,7 +65,7 @@ class IsotropicPriorSection(Section):
     scale: Positive = 1.0
     spectrum_file: str | None = None
     mean_file: str | None = None
-    file_frequency_mhz: Positive | None = None
+    file_frequency_mhz: Megahertz | None = None
     spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
     log_amplitude_std: Positive | None = None
     tilt_std: Positive | None = None

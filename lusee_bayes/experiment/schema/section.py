@@ -6,7 +6,9 @@ import os
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from lusee_bayes.core.units import LARGEST_MHZ, NOT_HZ
 
 S = TypeVar("S", bound="Section")
 
@@ -14,6 +16,12 @@ S = TypeVar("S", bound="Section")
 def _not_tiny(value: float) -> float:
     if value < SMALLEST:
         raise ValueError(f"input should be at least {SMALLEST:g}")
+    return value
+
+
+def _not_hz(value: Any) -> Any:
+    if isinstance(value, int | float) and value > LARGEST_MHZ:
+        raise ValueError(NOT_HZ)
     return value
 
 
@@ -25,7 +33,9 @@ Angle = Annotated[float, Field(ge=-3600, le=3600)]
 # of random numbers; channels have one each, so that some room is left below 64 bits
 Seed = Annotated[int, Field(ge=0, lt=2**62)]
 # of LuSEE-Night's band, in MHz
-Frequency = Annotated[float, Field(ge=1, le=50)]
+Frequency = Annotated[float, Field(ge=1, le=50), BeforeValidator(_not_hz)]
+# of a file, or of a spectrum
+Megahertz = Annotated[Positive, BeforeValidator(_not_hz)]
 # what is done about something that is not known
 Treatment = Literal["marginalised", "sampled", "ignored"]
 

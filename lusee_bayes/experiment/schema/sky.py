@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
-from lusee_bayes.experiment.schema.section import Positive, Section, Seed, without_other_kinds
+from lusee_bayes.experiment.schema.section import Megahertz, Section, Seed, without_other_kinds
 from lusee_bayes.sky import BRIGHT_SOURCES, FileSource, GalaxySource, SkySource
 
 
@@ -56,7 +56,7 @@ class FileSkySection(Section):
     model: Literal["file"] = "file"
     file: str
     dataset: str | None = None
-    file_frequency_mhz: Positive | None = None
+    file_frequency_mhz: Megahertz | None = None
     spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
 
     @property

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from lusee_bayes.experiment.schema.section import Positive, Section
+from lusee_bayes.experiment.schema.section import Megahertz, Positive, Section
 from lusee_bayes.sky.positive_skies import check_fields
 from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components
 
@@ -60,8 +60,8 @@ class SpectralSection(Section):
     ] = ("level", "index", "curvature", "absorption")
     sources: bool = True
     index: Annotated[float, Field(ge=-20, le=20)] = -2.5
-    reference_mhz: Positive = 20.0
-    turnover_mhz: Positive = 5.0
+    reference_mhz: Megahertz = 20.0
+    turnover_mhz: Megahertz = 5.0
     length: Positive = 1.0
     residual: Annotated[float, Field(ge=0, le=1)] | None = None
     solver: Literal["auto", "direct", "conjugate_gradients"] = "auto"

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from lusee_bayes.core.reading import require_file
-from lusee_bayes.experiment.schema.section import Positive, Section
+from lusee_bayes.experiment.schema.section import Megahertz, Positive, Section
 from lusee_bayes.sky.template import EmbeddedTemplate, Template, read_template
 
 # the template that no file is needed for
@@ -21,7 +21,7 @@ class TemplateSection(Section):
 
     model: str
     template: str = EMBEDDED
-    file_frequency_mhz: Positive | None = None
+    file_frequency_mhz: Megahertz | None = None
     spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
     smoothing_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
     amplitude: Positive | None = None

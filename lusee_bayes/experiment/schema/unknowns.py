@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from lusee_bayes.experiment.schema.section import Positive, Section, Seed, Treatment
+from lusee_bayes.experiment.schema.section import Megahertz, Positive, Section, Seed, Treatment
 
 
 class ReceiverNoiseSection(Section):
@@ -38,7 +38,7 @@ class ReceiverNoiseSection(Section):
     power_v2_hz: Positive | None = None
     power_k: Positive | None = None
     slope: Annotated[float, Field(ge=-10, le=10)] = 0.0
-    reference_mhz: Positive = 10.0
+    reference_mhz: Megahertz = 10.0
     relative_std: Positive = 0.1
     smooth_octaves: Positive | None = None
     smooth_seed: Seed | None = None

@@ -19,8 +19,8 @@ LOADS = ("ZL_real", "ZL_imag")
 LAYOUT = Layout(
     "loads ZL of four receivers, as luseepy's four-port waterfalls hold them",
     {
-        "freq": Variable(("freq",), low=0.0, grows=True),
-        **{name: Variable(("freq", N_ANTENNAS, N_ANTENNAS)) for name in LOADS},
+        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+        **{name: Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm") for name in LOADS},
     },
 )
 

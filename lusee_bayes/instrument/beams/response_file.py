@@ -26,7 +26,7 @@ from scipy.constants import Boltzmann, physical_constants
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.fits_files import read_fits
-from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.instrument.beams.circuit import Circuit
 from lusee_bayes.instrument.beams.fields import SPEED_OF_LIGHT, AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
@@ -37,6 +37,7 @@ from lusee_bayes.instrument.beams.gridded import (
     on_grid,
 )
 from lusee_bayes.instrument.beams.luseepy_rules import BandLimitedGrid
+from lusee_bayes.instrument.beams.luseepy_words import CONVENTIONS, SOURCES, require_conventions
 from lusee_bayes.instrument.beams.product_beams import ProductBeams, product_modes
 from lusee_bayes.instrument.beams.receiver import JFETReceiver, Receiver
 from lusee_bayes.instrument.products import N_ANTENNAS, to_matrix, to_real
@@ -49,15 +50,20 @@ PARTS = ("real", "imag")
 LAYOUT = Layout(
     "a four-port response of luseepy, FITS version 3",
     {
-        "freq": Variable(("freq",), low=0.0, grows=True),
-        **{name: Variable((name,), grows=True) for name in AXES[1:]},
-        **{f"{name}_{part}": Variable((N_ANTENNAS, *AXES)) for name in LENGTHS for part in PARTS},
+        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+        **{name: Variable((name,), grows=True, unit="deg") for name in AXES[1:]},
         **{
-            f"{name}_{part}": Variable(("freq", N_ANTENNAS, N_ANTENNAS))
+            f"{name}_{part}": Variable((N_ANTENNAS, *AXES), unit="m")
+            for name in LENGTHS
+            for part in PARTS
+        },
+        **{
+            f"{name}_{part}": Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm")
             for name in MATRICES
             for part in PARTS
         },
     },
+    dict.fromkeys((*CONVENTIONS, *SOURCES), Attribute("word", optional=True)),
 )
 # files hold the matrices in single precision; three of them are added up
 RESISTANCE_TOLERANCE = 1e-6
@@ -259,9 +265,11 @@ def read_response(path: str | Path) -> PortResponse:
     InputError
         For a missing or truncated file, a missing image, shapes that do not fit, directions other
         than the hemisphere above the horizon, frequencies that do not grow, numbers that are not
-        finite, or resistances that do not add up.
+        finite, resistances that do not add up, or a header that states other conventions.
     """
-    images = read_fits(path, LAYOUT, "check beam.file").arrays
+    found = read_fits(path, LAYOUT, "check beam.file")
+    require_conventions(path, found.values)
+    images = found.arrays
     frequencies, theta_deg, phi_deg = (images[name] for name in AXES)
     for name, degrees, last in (("theta", theta_deg, 90.0), ("phi", phi_deg, 360.0)):
         if not np.allclose(degrees, np.linspace(0.0, last, len(degrees)), rtol=0, atol=1e-9):

@@ -15,6 +15,7 @@ from jaxtyping import Complex, Float
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.representation import Described, listed
+from lusee_bayes.core.units import require_mhz
 from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
 from lusee_bayes.instrument.beams.gridded import at_frequency
@@ -212,6 +213,7 @@ def sampled_beams(
     known = np.atleast_1d(np.asarray(frequencies_mhz, dtype=np.float64))
     if known.ndim != 1 or not (known > 0.0).all() or not (np.diff(known) > 0.0).all():
         raise InputError(f"{path}: frequencies_mhz must be positive and grow, got {known}")
+    require_mhz(f"{path}: frequencies_mhz", known)
     fields = [one for one in (e_theta, e_phi) if one is not None]
     if len(fields) not in (0, 2) or bool(fields) == (products is not None):
         raise InputError(f"{path}: give e_theta and e_phi, or products")

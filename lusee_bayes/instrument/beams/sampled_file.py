@@ -48,8 +48,8 @@ def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
     # below the horizon there may be anything
     values = Variable(("frequency", first, *directions), missing=True)
     angles = {
-        "theta_deg": Variable(("theta",), low=0.0, high=180.0, grows=True),
-        "phi_deg": Variable(("phi",), low=0.0, high=360.0, grows=True),
+        "theta_deg": Variable(("theta",), low=0.0, high=180.0, grows=True, unit="deg"),
+        "phi_deg": Variable(("phi",), low=0.0, high=360.0, grows=True, unit="deg"),
     }
     attributes = {
         "absolute": Attribute("boolean"),
@@ -58,7 +58,7 @@ def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
     return Layout(
         WHAT,
         {
-            "frequency_mhz": Variable(("frequency",), low=0.0, grows=True),
+            "frequency_mhz": Variable(("frequency",), low=0.0, grows=True, unit="MHz"),
             **dict.fromkeys(FIELDS if fields else (POWER,), values),
             **(angles if grid else {}),
         },

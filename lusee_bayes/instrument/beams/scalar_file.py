@@ -31,23 +31,25 @@ from lusee_bayes.instrument.beams.gridded import (
     on_grid,
 )
 from lusee_bayes.instrument.beams.luseepy_rules import rectangle_rule
+from lusee_bayes.instrument.beams.luseepy_words import CONVENTIONS, require_conventions
 from lusee_bayes.instrument.beams.product_beams import ProductBeams, product_modes
 from lusee_bayes.instrument.products import to_real
 
 FIELDS = ("Etheta_real", "Etheta_imag", "EPhi_real", "EPhi_imag")
 IMPEDANCE = ("Z_real", "Z_imag")
-FIELD, NUMBERS = Variable(("freq", "theta", "phi")), Variable(("freq",), optional=True)
+FIELD, OHM = Variable(("freq", "theta", "phi")), Variable(("freq",), optional=True, unit="Ohm")
 LAYOUT = Layout(
     "a scalar beam file of luseepy, FITS version 2",
     {
         **dict.fromkeys(FIELDS, FIELD),
-        "freq": Variable(("freq",), low=0.0, grows=True),
+        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
         "gain_conv": Variable(("freq",)),
-        **dict.fromkeys(IMPEDANCE, NUMBERS),
+        **dict.fromkeys(IMPEDANCE, OHM),
     },
     {
         **{key: Attribute("integer", low=2.0) for key in ("THETA_N", "PHI_N")},
         **{key: Attribute() for key in ("THETA_MIN", "THETA_MAX", "PHI_MIN", "PHI_MAX")},
+        **dict.fromkeys(CONVENTIONS, Attribute("word", optional=True)),
     },
 )
 # luseepy turns the pattern by 90 degrees from port to port: North, West, South, East for an arm
@@ -247,11 +249,12 @@ def read_scalar_beam(path: str | Path) -> ScalarBeam:
     ------
     InputError
         For a missing or truncated file, a missing image, shapes that do not fit, directions other
-        than the hemisphere above the horizon, frequencies that do not grow, or numbers that are
-        not finite.
+        than the hemisphere above the horizon, frequencies that do not grow, numbers that are
+        not finite, or a header that states other conventions.
     """
     found = read_fits(path, LAYOUT, "check beam.file")
     images, said, sizes = found.arrays, found.values, found.sizes
+    require_conventions(path, said)
     ends = [said[key] for key in ("THETA_MIN", "THETA_MAX", "PHI_MIN", "PHI_MAX")]
     if ends != [0.0, 90.0, 0.0, 360.0]:
         raise InputError(

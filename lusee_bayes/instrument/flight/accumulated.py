@@ -18,6 +18,7 @@ from lusee_bayes.instrument.flight.recipe import Recipe
 from lusee_bayes.instrument.flight.reduced import (
     BURST,
     COMB,
+    CORRECTED,
     NO_DATA,
     PRODUCT,
     SATURATED,
@@ -226,10 +227,18 @@ def _origin(session: Session, recipe: Recipe) -> Mapping[str, Any]:
         "window_s": float(session.window_s.max()),
         "saturated": int(session.saturated.sum()),
         "errors": int((session.errors != 0).sum()),
-        "clock": "clock file" if session.clock is None else "session",
+        "clock": _whose(session, recipe),
         "clock_file": None if recipe.clock is None else Path(recipe.clock.source).name,
         "scale": None if clock is None else clock.scale,
         "rate": 1.0 if clock is None else clock.rate,
         "first_s": float(session.raw_s[0]),
         "last_s": float(session.raw_s[-1]),
     }
+
+
+def _whose(session: Session, recipe: Recipe) -> str:
+    """Who says which UTC a session's clock stands for."""
+    if session.clock is None:
+        return "clock file"
+    corrected = recipe.clock is not None and recipe.clock.stated is not None
+    return CORRECTED if corrected else "session"

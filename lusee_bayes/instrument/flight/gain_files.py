@@ -28,7 +28,7 @@ LAYOUT = Layout(
     "a gain table",
     {
         "level": Variable(("level",), "text", choices=LETTERS),
-        "anchor_mhz": Variable(("level", "port", "anchor"), low=0.0),
+        "anchor_mhz": Variable(("level", "port", "anchor"), low=0.0, unit="MHz"),
         "mean": Variable(("level", "port", "anchor")),
         "components": Variable(DIMS),
         "coefficient": Variable((*DIMS[:3], "term")),

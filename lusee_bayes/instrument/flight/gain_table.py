@@ -21,9 +21,10 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.checks import require_positive, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import interpolate
+from lusee_bayes.core.units import require_mhz
 from lusee_bayes.instrument.flight.session import TELEMETRY
 from lusee_bayes.instrument.flight.spectrometer import LEVELS, PORTS
 
@@ -74,6 +75,8 @@ class GainTable:
         require_shape(f"{self.path}: coefficient", self.coefficient, shape)
         if not (np.diff(self.anchor_mhz, axis=2) > 0.0).all():
             raise InputError(f"{self.path}: the frequencies of the gains do not grow")
+        require_mhz(f"{self.path}: the frequencies of the gains", self.anchor_mhz)
+        require_positive(f"{self.path}: the mean gain", self.mean, "give counts for 1 nV^2/Hz")
 
     @cached_property
     def _splines(self) -> dict[tuple[int, int], interpolate.CubicSpline]:

@@ -34,6 +34,9 @@ REASONS = (
 )
 USED, SATURATED, NO_DATA, COMB, TOO_MANY, BURST, PRODUCT, NO_FIT = range(len(REASONS))
 
+# whose clock a session has whose own is corrected by a clock file
+CORRECTED = "session, corrected by the clock file"
+
 # beyond these, something is said: scatter over the radiometer noise, and what two more powers of
 # the frequency change, in standard deviations of a bin
 NOISY, CURVED = 1.2, 0.5
@@ -141,6 +144,9 @@ class Reduced(Described):
 
     def notes(self) -> tuple[str, ...]:
         """Return what has been taken from elsewhere than the sessions, a sentence each."""
+        corrected = {s["clock_file"] for s in self.sessions if s["clock"] == CORRECTED}
+        if corrected:
+            return (f"The UTC that the sessions state is corrected by {corrected.pop()}.",)
         told = [s for s in self.sessions if s["clock"] == "clock file" and s.get("clock_file")]
         if not told:
             return ()

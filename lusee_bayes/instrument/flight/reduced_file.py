@@ -21,7 +21,7 @@ from lusee_bayes.instrument.flight.reduced import REASONS, Curves, Reduced
 from lusee_bayes.instrument.flight.spectrometer import NO_LEVEL, PORTS
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import labels
-from lusee_bayes.instrument.times import utc_of
+from lusee_bayes.instrument.times import JD_SCALES, utc_of_jd
 from lusee_bayes.instrument.windows import Windows
 
 HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."
@@ -30,10 +30,10 @@ BANDS, GAINS = ("frequency", "product", "bin"), ("frequency", "port", "bin")
 LAYOUT = Layout(
     "reduced spectra",
     {
-        "frequency": Variable(("frequency",), low=0.0, grows=True),
+        "frequency": Variable(("frequency",), low=0.0, grows=True, unit="MHz"),
         "product": Variable(("product",), "text"),
-        "visibility": Variable(BANDS, missing=True),
-        "before_flags": Variable(BANDS, missing=True),
+        "visibility": Variable(BANDS, missing=True, unit="V^2/Hz"),
+        "before_flags": Variable(BANDS, missing=True, unit="V^2/Hz"),
         "n_averaged": Variable(("frequency", "bin"), low=0.0),
         "level": Variable(("bin", PORTS), "text", choices=(*LETTERS, NO_LEVEL)),
         "gain": Variable(GAINS, missing=True),
@@ -61,6 +61,7 @@ LAYOUT = Layout(
     {
         "lon_deg": Attribute(low=-360.0, high=360.0),
         "lat_deg": Attribute(low=-90.0, high=90.0),
+        **JD_SCALES,
         "step_s": Attribute(low=0.0),
         "bandwidth_mhz": Attribute(low=0.0),
         "average_s": Attribute(low=0.0, optional=True),
@@ -172,7 +173,7 @@ def read_reduced(path: str | Path) -> Reduced:
         observation = Observation(
             said["lon_deg"],
             said["lat_deg"],
-            utc_of(here["jd1"], here["jd2"]),
+            utc_of_jd(found),
             here["run"],
             tuple(here["turntable_deg"].tolist()),
             said["step_s"],

@@ -23,7 +23,7 @@ WHAT = "a session of lusee.ingest in FITS"
 # tables, with what comes before the names of their columns in HDF5
 TABLES = {"SPECTRA_TIMES": "spectra", "SPECTRA_META": META, "SPEC_INTERP": "telemetry"}
 # columns and words that have another name there
-COLUMNS = {"spectra/RAW_TIME": "spectra/raw_times"}
+COLUMNS = {"spectra/RAW_TIME": "spectra/raw_times", "spectra/MJD_TIME": "spectra/mjd_times"}
 WORDS = {
     "CONSTANTS": {
         "LUN_LAT": "constants.lun_lat_deg",

@@ -12,15 +12,15 @@ from jaxtyping import Shaped
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Unread, Variable
-from lusee_bayes.instrument.flight.clock import Clock
+from lusee_bayes.instrument.flight.clock import DAY_S, SAME_S, Clock
 from lusee_bayes.instrument.flight.session import TELEMETRY, Read, Session
 from lusee_bayes.instrument.flight.spectrometer import LEVELS, N_CHANNELS, NO_LEVEL, PORTS
+from lusee_bayes.instrument.times import scale_of
 
 MJD_ZERO = 2400000.5
 META = "spectra/metadata"
 # what luseepy makes of the scale of a mission clock that nobody has established
 UNKNOWN = "unknown"
-SCALES = (UNKNOWN, "utc", "tai", "tt", "tdb")
 
 
 def _counts(*more: int, low: float = -np.inf, high: float = np.inf, optional: bool = False):
@@ -29,6 +29,8 @@ def _counts(*more: int, low: float = -np.inf, high: float = np.inf, optional: bo
 
 ROWS = {
     "spectra/raw_times": Variable(("row",)),
+    # layout 3 alone; NaN where the clock is not known
+    "spectra/mjd_times": Variable(("row",), finite=False, optional=True),
     f"{META}/Navgf": _counts(),
     f"{META}/Navg1_shift": _counts(low=0.0, high=40.0),
     f"{META}/Navg2_shift": _counts(low=0.0, high=40.0),
@@ -175,16 +177,24 @@ def _version(text: str) -> str:
 
 def _clock(path: Path, found: Content) -> Clock | None:
     scale = found.values.get("constants.time_scale", UNKNOWN).lower()
-    if scale not in SCALES:
-        raise InputError(
-            f"{path}: time_scale is '{scale}'; luseepy's layout 3 has {', '.join(SCALES)}"
-        )
     mjd = found.values["constants.mjd_epoch_offset_days"]
     # luseepy writes zero where the epoch is not known
-    if scale == UNKNOWN or mjd == 0.0:
+    if mjd == 0.0:
         return None
     raw_s = found.values["constants.raw_time_subtract_seconds"]
-    return Clock(str(path), MJD_ZERO, mjd, scale, raw_s)
+    readings = found.arrays["spectra/raw_times"]
+    by_epoch = mjd + (readings - raw_s) / DAY_S
+    theirs = found.arrays.get("spectra/mjd_times", by_epoch)
+    off = np.flatnonzero(np.abs(theirs - by_epoch) > SAME_S / DAY_S)
+    if off.size:
+        k = int(off[0])
+        raise InputError(
+            f"{path}: mjd_times of spectrum {k} is {theirs[k]:.9g}, raw_times {readings[k]:.9g} s "
+            f"with the epoch of the constants {by_epoch[k]:.9g}; ingest the session again"
+        )
+    if scale == UNKNOWN:
+        return None
+    return Clock(str(path), MJD_ZERO, mjd, scale_of(f"{path}: time_scale", scale), raw_s)
 
 
 def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> Shaped[np.ndarray, "rows ports"]:

@@ -18,10 +18,10 @@ from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Unread
-from lusee_bayes.instrument.flight.clock import SCALES, Clock
+from lusee_bayes.instrument.flight.clock import Clock
 from lusee_bayes.instrument.flight.session import TELEMETRY, Read, Session
 from lusee_bayes.instrument.flight.session_layout import META, session_of
-from lusee_bayes.instrument.times import unannounced_leap_seconds
+from lusee_bayes.instrument.times import scale_of, unannounced_leap_seconds
 
 # names of layout 4 for those of layout 3
 FIELDS = {
@@ -94,6 +94,7 @@ def session_of_4(
     arrays = {"spectra/data": cube, **_metadata(path, tree, cube.shape[0] if cube.shape else 0)}
     if (raw_s := tree.array("spectra/raw_seconds")) is not None:
         arrays["spectra/raw_times"] = raw_s
+        _require_valid(path, tree.array("spectra/raw_time_valid"))
     clock = _clock(path, tree)
     if clock is not None and raw_s is not None:
         arrays |= _telemetry(path, tree, clock, np.asarray(raw_s))
@@ -112,24 +113,48 @@ def _metadata(path: Path, tree: Tree, n: int) -> dict[str, Unread]:
                 f"{path}: {META}/fields/{theirs} is there in the shape {tuple(values.shape)} for "
                 f"{n} spectra, or has several shapes; ingest the session again"
             )
+        rows = tree.array(f"{META}/fields/{theirs}/variant_000/row_indices")
+        if rows is not None and not np.array_equal(np.asarray(rows), np.arange(n)):
+            raise InputError(
+                f"{path}: row_indices of {META}/fields/{theirs} are not 0 to {n - 1}, a number for "
+                "each spectrum; ingest the session again"
+            )
         found[f"{META}/{ours}"] = values
     if (navgf := tree.array("spectra/navgf")) is not None:
-        found[f"{META}/Navgf"] = navgf
+        told = np.asarray(found.setdefault(f"{META}/Navgf", navgf))
+        if not np.array_equal(told, np.asarray(navgf)):
+            raise InputError(
+                f"{path}: spectra/navgf is {_values(navgf)}, navgf of the metadata is "
+                f"{_values(told)}; ingest the session again"
+            )
     return found
+
+
+def _values(numbers: Unread) -> str:
+    """Which values an array has."""
+    return ", ".join(map(str, np.unique(np.asarray(numbers)).tolist()))
+
+
+def _require_valid(path: Path, valid: Unread | None) -> None:
+    """InputError where a file marks times of its spectra as invalid."""
+    marks = np.ones(1) if valid is None else np.asarray(valid)
+    if not marks.all():
+        raise InputError(
+            f"{path}: raw_time_valid marks the clock of {int((marks == 0).sum())} of {marks.size} "
+            "spectra as invalid; ingest the session again without them"
+        )
 
 
 def _clock(path: Path, tree: Tree) -> Clock | None:
     said = tree.attributes("clock_reference")
     if not bool(said.get("available")):
         return None
-    scale, text = (str(said[name]) for name in ("time_scale", "clock_reference_isot"))
-    if scale not in SCALES:
-        raise InputError(f"{path}: time_scale is '{scale}'; expected one of {', '.join(SCALES)}")
+    scale = scale_of(f"{path}: time_scale", str(said["time_scale"]))
     raw_s = _anchors(tree).get("spectrometer")
     if raw_s is None:
         return None
     with unannounced_leap_seconds():
-        time = Time(text, format="isot", scale=scale)
+        time = Time(str(said["clock_reference_isot"]), format="isot", scale=scale)
     return Clock(str(path), float(time.jd1), float(time.jd2), scale, raw_s)
 
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.time import STANDARD_TIME_SCALES
 from jaxtyping import Float
 
 from lusee_bayes.core.checks import require_positive
@@ -26,7 +25,7 @@ from lusee_bayes.instrument.beams.gridded import Interpolation
 from lusee_bayes.instrument.beams.receiver import LOADS, MeasuredReceiver
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import N_ANTENNAS, all_products, labels
-from lusee_bayes.instrument.times import utc_of
+from lusee_bayes.instrument.times import scale_of, utc_of
 from lusee_bayes.instrument.waterfalls.waterfall import SITE_AND_STEP, Waterfall
 
 UNIT = "V^2/Hz"
@@ -35,19 +34,23 @@ INTERPOLATIONS: dict[Interpolation, str] = {"linear": "linear-native-alm", "spli
 LAYOUT = Layout(
     "a waterfall of luseepy's four-port simulator",
     {
-        "freq": Variable(("freq",), low=0.0, grows=True),
-        "time": Variable(("time", 2)),
+        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+        "time": Variable(("time", 2), unit="d"),
         "products.label": Variable(("product",), "text"),
-        # a sample that is not finite is missing
-        "data": Variable(("time", "product", "freq"), missing=True),
+        # NaN where a sample is missing
+        "data": Variable(("time", "product", "freq"), finite=False, unit=UNIT),
         "blackbody_normalization_real": Variable(("freq", N_ANTENNAS, N_ANTENNAS)),
-        **{name: Variable(("freq", N_ANTENNAS, N_ANTENNAS), optional=True) for name in LOADS},
+        **{
+            name: Variable(("freq", N_ANTENNAS, N_ANTENNAS), optional=True, unit="Ohm")
+            for name in LOADS
+        },
     },
     {
         **SITE_AND_STEP,
         "TMOON_K": Attribute(low=0.0),
         "TANT_K": Attribute(low=0.0, optional=True),
         "TIMESYS": Attribute("text", optional=True),
+        "TIMEUNIT": Attribute("text", choices=("d",), optional=True),
         "FREQINT": Attribute("text", optional=True),
         "BUNIT": Attribute("text", choices=(UNIT,)),
     },
@@ -119,11 +122,8 @@ def _places(path: Path, products: np.ndarray) -> list[int]:
 def _observation(
     path: Path, said: dict[str, Any], times: Float[np.ndarray, "times 2"]
 ) -> Observation:
-    scale = said.get("TIMESYS", "UTC").strip().lower()
-    if scale not in STANDARD_TIME_SCALES:
-        known = ", ".join(s.upper() for s in STANDARD_TIME_SCALES)
-        raise InputError(f"{path}: TIMESYS is {scale.upper()}; expected one of {known}")
     with naming(path):
+        scale = scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
         return Observation(
             said["LUN_LONG_DEG"],
             said["LUN_LAT_DEG"],

@@ -28,9 +28,9 @@ from lusee_bayes.instrument.waterfalls.waterfall import SITE_AND_STEP, Waterfall
 LAYOUT = Layout(
     "a waterfall of luseepy's simulator",
     {
-        "freq": Variable(("freq",), low=0.0, grows=True),
-        # a sample that is not finite is missing
-        "data": Variable(("time", "product", "freq"), missing=True),
+        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+        # NaN where a sample is missing
+        "data": Variable(("time", "product", "freq"), finite=False, unit="K"),
         "combinations": Variable(("pair", 2), "integer", low=0.0, high=N_ANTENNAS - 1.0),
     },
     {"LUNAR_DAY": Attribute("word"), **SITE_AND_STEP},
