@@ -139,7 +139,7 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
     if section is None or not section.leave_out or data.calibration is None:
         return experiment
     with stages("times that do not fit"):
-        found = fitting(experiment.setup, data, section.false_alarm)
+        found = fitting(experiment.setup, data, section.false_alarm, stages)
         setup, kept = experiment.setup, data
         if found.flagged.any():
             setup, kept = without(setup, data, found.flagged)

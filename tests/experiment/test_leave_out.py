@@ -72,14 +72,14 @@ def test_a_single_bad_value_is_found_alone(experiment):
     values[bad] += 40.0 * std[bad]
     found = fitting(experiment.setup, replace(data, data=values), FALSE_ALARM)
     assert np.argwhere(found.flagged).tolist() == [[9, 31]]
-    assert "otherwise: 1 single value." in found.remark
+    assert "data: 1 single value," in found.remark
 
 
 def test_noise_that_is_larger_than_said_is_not_the_times_fault(experiment):
     data = with_bursts(experiment, np.arange(65), 2.0)
     found = fitting(experiment.setup, data, FALSE_ALARM)
     assert not found.flagged.any()
-    assert found.remark == TOO_MANY
+    assert found.remark.startswith(TOO_MANY)
 
 
 @pytest.mark.parametrize("strength", [2.0, 1e3])
@@ -95,7 +95,7 @@ def test_a_bad_product_is_found_alone(experiment, strength):
     expected[6] = expected[:, 40] = True
     np.testing.assert_array_equal(found.flagged, expected)
     assert [(group.kind, group.name) for group in found.groups] == [("product", data.labels[6])]
-    assert f"otherwise: product {data.labels[6]} and 1 of 65 times." in found.remark
+    assert f"data: product {data.labels[6]} and 1 of 65 times," in found.remark
 
 
 def test_a_bad_day_is_found_alone(experiment):
@@ -118,11 +118,11 @@ def test_many_bad_products_are_not_their_own_fault(experiment):
     values = np.asarray(data.data) + np.where(data.layout.product % 3 == 0, off, 0.0)
     found = fitting(experiment.setup, replace(data, data=values), FALSE_ALARM)
     assert not found.flagged.any()
-    assert found.remark == TOO_MANY
+    assert found.remark.startswith(TOO_MANY)
 
 
 def test_what_cannot_be_judged_is_said(experiment, monkeypatch):
-    monkeypatch.setattr("lusee_bayes.experiment.comparison.leave_out", lambda *_: None)
+    monkeypatch.setattr("lusee_bayes.experiment.comparison.memory_limit", lambda: 1000)
     found = fitting(experiment.setup, experiment.data, FALSE_ALARM)
     assert not found.flagged.any()
     assert found.remark == NOT_JUDGED
@@ -139,7 +139,7 @@ def test_what_64_bits_do_not_tell_is_not_compared(experiment, monkeypatch):
     def singular(*_, **__):
         raise LinAlgError("singular")
 
-    monkeypatch.setattr("lusee_bayes.linear.left_out_structured.cho_factor", singular)
+    monkeypatch.setattr("lusee_bayes.linear.left_out_dense.cho_factor", singular)
     data = with_bursts(experiment, [7], 1e3)
     found = fitting(experiment.setup, data, FALSE_ALARM)
     assert not found.flagged.any()
