@@ -184,7 +184,7 @@ def _tail(
     return np.where(some, found, 1.0)
 
 
-def compared(setup: Setup, data: Visibilities) -> Comparison | None:
+def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Comparison | None:
     """Leave out every time.
 
     Under a prior that is wide enough for any sky (:mod:`lusee_bayes.linear.residuals`), so that
@@ -195,6 +195,8 @@ def compared(setup: Setup, data: Visibilities) -> Comparison | None:
     setup : Setup
     data : Visibilities
         Measured.
+    settle : bool
+        In as many rounds as N needs to be built around what the data say; else in one.
 
     Returns
     -------
@@ -203,7 +205,7 @@ def compared(setup: Setup, data: Visibilities) -> Comparison | None:
     """
     if _memory(setup, data) > MOST_MEMORY * memory_limit():
         return None
-    model, posterior = on_host(_conditioned(setup, data))
+    model, posterior = on_host(_conditioned(setup, data, settle))
     wide = _wide(posterior, model.n_data)
     left_out = DenseLeftOut(replace(model, prior=wide.prior), data.data, data.layout)
     return Comparison.of(left_out, data)
@@ -216,14 +218,18 @@ def _memory(setup: Setup, data: Visibilities) -> float:
     return 8.0 * ARRAYS * n * (setup.prior.size + (n if across else 0))
 
 
-def _conditioned(setup: Setup, data: Visibilities) -> tuple[LinearGaussian, Posterior]:
+def _conditioned(
+    setup: Setup, data: Visibilities, settle: bool
+) -> tuple[LinearGaussian, Posterior]:
     """Model and posterior, in as many rounds as N needs; in one where bad data let none settle."""
-    try:
-        found = settled(setup, data)
-    except InputError:
-        model, _ = model_about(setup, Around(data))
-        return model, model.condition(data.data)
-    return found.model, found.posterior
+    if settle:
+        try:
+            found = settled(setup, data)
+        except InputError:
+            return _conditioned(setup, data, settle=False)
+        return found.model, found.posterior
+    model, _ = model_about(setup, Around(data))
+    return model, model.condition(data.data)
 
 
 def _wide(posterior: Posterior, n_data: int) -> Posterior:

@@ -140,9 +140,7 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
         return experiment
     with stages("times that do not fit"):
         found = fitting(experiment.setup, data, section.false_alarm, stages)
-        setup, kept = experiment.setup, data
-        if found.flagged.any():
-            setup, kept = without(setup, data, found.flagged)
+        setup, kept = without(experiment.setup, data, found.flagged)
     remarks = (found.remark,) if found.remark else ()
     for remark in remarks:
         stages.say(f"  {remark}")

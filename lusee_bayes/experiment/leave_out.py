@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.comparison import Comparison, Group, compared
+from lusee_bayes.experiment.rounds import rebuilds
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.products import all_products
@@ -41,8 +42,10 @@ MOST = 0.2
 SMALL = 0.05
 # by how much lmax is raised to look for it, how often, and how far chi^2 then falls at least
 STEP, STEPS, FALLS = 8, 3, 0.5
-# what stands out less than this part of the worst waits for the next fit
-FAR = 1e-2
+# what stands out less than this part of the worst waits for the next fit; what stands out this much
+# more than half of the times goes before N is built around what all others say: it would take N
+# along, which then settles nowhere
+FAR, OBVIOUS = 1e-2, 1e2
 
 
 @dataclass(frozen=True)
@@ -117,13 +120,20 @@ def fitting(
 def _found(setup: Setup, data: Visibilities, false_alarm: float, stages: Stages) -> Fitting:
     """Find data that do not fit at the setup's lmax."""
     limits = _Limits.of(data)
-    nothing = np.zeros(limits.present.shape, dtype=bool)
-    gone, groups, first, kept = nothing, (), None, ""
-    for rounds in range(1, MAX_ROUNDS + 1):
-        start = compared(*(without(setup, data, gone) if gone.any() else (setup, data)))
+    gone = nothing = np.zeros(limits.present.shape, dtype=bool)
+    before, groups, kept = np.zeros(nothing.shape[1]), (), ""
+    first = 0 if rebuilds(setup) else 1
+    for rounds in range(first, MAX_ROUNDS + 1):
+        start = compared(*without(setup, data, gone), settle=rounds > 0)
         if start is None:
-            return Fitting(nothing, rounds, np.zeros(nothing.shape[1]), NOT_JUDGED)
-        first = first or start
+            return Fitting(nothing, rounds, before, NOT_JUDGED)
+        before = np.where(before > 0.0, before, start.ratio)
+        if not rounds:
+            least = OBVIOUS * max(float(np.median(start.size)), 1.0)
+            _, obvious = _one_by_one(start, gone, nothing, limits, false_alarm, least)
+            gone = nothing if obvious is None else obvious
+            before = np.where(gone.any(axis=0), before, 0.0)
+            continue
         more, auto = _eliminated(start, gone, limits, false_alarm)
         kept = kept or auto
         if more is None:
@@ -136,9 +146,9 @@ def _found(setup: Setup, data: Visibilities, false_alarm: float, stages: Stages)
         if not more.flagged.any():
             share = limits.count(gone) / data.layout.size
             remark = " ".join(filter(None, [_remark(gone, groups, share, false_alarm), kept]))
-            return Fitting(gone, rounds, first.ratio, remark, groups, share)
+            return Fitting(gone, rounds, before, remark, groups, share)
     remark = f"{TOO_MANY} {kept}".strip()
-    return Fitting(nothing, rounds, first.ratio, remark, refused=True)
+    return Fitting(nothing, rounds, before, remark, refused=True)
 
 
 def _higher_lmax(
@@ -226,6 +236,27 @@ class _Eliminated:
     groups: tuple[Group, ...]
 
 
+def _one_by_one(
+    start: Comparison,
+    gone: Bool[np.ndarray, "products times"],
+    groups: Bool[np.ndarray, "products times"],
+    limits: _Limits,
+    false_alarm: float,
+    least: float,
+) -> tuple[Comparison, Bool[np.ndarray, "products times"] | None]:
+    """Flag times and values, the worst first; ``groups`` are among what is ``gone`` from ``start``.
+
+    Of what is left, and what goes in all; or of what was left before that was too much, and None.
+    """
+    found = start
+    while (worst := found.worst(false_alarm, least)).any():
+        gone = gone | worst
+        if limits.broken(gone, groups):
+            return found, None
+        found = found.without(worst)
+    return found, gone
+
+
 def _eliminated(
     start: Comparison,
     gone: Bool[np.ndarray, "products times"],
@@ -239,15 +270,13 @@ def _eliminated(
     base, groups, first = start, (), None
     of_groups = np.zeros_like(gone)
     while True:
-        found, flagged, broken = base, of_groups, False
         least = FAR * float(base.size.max())
-        while not broken and (worst := found.worst(false_alarm, least)).any():
-            flagged = flagged | worst
-            broken = limits.broken(gone | flagged, gone | of_groups)
-            found = found if broken else found.without(worst)
-        result = None if broken else _Eliminated(flagged, groups)
+        found, flagged = _one_by_one(
+            base, gone | of_groups, gone | of_groups, limits, false_alarm, least
+        )
+        result = None if flagged is None else _Eliminated(flagged & ~gone, groups)
         first = first if groups else result
-        if not broken and found.worst(false_alarm).any():
+        if result is not None and found.worst(false_alarm).any():
             return result, ""
         group = found.worst_group(false_alarm)
         if group is None:
@@ -302,6 +331,8 @@ def without(
     InputError
         If nothing is left.
     """
+    if not gone.any():
+        return setup, data
     layout = DataLayout.from_flags(~np.asarray(data.layout.present) | gone)
     kept = replace(data, data=layout.gather(data.layout.scatter(data.data)), layout=layout)
     instrument = replace(setup.instrument, layout=layout)

@@ -163,8 +163,15 @@ class MapResult(Described):
         offsets = [] if self.pointing is None else self.pointing.lines()
         unknowns = [] if self.unknowns is None else self.unknowns.lines()
         told = [prior_sentence(self.experiment), *fluxes, *offsets, *unknowns]
-        notes = () if self.reduced is None else self.reduced.notes()
-        return [self.headline(), *told, self.verdict(), RULE, *self.channel.doubts, *notes]
+        return [self.headline(), *told, self.verdict(), RULE, *self.channel.doubts, *self._flags()]
+
+    def _flags(self) -> list[str]:
+        """How much of flight data was flagged, and what is doubtful about them."""
+        if self.reduced is None:
+            return []
+        fitting = self.experiment.fitting
+        line = self.reduced.flag_line(self.band, 0.0 if fitting is None else fitting.share)
+        return [line.capitalize(), *self.reduced.doubts(self.band), *self.reduced.notes()]
 
 
 def map_result(

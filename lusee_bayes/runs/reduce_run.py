@@ -39,10 +39,9 @@ def reduced_lines(reduced: Reduced) -> list[str]:
     """What was flagged in each band, and how its noise compares with the radiometer's."""
     lines = [reduced.description()[0], *reduced.notes()]
     for band, frequency in enumerate(reduced.frequencies_mhz):
-        parts = [f"{name} {share:.2%}" for name, share in reduced.shares(band).items()]
         noise = reduced.scatter[band]
         told = "" if np.isnan(noise) else f"; scatter {noise:.2f} times the radiometer's"
-        lines.append(f"{frequency:g} MHz: {', '.join(parts)}{told}")
+        lines.append(f"{frequency:g} MHz: {reduced.flag_line(band)}{told}")
         lines += [f"  {text}" for text in reduced.doubts(band)]
     return lines
 
