@@ -196,7 +196,8 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Compar
     data : Visibilities
         Measured.
     settle : bool
-        In as many rounds as N needs to be built around what the data say; else in one.
+        In as many rounds as N needs to be built around what the data say; else in one, and under
+        a prior whose width asks nothing of them: for what stands out in any case.
 
     Returns
     -------
@@ -205,9 +206,13 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Compar
     """
     if _memory(setup, data) > MOST_MEMORY * memory_limit():
         return None
-    model, posterior = on_host(_conditioned(setup, data, settle))
-    wide = _wide(posterior, model.n_data)
-    left_out = DenseLeftOut(replace(model, prior=wide.prior), data.data, data.layout)
+    if settle:
+        model, posterior = on_host(_conditioned(setup, data))
+        prior = _wide(posterior, model.n_data).prior
+    else:
+        model = on_host(model_about(setup, Around(data))[0])
+        prior = model.prior.widened(WIDER)
+    left_out = DenseLeftOut(replace(model, prior=prior), data.data, data.layout)
     return Comparison.of(left_out, data)
 
 
@@ -218,18 +223,14 @@ def _memory(setup: Setup, data: Visibilities) -> float:
     return 8.0 * ARRAYS * n * (setup.prior.size + (n if across else 0))
 
 
-def _conditioned(
-    setup: Setup, data: Visibilities, settle: bool
-) -> tuple[LinearGaussian, Posterior]:
+def _conditioned(setup: Setup, data: Visibilities) -> tuple[LinearGaussian, Posterior]:
     """Model and posterior, in as many rounds as N needs; in one where bad data let none settle."""
-    if settle:
-        try:
-            found = settled(setup, data)
-        except InputError:
-            return _conditioned(setup, data, settle=False)
-        return found.model, found.posterior
-    model, _ = model_about(setup, Around(data))
-    return model, model.condition(data.data)
+    try:
+        found = settled(setup, data)
+    except InputError:
+        model, _ = model_about(setup, Around(data))
+        return model, model.condition(data.data)
+    return found.model, found.posterior
 
 
 def _wide(posterior: Posterior, n_data: int) -> Posterior:
