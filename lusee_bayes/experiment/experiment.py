@@ -73,7 +73,8 @@ def build(
     scenario : Scenario
         Of one frequency.
     data : Visibilities, optional
-        Measured data; without them the scenario's own are simulated.
+        Measured data; without them the scenario's own are simulated. A truth of another lmax is
+        cut, or filled with zeros.
     stages : Stages, optional
         Told what is being done.
 
@@ -97,6 +98,7 @@ def observed(
     stages = stages or Stages()
     if data is None:
         return simulated(scenario, stages)
+    data = data.with_truth_up_to(scenario.lmax)
     setup = set_up(scenario, data, stages)
     std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     doubts = (*require_plausible(data, setup.signal, std), *_about_gains(scenario, data))

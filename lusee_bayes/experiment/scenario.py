@@ -16,6 +16,7 @@ import yaml
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.yaml_files import parse_yaml, read_yaml
 from lusee_bayes.experiment.overrides import apply_override
 from lusee_bayes.experiment.scenario_errors import one_sentence
@@ -250,8 +251,8 @@ def _validate(tree: dict[str, Any], source: str | Path) -> Scenario:
 
 def _read_yaml(source: str | Path) -> dict[str, Any]:
     names = scenario_names()
-    if os.path.exists(source):
-        tree = read_yaml(source, "a scenario")
+    if os.path.exists(user_path(source)):
+        tree = read_yaml(user_path(source), "a scenario")
     elif str(source) in names:
         tree = parse_yaml((FOLDER / f"{source}.yaml").read_text(), str(source))
     else:

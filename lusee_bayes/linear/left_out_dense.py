@@ -194,5 +194,6 @@ def _blocks(
     for index in np.split(order, np.flatnonzero(np.diff(layout.time[order])) + 1):
         product, time = layout.product[index], layout.time[index[0]]
         here = weights[..., time]
-        found.append((index, np.diag(here[product]) if here.ndim == 1 else here[product][:, product]))
+        here = np.diag(here) if here.ndim == 1 else here
+        found.append((index, here[np.ix_(product, product)]))
     return found, templates

@@ -175,14 +175,14 @@ class MapResult(Described):
 
 
 def map_result(
-    experiment: Experiment, *, onto: Path | None = None, stages: Stages | None = None
+    experiment: Experiment, *, onto: str | Path | None = None, stages: Stages | None = None
 ) -> MapResult:
     """Condition an experiment's model on its data, and work out the uncertainties.
 
     Parameters
     ----------
     experiment : Experiment
-    onto : Path, optional
+    onto : path, optional
         Folder of an updatable run, to whose data these are added.
     stages : Stages, optional
         Told what is being done.

@@ -71,7 +71,7 @@ def run_compare_priors(
         Of the results.
     priors : sequence of str, optional
         Names (:func:`.named_priors`), two or more; by default all that can be.
-    data : Path or sequence of Path, optional
+    data : Visibilities, path, or sequence of them, optional
         Visibilities to map; without them the scenario's own are simulated.
     truth : bool
         The given data are of the scenario's own sky.

@@ -13,6 +13,7 @@ from astropy.time import Time
 from lusee_bayes.core.destinations import require_folder
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import transaction
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
 from lusee_bayes.experiment.scenario import Scenario
@@ -78,7 +79,7 @@ def run_simulate_flight(
     InputError
         As :func:`.simulate_flight`, and if the folder holds sessions already, or cannot be written.
     """
-    folder = Path(folder)
+    folder = user_path(folder)
     require_folder(folder)
     _require_no_sessions(folder, replace)
     stages = stages or Stages()

@@ -15,7 +15,6 @@ from lusee_bayes.core.tables import rows_of, write_csv
 from lusee_bayes.experiment.data_files import (
     Data,
     are_sessions,
-    files_of,
     read_data,
     reduced_of,
 )
@@ -77,7 +76,7 @@ def run_map(
     *,
     data: Data | None = None,
     truth: bool = False,
-    onto: Path | None = None,
+    onto: str | Path | None = None,
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
@@ -93,12 +92,12 @@ def run_map(
         Of one frequency or of several; ``output`` says what is written besides the maps.
     folder : path
         Of the results.
-    data : Path or sequence of Path, optional
-        Visibilities to map, or sessions of the spectrometer; without them the scenario's own are
-        simulated.
+    data : Visibilities, path, or sequence of them, optional
+        Visibilities to map, in memory or in a file, or sessions of the spectrometer; without them
+        the scenario's own are simulated.
     truth : bool
         The given data are of the scenario's own sky: compare the map with it.
-    onto : Path, optional
+    onto : path, optional
         Folder of an updatable run, to whose data these are added.
     engine : Engine, optional
         What carries out the channels; by default this process.
@@ -139,7 +138,7 @@ def _run_single(
     folder: str | Path,
     data: Data | None,
     truth: bool,
-    onto: Path | None,
+    onto: str | Path | None,
     replace: bool,
     stages: Stages,
 ) -> MapRun:
@@ -173,13 +172,13 @@ def _as_used(reduced: Reduced, experiment: Experiment) -> Reduced:
 
 def _one_file(
     data: Data | None, scenario: Scenario, folder: Path, stages: Stages
-) -> tuple[Path | None, Reduced | None]:
-    """The file that all channels are read from: of sessions, their reduced spectra."""
+) -> tuple[Data | None, Reduced | None]:
+    """The data that all channels are read from: of sessions, the file of their reduced spectra."""
     if data is None:
         return None, None
     reduced = reduced_of(data, scenario, stages)
     if reduced is None or not are_sessions(data):
-        return files_of(data)[0], reduced
+        return data, reduced
     path = folder / CHANNELS / REDUCED
     path.parent.mkdir(exist_ok=True)
     return write_reduced(path, reduced, scenario.to_yaml()), reduced

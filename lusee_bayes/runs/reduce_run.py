@@ -10,6 +10,7 @@ import numpy as np
 
 from lusee_bayes.core.destinations import require_new
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.experiment.scenario import Scenario
@@ -48,7 +49,7 @@ def reduced_lines(reduced: Reduced) -> list[str]:
 
 def run_reduce(
     scenario: Scenario,
-    files: Sequence[Path],
+    files: Sequence[str | Path],
     path: str | Path,
     *,
     replace: bool = False,
@@ -59,7 +60,7 @@ def run_reduce(
     Parameters
     ----------
     scenario : Scenario
-    files : sequence of Path
+    files : sequence of paths
         Sessions, in any order.
     path : path
         The netCDF file to write.
@@ -74,8 +75,8 @@ def run_reduce(
         As :func:`.reduce_files`, if the file would replace a session, and if it is there already,
         unless ``replace``.
     """
-    stages, path = stages or Stages(), Path(path)
-    if path.resolve() in [Path(file).resolve() for file in files]:
+    stages, path = stages or Stages(), user_path(path)
+    if path.resolve() in [user_path(file).resolve() for file in files]:
         raise InputError(f"'{path}' is one of the sessions; give -o another name")
     require_new(path, replace=replace)
     reduced = reduce_files(files, scenario, stages)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import build
@@ -86,7 +87,7 @@ def run_sample(
         By default :func:`default_program`.
     sampler : Sampler, optional
         By default with the scenario's seed.
-    data : Path or sequence of Path, optional
+    data : Visibilities, path, or sequence of them, optional
         Visibilities to use; without them the scenario's own are simulated.
     resume : bool
         Go on with the unfinished run in the folder, or take over a finished one.
@@ -108,7 +109,7 @@ def run_sample(
         )
     program = program or default_program(scenario)
     sampler = sampler or Sampler(seed=scenario.seed)
-    folder = Path(folder)
+    folder = user_path(folder)
     if not scenario.frequencies_mhz:
         return _run_single(scenario, folder, program, sampler, data, resume, replace, stages)
     stages = stages or Stages()

@@ -9,6 +9,7 @@ import numpy as np
 
 from lusee_bayes.core.destinations import require_new
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.experiment import Experiment, simulated
 from lusee_bayes.experiment.scenario import Scenario
@@ -52,7 +53,7 @@ def run_simulate(
         If the file is there already, for several channels in a netCDF file, and for what a
         waterfall cannot hold.
     """
-    path, channels = Path(path), (scenario,)
+    path, channels = user_path(path), (scenario,)
     stages = stages or Stages()
     require_new(path, replace=replace)
     if path.suffix == ".fits" and scenario.observation.window != "instant":

@@ -62,7 +62,7 @@ def run_validate(
         By default with the scenario's seed.
     simulations : int
         Data sets for simulation-based calibration.
-    data : Path or sequence of Path, optional
+    data : Visibilities, path, or sequence of them, optional
         Visibilities to use; without them the scenario's own are simulated.
     resume : bool
         Go on with the unfinished run in the folder, or judge the finished one again.

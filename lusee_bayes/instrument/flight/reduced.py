@@ -278,7 +278,7 @@ class Reduced(Described):
 
     def _calibration(self, band: int, bins: Int[np.ndarray, " left"]) -> Calibration:
         names, ports, slopes = [], [], []
-        lost = sum(self.flagged(band).values())
+        lost = float(sum(self.flagged(band).values()))
         levels = self.level[bins]
         for level in LETTERS:
             for port in range(levels.shape[1]):
