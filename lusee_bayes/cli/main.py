@@ -49,7 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
     gc.set_threshold(100_000, 20, 100)
     given = sys.argv[1:] if arguments is None else arguments
     # ~ within an option, as in --data=~/a.nc, is one that no shell has replaced
-    expanded = [HOME.sub(lambda found: found[1] + str(user_path(found[2])), one) for one in given]
+    expanded = [HOME.sub(lambda own: (own[1] or "") + str(user_path(own[2])), one) for one in given]
     before = COMMAND.set(shlex.join(["lusee-bayes", *given]))
     errors = Console(stderr=True, soft_wrap=True, highlight=False)
     try:

@@ -46,8 +46,13 @@ SAME_TEMPERATURE = 1e-12
 Data = Visibilities | str | Path | Sequence[Visibilities] | Sequence[str | Path]
 
 
-def items_of(data: Data) -> tuple[Visibilities, ...] | tuple[Path, ...]:
+def items_of(data: object) -> tuple[Visibilities, ...] | tuple[Path, ...]:
     """The sets in memory, or the files that data are in.
+
+    Parameters
+    ----------
+    data : Data
+        Or whatever else is given for it.
 
     Raises
     ------

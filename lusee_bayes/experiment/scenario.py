@@ -228,18 +228,24 @@ def scenario_names() -> list[str]:
     )
 
 
-def load_scenario(source: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Scenario:
+def load_scenario(
+    source: str | Path | Scenario, overrides: list[str] | tuple[str, ...] = ()
+) -> Scenario:
     """Read a YAML file, or a scenario of the package by name, and apply ``key.path=value``.
+
+    A scenario is taken as it is, so that every run takes one, its file or its name.
 
     InputError with one sentence for a missing file, bad YAML, an unknown key or a bad value.
     """
-    scenario = _validate(_read_yaml(source), source)
+    scenario = source
+    if not isinstance(source, Scenario):
+        scenario = _validate(_read_yaml(source), source)
     if not overrides:
         return scenario
     tree = scenario.model_dump(mode="json")  # defaults included, so that any entry can be set
     for override in overrides:
         apply_override(tree, override)
-    return _validate(tree, source)
+    return _validate(tree, "the scenario" if isinstance(source, Scenario) else source)
 
 
 def _validate(tree: dict[str, Any], source: str | Path) -> Scenario:

@@ -11,7 +11,7 @@ from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
 from lusee_bayes.experiment.data_files import Data, files_of, names_of_data, read_data
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import require_fitting, set_up
 from lusee_bayes.instrument.averaging import averaged, product_live_s
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -64,7 +64,7 @@ class AverageRun:
 
 
 def run_average(
-    scenario: Scenario,
+    scenario: Scenario | str | Path,
     data: Data,
     to_s: float,
     path: str | Path,
@@ -77,7 +77,7 @@ def run_average(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : Scenario, or its file or name
         How to read the data, and what the information is worked out with; ``average_s`` does not
         count.
     data : Visibilities or path
@@ -99,6 +99,7 @@ def run_average(
         As :func:`.read_data` and :func:`.averaged`, for a scenario that the data do not fit or that
         needs more memory than there is, and if the file is there already, unless ``replace``.
     """
+    scenario = load_scenario(scenario)
     stages, path = stages or Stages(), user_path(path)
     if path.suffix == ".fits":
         raise InputError(

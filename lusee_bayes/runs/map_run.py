@@ -20,7 +20,7 @@ from lusee_bayes.experiment.data_files import (
 )
 from lusee_bayes.experiment.experiment import Experiment, build, with_truth
 from lusee_bayes.experiment.flight_data import visibilities_of
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.instrument.flight.reduced_file import write_reduced
 from lusee_bayes.linear.compact import CompactPosterior
@@ -71,7 +71,7 @@ class MapRun:
 
 
 def run_map(
-    scenario: Scenario,
+    scenario: Scenario | str | Path,
     folder: str | Path,
     *,
     data: Data | None = None,
@@ -88,7 +88,7 @@ def run_map(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : Scenario, or its file or name
         Of one frequency or of several; ``output`` says what is written besides the maps.
     folder : path
         Of the results.
@@ -111,6 +111,7 @@ def run_map(
     InputError
         If the scenario samples something, or for whatever is wrong with scenario, data or folder.
     """
+    scenario = load_scenario(scenario)
     stages = stages or Stages()
     require_marginal("a map", "use: lusee-bayes sample", scenario.samples)
     if not scenario.frequencies_mhz:

@@ -13,7 +13,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_data import reduce_files
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.instrument.flight.reduced_file import write_reduced
 
@@ -48,7 +48,7 @@ def reduced_lines(reduced: Reduced) -> list[str]:
 
 
 def run_reduce(
-    scenario: Scenario,
+    scenario: Scenario | str | Path,
     files: Sequence[str | Path],
     path: str | Path,
     *,
@@ -59,7 +59,7 @@ def run_reduce(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : Scenario, or its file or name
     files : sequence of paths
         Sessions, in any order.
     path : path
@@ -75,6 +75,7 @@ def run_reduce(
         As :func:`.reduce_files`, if the file would replace a session, and if it is there already,
         unless ``replace``.
     """
+    scenario = load_scenario(scenario)
     stages, path = stages or Stages(), user_path(path)
     if path.resolve() in [user_path(file).resolve() for file in files]:
         raise InputError(f"'{path}' is one of the sessions; give -o another name")

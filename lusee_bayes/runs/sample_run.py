@@ -13,7 +13,7 @@ from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.report.figures import chains as chain_figures
 from lusee_bayes.report.figures import samples as sample_figures
 from lusee_bayes.results.cost import require_resources
@@ -63,7 +63,7 @@ def default_program(scenario: Scenario) -> Program:
 
 
 def run_sample(
-    scenario: Scenario,
+    scenario: Scenario | str | Path,
     folder: str | Path,
     *,
     program: Program | None = None,
@@ -80,7 +80,7 @@ def run_sample(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : Scenario, or its file or name
     folder : path
         Of the results; draws are kept in it as they come.
     program : Program, optional
@@ -102,6 +102,7 @@ def run_sample(
         For a joint scenario, an unfinished run in the folder that is not to be resumed, and for
         whatever is wrong with scenario, program, data or folder.
     """
+    scenario = load_scenario(scenario)
     if scenario.joint:
         raise InputError(
             "channels are sampled one by one; the joint posterior is Gaussian, and lusee-bayes map "

@@ -12,7 +12,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.experiment import Experiment, simulated
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import write_four_port, write_waterfall
 from lusee_bayes.instrument.waterfalls.writing import NO_ROOM
@@ -20,7 +20,7 @@ from lusee_bayes.results.cost import require_fits, simulation_cost
 
 
 def run_simulate(
-    scenario: Scenario,
+    scenario: Scenario | str | Path,
     path: str | Path,
     *,
     frequencies_mhz: Sequence[float] = (),
@@ -31,7 +31,7 @@ def run_simulate(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : Scenario, or its file or name
     path : path
         The file: netCDF, or luseepy's waterfall if the name ends in ``.fits``.
     frequencies_mhz : sequence of float
@@ -53,6 +53,7 @@ def run_simulate(
         If the file is there already, for several channels in a netCDF file, and for what a
         waterfall cannot hold.
     """
+    scenario = load_scenario(scenario)
     path, channels = user_path(path), (scenario,)
     stages = stages or Stages()
     require_new(path, replace=replace)
