@@ -1,5 +1,6 @@
 from .core.errors import InputError as InputError
 from .core.version import __version__ as __version__
+from .experiment.data_files import read_data as read_data
 from .experiment.experiment import Experiment as Experiment
 from .experiment.experiment import build as build
 from .experiment.inference import infer as infer

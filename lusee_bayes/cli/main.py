@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import shlex
 import sys
 
@@ -17,7 +18,11 @@ from rich.console import Console
 from lusee_bayes.cli.commands import COMMANDS, help_of
 from lusee_bayes.core.command_line import COMMAND
 from lusee_bayes.core.errors import InputError, WorkersLost
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.version import __version__
+
+# the beginning of a path in the user's folder, by itself or after the name of an option
+HOME = re.compile(r"^(--[a-z-]+=)?(~.*)$", re.DOTALL)
 
 app = App(
     name="lusee-bayes",
@@ -43,10 +48,12 @@ def main(arguments: list[str] | None = None) -> int:
     # and again takes a fifth of their time
     gc.set_threshold(100_000, 20, 100)
     given = sys.argv[1:] if arguments is None else arguments
+    # ~ within an option, as in --data=~/a.nc, is one that no shell has replaced
+    expanded = [HOME.sub(lambda own: (own[1] or "") + str(user_path(own[2])), one) for one in given]
     before = COMMAND.set(shlex.join(["lusee-bayes", *given]))
     errors = Console(stderr=True, soft_wrap=True, highlight=False)
     try:
-        code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+        code = app(expanded, exit_on_error=False, print_error=False, result_action="return_value")
     except InputError as error:
         errors.print(f"lusee-bayes: {error}", markup=False)
         return 2

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.paths import user_path
 
 # held while a run works in a folder; says whose it is
 LOCK = ".lock"
@@ -30,7 +31,7 @@ def require_folder(folder: str | Path) -> None:
         If it, or what it would lie in, is no folder or cannot be written into; if its name is too
         long; and for the root of all files.
     """
-    folder = Path(folder)
+    folder = user_path(folder)
     _require_name(folder)
     if folder.resolve() == Path(folder.resolve().anchor):
         raise InputError(f"'{folder}' is the root of all files; give a folder for the results")
@@ -57,7 +58,7 @@ def require_target(path: str | Path) -> None:
     InputError
         If it is a folder, a pipe or a device, or as :func:`require_folder` for what it lies in.
     """
-    path = Path(path)
+    path = user_path(path)
     _require_name(path)
     mode = _mode(path)
     if not path.name or (mode is not None and stat.S_ISDIR(mode)):
@@ -83,7 +84,7 @@ def require_new(path: str | Path, *, replace: bool) -> None:
         If something is there, unless ``replace``; as :func:`require_target`.
     """
     require_target(path)
-    if not replace and Path(path).exists():
+    if not replace and user_path(path).exists():
         raise InputError(f"'{path}' is there already; give -o another name, or --force")
 
 

@@ -20,6 +20,7 @@ from pathlib import Path, PurePosixPath
 
 from lusee_bayes.core.destinations import require_folder, require_target
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.paths import user_path
 
 # names inside a folder of results: scratch folders (with the process's number and its host, since
 # several may share a disk), the new results that are still to be moved into place, and the list of
@@ -70,7 +71,7 @@ def transaction(
         If ``folder``, or what it would lie in, is a file; if one of the results has the name of a
         folder there; and as :func:`recover`.
     """
-    folder = Path(folder)
+    folder = user_path(folder)
     require_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     recover(folder)
@@ -103,7 +104,7 @@ def recover(folder: str | Path) -> None:
     InputError
         If the folder's manifest cannot be read.
     """
-    folder = Path(folder)
+    folder = user_path(folder)
     if not folder.is_dir():
         return
     old, committed = read_manifest(folder), folder / COMMITTED
@@ -251,7 +252,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     InputError
         If the file cannot be written, or something else than a file has its name.
     """
-    path = Path(path)
+    path = user_path(path)
     require_target(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")

@@ -16,6 +16,7 @@ import numpy as np
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Content, Layout
+from lusee_bayes.core.paths import user_path
 
 # a text file that is larger is none that a person or this package has written
 LARGEST_TEXT = 50_000_000
@@ -41,7 +42,7 @@ def require_file(path: str | Path, what: str, hint: str = "") -> Path:
     InputError
         If there is none, or a folder, a pipe or a device.
     """
-    path = Path(path)
+    path = user_path(path)
     try:
         mode = path.stat().st_mode
     except FileNotFoundError as error:

@@ -6,24 +6,28 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import special
+from lusee_bayes.core.memory import memory_limit
 from lusee_bayes.core.threads import in_threads
 from lusee_bayes.experiment.rounds import model_about, settled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import Around
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.linear.left_out import LeftOut, Missed
+from lusee_bayes.linear.left_out import Missed
+from lusee_bayes.linear.left_out_dense import DenseLeftOut
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.residuals import HOURS_A_DAY, leave_out
+from lusee_bayes.linear.residuals import HOURS_A_DAY
 from lusee_bayes.linear.split import WIDER, Split, widened
 
 # of the times beyond the limit, those within this share of the worst go in one round
 WORST = 0.3
+# arrays of the size of A that are in memory at once, and the share of it that they may take
+ARRAYS, MOST_MEMORY = 5, 0.5
 
 
 class Group(NamedTuple):
@@ -52,7 +56,8 @@ class Comparison:
     Attributes
     ----------
     data : Visibilities
-    left_out : LeftOut
+        With the times and the labels; which of them are compared, ``left_out`` knows.
+    left_out : DenseLeftOut
     chi2, degrees : (times,) arrays
         Of each time, and its mean; 0 where there is nothing to compare with.
     z : (products, times) array
@@ -60,17 +65,40 @@ class Comparison:
     """
 
     data: Visibilities
-    left_out: LeftOut
+    left_out: DenseLeftOut
     chi2: Float[np.ndarray, " times"]
     degrees: Float[np.ndarray, " times"]
     z: Float[np.ndarray, "products times"]
+
+    @classmethod
+    def of(cls, left_out: DenseLeftOut, data: Visibilities) -> Comparison:
+        """Leave out every time, one after the other."""
+        layout, n = left_out.layout, data.layout.n_times
+        counts = np.bincount(layout.time, minlength=n)
+        some, times = np.flatnonzero(counts), np.arange(n)
+        missed = in_threads(lambda k: left_out.stretch(times == k), some.tolist())
+        chi2, degrees = np.zeros(n), np.zeros(n)
+        chi2[some], degrees[some] = _judged(missed, counts[some])
+        with np.errstate(invalid="ignore"):
+            z = left_out.u / np.sqrt(left_out.inverse_diagonal)
+        known = np.asarray(layout.present) & np.isfinite(z) & (degrees > 0.0)
+        return cls(data, left_out, chi2, degrees, np.where(known, z, 0.0))
+
+    def without(self, gone: Bool[np.ndarray, "products times"]) -> Comparison:
+        """Compare the others, with the same model."""
+        return Comparison.of(self.left_out.without(gone), self.data)
 
     @property
     def ratio(self) -> Float[np.ndarray, " times"]:
         """chi^2 of the times over their means, or 0."""
         return np.where(self.degrees > 0.0, self.chi2 / np.maximum(self.degrees, 0.5), 0.0)
 
-    def worst(self, false_alarm: float) -> Bool[np.ndarray, "products times"]:
+    @property
+    def size(self) -> Float[np.ndarray, " times"]:
+        """By how much times, or one of their data, stand out: chi^2 over its mean."""
+        return np.maximum(self.ratio, (self.z**2).max(axis=0) / len(self.z))
+
+    def worst(self, false_alarm: float, least: float = 0.0) -> Bool[np.ndarray, "products times"]:
         """The worst of what stands out: whole times, or a value without which its time fits.
 
         chi^2 of a time less z^2 of one of its data is that of its other data.
@@ -79,6 +107,8 @@ class Comparison:
         ----------
         false_alarm : float
             Chance that a time of noise alone is flagged, or one of its products.
+        least : float
+            ``size`` of what is looked at.
 
         Returns
         -------
@@ -90,8 +120,7 @@ class Comparison:
         tail = _tail(self.chi2, self.degrees)
         single = np.where(judged, special.chdtrc(1.0, most), 1.0) * len(squares)
         out = (tail < false_alarm) | (single < false_alarm)
-        size = np.maximum(self.ratio, most / len(squares))
-        out &= size >= WORST * size.max()
+        out &= self.size >= max(WORST * self.size.max(), least)
         rest = _tail(self.chi2 - most, self.degrees - 1.0)
         alone = out & (self.degrees > 1.5) & (rest >= false_alarm)
         found = np.broadcast_to(out & ~alone, squares.shape).copy()
@@ -111,7 +140,8 @@ class Comparison:
         Group or None
             None if none stands out.
         """
-        layout, left_out = self.data.layout, self.left_out
+        left_out = self.left_out
+        layout = left_out.layout
         shape = (layout.n_products, layout.n_times)
         day = np.floor(self.data.observation.hours / HOURS_A_DAY).astype(int)
         groups, leave = [], []
@@ -127,15 +157,22 @@ class Comparison:
         # one that holds all data has nothing to be compared with
         some = np.flatnonzero(counts < layout.size)
         missed: list[Missed] = in_threads(lambda k: leave[k](), some.tolist())
-        chi2, new = np.array([(m.chi2, m.directions) for m in missed]).reshape(-1, 2).T
-        degrees = counts[some] - np.clip(new, 0.0, counts[some])
-        told = np.isfinite(chi2) & (degrees >= 0.5)
-        chi2, degrees = np.where(told, chi2, 0.0), np.where(told, degrees, 0.0)
+        chi2, degrees = _judged(missed, counts[some])
         out = _tail(chi2, degrees) < false_alarm
         if not out.any():
             return None
         kind, name, mine = groups[some[np.where(out, chi2 - degrees, -np.inf).argmax()]]
         return Group(kind, name, mine, sum(of == kind for of, _, _ in groups))
+
+
+def _judged(
+    missed: list[Missed], counts: Int[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """chi^2 of groups and its means; 0 where the others tell less than half a datum."""
+    chi2, new = np.array([(m.chi2, m.directions) for m in missed]).reshape(-1, 2).T
+    degrees = counts - np.clip(new, 0.0, counts)
+    told = np.isfinite(chi2) & (degrees >= 0.5)
+    return np.where(told, chi2, 0.0), np.where(told, degrees, 0.0)
 
 
 def _tail(
@@ -147,7 +184,7 @@ def _tail(
     return np.where(some, found, 1.0)
 
 
-def compared(setup: Setup, data: Visibilities) -> Comparison | None:
+def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Comparison | None:
     """Leave out every time.
 
     Under a prior that is wide enough for any sky (:mod:`lusee_bayes.linear.residuals`), so that
@@ -158,33 +195,32 @@ def compared(setup: Setup, data: Visibilities) -> Comparison | None:
     setup : Setup
     data : Visibilities
         Measured.
+    settle : bool
+        In as many rounds as N needs to be built around what the data say; else in one, and under
+        a prior whose width asks nothing of them: for what stands out in any case.
 
     Returns
     -------
     Comparison or None
         None where it would need too much memory.
     """
-    model, posterior = on_host(_conditioned(setup, data))
-    wide = _wide(posterior, model.n_data)
-    left_out = leave_out(replace(model, prior=wide.prior), wide, data)
-    if left_out is None:
+    if _memory(setup, data) > MOST_MEMORY * memory_limit():
         return None
-    n = data.layout.n_times
-    counts = np.bincount(data.layout.time, minlength=n)
-    some = np.flatnonzero(counts)
-    times = np.arange(n)
-    missed = in_threads(lambda k: left_out.stretch(times == k), some.tolist())
-    chi2, degrees = np.zeros(n), np.zeros(n)
-    chi2[some] = [m.chi2 for m in missed]
-    new = np.array([m.directions for m in missed])
-    degrees[some] = counts[some] - np.clip(new, 0.0, counts[some])
-    # where the others tell less than half a datum, there is nothing to compare with
-    told = np.isfinite(chi2) & (degrees >= 0.5)
-    chi2, degrees = np.where(told, chi2, 0.0), np.where(told, degrees, 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        z = left_out.u / np.sqrt(left_out.inverse_diagonal)
-    known = np.asarray(data.layout.present) & np.isfinite(z) & (degrees > 0.0)
-    return Comparison(data, left_out, chi2, degrees, np.where(known, z, 0.0))
+    if settle:
+        model, posterior = on_host(_conditioned(setup, data))
+        prior = _wide(posterior, model.n_data).prior
+    else:
+        model = on_host(model_about(setup, Around(data))[0])
+        prior = model.prior.widened(WIDER)
+    left_out = DenseLeftOut(replace(model, prior=prior), data.data, data.layout)
+    return Comparison.of(left_out, data)
+
+
+def _memory(setup: Setup, data: Visibilities) -> float:
+    """Bytes; where N couples times, it is a matrix of all data, too."""
+    n, gain = data.layout.size, setup.scenario.noise.gain
+    across = gain is not None and gain.treatment != "ignored"
+    return 8.0 * ARRAYS * n * (setup.prior.size + (n if across else 0))
 
 
 def _conditioned(setup: Setup, data: Visibilities) -> tuple[LinearGaussian, Posterior]:

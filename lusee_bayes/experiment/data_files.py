@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,11 +12,13 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import image_names, is_fits
 from lusee_bayes.core.formats import format_of
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.experiment.flight_data import reduce_files, visibilities_of
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.averaging import averaged
+from lusee_bayes.instrument.beams.gridded import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.instrument.flight.reduced_file import read_reduced
 from lusee_bayes.instrument.flight.sessions import is_session
@@ -38,13 +41,67 @@ SAME_SCALE = 1e-5
 SAME_TEMPERATURE = 1e-12
 
 
-# a file of visibilities or of reduced spectra, or sessions of the spectrometer
-Data = Path | Sequence[Path]
+# visibilities in memory, of several frequencies a set for each; a file of visibilities or of
+# reduced spectra; or sessions of the spectrometer
+Data = Visibilities | str | Path | Sequence[Visibilities] | Sequence[str | Path]
+
+
+def items_of(data: object) -> tuple[Visibilities, ...] | tuple[Path, ...]:
+    """The sets in memory, or the files that data are in.
+
+    Parameters
+    ----------
+    data : Data
+        Or whatever else is given for it.
+
+    Raises
+    ------
+    InputError
+        For nothing, for anything else, and for sets and files together.
+    """
+    given = (data,) if isinstance(data, Visibilities | str | Path) else data
+    wrong = [given] if not isinstance(given, Sequence) else []
+    wrong = wrong or [one for one in given if not isinstance(one, Visibilities | str | Path)]
+    if wrong:
+        raise InputError(
+            f"data are Visibilities, paths of files, or several of one of them, not a "
+            f"{type(wrong[0]).__name__}; Visibilities.from_arrays makes some of arrays"
+        )
+    sets = tuple(one for one in given if isinstance(one, Visibilities))
+    if not given or len(sets) not in (0, len(given)):
+        raise InputError(
+            "no data are given" if not given else "data are in memory or in files, not in both"
+        )
+    return sets or tuple(user_path(path) for path in given)
 
 
 def files_of(data: Data) -> tuple[Path, ...]:
-    """The files that data are in."""
-    return (data,) if isinstance(data, Path) else tuple(data)
+    """The files that data are in; none for visibilities in memory."""
+    return tuple(item for item in items_of(data) if isinstance(item, Path))
+
+
+def anchored(data: Data) -> tuple[Visibilities, ...] | tuple[Path, ...]:
+    """The same from any folder."""
+    return tuple(path.absolute() for path in files_of(data)) or items_of(data)
+
+
+def names_of_data(data: Data) -> tuple[str, ...]:
+    """Paths of the files, or that there are none."""
+    return tuple(map(str, files_of(data))) or ("visibilities in memory",)
+
+
+def digest_of(data: Data) -> str:
+    """Hash of the content, whatever the names of files are. InputError if there is no file."""
+    digests = []
+    for item in items_of(data):
+        if isinstance(item, Visibilities):
+            digests.append(item.digest())
+            continue
+        with require_file(item, "data", HINT).open("rb") as file:
+            digests.append(hashlib.file_digest(file, "sha256").hexdigest())
+    if len(digests) == 1:
+        return digests[0]
+    return hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
 def are_sessions(data: Data) -> bool:
@@ -56,6 +113,8 @@ def are_sessions(data: Data) -> bool:
         If there are several files, and one is no session.
     """
     files = files_of(data)
+    if not files:
+        return False
     sessions = [is_session(require_file(path, "data", HINT)) for path in files]
     if len(files) > 1 and not all(sessions):
         other = files[sessions.index(False)]
@@ -76,7 +135,8 @@ def reduced_of(data: Data, scenario: Scenario, stages: Stages | None = None) -> 
     files = files_of(data)
     if are_sessions(data):
         return reduce_files(files, scenario, stages)
-    return read_reduced(files[0]) if format_of(files[0]) == formats.REDUCED else None
+    is_reduced = bool(files) and format_of(files[0]) == formats.REDUCED
+    return read_reduced(files[0]) if is_reduced else None
 
 
 def read_data(data: Data, scenario: Scenario) -> Visibilities:
@@ -84,8 +144,9 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
 
     Parameters
     ----------
-    data : Path, or sequence of Path
-        A file, or sessions of the spectrometer, which are reduced.
+    data : Visibilities, path, or sequence of them
+        Visibilities in memory, the one of the scenario's frequency of several; a file; or sessions
+        of the spectrometer, which are reduced.
     scenario : Scenario
         Of the frequency to read, of the instrument that a waterfall has to fit, of what the times
         of a file are that does not say so, and of the time to average over.
@@ -99,17 +160,21 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
     reduced = reduced_of(data, scenario)
     if reduced is not None:
         return visibilities_of(reduced, scenario)
-    path = files_of(data)[0]
-    _require_data(path)
     timestamp, average_s = scenario.observation.timestamp, scenario.observation.average_s
-    if is_fits(path):
+    files = files_of(data)
+    path = files[0] if files else "the data"
+    if files:
+        _require_data(path)
+    if not files:
+        data = _stamped(path, _nearest(items_of(data), scenario.frequency_mhz), timestamp)
+    elif is_fits(path):
         data = _channel(path, scenario)
         # samples of luseepy's simulators are instants; its layout cannot say that others are not
         if timestamp is not None:
             with naming(path):
                 data = data.stamped(timestamp)
     else:
-        data = _own(path, timestamp)
+        data = _stamped(path, read_visibilities(path), timestamp)
     if average_s is None:
         return data
     with naming(path):
@@ -128,9 +193,17 @@ def _require_data(path: Path) -> None:
         raise InputError(f"{path} holds nothing that can be mapped{said}; give {ACCEPTED}")
 
 
-def _own(path: Path, timestamp: Timestamp | None) -> Visibilities:
-    """Read a file of the package; its times are what it says, or else what the scenario says."""
-    data = read_visibilities(path)
+def _nearest(sets: Sequence[Visibilities], frequency_mhz: float) -> Visibilities:
+    """The one set, or the one of a frequency. InputError if there is none."""
+    apart = [abs(data.frequency_mhz - frequency_mhz) for data in sets]
+    if len(sets) > 1 and min(apart) > SAME_FREQUENCY_MHZ:
+        known = ", ".join(f"{data.frequency_mhz:.9g}" for data in sets)
+        raise InputError(f"the data are at {known} MHz, none of them at {frequency_mhz:.15g} MHz")
+    return sets[int(np.argmin(apart))]
+
+
+def _stamped(path: str | Path, data: Visibilities, timestamp: Timestamp | None) -> Visibilities:
+    """Times are what the data say, or else what the scenario says."""
     if not data.says_window:
         if timestamp is None:
             raise InputError(

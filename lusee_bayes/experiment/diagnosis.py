@@ -41,7 +41,7 @@ from lusee_bayes.instrument.beams import ProductBeams
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
-from lusee_bayes.instrument.pointing_offsets import offset_names, with_offsets
+from lusee_bayes.instrument.pointing_offsets import kind_of, offset_names, with_offsets
 from lusee_bayes.instrument.products import all_products, auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.fit import ChiSquare, stands_out, two_sided
@@ -309,11 +309,12 @@ def _offsets(here: _Data, low: Pointing) -> Iterator[tuple[float, ModelMistake]]
             if curvature > 0.0:
                 value += reach * np.clip(0.5 * (seen[0] - seen[2]) / curvature, -3.0, 3.0)
             chi2 = min(seen)
+        section, kind = setup.scenario.noise.pointing, kind_of(name)
+        remedy = f"give noise.pointing.{kind}"
+        if section is not None and kind in section.kinds:
+            remedy = f"widen its prior, noise.pointing.{kind}, or set treatment=sampled"
         words = f"{name} is off by {value:.3g}"
-        yield (
-            chi2,
-            ModelMistake(words, f"give noise.pointing.{name}", setup.beams, shifted(value)),
-        )
+        yield chi2, ModelMistake(words, remedy, setup.beams, shifted(value))
 
 
 def _noise_level(found: Residuals, data: Visibilities) -> Iterator[Proposal]:
@@ -382,7 +383,7 @@ class _Mixed:
             yield self._factor(f"product {product.label}", which)
         yield self._factor("every auto", autos)
         for port in range(n_ports):
-            powers = np.array([(p.i == port) + (p.j == port) for p in products])
+            powers = np.array([float(p.i == port) + float(p.j == port) for p in products])
             yield self._gain(port, powers)
         yield self._constant(np.flatnonzero(autos))
         yield from self._times()

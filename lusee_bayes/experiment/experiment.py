@@ -77,7 +77,8 @@ def build(
     scenario : Scenario
         Of one frequency.
     data : Visibilities, optional
-        Measured data; without them the scenario's own are simulated.
+        Measured data; without them the scenario's own are simulated. A truth of another lmax is
+        cut, or filled with zeros.
     stages : Stages, optional
         Told what is being done.
 
@@ -101,6 +102,7 @@ def observed(
     stages = stages or Stages()
     if data is None:
         return simulated(scenario, stages)
+    data = data.with_truth_up_to(scenario.lmax)
     setup = set_up(scenario, data, stages)
     std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     doubts = (*require_plausible(data, setup.signal, std), *_about_gains(scenario, data))
@@ -143,10 +145,8 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
     if section is None or not section.leave_out or data.calibration is None:
         return experiment
     with stages("times that do not fit"):
-        found = fitting(experiment.setup, data, section.false_alarm)
-        setup, kept = experiment.setup, data
-        if found.flagged.any():
-            setup, kept = without(setup, data, found.flagged)
+        found = fitting(experiment.setup, data, section.false_alarm, stages)
+        setup, kept = without(experiment.setup, data, found.flagged)
     remarks = (found.remark,) if found.remark else ()
     for remark in remarks:
         stages.say(f"  {remark}")

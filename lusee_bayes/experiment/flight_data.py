@@ -12,6 +12,7 @@ from jaxtyping import Float
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import format_of
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import FlightSection
@@ -29,13 +30,13 @@ from lusee_bayes.instrument.visibilities import Visibilities
 
 
 def reduce_files(
-    paths: Sequence[Path], scenario: Scenario, stages: Stages | None = None
+    paths: Sequence[str | Path], scenario: Scenario, stages: Stages | None = None
 ) -> Reduced:
     """Reduce sessions to the scenario's frequencies.
 
     Parameters
     ----------
-    paths : sequence of Path
+    paths : sequence of paths
         HDF5 or FITS of luseepy's ``lusee.ingest``, in any order.
     scenario : Scenario
     stages : Stages, optional
@@ -48,7 +49,8 @@ def reduce_files(
         already, or as :func:`.read_session` and :func:`.reduce_sessions`.
     """
     stages = stages or Stages()
-    known = [Path(path).resolve() for path in paths]
+    paths = [user_path(path) for path in paths]
+    known = [path.resolve() for path in paths]
     for k, path in enumerate(known):
         if path in known[:k]:
             raise InputError(f"'{paths[k]}' is given twice; give every session once")

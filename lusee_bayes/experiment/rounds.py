@@ -110,7 +110,7 @@ def settled(setup: Setup, data: Visibilities, start: Around | None = None) -> In
         model, found = model_about(setup, around)
         return Inference(model, found, model.condition(data.data), rounds, around)
 
-    found = conditioned(start or Around(data, freedom=_freedom(setup, data)), 1)
+    found = conditioned(start or _start(setup, data), 1)
     if not rebuilds(setup):
         return found
     step = _Step()
@@ -183,20 +183,25 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
     return around, step
 
 
-def _freedom(setup: Setup, data: Visibilities) -> Float[np.ndarray, " data"] | None:
-    """Share of each datum that the model follows whose gains are the table's; None without one.
+def _start(setup: Setup, data: Visibilities) -> Around:
+    """What N is built around first: the data and, with a gain table, a model that trusts it.
 
-    The errors change it by no more than what they change the radiometer noise by.
+    That model gives the share of each datum that it follows, which errors of the table change by no
+    more than what they change the radiometer noise by; and, where the modelled sky is another than
+    the data's, visibilities before the gains.
     """
     found = systematics(setup, Around(data))
     others = [(treatment, s) for treatment, s in found if not isinstance(s, GainTable)]
     if len(others) == len(found):
-        return None
+        return Around(data)
     model = marginalised(base_model(setup, Around(data)), others)
     columns = [np.zeros((model.n_data, 0))]
     columns += [np.asarray(s.columns) for _, s in others if isinstance(s, Templated)]
     columns += [np.asarray(s.templates()) for _, s in others if isinstance(s, PointSources)]
-    return data_freedom(model, model.condition(data.data), np.concatenate(columns, axis=1))
+    posterior = model.condition(data.data)
+    freedom = data_freedom(model, posterior, np.concatenate(columns, axis=1))
+    seen = np.asarray(model.predict(posterior.mean)) if setup.measured else None
+    return Around(data, seen=seen, freedom=freedom)
 
 
 def _before_gains(

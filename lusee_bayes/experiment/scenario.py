@@ -16,6 +16,7 @@ import yaml
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.yaml_files import parse_yaml, read_yaml
 from lusee_bayes.experiment.overrides import apply_override
 from lusee_bayes.experiment.scenario_errors import one_sentence
@@ -227,18 +228,24 @@ def scenario_names() -> list[str]:
     )
 
 
-def load_scenario(source: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Scenario:
+def load_scenario(
+    source: str | Path | Scenario, overrides: list[str] | tuple[str, ...] = ()
+) -> Scenario:
     """Read a YAML file, or a scenario of the package by name, and apply ``key.path=value``.
+
+    A scenario is taken as it is, so that every run takes one, its file or its name.
 
     InputError with one sentence for a missing file, bad YAML, an unknown key or a bad value.
     """
-    scenario = _validate(_read_yaml(source), source)
+    scenario = source
+    if not isinstance(source, Scenario):
+        scenario = _validate(_read_yaml(source), source)
     if not overrides:
         return scenario
     tree = scenario.model_dump(mode="json")  # defaults included, so that any entry can be set
     for override in overrides:
         apply_override(tree, override)
-    return _validate(tree, source)
+    return _validate(tree, "the scenario" if isinstance(source, Scenario) else source)
 
 
 def _validate(tree: dict[str, Any], source: str | Path) -> Scenario:
@@ -250,8 +257,8 @@ def _validate(tree: dict[str, Any], source: str | Path) -> Scenario:
 
 def _read_yaml(source: str | Path) -> dict[str, Any]:
     names = scenario_names()
-    if os.path.exists(source):
-        tree = read_yaml(source, "a scenario")
+    if os.path.exists(user_path(source)):
+        tree = read_yaml(user_path(source), "a scenario")
     elif str(source) in names:
         tree = parse_yaml((FOLDER / f"{source}.yaml").read_text(), str(source))
     else:

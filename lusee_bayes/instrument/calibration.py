@@ -32,6 +32,8 @@ class Calibration:
     gain_slope : (errors, times) array
         By how much a port's power gain is above the table's, relative to it, where the error is
         one prior standard deviation; 0 at times when the port has another level.
+    lost : float
+        Share of the spectra that rules of the reduction flagged.
 
     Raises
     ------
@@ -43,6 +45,7 @@ class Calibration:
     gain_names: tuple[str, ...] = ()
     gain_port: Int[np.ndarray, " errors"] | None = None
     gain_slope: Float[np.ndarray, "errors times"] | None = None
+    lost: float = 0.0
 
     def __post_init__(self):
         require_positive("the number of samples averaged", self.n_averaged)
@@ -57,4 +60,4 @@ class Calibration:
     def select(self, keep: Bool[np.ndarray, " times"]) -> Calibration:
         """Return that of the times where ``keep`` is True."""
         slope = None if self.gain_slope is None else self.gain_slope[:, keep]
-        return Calibration(self.n_averaged[keep], self.gain_names, self.gain_port, slope)
+        return Calibration(self.n_averaged[keep], self.gain_names, self.gain_port, slope, self.lost)

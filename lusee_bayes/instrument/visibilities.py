@@ -16,7 +16,8 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_finite, require_float64, require_positive, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
-from lusee_bayes.core.harmonics import lmax_of
+from lusee_bayes.core.harmonics import lmax_of, n_modes
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.representation import Described, extent, listed
 from lusee_bayes.core.units import require_mhz
 from lusee_bayes.core.version import __version__
@@ -48,7 +49,8 @@ class Visibilities(Described):
     observation : Observation
     frequency_mhz : float
     truth : (modes,) array or None
-        The sky of simulated data in K, Galactic; None for real data.
+        The sky of simulated data in K, Galactic, of any lmax (:meth:`with_truth_up_to`); None for
+        real data.
     receiver : MeasuredReceiver or None
         The loads through which they were taken, for data of luseepy's four ports.
     says_window : bool
@@ -229,6 +231,15 @@ class Visibilities(Described):
         seen = replace(observation, times=times, windows=windows)
         return replace(self, observation=seen, says_window=True)
 
+    def with_truth_up_to(self, lmax: int) -> Visibilities:
+        """Return the same with the truth of a map of this lmax: cut, or zero above its own."""
+        if self.truth is None or len(self.truth) == n_modes(lmax):
+            return self
+        truth = np.zeros(n_modes(lmax))
+        known = np.asarray(self.truth)[: len(truth)]
+        truth[: len(known)] = known
+        return replace(self, truth=truth)
+
     def to_dataset(self) -> xr.Dataset:
         """Return a Dataset with dims product, time and run_number.
 
@@ -283,4 +294,4 @@ class Visibilities(Described):
         """
         with replacing(path) as partial:
             self.to_dataset().assign_attrs(attrs or {}).to_netcdf(partial, engine="h5netcdf")
-        return Path(path)
+        return user_path(path)

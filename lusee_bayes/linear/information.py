@@ -196,12 +196,13 @@ class Information(Described, eqx.Module):
         """
         if factor == 1.0:
             return self
+        xp = namespace(self.matrix)
         return replace(
             self,
             matrix=self.matrix / factor,
             vector=self.vector / factor,
-            misfit=self.misfit / factor,
-            log_det=self.log_det + self.n_data * np.log(factor),
+            misfit=xp.asarray(self.misfit / factor),
+            log_det=xp.asarray(self.log_det + self.n_data * np.log(factor)),
             perturbations=None,
         )
 

@@ -186,20 +186,20 @@ def demanded_factor(information: Information, prior: Prior) -> float:
     prior : Prior
         Before there are data, over the same modes.
     """
-    n_data = float(information.n_data)
+    n_data = int(information.n_data)
     try:
         posterior = information.posterior(prior)
         chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
         left = Split.of(posterior, chi2, n_data).instrument
     except InputError:  # the data are too far from any sky for these numbers: rounding rules them
-        left = ChiSquare(float(information.misfit), n_data)
+        left = ChiSquare(float(information.misfit), float(n_data))
     fits = left.too_small or not stands_out(left.p, 1)
     return 1.0 if fits else left.chi2 / left.degrees
 
 
 def _fixed(family: PriorFamily, information: Information) -> Learned:
     """The family's prior before there are data, as wide as the data ask for; see ``settled``."""
-    start, prior, n_data = family.hyperprior.start(), family.expected(), float(information.n_data)
+    start, prior, n_data = family.hyperprior.start(), family.expected(), int(information.n_data)
     posterior = information.posterior(prior)
     known = n_data - expected_chi2(posterior, n_data)
     width = max(1.0, np.sqrt(float(posterior.prior_chi2()) / max(known, 1.0)))

@@ -15,10 +15,9 @@ import xarray as xr
 
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.netcdf_files import says
-from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.version import __version__
+from lusee_bayes.experiment.data_files import Data, digest_of
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.instrument.visibilities import HINT
 
 CHANNELS = "channels"
 
@@ -57,7 +56,7 @@ class ChannelFiles:
             return (file if names is None else file[[n for n in names if n in file]]).load()
 
 
-def identity_of(scenario: Scenario, data: Path | None, truth: bool, n_draws: int) -> str:
+def identity_of(scenario: Scenario, data: Data | None, truth: bool, n_draws: int) -> str:
     """Of all that the results of a run depend on: scenario, data, draws, and the package.
 
     Raises
@@ -67,6 +66,5 @@ def identity_of(scenario: Scenario, data: Path | None, truth: bool, n_draws: int
     """
     parts = [scenario.to_yaml(), str(truth), str(n_draws), __version__]
     if data is not None:
-        require_file(data, "data", HINT)
-        parts.append(hashlib.sha256(data.read_bytes()).hexdigest())
+        parts.append(digest_of(data))
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()

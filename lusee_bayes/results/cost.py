@@ -19,6 +19,7 @@ from lusee_bayes.core.engine import Demand
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.memory import gigabytes, memory_limit
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.comparison import ARRAYS, MOST_MEMORY
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.results.joint_components import is_iterative
@@ -34,6 +35,8 @@ SQUARES, JOINT_SQUARES, OPERATIONS = 8, 4, 12
 ROUNDS = 8
 # what learning a prior adds to them: about five steps with all modes
 LEARNING_SQUARES, LEARNING_OPERATIONS = 4, 80
+# what comparing times of flight data adds, in n_data n^2
+COMPARING_OPERATIONS = 40
 # pixels of every map of a report, and of what each is made of
 MAPS = 12
 # seconds of everything that is not linear algebra
@@ -155,6 +158,10 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
     if scenario.prior.is_learned and not scenario.joint:
         squares += LEARNING_SQUARES * float(n_modes) ** 2
         operations += LEARNING_OPERATIONS * n_channels * float(n_modes) ** 3
+    if scenario.flight is not None and scenario.flight.leave_out:
+        operations += n_channels * COMPARING_OPERATIONS * float(n_data) * float(n_modes) ** 2
+        # without room for it they are not compared
+        squares += min(ARRAYS * float(n_data) * n_modes, MOST_MEMORY * memory_limit() / 8.0)
     gain = scenario.noise.gain
     if gain is not None and gain.treatment == "marginalised":
         # N couples all times, and A is formed

@@ -136,7 +136,8 @@ class CubeResult(Described):
         """What a terminal shows."""
         prior = [] if self.components is None else [self.prior_words()]
         unknowns = [] if self.unknowns is None else self.unknowns.lines()
-        notes = () if self.reduced is None else self.reduced.notes()
+        reduced = self.reduced
+        notes = () if reduced is None else (reduced.flag_line().capitalize(), *reduced.notes())
         told = [self.headline(), *prior, *unknowns, self.verdict(), RULE]
         return [*told, *self.doubts(), *self.gaps(), *notes]
 

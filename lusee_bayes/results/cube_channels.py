@@ -10,7 +10,7 @@ from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.data_files import Data, anchored, read_data
 from lusee_bayes.experiment.experiment import build, with_truth
 from lusee_bayes.experiment.inference import inform
 from lusee_bayes.experiment.scenario import Scenario
@@ -42,7 +42,7 @@ def cube_result(
     scenario: Scenario,
     folder: Path,
     *,
-    data: Path | None = None,
+    data: Data | None = None,
     truth: bool = False,
     engine: Engine | None = None,
     stages: Stages | None = None,
@@ -59,8 +59,8 @@ def cube_result(
         Of several frequencies.
     folder : Path
         Of the run; unfinished work is kept in it.
-    data : Path, optional
-        File of measured data; without it the scenario's own are simulated.
+    data : Visibilities, path, or sequence of them, optional
+        Measured; without them the scenario's own are simulated.
     truth : bool
         The data are of the scenario's own sky.
     engine : Engine, optional
@@ -83,7 +83,7 @@ def cube_result(
     # workers may have other folders of their own
     files = ChannelFiles(folder.resolve(), identity_of(scenario, data, truth, n_draws))
     channels = tuple(channel.anchored() for channel in scenario.channels())
-    data = None if data is None else data.absolute()
+    data = None if data is None else anchored(data)
     names = [names_of((channel,)) for channel in channels]
     tied = scenario.ties_receivers
     wanted = "information" if scenario.joint else "alone" if tied else "result"

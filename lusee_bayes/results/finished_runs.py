@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover, require_files
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import read_json, read_table
 from lusee_bayes.results.diagnostics_file import read_diagnostics
 from lusee_bayes.results.provenance import Provenance
@@ -46,7 +47,7 @@ class FinishedRun:
     @classmethod
     def read(cls, folder: str | Path) -> FinishedRun:
         """InputError if the folder is not one of a finished map run."""
-        folder = Path(folder)
+        folder = user_path(folder)
         recover(folder)
         require_files(folder, NEEDED, "map")
         summary = read_json(folder / "summary.json", MAP_SUMMARY)

@@ -169,14 +169,21 @@ class MapResult(Described):
         offsets = [] if self.pointing is None else self.pointing.lines()
         unknowns = [] if self.unknowns is None else self.unknowns.lines()
         told = [prior_sentence(self.experiment), *fluxes, *offsets, *unknowns]
-        notes = () if self.reduced is None else self.reduced.notes()
-        return [self.verdict(), *told, self.headline(), RULE, *self.channel.doubts, *notes]
+        return [self.verdict(), *told, self.headline(), RULE, *self.channel.doubts, *self._flags()]
+
+    def _flags(self) -> list[str]:
+        """How much of flight data was flagged, and what is doubtful about them."""
+        if self.reduced is None:
+            return []
+        fitting = self.experiment.fitting
+        line = self.reduced.flag_line(self.band, 0.0 if fitting is None else fitting.share)
+        return [line.capitalize(), *self.reduced.doubts(self.band), *self.reduced.notes()]
 
 
 def map_result(
     experiment: Experiment,
     *,
-    onto: Path | None = None,
+    onto: str | Path | None = None,
     diagnosed: bool = False,
     stages: Stages | None = None,
 ) -> MapResult:
@@ -185,7 +192,7 @@ def map_result(
     Parameters
     ----------
     experiment : Experiment
-    onto : Path, optional
+    onto : path, optional
         Folder of an updatable run, to whose data these are added.
     diagnosed : bool
         Try the usual mistakes even if the data fit.

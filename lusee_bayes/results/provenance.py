@@ -10,7 +10,7 @@ from pathlib import Path
 from lusee_bayes.core.command_line import COMMAND
 from lusee_bayes.core.reading import read_json
 from lusee_bayes.core.version import __version__
-from lusee_bayes.experiment.data_files import Data, files_of
+from lusee_bayes.experiment.data_files import Data, names_of_data
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.observation import Observation
@@ -66,7 +66,7 @@ class Provenance:
     ) -> Provenance:
         """Of a run that has used data of an observation, read from files or simulated."""
         return cls(
-            file="" if data is None else ", ".join(map(str, files_of(data))),
+            file="" if data is None else ", ".join(names_of_data(data)),
             known_sky=known_sky,
             seed=scenario.seed,
             first=str(observation.times[0].isot)[:19],

@@ -16,6 +16,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover
 from lusee_bayes.core.harmonics import n_modes, power_spectrum
 from lusee_bayes.core.netcdf_files import read_netcdf
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import reading
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.posterior import Posterior
@@ -37,7 +38,7 @@ def read_updatable(folder: str | Path, scenario: Scenario) -> Updatable:
     InputError if the folder has none, or one of another frequency or lmax.
     """
     recover(folder)
-    path = Path(folder) / "posterior.nc"
+    path = user_path(folder) / "posterior.nc"
     saved = read_netcdf(path, formats.POSTERIOR, UPDATABLE, HINT)
     here, said = saved.arrays, saved.values
     needed = {"precision_root", "white_mean", "log_evidence", "data_digests"}

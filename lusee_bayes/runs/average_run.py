@@ -7,10 +7,11 @@ from pathlib import Path
 
 from lusee_bayes.core.destinations import require_new
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
-from lusee_bayes.experiment.data_files import read_data
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.data_files import Data, files_of, names_of_data, read_data
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import require_fitting, set_up
 from lusee_bayes.instrument.averaging import averaged, product_live_s
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -63,8 +64,8 @@ class AverageRun:
 
 
 def run_average(
-    scenario: Scenario,
-    data: Path,
+    scenario: Scenario | str | Path,
+    data: Data,
     to_s: float,
     path: str | Path,
     *,
@@ -76,11 +77,11 @@ def run_average(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : Scenario, or its file or name
         How to read the data, and what the information is worked out with; ``average_s`` does not
         count.
-    data : Path
-        Visibilities with windows.
+    data : Visibilities or path
+        With windows.
     to_s : float
         Length of the averages, in seconds.
     path : path
@@ -98,13 +99,14 @@ def run_average(
         As :func:`.read_data` and :func:`.averaged`, for a scenario that the data do not fit or that
         needs more memory than there is, and if the file is there already, unless ``replace``.
     """
-    stages, path = stages or Stages(), Path(path)
+    scenario = load_scenario(scenario)
+    stages, path = stages or Stages(), user_path(path)
     if path.suffix == ".fits":
         raise InputError(
             f"'{path}': averages have windows, for which luseepy's waterfalls have no room; give "
             "-o a name that does not end in .fits"
         )
-    if path.resolve() == Path(data).resolve():
+    if path.resolve() in [file.resolve() for file in files_of(data)]:
         raise InputError(
             f"'{path}': the averages would replace the data that they are made of; give -o "
             "another name"
@@ -119,7 +121,7 @@ def run_average(
     scenario = scenario.model_copy(update={"observation": section})
     with stages("data"):
         fine = read_data(data, scenario)
-        with naming(data):
+        with naming(names_of_data(data)[0]):
             coarse = averaged(fine, to_s)
     if information:
         require_fitting(fine, scenario)

@@ -14,7 +14,7 @@ from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import Experiment, observed, with_truth
 from lusee_bayes.experiment.learned_prior import about_sky, evidence_by_sampling, learned_prior
 from lusee_bayes.experiment.named_priors import named_priors
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.linear.importance import LogMean, require_draws
 from lusee_bayes.linear.information import Information
@@ -46,7 +46,7 @@ class ComparePriorsRun:
 
 
 def run_compare_priors(
-    scenario: Scenario,
+    scenario: Scenario | str | Path,
     folder: str | Path,
     priors: Sequence[str] | None = None,
     *,
@@ -65,13 +65,13 @@ def run_compare_priors(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : Scenario, or its file or name
         Of one frequency.
     folder : path
         Of the results.
     priors : sequence of str, optional
         Names (:func:`.named_priors`), two or more; by default all that can be.
-    data : Path or sequence of Path, optional
+    data : Visibilities, path, or sequence of them, optional
         Visibilities to map; without them the scenario's own are simulated.
     truth : bool
         The given data are of the scenario's own sky.
@@ -92,6 +92,7 @@ def run_compare_priors(
         As :func:`.named_priors`, for a scenario of several frequencies or one that samples
         something, and as :func:`run_map`.
     """
+    scenario = load_scenario(scenario)
     engine, stages = engine or ThisProcess(side_by_side=1), stages or Stages()
     require_single_frequency("compare-priors", bool(scenario.frequencies_mhz))
     require_marginal("compare-priors", "set treatment=marginalised", scenario.samples)

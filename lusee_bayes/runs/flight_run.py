@@ -13,9 +13,10 @@ from astropy.time import Time
 from lusee_bayes.core.destinations import require_folder
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import transaction
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.flight.clock import Clock
 from lusee_bayes.instrument.flight.gain_files import write_gain_table
 from lusee_bayes.instrument.flight.session_writing import write_session
@@ -49,7 +50,7 @@ class FlightFiles:
 
 
 def run_simulate_flight(
-    scenario: Scenario,
+    scenario: Scenario | str | Path,
     folder: str | Path,
     *,
     frequencies_mhz: Sequence[float] = (),
@@ -60,7 +61,7 @@ def run_simulate_flight(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : Scenario, or its file or name
         Of one frequency, or several.
     folder : path
         Takes ``session_000.h5``, ... , ``truth.npz`` with what is in which spectrum,
@@ -78,7 +79,7 @@ def run_simulate_flight(
     InputError
         As :func:`.simulate_flight`, and if the folder holds sessions already, or cannot be written.
     """
-    folder = Path(folder)
+    scenario, folder = load_scenario(scenario), user_path(folder)
     require_folder(folder)
     _require_no_sessions(folder, replace)
     stages = stages or Stages()

@@ -14,6 +14,7 @@ from lusee_bayes.core.compilation_cache import publish, use_compilation_cache
 from lusee_bayes.core.destinations import locked, require_folder
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.files import MANIFEST, recover, transaction
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.report.figures.drawing import save
 from lusee_bayes.report.pages import PAGES, REPORT
@@ -107,7 +108,7 @@ def run_folder(
     WorkersLost
         With what the folder holds added to its message.
     """
-    folder = Path(folder)
+    folder = user_path(folder)
     require_folder(folder)
     made = _made(folder)
     try:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.sky import FileSource, GalaxySource, SkySource
 from lusee_bayes.testing.skies import SmoothSky, SpottySky
 
@@ -53,7 +54,7 @@ def given_skies(texts: Sequence[str | Path]) -> list[GivenSky]:
     InputError
         For what is neither, a seed that is no whole number, and two skies of one name.
     """
-    found = [_given(str(text)) for text in texts]
+    found = [_given(str(user_path(text))) for text in texts]
     names = [sky.name for sky in found]
     twice = [name for name in names if names.count(name) > 1]
     if twice:

@@ -15,13 +15,12 @@ from lusee_bayes.core.tables import rows_of, write_csv
 from lusee_bayes.experiment.data_files import (
     Data,
     are_sessions,
-    files_of,
     read_data,
     reduced_of,
 )
 from lusee_bayes.experiment.experiment import Experiment, build, with_truth
 from lusee_bayes.experiment.flight_data import visibilities_of
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.instrument.flight.reduced_file import write_reduced
 from lusee_bayes.linear.compact import CompactPosterior
@@ -72,12 +71,12 @@ class MapRun:
 
 
 def run_map(
-    scenario: Scenario,
+    scenario: Scenario | str | Path,
     folder: str | Path,
     *,
     data: Data | None = None,
     truth: bool = False,
-    onto: Path | None = None,
+    onto: str | Path | None = None,
     diagnosed: bool = False,
     engine: Engine | None = None,
     replace: bool = False,
@@ -90,16 +89,16 @@ def run_map(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : Scenario, or its file or name
         Of one frequency or of several; ``output`` says what is written besides the maps.
     folder : path
         Of the results.
-    data : Path or sequence of Path, optional
-        Visibilities to map, or sessions of the spectrometer; without them the scenario's own are
-        simulated.
+    data : Visibilities, path, or sequence of them, optional
+        Visibilities to map, in memory or in a file, or sessions of the spectrometer; without them
+        the scenario's own are simulated.
     truth : bool
         The given data are of the scenario's own sky: compare the map with it.
-    onto : Path, optional
+    onto : path, optional
         Folder of an updatable run, to whose data these are added.
     diagnosed : bool
         Try the usual mistakes in data and model even if the data fit.
@@ -115,6 +114,7 @@ def run_map(
     InputError
         If the scenario samples something, or for whatever is wrong with scenario, data or folder.
     """
+    scenario = load_scenario(scenario)
     stages = stages or Stages()
     require_marginal("a map", "use: lusee-bayes sample", scenario.samples)
     if not scenario.frequencies_mhz:
@@ -143,7 +143,7 @@ def _run_single(
     folder: str | Path,
     data: Data | None,
     truth: bool,
-    onto: Path | None,
+    onto: str | Path | None,
     diagnosed: bool,
     replace: bool,
     stages: Stages,
@@ -178,13 +178,13 @@ def _as_used(reduced: Reduced, experiment: Experiment) -> Reduced:
 
 def _one_file(
     data: Data | None, scenario: Scenario, folder: Path, stages: Stages
-) -> tuple[Path | None, Reduced | None]:
-    """The file that all channels are read from: of sessions, their reduced spectra."""
+) -> tuple[Data | None, Reduced | None]:
+    """The data that all channels are read from: of sessions, the file of their reduced spectra."""
     if data is None:
         return None, None
     reduced = reduced_of(data, scenario, stages)
     if reduced is None or not are_sessions(data):
-        return files_of(data)[0], reduced
+        return data, reduced
     path = folder / CHANNELS / REDUCED
     path.parent.mkdir(exist_ok=True)
     return write_reduced(path, reduced, scenario.to_yaml()), reduced

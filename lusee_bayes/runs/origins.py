@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -10,10 +9,8 @@ from typing import Any
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import read_manifest
-from lusee_bayes.core.reading import require_file
-from lusee_bayes.experiment.data_files import Data, files_of
+from lusee_bayes.experiment.data_files import Data, digest_of, names_of_data
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.instrument.visibilities import HINT
 
 Origin = Mapping[str, str]
 
@@ -27,8 +24,8 @@ def origin_of(
     ----------
     scenario : Scenario, optional
         What it says of output does not count.
-    data : Path or sequence of Path, optional
-        Files of visibilities; their content counts, not their names.
+    data : Visibilities, path, or sequence of them, optional
+        Their content counts, not the names of files.
     **others
         Whatever else does; None for what is not there.
 
@@ -47,15 +44,8 @@ def origin_of(
         tree = scenario.model_dump(mode="json", exclude={"output"})
         found |= {name: json.dumps(value) for name, value in _entries(tree)}
     if data is not None:
-        digests = []
-        for path in files_of(data):
-            with require_file(path, "data", HINT).open("rb") as file:
-                digests.append(hashlib.file_digest(file, "sha256").hexdigest())
-        names = ", ".join(f"'{path.name}'" for path in files_of(data))
-        digest = digests[0]
-        if len(digests) > 1:
-            digest = hashlib.sha256("".join(digests).encode()).hexdigest()
-        found["data"] = f"{names} ({digest[:12]})"
+        names = ", ".join(f"'{Path(name).name}'" for name in names_of_data(data))
+        found["data"] = f"{names} ({digest_of(data)[:12]})"
     return found | {name: str(value) for name, value in others.items() if value is not None}
 
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from lusee_bayes.core.destinations import require_new
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_data import reduce_files
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.instrument.flight.reduced_file import write_reduced
 
@@ -39,17 +40,16 @@ def reduced_lines(reduced: Reduced) -> list[str]:
     """What was flagged in each band, and how its noise compares with the radiometer's."""
     lines = [reduced.description()[0], *reduced.notes()]
     for band, frequency in enumerate(reduced.frequencies_mhz):
-        parts = [f"{name} {share:.2%}" for name, share in reduced.shares(band).items()]
         noise = reduced.scatter[band]
         told = "" if np.isnan(noise) else f"; scatter {noise:.2f} times the radiometer's"
-        lines.append(f"{frequency:g} MHz: {', '.join(parts)}{told}")
+        lines.append(f"{frequency:g} MHz: {reduced.flag_line(band)}{told}")
         lines += [f"  {text}" for text in reduced.doubts(band)]
     return lines
 
 
 def run_reduce(
-    scenario: Scenario,
-    files: Sequence[Path],
+    scenario: Scenario | str | Path,
+    files: Sequence[str | Path],
     path: str | Path,
     *,
     replace: bool = False,
@@ -59,8 +59,8 @@ def run_reduce(
 
     Parameters
     ----------
-    scenario : Scenario
-    files : sequence of Path
+    scenario : Scenario, or its file or name
+    files : sequence of paths
         Sessions, in any order.
     path : path
         The netCDF file to write.
@@ -75,8 +75,9 @@ def run_reduce(
         As :func:`.reduce_files`, if the file would replace a session, if it is there already,
         unless ``replace``, and if the sessions have no number in any band.
     """
-    stages, path = stages or Stages(), Path(path)
-    if path.resolve() in [Path(file).resolve() for file in files]:
+    scenario = load_scenario(scenario)
+    stages, path = stages or Stages(), user_path(path)
+    if path.resolve() in [user_path(file).resolve() for file in files]:
         raise InputError(f"'{path}' is one of the sessions; give -o another name")
     require_new(path, replace=replace)
     reduced = reduce_files(files, scenario, stages)

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.report.figures import chains as chain_figures
 from lusee_bayes.report.figures import samples as sample_figures
 from lusee_bayes.results.cost import require_resources
@@ -62,7 +63,7 @@ def default_program(scenario: Scenario) -> Program:
 
 
 def run_sample(
-    scenario: Scenario,
+    scenario: Scenario | str | Path,
     folder: str | Path,
     *,
     program: Program | None = None,
@@ -79,14 +80,14 @@ def run_sample(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : Scenario, or its file or name
     folder : path
         Of the results; draws are kept in it as they come.
     program : Program, optional
         By default :func:`default_program`.
     sampler : Sampler, optional
         By default with the scenario's seed.
-    data : Path or sequence of Path, optional
+    data : Visibilities, path, or sequence of them, optional
         Visibilities to use; without them the scenario's own are simulated.
     resume : bool
         Go on with the unfinished run in the folder, or take over a finished one.
@@ -101,6 +102,7 @@ def run_sample(
         For a joint scenario, an unfinished run in the folder that is not to be resumed, and for
         whatever is wrong with scenario, program, data or folder.
     """
+    scenario = load_scenario(scenario)
     if scenario.joint:
         raise InputError(
             "channels are sampled one by one; the joint posterior is Gaussian, and lusee-bayes map "
@@ -108,7 +110,7 @@ def run_sample(
         )
     program = program or default_program(scenario)
     sampler = sampler or Sampler(seed=scenario.seed)
-    folder = Path(folder)
+    folder = user_path(folder)
     if not scenario.frequencies_mhz:
         return _run_single(scenario, folder, program, sampler, data, resume, replace, stages)
     stages = stages or Stages()

@@ -9,9 +9,10 @@ import numpy as np
 
 from lusee_bayes.core.destinations import require_new
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.experiment import Experiment, simulated
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import write_four_port, write_waterfall
 from lusee_bayes.instrument.waterfalls.writing import NO_ROOM
@@ -19,7 +20,7 @@ from lusee_bayes.results.cost import require_fits, simulation_cost
 
 
 def run_simulate(
-    scenario: Scenario,
+    scenario: Scenario | str | Path,
     path: str | Path,
     *,
     frequencies_mhz: Sequence[float] = (),
@@ -30,7 +31,7 @@ def run_simulate(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : Scenario, or its file or name
     path : path
         The file: netCDF, or luseepy's waterfall if the name ends in ``.fits``.
     frequencies_mhz : sequence of float
@@ -52,7 +53,8 @@ def run_simulate(
         If the file is there already, for several channels in a netCDF file, and for what a
         waterfall cannot hold.
     """
-    path, channels = Path(path), (scenario,)
+    scenario = load_scenario(scenario)
+    path, channels = user_path(path), (scenario,)
     stages = stages or Stages()
     require_new(path, replace=replace)
     if path.suffix == ".fits" and scenario.observation.window != "instant":

@@ -13,7 +13,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.tables import write_csv
 from lusee_bayes.experiment.experiment import under_sky
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.report.figures import coverage as coverage_figures
 from lusee_bayes.results.cost import require_resources
@@ -42,7 +42,7 @@ class SkiesRun:
 
 
 def run_skies(
-    scenario: Scenario,
+    scenario: Scenario | str | Path,
     folder: str | Path,
     skies: Sequence[str | Path],
     *,
@@ -58,7 +58,7 @@ def run_skies(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : Scenario, or its file or name
         Of one frequency.
     folder : path
         Of the results.
@@ -79,6 +79,7 @@ def run_skies(
         For no sky, one that there is not, a scenario of several frequencies or one that samples
         something, and as :func:`run_map`.
     """
+    scenario = load_scenario(scenario)
     engine, stages = engine or ThisProcess(side_by_side=1), stages or Stages()
     require_single_frequency("--skies", bool(scenario.frequencies_mhz))
     require_marginal("--skies", "set treatment=marginalised", scenario.samples)

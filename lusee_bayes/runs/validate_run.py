@@ -10,7 +10,7 @@ from lusee_bayes.core.engine import Engine
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.report.figures import samples as sample_figures
 from lusee_bayes.results.cost import require_resources
 from lusee_bayes.results.provenance import Provenance
@@ -35,7 +35,7 @@ class ValidationRun:
 
 
 def run_validate(
-    scenario: Scenario,
+    scenario: Scenario | str | Path,
     folder: str | Path,
     *,
     name: str = "the scenario",
@@ -53,7 +53,7 @@ def run_validate(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : Scenario, or its file or name
     folder : path
         Of the results; draws are kept in it as they come.
     name : str
@@ -62,7 +62,7 @@ def run_validate(
         By default with the scenario's seed.
     simulations : int
         Data sets for simulation-based calibration.
-    data : Path or sequence of Path, optional
+    data : Visibilities, path, or sequence of them, optional
         Visibilities to use; without them the scenario's own are simulated.
     resume : bool
         Go on with the unfinished run in the folder, or judge the finished one again.
@@ -78,6 +78,7 @@ def run_validate(
     InputError
         For too few draws or simulations, and as :func:`run_sample`.
     """
+    scenario = load_scenario(scenario)
     stages = stages or Stages()
     sampler = sampler or Sampler(seed=scenario.seed)
     program = load_program("sky")

@@ -20,6 +20,7 @@ from numpyro import handlers
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import read_text, require_file
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.sampling.promotion import numpyro_promotion
@@ -175,7 +176,7 @@ def load_program(source: str | Path) -> Program:
 def _find(source: str | Path) -> Path:
     if str(source) in program_names():
         return next(f / f"{source}.py" for f in FOLDERS if (f / f"{source}.py").exists())
-    path = Path(source)
+    path = user_path(source)
     if path.suffix == ".py":
         own = f"the package has {', '.join(program_names())}"
         return require_file(path, "program", own)

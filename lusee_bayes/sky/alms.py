@@ -21,6 +21,7 @@ from lusee_bayes.core.fits_files import is_fits, opened
 from lusee_bayes.core.harmonics import from_healpy, lmax_of, n_modes, to_healpy
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import read_arrays
 from lusee_bayes.sky.files import SkyFile
 
@@ -83,7 +84,7 @@ class SkyAlms(SkyFile):
             For a file that cannot be read, arrays that are missing or do not fit, coefficients
             that do not fill an lmax, and numbers that are not finite.
         """
-        path = Path(path)
+        path = user_path(path)
         frequencies, alm = _read_npz(path) if path.suffix == ".npz" else (None, _read_fits(path))
         require_finite(f"{path}: the coefficients", np.stack([alm.real, alm.imag]))
         return cls(str(path), frequencies, from_healpy(np.atleast_2d(alm)))
@@ -156,7 +157,7 @@ def write_alms(path: str | Path, modes: Float[Array, " modes"], header: dict[str
         table.header[key] = value
     with replacing(path) as partial:
         fits.HDUList([fits.PrimaryHDU(), table]).writeto(partial)
-    return Path(path)
+    return user_path(path)
 
 
 def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.fits_files import is_fits, opened
 from lusee_bayes.core.hdf5_probe import require_readable_hdf5
 from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import reading
 from lusee_bayes.sky.files import SkyFile, modes_of_map
 
@@ -63,7 +64,7 @@ class SkyMap(SkyFile):
         InputError
             If the file cannot be used. The message says what is wrong and how to mend it.
         """
-        path = Path(path)
+        path = user_path(path)
         hdf5 = h5py.is_hdf5(path)
         pixels = _read_hdf5(path, dataset or ULSA_DATASET) if hdf5 else _read_fits(path)
         if not _nside(pixels.size):

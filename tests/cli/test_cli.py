@@ -161,6 +161,19 @@ def test_info_recognises_its_files(folder, tmp_path, capsys):
         assert words in capsys.readouterr().out
 
 
+def test_the_users_folder_stands_for_a_tilde_everywhere(tmp_path, monkeypatch, capsys):
+    """In an option with =, which no shell replaces, in --set and in a scenario."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert run("simulate", "fiducial", *SMALL, "--output=~/sim.nc", "-q") == 0
+    assert (tmp_path / "sim.nc").is_file()
+    assert run("info", "~/sim.nc") == 0
+    (tmp_path / "own.yaml").write_text("sky: {model: file, file: ~/gone.fits}")
+    assert run("map", "~/own.yaml", "-o", "~/out") == 2
+    assert run("map", "fiducial", "--set", "beam.file=~/gone.nc", "-o", "~/out") == 2
+    told = capsys.readouterr().err
+    assert f"'{tmp_path / 'gone.fits'}'" in told and f"'{tmp_path / 'gone.nc'}'" in told
+
+
 @pytest.mark.long
 def test_data_without_truth(folder, tmp_path):
     run("simulate", "fiducial", *SMALL, "-o", tmp_path / "sim.nc", "-q")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from fits_files import write_images
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.data_files import read_data
+from lusee_bayes.experiment.data_files import digest_of, items_of, read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.averaging import averaged
@@ -15,7 +17,7 @@ from lusee_bayes.instrument.observation import Observation, Run
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.visibilities_file import read_visibilities
 from lusee_bayes.instrument.waterfalls import write_waterfall
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.testing import assert_refused, small_scenario
 
 STEP = 7200.0
 # from the stamps to the beginning of the windows
@@ -40,6 +42,41 @@ def file_of(folder, window):
 
 def scenario(*overrides):
     return small_scenario(*overrides, lmax=2, cycles=0.02)
+
+
+def test_data_come_as_paths_or_in_memory(tmp_path, monkeypatch):
+    """A string, ~ of a user, several frequencies: the same data by every way."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    path, _ = file_of(tmp_path, "mean")
+    read = read_visibilities(path)
+    for given in (path, str(path), "~/data.nc", [str(path)], read, (read,)):
+        found = read_data(given, scenario())
+        assert found.digest() == read.digest() == digest_of(found)
+    other = replace(read, frequency_mhz=30.0)
+    there = read_data([read, other], scenario("frequency_mhz=30"))
+    assert there.frequency_mhz == 30.0
+    averages = read_data(read, scenario(f"observation.average_s={2 * STEP}"))
+    assert averages.digest() == averaged(read, 2 * STEP).digest()
+    for given, noun in (
+        ([read, other], "none of them at 20 MHz"),
+        ([read, path], "not in both"),
+        ([], "no data"),
+    ):
+        with pytest.raises(InputError, match=noun):
+            read_data(given, scenario("frequency_mhz=20"))
+    for given in (np.zeros(3), [3.0]):
+        assert_refused(lambda given=given: items_of(given))
+
+
+def test_a_truth_of_another_lmax_is_cut_or_filled():
+    """Data that are simulated at one lmax and mapped at others."""
+    made = build(scenario()).data
+    for lmax in (1, 2, 4):
+        truth = build(small_scenario(lmax=lmax, cycles=0.02), made).data.truth
+        n = min(9, (lmax + 1) ** 2)
+        assert truth.shape == ((lmax + 1) ** 2,)
+        np.testing.assert_array_equal(truth[:n], made.truth[:n])
+        assert not truth[n:].any()
 
 
 @pytest.mark.parametrize("timestamp", TO_START)

@@ -13,7 +13,8 @@ from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model, radiometer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.simulate import simulate
-from lusee_bayes.experiment.terms import Around, measured_visibilities
+from lusee_bayes.experiment.terms import Around
+from lusee_bayes.experiment.terms.noise_about import measured_visibilities
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
@@ -120,13 +121,13 @@ def test_the_radiometer_is_built_around_measured_temperatures_if_asked(tiny_expe
     setup = replace(tiny_experiment.setup, scenario=scenario)
     data = replace(tiny_experiment.data, data=2.0 * tiny_experiment.data.data)
     autos = [0, 7, 12, 15]
-    measured = np.asarray(radiometer(setup, data).diagonal()).reshape(16, -1)[autos]
+    measured = np.asarray(radiometer(setup, Around(data)).diagonal()).reshape(16, -1)[autos]
     modelled = np.asarray(radiometer(setup).diagonal()).reshape(16, -1)[autos]
     signal = np.asarray(setup.signal)[autos]
     expected = modelled * (np.asarray(data.data).reshape(16, -1)[autos] / signal) ** 2
     np.testing.assert_allclose(measured, expected, rtol=1e-12)
     np.testing.assert_array_equal(
-        full_model(setup, Around(data)).noise.diagonal(), radiometer(setup, data).diagonal()
+        full_model(setup, Around(data)).noise.diagonal(), radiometer(setup, Around(data)).diagonal()
     )
 
 

@@ -113,7 +113,7 @@ def test_ignored_or_left_out_it_is_not_in_n(registered):
 
 def test_sampled_it_is_left_to_the_program(registered):
     setup = setup_with(treatment="sampled")
-    base, (term,) = model_to_sample(setup, small_experiment().data)
+    base, (term,) = model_to_sample(setup, Around(small_experiment().data))
     assert isinstance(term, Hum)
     np.testing.assert_array_equal(base.noise.diagonal(), radiometer(setup).diagonal())
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -15,7 +16,15 @@ from lusee_bayes.instrument.flight.clock import read_clock
 from lusee_bayes.instrument.flight.gain_files import read_gain_table
 from lusee_bayes.instrument.flight.lines import KnownLines
 from lusee_bayes.instrument.flight.recipe import Recipe
-from lusee_bayes.instrument.flight.reduced import COMB, NO_FIT, REASONS, SATURATED, USED
+from lusee_bayes.instrument.flight.reduced import (
+    BURST,
+    COMB,
+    NO_DATA,
+    NO_FIT,
+    REASONS,
+    SATURATED,
+    USED,
+)
 from lusee_bayes.instrument.flight.reduced_file import read_reduced, write_reduced
 from lusee_bayes.instrument.flight.reduction import reduce_sessions
 from lusee_bayes.instrument.flight.sessions import read_session
@@ -261,6 +270,21 @@ def test_components_change_the_gain_as_the_table_says(flight, table):
     ratio = found.values[0, 0] / other.values[0, 0] - 1.0
     # to first order; of a band's mean gain for the middle's
     np.testing.assert_allclose(calibration.gain_slope[0], ratio, rtol=0.02)
+
+
+def test_shares_of_flags_are_those_of_the_values_that_there_were(reduced):
+    """Of 20 spectra 2 hold no data, 3 are bursts, 2 saturated; half of the rest does not fit."""
+    reason = np.full(reduced.reason.shape, NO_DATA, dtype=np.uint8)
+    reason[0, :20] = USED
+    reason[0, :7] = [NO_DATA, NO_DATA, BURST, BURST, BURST, SATURATED, SATURATED]
+    some = replace(reduced, reason=reason)
+    assert some.flagged(0) == pytest.approx({"saturated": 2 / 18, "burst": 3 / 18})
+    line = some.flag_line(0, 0.5)
+    assert line.startswith("flagged 63.89% of the values: ")
+    assert "does not fit the map 36.11%" in line and "burst 16.67%" in line
+    told = [text for text in some.doubts(0) if "more than a fifth" in text]
+    assert len(told) == 1 and "burst 16.67%" in told[0]
+    assert not any("fifth" in text for text in reduced.doubts(0))
 
 
 def test_files_of_reduced_spectra_hold_all(reduced, tmp_path):

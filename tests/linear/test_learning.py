@@ -120,7 +120,7 @@ def test_others_integrated_out(case):
 
 def test_nothing_settles_without_steps(case, monkeypatch):
     monkeypatch.setattr("lusee_bayes.linear.learning.MAX_STEPS", 0)
-    with pytest.raises(InputError, match=r"did not settle in 0 steps.*prior\.model"):
+    with pytest.raises(InputError, match="did not settle in 0 steps"):
         learn(case.family, case.information)
     # a family far from its own start is still found
     far = replace(case.family, log_monopole=case.family.log_monopole + 1.0)

@@ -84,6 +84,32 @@ def test_densities_of_groups_are_what_the_covariance_of_the_data_says():
     assert not groups
 
 
+@pytest.mark.parametrize("kind", [*KINDS, "coupled"])
+def test_what_is_taken_out_leaves_the_model_of_the_rest(kind):
+    """K = A S A^T + N of the others as a matrix: their u, and a time's chi^2 given the rest."""
+    drift = ["noise.gain={sigma: 0.01, visibilities: model}"]
+    e = build(load_scenario("fiducial", [*FEW, NOISY, *KINDS.get(kind, drift)]))
+    model, layout = full_model(e.setup), e.data.layout
+    gone = np.zeros((layout.n_products, layout.n_times), dtype=bool)
+    gone[:, 4] = gone[6, 9] = gone[2] = True
+    left = DenseLeftOut(model, e.data.data, layout).without(gone)
+    keep = ~gone[layout.product, layout.time]
+    a, n = (np.asarray(x) for x in (model.coupling.dense(), model.noise.dense()))
+    k = (a @ np.diag(model.prior.variance()) @ a.T + n)[np.ix_(keep, keep)]
+    rest = e.data.data if model.offset is None else e.data.data - model.offset
+    inverse = np.linalg.inv(k)
+    u = inverse @ np.asarray(rest)[keep]
+    np.testing.assert_allclose(left.u[~gone], u, rtol=0, atol=1e-7 * np.abs(u).max())
+    assert not left.u[gone].any()
+    here = layout.time[keep] == 9
+    block = inverse[np.ix_(here, here)]
+    noise = (inverse @ n[np.ix_(keep, keep)] @ inverse)[np.ix_(here, here)]
+    found = left.stretch(np.arange(layout.n_times) == 9)
+    assert found.chi2 == pytest.approx(u[here] @ np.linalg.solve(block, u[here]), rel=1e-6)
+    expected = here.sum() - np.trace(np.linalg.solve(block, noise))
+    assert found.directions == pytest.approx(expected, abs=1e-5)
+
+
 def test_smooth_functions_are_few_and_make_up_every_phase():
     azimuth = np.linspace(2.9, 3.6, 300) % np.pi  # a turn in between does not matter
     azimuth = np.where(azimuth < 1.0, azimuth + np.pi, azimuth)

@@ -96,6 +96,27 @@ def test_independent_channels_are_maps_of_each_frequency(independent):
     assert not (independent / "channels").exists()
 
 
+def test_runs_take_names_strings_and_data_in_memory(tmp_path, monkeypatch, numbers_alone):
+    """A cube of sets in memory is that of the same data simulated; ~ is the user's folder."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    scenario = three(frequencies="[20, 25]")
+    sets = [build(channel).data for channel in scenario.channels()]
+    file = tmp_path / "three.yaml"
+    file.write_text(scenario.to_yaml())
+    here = run_map("~/three.yaml", "~/memory", data=sets, truth=True)
+    assert here.folder == tmp_path / "memory"
+    assert_equal(
+        posterior_of(here.folder), posterior_of(run_map(file, tmp_path / "b").folder), 1e-6
+    )
+    # the same sets are the same run, others are not
+    run_map(scenario, str(here.folder), data=tuple(sets), truth=True)
+    with pytest.raises(InputError, match="data is"):
+        run_map(scenario, here.folder, data=sets[::-1], truth=True)
+    assert json.loads((here.folder / "provenance.json").read_text())["file"] == (
+        "visibilities in memory"
+    )
+
+
 @pytest.mark.long
 def test_files_of_a_cube_agree_with_each_other(joint, capsys):
     cube = posterior_of(joint)

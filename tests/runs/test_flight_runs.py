@@ -50,7 +50,10 @@ def test_a_map_of_simulated_sessions_has_the_sky_that_was_simulated(tmp_path, ca
     line = capsys.readouterr().out.strip().splitlines()[-1]
     program, *arguments = shlex.split(line)
     assert program == "lusee-bayes"
-    assert main([*arguments, "--covariance", "--truth", "-q", "-o", str(tmp_path / "map")]) == 0
+    assert main([*arguments, "--covariance", "--truth", "-o", str(tmp_path / "map")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(line.startswith("Flagged ") and "% of the values" in line for line in lines) == 1
+    assert any("times compared at lmax=3, round 1" in line for line in lines)
     found = xr.load_dataset(tmp_path / "map" / "posterior.nc", engine="h5netcdf")
     off = (found["mean"] - found["truth"]).values
     chi2 = off @ np.linalg.solve(found["covariance"].values, off)

@@ -19,7 +19,7 @@ import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model, model_to_sample, radiometer
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.simulate import true_values
-from lusee_bayes.experiment.terms import point_sources
+from lusee_bayes.experiment.terms import Around, point_sources
 from lusee_bayes.instrument.beams import monopole_beams
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.noise import difference
@@ -271,7 +271,7 @@ def test_the_level_is_that_of_the_radiometer_only():
     sources = ALL[4].replace("sampled", "marginalised")
     e = small_experiment(ALL[0], "noise.beam.shift_mhz=2", sources)
     setup, data, program = e.setup, e.data, load_program("systematics")
-    base, rest = model_to_sample(setup, data)
+    base, rest = model_to_sample(setup, Around(data))
     assert isinstance(rest[0], NoiseLevel)
     assert all(isinstance(systematic, Marginalised) for systematic in rest[1:]) and len(rest) == 3
     np.testing.assert_array_equal(base.noise.diagonal(), radiometer(setup).diagonal())

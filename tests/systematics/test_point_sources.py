@@ -30,7 +30,7 @@ from lusee_bayes.experiment.model import (
 )
 from lusee_bayes.experiment.setup import Setup, source_responses
 from lusee_bayes.experiment.simulate import simulate, true_values
-from lusee_bayes.experiment.terms import point_sources
+from lusee_bayes.experiment.terms import Around, point_sources
 from lusee_bayes.instrument.source_response import altitude_deg
 from lusee_bayes.linear.fit import RULE
 from lusee_bayes.linear.templates import template_amplitudes
@@ -325,7 +325,7 @@ def test_the_treatment_changes_the_model_only():
     sampled = setup_of("sampled")
     marginalised = full_model(setup_of()).noise.dense()
     np.testing.assert_array_equal(full_model(sampled).noise.dense(), marginalised)
-    base, rest = model_to_sample(sampled, data())
+    base, rest = model_to_sample(sampled, Around(data()))
     assert base.offset is None and len(rest) == 1
 
 

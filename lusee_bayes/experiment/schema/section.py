@@ -10,6 +10,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from lusee_bayes.core.units import LARGEST_MHZ, NOT_HZ
 
+from lusee_bayes.core.paths import user_path
+
 S = TypeVar("S", bound="Section")
 
 
@@ -74,11 +76,13 @@ class Section(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _lists_are_tuples(cls, tree: Any) -> Any:
-        """YAML has lists where sections have tuples."""
+    def _as_sections_have_it(cls, tree: Any) -> Any:
+        """YAML has lists where sections have tuples, and ``~`` in the names of files."""
         if not isinstance(tree, Mapping):
             return tree
-        return {key: tuple(v) if isinstance(v, list) else v for key, v in tree.items()}
+        found = {key: tuple(v) if isinstance(v, list) else v for key, v in tree.items()}
+        names = {key: found[key] for key in FILES if isinstance(found.get(key), str)}
+        return found | {key: str(user_path(n)) for key, n in names.items() if n.startswith("~")}
 
 
 def known_keys(kinds: Mapping[str, type[Section]]) -> set[str]:

@@ -10,8 +10,6 @@ in rounds (:mod:`lusee_bayes.experiment.rounds`).
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from jaxtyping import Float
 
@@ -19,6 +17,7 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.schema import NoiseAbout
 from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.experiment.terms.term import Around
 from lusee_bayes.instrument.gaps import without_gaps
 from lusee_bayes.instrument.products import all_products, auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -26,13 +25,6 @@ from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
 
 # in standard deviations of a common amplitude
 HARMLESS_BIAS = 0.1
-
-
-class _Around(Protocol):
-    """What :class:`.Around` has of it."""
-
-    data: Visibilities | None
-    visibilities: Float[Array, "products times"] | None
 
 
 def radiometer_about(setup: Setup) -> NoiseAbout:
@@ -85,7 +77,7 @@ def _has_autos(setup: Setup) -> bool:
 
 
 def noise_visibilities(
-    setup: Setup, around: _Around, about: NoiseAbout
+    setup: Setup, around: Around, about: NoiseAbout
 ) -> Float[Array, "products times"]:
     """The visibilities that a term of N is built around, in K.
 

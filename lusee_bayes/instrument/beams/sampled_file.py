@@ -21,6 +21,7 @@ from lusee_bayes.core.files import replacing
 from lusee_bayes.core.fits_files import image_names, is_fits, read_fits
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.netcdf_files import read_netcdf
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import naming
 from lusee_bayes.instrument.beams.sampled import SampledBeams, sampled_beams
 from lusee_bayes.instrument.products import labels
@@ -68,7 +69,7 @@ def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
 
 def is_sampled_file(path: str | Path) -> bool:
     """Whether there is a file of this layout at a path."""
-    path = Path(path)
+    path = user_path(path)
     if not path.is_file():
         return False
     if is_fits(path):
@@ -92,7 +93,7 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
     InputError
         If the file is missing, damaged or of another kind, or not as declared.
     """
-    path = Path(path)
+    path = user_path(path)
     in_fits = path.is_file() and is_fits(path)
     if in_fits:
         there = frozenset(image_names(path))
@@ -136,7 +137,7 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
     -------
     Path
     """
-    path, fields = Path(path), beams.products is None
+    path, fields = user_path(path), beams.products is None
     grid = beams.directions.theta is not None
     arrays = {"frequency_mhz": beams.frequencies_mhz}
     if fields:

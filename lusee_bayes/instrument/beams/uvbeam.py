@@ -17,13 +17,14 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import has_words
 from lusee_bayes.core.formats import UVBEAM_WORDS
 from lusee_bayes.core.lazy import pyuvdata
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import reading
 from lusee_bayes.instrument.beams.sampled import SampledBeams, sampled_beams
 
 
 def is_uvbeam_file(path: str | Path) -> bool:
     """Whether there is a beam FITS file of pyuvdata at a path."""
-    path = Path(path)
+    path = user_path(path)
     return path.is_file() and has_words(path, UVBEAM_WORDS)
 
 

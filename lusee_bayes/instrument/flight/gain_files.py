@@ -12,6 +12,7 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.netcdf_files import read_netcdf
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import read_table, reading, require_file
 from lusee_bayes.instrument.flight.gain_table import (
     LETTERS,
@@ -59,7 +60,7 @@ def read_gain_table(path: str | Path, model: str = "quadratic") -> GainTable:
     InputError
         If something is missing or not as it should be.
     """
-    path = Path(path)
+    path = user_path(path)
     if path.is_dir():
         return _read_folder(path, model)
     require_file(path, "a gain table", HINT)
@@ -92,7 +93,7 @@ def write_gain_table(path: str | Path, table: GainTable) -> Path:
     )
     with replacing(path) as partial:
         dataset.to_netcdf(partial, engine="h5netcdf")
-    return Path(path)
+    return user_path(path)
 
 
 def _read_folder(folder: Path, model: str) -> GainTable:

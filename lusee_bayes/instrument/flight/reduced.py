@@ -40,6 +40,8 @@ CORRECTED = "session, corrected by the clock file"
 # beyond these, something is said: scatter over the radiometer noise, and what two more powers of
 # the frequency change, in standard deviations of a bin
 NOISY, CURVED = 1.2, 0.5
+# likewise, the share of the spectra that is flagged
+MUCH = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,9 +185,37 @@ class Reduced(Described):
             if share or not k
         }
 
+    def flagged(self, band: int | None = None, misfit: float = 0.0) -> dict[str, float]:
+        """Return the share that each rule has flagged of the values that there were.
+
+        Parameters
+        ----------
+        band : int, optional
+            By default all of them.
+        misfit : float
+            Share of the values left by the other rules that does not fit the map.
+        """
+        rows = self.reason if band is None else self.reason[band]
+        counts = np.bincount(rows.ravel(), minlength=len(REASONS))
+        counts[[USED, NO_DATA]] = counts[USED] + counts[NO_FIT], 0
+        shares = counts / max(counts.sum() - counts[NO_FIT], 1)
+        shares[NO_FIT] = misfit * shares[USED]
+        return {REASONS[k]: float(shares[k]) for k in range(1, len(REASONS)) if shares[k]}
+
+    def flag_line(self, band: int | None = None, misfit: float = 0.0) -> str:
+        """Say how much was flagged, as :meth:`flagged`."""
+        found = self.flagged(band, misfit)
+        rules = ", ".join(f"{name} {share:.2%}" for name, share in found.items())
+        return f"flagged {sum(found.values()):.2%} of the values" + (f": {rules}" if rules else "")
+
     def doubts(self, band: int) -> tuple[str, ...]:
         """Return what is doubtful about a band, a sentence each."""
         found = []
+        if sum(self.flagged(band).values()) > MUCH:
+            found.append(
+                f"The rules of the reduction {self.flag_line(band)}. That is more than a fifth: "
+                "check the sessions, flight.false_alarm, flight.lines and flight.comb."
+            )
         noise, curvature = float(self.scatter[band]), float(self.curvature[band])
         if noise > NOISY:
             found.append(
@@ -254,6 +284,7 @@ class Reduced(Described):
 
     def _calibration(self, band: int, bins: Int[np.ndarray, " left"]) -> Calibration:
         names, ports, slopes = [], [], []
+        lost = float(sum(self.flagged(band).values()))
         levels = self.level[bins]
         for level in LETTERS:
             for port in range(levels.shape[1]):
@@ -265,8 +296,8 @@ class Reduced(Described):
                         slopes.append(np.where(here, slope, 0.0))
         n_averaged = self.n_averaged[band, bins]
         if not names:
-            return Calibration(n_averaged)
-        return Calibration(n_averaged, tuple(names), np.array(ports), np.array(slopes))
+            return Calibration(n_averaged, lost=lost)
+        return Calibration(n_averaged, tuple(names), np.array(ports), np.array(slopes), lost)
 
     def _errors(
         self, band: int, bins: Int[np.ndarray, " left"], level: str, port: int

@@ -14,6 +14,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.netcdf_files import read_netcdf
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument.flight.gain_table import LETTERS
@@ -138,7 +139,7 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
     encoding = dict.fromkeys(("before_flags", "reason", "line_share", "visibility"), small)
     with replacing(path) as partial:
         dataset.to_netcdf(partial, engine="h5netcdf", encoding=encoding)
-    return Path(path)
+    return user_path(path)
 
 
 def read_reduced(path: str | Path) -> Reduced:

@@ -14,6 +14,7 @@ from jaxtyping import Float32
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.instrument.flight.session_rows import SessionRows
 from lusee_bayes.instrument.flight.session_writing_fits import write_fits_session
 from lusee_bayes.instrument.flight.session_writing_hdf5 import write_hdf5_session
@@ -53,7 +54,7 @@ def write_session(
             f"sessions are written as hdf5 or fits of layout 3 or 4, not as {kind} of layout "
             f"{layout}"
         )
-    path = Path(path)
+    path = user_path(path)
     with replacing(path) as partial:
         if kind == "fits":
             write_fits_session(partial, rows, blocks, layout)

@@ -12,6 +12,7 @@ from astropy.io import fits
 from jaxtyping import Complex, Float
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.instrument.beams.circuit import Circuit
 from lusee_bayes.instrument.beams.gridded import Interpolation
 from lusee_bayes.instrument.products import all_products, labels, to_matrix
@@ -62,7 +63,7 @@ def write_four_port(
         For what the layout cannot hold: open ports, windows, turntable angles other than 0, other
         than four ports, channels of different observations.
     """
-    path, observation = Path(path), channels[0].observation
+    path, observation = user_path(path), channels[0].observation
     receiver, loads = circuits[0].receiver, [circuit.load_ohm for circuit in circuits]
     if receiver is None:
         raise InputError(

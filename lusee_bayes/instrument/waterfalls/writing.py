@@ -14,6 +14,7 @@ from jaxtyping import Complex, Float
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
+from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import N_ANTENNAS, all_products
@@ -57,7 +58,7 @@ def write_waterfall(
         other than 0, other than four ports, channels of different observations, fewer than two
         channels.
     """
-    path, first = Path(path), channels[0].observation
+    path, first = user_path(path), channels[0].observation
     if len(channels) < 2:
         raise InputError(
             f"{path}: luseepy's reader takes waterfalls of at least two channels; give it "
