@@ -49,7 +49,8 @@ def checks_table(checks: list[Check]) -> Table:
     table = Table("check", "value", "allowed", "", "what it is")
     for check in checks:
         verdict = "ok" if check.passed else "FAILED"
-        table.add_row(check.name, f"{check.value:.4g}", allowed(check), verdict, check.meaning)
+        meaning = escape(check.meaning)
+        table.add_row(escape(check.name), f"{check.value:.4g}", allowed(check), verdict, meaning)
     return table
 
 

@@ -85,7 +85,7 @@ def transaction(
             "discard": list(discard),
             "origin": dict(origin or {}),
         }
-        (stage / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n")
+        (stage / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
         with uninterrupted():
             os.replace(stage, folder / COMMITTED)
             recover(folder)
@@ -177,7 +177,7 @@ def read_manifest(folder: Path) -> dict | None:
     if not path.is_file():
         return None
     try:
-        manifest = json.loads(path.read_text())
+        manifest = json.loads(path.read_text(encoding="utf-8"))
         found = {name: manifest[name] for name in ("kind", "files", "discard")}
         if not isinstance(found["kind"], str):
             raise TypeError("the kind of the run is no text")

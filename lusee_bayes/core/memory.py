@@ -18,7 +18,7 @@ def memory_limit() -> int:
     """Bytes of this machine's memory, or of the share of it that the process is limited to."""
     limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     for path in CGROUP_LIMITS:
-        text = path.read_text().strip() if path.is_file() else ""
+        text = path.read_text(encoding="utf-8").strip() if path.is_file() else ""
         if text.isdigit():
             limits.append(int(text))
     return min(limits)

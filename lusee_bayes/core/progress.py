@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -45,7 +46,7 @@ class Stages:
         if self.console is None:
             yield
         else:
-            with self.console.status(f"{name} ..."):
+            with self.console.status(escape(f"{name} ...")):
                 yield
         self._finish(name, start)
 
@@ -69,12 +70,12 @@ class Stages:
             yield lambda done, remark="": None
         else:
             columns = (
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),
                 BarColumn(),
                 MofNCompleteColumn(),
                 TimeElapsedColumn(),
                 TimeRemainingColumn(),
-                TextColumn("{task.fields[remark]}"),
+                TextColumn("{task.fields[remark]}", markup=False),
             )
             with Progress(*columns, console=self.console, transient=True) as bar:
                 task = bar.add_task(name, total=total, remark="")
@@ -91,7 +92,7 @@ class Stages:
         if self.console is not None:
             memory = f"  {peak_memory_gb():6.2f} GB" if self.verbose else ""
             text = f"  {name:<28} {self.seconds[name]:7.2f} s{memory}"
-            self.console.print(text, highlight=False)
+            self.console.print(text, highlight=False, markup=False)
 
 
 def peak_memory_gb() -> float:

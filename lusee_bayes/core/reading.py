@@ -88,7 +88,7 @@ def reading(path: str | Path, what: str, hint: str = "") -> Iterator[Path]:
             # what is said of a damaged file is said by the error, if by anything
             warnings.simplefilter("ignore")
             yield path
-    except InputError:
+    except (InputError, MemoryError):
         raise
     except Exception as error:
         raise InputError(

@@ -186,7 +186,7 @@ def sample_result(
         "program": program.name,
         "program text": program.digest,
         **{f"sampler's {name}": value for name, value in sampler.identity().items()},
-        "versions": versions(),
+        "versions": versions(with_commit=False),
     }
     if resume and (finished := _finished(folder, identity, sampler)) is not None:
         return SampleResult(experiment, inference, finished, stages.seconds, None)

@@ -140,9 +140,11 @@ def _under(
 
 
 def _write_texts(result: PriorComparison, folder: Path) -> None:
-    (folder / "priors.json").write_text(json.dumps(result.as_json(), indent=2) + "\n")
-    (folder / "priors.md").write_text(result.as_markdown())
-    (folder / "scenario.yaml").write_text(result.scenario.to_yaml())
+    (folder / "priors.json").write_text(
+        json.dumps(result.as_json(), indent=2) + "\n", encoding="utf-8"
+    )
+    (folder / "priors.md").write_text(result.as_markdown(), encoding="utf-8")
+    (folder / "scenario.yaml").write_text(result.scenario.to_yaml(), encoding="utf-8")
 
 
 # what the folder of a comparison of priors holds; a new file is one line here

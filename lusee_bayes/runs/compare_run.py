@@ -57,7 +57,9 @@ def run_compare(
 
 
 def _write_page(runs: list[FinishedRun], folder: Path) -> None:
-    (folder / "comparison.html").write_text(comparison_page(runs, folder / FIGURES))
+    (folder / "comparison.html").write_text(
+        comparison_page(runs, folder / FIGURES), encoding="utf-8"
+    )
 
 
 # what the folder of a comparison holds; a new file is one line here

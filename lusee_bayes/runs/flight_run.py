@@ -91,9 +91,11 @@ def run_simulate_flight(
         if flight_of(scenario).gain_table is None:
             write_gain_table(stage / GAINS, made.table)
         if made.section.clock == "unknown":
-            (stage / CLOCK).write_text(_clock_text(made.clock))
+            (stage / CLOCK).write_text(_clock_text(made.clock), encoding="utf-8")
         np.savez(stage / TRUTH, **_truth(made))
-        (stage / SCENARIO).write_text(_to_be_mapped(made, folder.resolve()).to_yaml())
+        (stage / SCENARIO).write_text(
+            _to_be_mapped(made, folder.resolve()).to_yaml(), encoding="utf-8"
+        )
         with stages.progress("spectra", made.observation.n_times) as done:
             for name, session in zip(names, made.sessions, strict=True):
                 write_session(

@@ -203,7 +203,7 @@ def write_run(
                 provenance.write(stage)
             if kind.name in PAGES:
                 page = PAGES[kind.name](stage, folder.resolve().name)
-                (stage / REPORT).write_text(page)
+                (stage / REPORT).write_text(page, encoding="utf-8")
         files = sorted(path.relative_to(stage) for path in stage.rglob("*") if path.is_file())
     return [folder / name for name in files]
 

@@ -231,11 +231,13 @@ def _write_cubes(result: CubeResult, folder: Path) -> None:
 
 
 def _write_scenario(result: MapResult | CubeResult, folder: Path) -> None:
-    (folder / "scenario.yaml").write_text(result.scenario.to_yaml())
+    (folder / "scenario.yaml").write_text(result.scenario.to_yaml(), encoding="utf-8")
 
 
 def _write_summary(result: MapResult | CubeResult, folder: Path) -> None:
-    (folder / "summary.json").write_text(json.dumps(result.summary(), indent=2) + "\n")
+    (folder / "summary.json").write_text(
+        json.dumps(result.summary(), indent=2) + "\n", encoding="utf-8"
+    )
 
 
 def _write_unknowns(result: MapResult | CubeResult, folder: Path) -> None:

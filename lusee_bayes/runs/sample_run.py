@@ -157,7 +157,7 @@ def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Pat
     for name in ("mean", "std"):
         pixels = np.stack([result.maps[name] for result in results])
         write_cube(folder / f"{name}.fits", name, pixels, frequencies, scenario)
-    (folder / "scenario.yaml").write_text(scenario.to_yaml())
+    (folder / "scenario.yaml").write_text(scenario.to_yaml(), encoding="utf-8")
 
 
 def _write_maps(result: SampleResult, folder: Path) -> None:
@@ -167,8 +167,10 @@ def _write_maps(result: SampleResult, folder: Path) -> None:
 
 def _write_summaries(result: SampleResult, folder: Path) -> None:
     result.summary_table().to_csv(folder / "summary.csv", index_label="quantity")
-    (folder / "scenario.yaml").write_text(result.experiment.scenario.to_yaml())
-    (folder / "sampling.json").write_text(json.dumps(result.figures(), indent=2) + "\n")
+    (folder / "scenario.yaml").write_text(result.experiment.scenario.to_yaml(), encoding="utf-8")
+    (folder / "sampling.json").write_text(
+        json.dumps(result.figures(), indent=2) + "\n", encoding="utf-8"
+    )
 
 
 SAMPLE_OUTPUTS = (

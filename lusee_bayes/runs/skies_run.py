@@ -107,9 +107,11 @@ def run_skies(
 
 
 def _write_texts(result: SkiesResult, folder: Path) -> None:
-    (folder / "coverage.json").write_text(json.dumps(result.as_json(), indent=2) + "\n")
-    (folder / "coverage.md").write_text(result.as_markdown())
-    (folder / "scenario.yaml").write_text(result.scenario.to_yaml())
+    (folder / "coverage.json").write_text(
+        json.dumps(result.as_json(), indent=2) + "\n", encoding="utf-8"
+    )
+    (folder / "coverage.md").write_text(result.as_markdown(), encoding="utf-8")
+    (folder / "scenario.yaml").write_text(result.scenario.to_yaml(), encoding="utf-8")
 
 
 # what the folder of a validation on given skies holds; a new file is one line here

@@ -116,8 +116,10 @@ def _of_sampled(output: Output) -> Output:
 
 
 def _write_verdict(result: ValidationResult, folder: Path) -> None:
-    (folder / "validation.json").write_text(json.dumps(result.as_json(), indent=2) + "\n")
-    (folder / "validation.md").write_text(result.as_markdown())
+    (folder / "validation.json").write_text(
+        json.dumps(result.as_json(), indent=2) + "\n", encoding="utf-8"
+    )
+    (folder / "validation.md").write_text(result.as_markdown(), encoding="utf-8")
 
 
 # what the folder of a validation holds; a new file is one line here
