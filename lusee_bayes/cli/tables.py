@@ -20,7 +20,7 @@ def forecast_table(forecasts: list[Forecast]) -> Table:
     """The forecasts of one scenario as a table for the terminal."""
     source = forecasts[0].variation.source
     text = Table(title=escape(source), title_justify="left", title_style="bold")
-    text.caption = "modes: with SNR > 1; ell: the first with SNR < 1; deg: resolution"
+    text.caption = "expected: modes with SNR > 1; ell, the first with SNR < 1; deg, resolution"
     text.add_column("variation", no_wrap=True)
     for name in ("days", "data", "bits", "more", "modes", "ell", "deg"):
         text.add_column(name, justify="right")

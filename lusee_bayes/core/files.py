@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
@@ -76,7 +77,8 @@ def transaction(
     recover(folder)
     stage = scratch_folder(folder)
     try:
-        yield stage
+        with _naming_last(folder, stage):
+            yield stage
         files = sorted(str(p.relative_to(stage)) for p in stage.rglob("*") if p.is_file())
         _require_free(folder, files)
         manifest = {
@@ -91,6 +93,19 @@ def transaction(
             recover(folder)
     finally:
         shutil.rmtree(stage, ignore_errors=True)
+
+
+def require_apart(folder: Path, inputs: Iterable[str | Path]) -> None:
+    """InputError where a run would replace its inputs: results in its folder, or its file."""
+    manifest = read_manifest(folder)
+    names = manifest["files"] if manifest else ()
+    written = {folder.resolve(), *((folder / name).resolve() for name in names)}
+    for path in inputs:
+        if Path(path).resolve() in written:
+            raise InputError(
+                f"'{path}' is an input of this run, which would replace it; give another place "
+                "for the results with -o"
+            )
 
 
 def recover(folder: str | Path) -> None:
@@ -237,6 +252,34 @@ def uninterrupted() -> Iterator[None]:
 
 
 @contextmanager
+def naming_disk(path: Path) -> Iterator[None]:
+    """Put the name of the file that is written into an OSError of the block that has none.
+
+    HDF5 puts the error's number into its message alone.
+    """
+    try:
+        yield
+    except OSError as error:
+        number = re.search(r"errno = (\d+)", str(error))
+        if error.errno is None and number is None:
+            raise
+        code = error.errno or int(number[1])
+        raise OSError(code, os.strerror(code), error.filename or str(path)) from error
+
+
+@contextmanager
+def _naming_last(folder: Path, stage: Path) -> Iterator[None]:
+    """The same for several files in turn: the one that was written last, where it will lie."""
+    try:
+        yield
+    except OSError as error:
+        written = [path for path in stage.rglob("*") if path.is_file()]
+        last = max(written, key=lambda path: path.stat().st_mtime_ns, default=stage)
+        with naming_disk(folder / last.relative_to(stage)):
+            raise error
+
+
+@contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """Write a single file whole or not at all.
 
@@ -256,7 +299,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        yield partial
+        with naming_disk(path):
+            yield partial
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from threading import Lock
 
 from rich.console import Console
 from rich.markup import escape
@@ -19,6 +20,9 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+# seconds and share of a stage between lines of its progress in a file
+LINE_S, LINE_SHARE = 10.0, 0.05
 
 
 @dataclass
@@ -52,7 +56,7 @@ class Stages:
 
     @contextmanager
     def progress(self, name: str, total: int) -> Iterator[Callable[[int, str], None]]:
-        """Run a ``with`` block as a stage with a progress bar.
+        """Run a ``with`` block as a stage with a progress bar, or lines where it is no terminal.
 
         Parameters
         ----------
@@ -68,6 +72,8 @@ class Stages:
         start = time.perf_counter()
         if self.console is None:
             yield lambda done, remark="": None
+        elif not self.console.is_terminal:
+            yield self._lines(name, total)
         else:
             columns = (
                 TextColumn("{task.description}", markup=False),
@@ -81,6 +87,22 @@ class Stages:
                 task = bar.add_task(name, total=total, remark="")
                 yield lambda done, remark="": bar.update(task, completed=done, remark=remark)
         self._finish(name, start)
+
+    def _lines(self, name: str, total: int) -> Callable[[int, str], None]:
+        """Progress in a file: a line when 10 s and 5 % have passed since the last one."""
+        said, share = time.perf_counter(), 0.0
+        counting = Lock()
+
+        def update(done: int, remark: str = "") -> None:
+            nonlocal said, share
+            now, reached = time.perf_counter(), done / max(total, 1)
+            with counting:
+                if now - said < LINE_S or reached - share < LINE_SHARE or done >= total:
+                    return
+                said, share = now, reached
+            self.say(f"  {name}: {done} of {total} ({reached:.0%}) {remark}".rstrip())
+
+        return update
 
     def say(self, text: str) -> None:
         """Print a line."""

@@ -219,7 +219,7 @@ def _require_address(address: str) -> None:
 
 
 def _require_answer(address: str) -> None:
-    """Ask a scheduler who it is; a Client waits for ever for what accepts connections in silence."""
+    """Ask a scheduler who it is; a Client waits for ever where connections meet silence."""
     import distributed
 
     async def ask() -> None:

@@ -30,7 +30,7 @@ from lusee_bayes.runs.folder import (
     run_folder,
     write_run,
 )
-from lusee_bayes.runs.origins import origin_of
+from lusee_bayes.runs.origins import inputs_of, origin_of
 
 # draws of a prior's parameters
 DRAWS = 100
@@ -101,7 +101,9 @@ def run_compare_priors(
     sections = {name: section.anchored() for name, section in sections.items()}
     names = ",".join(sections)
     origin = origin_of(scenario, data, truth=truth or None, priors=names, draws=draws)
-    with run_folder(folder, COMPARE_PRIORS, origin, replace=replace) as place:
+    with run_folder(
+        folder, COMPARE_PRIORS, origin, replace=replace, inputs=inputs_of(scenario, data)
+    ) as place:
         measured = None if data is None else read_data(data, scenario)
         require_resources(scenario, measured, stages)
         experiment = observed(scenario, measured, stages)

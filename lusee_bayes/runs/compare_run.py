@@ -51,7 +51,7 @@ def run_compare(
     """
     stages = stages or Stages()
     origin = origin_of()
-    with run_folder(folder, COMPARISON, origin, replace=replace) as place:
+    with run_folder(folder, COMPARISON, origin, replace=replace, inputs=folders) as place:
         runs = read_runs(folders)
         return ComparisonRun(runs, place, write_run(place, runs, COMPARISON, origin, stages))
 

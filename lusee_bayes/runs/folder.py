@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from lusee_bayes.core.compilation_cache import publish, use_compilation_cache
 from lusee_bayes.core.destinations import locked, require_folder
 from lusee_bayes.core.errors import InputError, WorkersLost
-from lusee_bayes.core.files import MANIFEST, recover, transaction
+from lusee_bayes.core.files import MANIFEST, recover, require_apart, transaction
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.report.figures.drawing import save
 from lusee_bayes.report.pages import PAGES, REPORT
@@ -78,6 +78,7 @@ def run_folder(
     resume: str = "",
     *,
     replace: bool = False,
+    inputs: Iterable[str | Path] = (),
 ) -> Iterator[Path]:
     """Open a folder for a run, and say what it holds if the run is interrupted.
 
@@ -91,6 +92,8 @@ def run_folder(
         How the run is gone on with.
     replace : bool
         Replace results of another run.
+    inputs : iterable of path
+        Files that the run reads (:func:`.inputs_of`), which are not to be replaced.
 
     Yields
     ------
@@ -101,7 +104,7 @@ def run_folder(
     ------
     InputError
         If ``folder``, or what it would lie in, is a file; if another run works in it, or has left
-        its results there.
+        its results there; if one of ``inputs`` is among the results that would be replaced.
     RunInterrupted
         Instead of KeyboardInterrupt.
     WorkersLost
@@ -115,6 +118,8 @@ def run_folder(
             recover(folder)
             if not replace:
                 require_own(folder, (kind.name, *kind.after), origin)
+            else:
+                require_apart(folder, inputs)
             before = _written_at(folder)
             use_compilation_cache()
             try:

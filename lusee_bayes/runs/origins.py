@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,19 @@ def origin_of(
             digest = hashlib.sha256("".join(digests).encode()).hexdigest()
         found["data"] = f"{names} ({digest[:12]})"
     return found | {name: str(value) for name, value in others.items() if value is not None}
+
+
+def inputs_of(
+    scenario: Scenario, data: Data | None = None, *others: str | Path | None
+) -> list[str | Path]:
+    """The files that a run reads: data, those that its scenario names, and others if given.
+
+    For :func:`.run_folder`.
+    """
+    tree = scenario.model_dump(mode="json")
+    named = [value for _, value in _entries(tree) if isinstance(value, str)]
+    given = [] if data is None else files_of(data)
+    return [*given, *filter(os.path.isfile, named), *filter(None, others)]
 
 
 def _entries(tree: Mapping[str, Any], parents: str = "") -> Iterator[tuple[str, Any]]:

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from lusee_bayes.core.destinations import require_new
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.instrument.flight.reduced_file import write_reduced
+from lusee_bayes.runs.origins import inputs_of
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,7 @@ def run_reduce(
         unless ``replace``.
     """
     stages, path = stages or Stages(), Path(path)
-    if path.resolve() in [Path(file).resolve() for file in files]:
-        raise InputError(f"'{path}' is one of the sessions; give -o another name")
-    require_new(path, replace=replace)
+    require_new(path, replace=replace, inputs=inputs_of(scenario, files))
     reduced = reduce_files(files, scenario, stages)
     with stages("file"):
         write_reduced(path, reduced, scenario.to_yaml())

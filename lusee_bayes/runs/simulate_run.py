@@ -16,6 +16,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import write_four_port, write_waterfall
 from lusee_bayes.instrument.waterfalls.writing import NO_ROOM
 from lusee_bayes.results.cost import require_fits, simulation_cost
+from lusee_bayes.runs.origins import inputs_of
 
 
 def run_simulate(
@@ -54,7 +55,7 @@ def run_simulate(
     """
     path, channels = Path(path), (scenario,)
     stages = stages or Stages()
-    require_new(path, replace=replace)
+    require_new(path, replace=replace, inputs=inputs_of(scenario))
     if path.suffix == ".fits" and scenario.observation.window != "instant":
         raise InputError(f"{path}: {NO_ROOM}")
     require_fits(simulation_cost(scenario, max(1, len(frequencies_mhz))), scenario)

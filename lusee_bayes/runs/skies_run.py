@@ -29,7 +29,7 @@ from lusee_bayes.runs.folder import (
     write_run,
 )
 from lusee_bayes.runs.given_skies import GivenSky, given_skies
-from lusee_bayes.runs.origins import origin_of
+from lusee_bayes.runs.origins import inputs_of, origin_of
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,8 @@ def run_skies(
         raise InputError("--skies: name at least one sky, such as embedded:2, smooth or a file")
     names = ", ".join(f"{sky.name} {sky.digest}".strip() for sky in given)
     origin = origin_of(scenario, skies=names)
-    with run_folder(folder, SKIES, origin, replace=replace) as place:
+    inputs = inputs_of(scenario)
+    with run_folder(folder, SKIES, origin, replace=replace, inputs=inputs) as place:
         n_draws = draws_needed(len(given))
         require_resources(scenario, None, stages, n_draws)
         setup = set_up(scenario, None, stages)
