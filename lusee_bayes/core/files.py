@@ -7,6 +7,7 @@ place, and where that is interrupted, whoever opens the folder next (:func:`reco
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -255,15 +256,16 @@ def uninterrupted() -> Iterator[None]:
 def naming_disk(path: Path) -> Iterator[None]:
     """Put the name of the file that is written into an OSError of the block that has none.
 
-    HDF5 puts the error's number into its message alone.
+    HDF5 puts the error's number into its message alone, and astropy gives none.
     """
     try:
         yield
     except OSError as error:
         number = re.search(r"errno = (\d+)", str(error))
-        if error.errno is None and number is None:
+        full = errno.ENOSPC if "Not enough space on disk" in str(error) else None
+        code = error.errno or (int(number[1]) if number else full)
+        if code is None:
             raise
-        code = error.errno or int(number[1])
         raise OSError(code, os.strerror(code), error.filename or str(path)) from error
 
 

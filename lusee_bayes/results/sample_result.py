@@ -94,9 +94,13 @@ class SampleResult:
         modes = [(ell, m) for ell in range(min(lmax, 2) + 1) for m in range(-ell, ell + 1)]
         return others | sky_quantities(self.skies, pixels=LANDMARKS, ells=ells, modes=modes)
 
+    @cached_property
+    def _summary(self) -> pd.DataFrame:
+        return summary(self.quantities())
+
     def summary_table(self) -> pd.DataFrame:
         """ArviZ's summary of :meth:`quantities`."""
-        return summary(self.quantities())
+        return self._summary
 
     @cached_property
     def maps(self) -> dict[str, np.ndarray]:
