@@ -40,10 +40,6 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 os.environ["JAX_ENABLE_X64"] = "1"
 if "jax" in sys.modules:
     sys.modules["jax"].config.update("jax_enable_x64", True)
-    # JAX has set its own level, 1, which XLA reads when it starts
-    _jaxs_own = os.environ["TF_CPP_MIN_LOG_LEVEL"] == "1"
-    if _jaxs_own and not sys.modules["jax._src.xla_bridge"].backends_are_initialized():
-        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
 
 # every public name stands in __init__.pyi; each is imported when it is first used, since JAX,
 # healpy, lunarsky and xarray take seconds together

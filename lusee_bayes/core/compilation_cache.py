@@ -23,8 +23,8 @@ from platformdirs import user_cache_path
 from lusee_bayes.core.files import remove_left_scratch, scratch_folder
 
 SWITCH, OFF = "LUSEE_BAYES_CACHE", "off"
-# the level of XLA's messages, and JAX's own setting: with it XLA warns of every program that it
-# finds in the cache, in red
+# the level of XLA's messages, and what JAX sets where it is imported before this package: XLA then
+# warns of every program that it finds in the cache, in red
 MESSAGES, CHATTY = "TF_CPP_MIN_LOG_LEVEL", "1"
 # the programs of one machine together; a map needs some 10 MB
 LARGEST_BYTES = 500_000_000
@@ -34,8 +34,8 @@ PROGRAM = "-cache"
 def use_compilation_cache() -> None:
     """Let JAX keep what it compiles from now on; does nothing when called again.
 
-    Nothing either where JAX had computed something before this package was imported: XLA would warn
-    of every program, and its messages can no longer be switched off.
+    Nothing either where JAX was imported before this package: XLA would warn of every program that
+    it finds, and reads the level of its messages no more.
     """
     if jax.config.jax_compilation_cache_dir is None and os.environ.get(MESSAGES) != CHATTY:
         _open()

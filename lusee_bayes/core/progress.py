@@ -90,17 +90,17 @@ class Stages:
 
     def _lines(self, name: str, total: int) -> Callable[[int, str], None]:
         """Progress in a file: a line when 10 s and 5 % have passed since the last one."""
-        said, share = time.perf_counter(), 0.0
+        said, last = time.perf_counter(), 0
         counting = Lock()
 
         def update(done: int, remark: str = "") -> None:
-            nonlocal said, share
-            now, reached = time.perf_counter(), done / max(total, 1)
+            nonlocal said, last
+            now = time.perf_counter()
             with counting:
-                if now - said < LINE_S or reached - share < LINE_SHARE or done >= total:
+                if now - said < LINE_S or done - last < LINE_SHARE * total or done >= total:
                     return
-                said, share = now, reached
-            self.say(f"  {name}: {done} of {total} ({reached:.0%}) {remark}".rstrip())
+                said, last = now, done
+            self.say(f"  {name}: {done} of {total} ({done / total:.0%}) {remark}".rstrip())
 
         return update
 

@@ -231,7 +231,8 @@ def _require_answer(address: str) -> None:
         # in a thread: this one may have a loop that runs, as in a notebook
         with threads(1) as pool:
             pool.submit(asyncio.run, ask()).result()
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, MemoryError) as error:
+        # MemoryError: Dask reads the length of a message from whatever a web server answers
         raise _no_answer(address, error) from error
 
 

@@ -1,5 +1,6 @@
 """Tasks in threads of this process: order, progress, failures, and the tree of a sum."""
 
+import socketserver
 import threading
 from dataclasses import replace
 
@@ -167,7 +168,7 @@ def test_what_is_no_scheduler_is_refused_in_seconds(answer, monkeypatch):
 
     with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Answer) as server:
         server.daemon_threads, server.block_on_close = True, False
-        Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+        threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
         address = f"tcp://127.0.0.1:{server.server_address[1]}"
         with (
             pytest.raises(InputError, match="no Dask scheduler answers"),

@@ -1,4 +1,4 @@
-"""What a run is expected to take: more of everything takes more, and what does not fit is refused."""
+"""What a run is expected to take: more of everything takes more; what does not fit is refused."""
 
 import pytest
 
