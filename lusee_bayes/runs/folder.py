@@ -158,7 +158,7 @@ def _state(folder: Path, before: int | None, unfinished: str, resume: str) -> st
     now = _written_at(folder)
     if now is not None and now != before:
         return f"the new results in '{folder}' are complete"
-    earlier = "nothing has been written" if now is None else "the earlier results are as they were"
+    earlier = "no results are written" if now is None else "the earlier results are as they were"
     if unfinished and any((folder / unfinished).glob("*")):
         return f"{earlier} in '{folder}'; {resume}"
     return f"{earlier} in '{folder}'"

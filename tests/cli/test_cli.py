@@ -241,7 +241,7 @@ def test_an_interrupted_write_leaves_the_previous_result_whole(
     assert content(out) == before
     assert not list(out.glob(".*"))
     assert run("map", "fiducial", *SMALL, "-o", tmp_path / "new", "-q") == 130
-    assert "interrupted; nothing has been written in" in capsys.readouterr().err
+    assert "interrupted; no results are written in" in capsys.readouterr().err
     assert content(tmp_path / "new") == {}
 
 
@@ -272,8 +272,8 @@ def raises(error):
 @pytest.mark.parametrize(
     ("fail", "code", "words"),
     [
-        (lambda: signal.raise_signal(signal.SIGTERM), 143, "terminated; nothing"),
-        (lambda: signal.raise_signal(signal.SIGHUP), 129, "terminated; nothing"),
+        (lambda: signal.raise_signal(signal.SIGTERM), 143, "terminated; no results"),
+        (lambda: signal.raise_signal(signal.SIGHUP), 129, "terminated; no results"),
         (raises(MemoryError("Unable to allocate 8 TiB")), 1, "not enough memory (Unable to alloc"),
         (raises(RuntimeError("RESOURCE_EXHAUSTED: Out of memory")), 1, "not enough memory (RES"),
         (raises(RuntimeError("can't start new thread")), 1, "not enough memory (can't start"),
