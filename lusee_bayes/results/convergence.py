@@ -27,7 +27,7 @@ def warnings_of(table: Mapping[str, np.ndarray], sampling: Mapping[str, Any]) ->
         sampling.json.
     """
     found = []
-    names, r_hat = table["quantity"], np.nan_to_num(table["r_hat"], nan=-np.inf)
+    names, r_hat = table["quantity"], np.nan_to_num(table["r_hat"], nan=-np.inf, posinf=np.inf)
     above = int((r_hat > AGREE).sum())
     if above:
         furthest = int(np.argmax(r_hat))
