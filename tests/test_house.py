@@ -2,13 +2,16 @@
 
 import ast
 import pkgutil
+import re
 from pathlib import Path
 
 import pytest
 
 import lusee_bayes as lb
+from lusee_bayes.core.version import commit, release, versions
 
 PACKAGE = Path(lb.__file__).parent
+ROOT = PACKAGE.parent
 MODULES = {
     module.name.rsplit(".", 1)[-1]: module.name
     for module in pkgutil.walk_packages(lb.__path__, "lusee_bayes.")
@@ -52,3 +55,31 @@ def test_modules_are_short():
         if (n := len(path.read_text().splitlines())) > 350
     }
     assert not long
+
+
+def test_there_is_one_version():
+    cited = re.search(r'^version: "(.*)"$', (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    logged = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert cited[1] == logged[1] == lb.__version__
+    assert release().startswith(lb.__version__) and versions()["lusee_bayes"] == lb.__version__
+    assert versions().get("commit") == commit() and "commit" not in versions(with_commit=False)
+
+
+def test_advice_names_no_package_of_an_index():
+    files = [*PACKAGE.rglob("*.py"), *(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
+    named = [p for p in files if "install 'lusee_bayes[" in p.read_text(encoding="utf-8")]
+    assert not named
+
+
+def test_every_text_names_its_encoding():
+    """Whatever the locale, files are UTF-8."""
+    for path in PACKAGE.rglob("*.py"):
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Attribute):
+                continue
+            mode = (
+                call.args[0].value if call.args and isinstance(call.args[0], ast.Constant) else ""
+            )
+            opens = call.func.attr == "open" and mode in ("r", "w", "a", "x")
+            if opens or call.func.attr in ("read_text", "write_text"):
+                assert any(one.arg == "encoding" for one in call.keywords), (path, call.lineno)

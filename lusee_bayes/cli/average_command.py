@@ -55,7 +55,7 @@ def average_command(
 
     console = Console(quiet=quiet, soft_wrap=True)
     run = run_average(
-        load(scenario, set_),
+        load(scenario, set_, replaces=output if force else None),
         data,
         parse_duration(to),
         output,

@@ -78,7 +78,10 @@ def compare_priors_command(
     from lusee_bayes.runs.compare_priors_run import run_compare_priors
 
     console = Console(quiet=quiet, soft_wrap=True)
-    resolved, stages = load(scenario, set_, flight__clock=clock), Stages(console, verbose=verbose)
+    resolved, stages = (
+        load(scenario, set_, replaces=output if force else None, flight__clock=clock),
+        Stages(console, verbose=verbose),
+    )
     names = None if priors is None else [n.strip() for n in priors.split(",") if n.strip()]
     demand = demand_of([posterior_cost(resolved)] * len(names or NAMED))
     with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:

@@ -1,38 +1,45 @@
 """The command line: parsing, error messages and exit codes. The work is in ``runs``.
 
-Exit codes: 0 success, 1 a validation that failed or workers that were lost, 2 bad input (one
-sentence on standard error), 130 interrupted.
+Exit codes: 0 success, 1 a validation failed, or workers, memory or disk gave out, 2 bad input (one
+sentence on standard error), 130 interrupted, 143 terminated.
 """
 
 from __future__ import annotations
 
 import gc
+import io
 import os
 import re
 import shlex
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import current_thread, main_thread
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, Parameter
 from rich.console import Console
 
 from lusee_bayes.cli.commands import COMMANDS, help_of
-from lusee_bayes.core.command_line import COMMAND
+from lusee_bayes.core.command_line import COMMAND, printable
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.paths import user_path
-from lusee_bayes.core.version import __version__
+from lusee_bayes.core.version import release
 
 # the beginning of a path in the user's folder, by itself or after the name of an option
 HOME = re.compile(r"^(--[a-z-]+=)?(~.*)$", re.DOTALL)
 
 app = App(
     name="lusee-bayes",
-    version=__version__,
+    version=release,
     suppress_keyboard_interrupt=False,
+    # [ begins a file's name like any other character
+    default_parameter=Parameter(json_list=False, json_dict=False),
     help=(
         "Bayesian maps of the low-frequency sky from LuSEE-Night's visibilities.\n\n"
-        "Exit codes: 0 success, 1 a validation that failed or workers that were lost, 2 bad input "
-        "(one sentence on standard error), 130 interrupted. lusee-bayes COMMAND --help shows "
-        "examples."
+        "Exit codes: 0 success, 1 a validation failed, or workers, memory or disk gave out, 2 bad "
+        "input (one sentence on standard error), 130 interrupted, 143 terminated. lusee-bayes "
+        "COMMAND --help shows examples."
     ),
 )
 app.register_install_completion_command()
@@ -40,6 +47,31 @@ app.register_install_completion_command()
 for _name in COMMANDS:
     _command = f"{_name.replace('-', '_')}_command"
     app.command(f"lusee_bayes.cli.{_command}:{_command}", name=_name, help=help_of(_name))
+
+
+# beginnings of messages of RuntimeErrors for want of memory: of XLA, and of Python's threads
+NO_MEMORY = ("RESOURCE_EXHAUSTED", "can't start new thread")
+UNCHANGED = "results are complete or unchanged"
+
+
+@contextmanager
+def _heeding_termination() -> Iterator[list[int]]:
+    """Treat SIGTERM and SIGHUP as Ctrl-C during the block; yields those that came."""
+    came: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        came.append(number)
+        raise KeyboardInterrupt
+
+    numbers = [signal.SIGTERM, signal.SIGHUP] if current_thread() is main_thread() else []
+    heeded = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
+    for number in heeded:
+        signal.signal(number, interrupt)
+    try:
+        yield came
+    finally:
+        for number in heeded:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -50,15 +82,27 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     # ~ within an option, as in --data=~/a.nc, is one that no shell has replaced
     expanded = [HOME.sub(lambda own: (own[1] or "") + str(user_path(own[2])), one) for one in given]
-    before = COMMAND.set(shlex.join(["lusee-bayes", *given]))
-    errors = Console(stderr=True, soft_wrap=True, highlight=False)
+    for stream in (sys.stdout, sys.stderr):
+        # names of files may have bytes, and reports letters, that the terminal's encoding lacks
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    before = COMMAND.set(printable(shlex.join(["lusee-bayes", *given])))
     try:
-        code = app(expanded, exit_on_error=False, print_error=False, result_action="return_value")
+        with _heeding_termination() as came:
+            return _run(expanded, came)
+    finally:
+        COMMAND.reset(before)
+
+
+def _run(arguments: list[str], came: list[int]) -> int:
+    errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
+    try:
+        code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except InputError as error:
-        errors.print(f"lusee-bayes: {error}", markup=False)
+        errors.print(f"lusee-bayes: {error}")
         return 2
     except CycloptsError as error:
-        errors.print(f"lusee-bayes: {' '.join(str(error).split())}", markup=False)
+        errors.print(f"lusee-bayes: {' '.join(str(error).split())}")
         return 2
     except BrokenPipeError:
         # whoever was to read the output has gone: head has its lines
@@ -68,16 +112,23 @@ def main(arguments: list[str] | None = None) -> int:
         if error.errno is None:
             raise
         at = f" ('{error.filename}')" if error.filename else ""
-        errors.print(f"lusee-bayes: {error.strerror}{at}; results are whole or as they were")
+        errors.print(f"lusee-bayes: {error.strerror}{at}; {UNCHANGED}")
         return 1
     except WorkersLost as error:
-        errors.print(f"lusee-bayes: {error}", markup=False)
+        errors.print(f"lusee-bayes: {error}")
+        return 1
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not str(error).startswith(NO_MEMORY):
+            raise
+        why = " ".join(str(error).split())[:200]
+        errors.print(
+            f"lusee-bayes: not enough memory{f' ({why})' if why else ''}; {UNCHANGED}. Use a "
+            "smaller lmax, fewer times or fewer draws, or a machine with more memory"
+        )
         return 1
     except KeyboardInterrupt as interrupt:
         # runs say what their folder holds
         held = str(interrupt) or "nothing has been written"
-        errors.print(f"lusee-bayes: interrupted; {held}", markup=False)
-        return 130
-    finally:
-        COMMAND.reset(before)
+        errors.print(f"lusee-bayes: {'terminated' if came else 'interrupted'}; {held}")
+        return 128 + (came or [signal.SIGINT])[0]
     return code if isinstance(code, int) else 0

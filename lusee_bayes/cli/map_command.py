@@ -99,6 +99,7 @@ def map_command(
         scenario,
         set_,
         frequencies,
+        replaces=output if force else None,
         joint=joint,
         flight__clock=clock,
         output__draws=draws,

@@ -91,6 +91,7 @@ def load(
     source: str,
     set_: list[str] | None,
     frequencies: str | None = None,
+    replaces: Path | None = None,
     **flags: str | int | bool | None,
 ) -> Scenario:
     """The scenario of a command, with its ``--set`` and with what options say of it.
@@ -103,16 +104,21 @@ def load(
         ``key.path=value``.
     frequencies : str
         See :func:`parse_frequencies`.
+    replaces : Path
+        A folder or file that is to be replaced: not where the scenario is in it.
     **flags
         Values of entries, dots written as ``__``; those that are None or False are left alone.
 
     Raises
     ------
     InputError
-        As :func:`.load_scenario`.
+        As :func:`.load_scenario`, and as :func:`.require_apart`.
     """
+    from lusee_bayes.core.files import require_apart
     from lusee_bayes.experiment.scenario import load_scenario
 
+    if replaces is not None:
+        require_apart(replaces, [source])
     overrides = list(set_ or [])
     if frequencies is not None:
         overrides.append(f"frequencies_mhz={parse_frequencies(frequencies)}")

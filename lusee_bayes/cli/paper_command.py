@@ -52,5 +52,5 @@ def paper_command(
     with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
         run = run_paper(output, skies=skies, engine=engine, replace=force, stages=stages)
     say(console, *(f"  {path}" for path in run.files if path.suffix != ".nc"))
-    say(console, (run.folder / "claims.md").read_text().splitlines()[0])
+    say(console, (run.folder / "claims.md").read_text(encoding="utf-8").splitlines()[0])
     say(console, f"look at {run.folder}/claims.md")

@@ -66,7 +66,7 @@ def headline(forecasts: list[Forecast], source: str) -> str:
     best = max(
         (f for f in forecasts if f.variation.source == source), key=lambda f: f.information_bits
     )
-    text = f"{source}: {first.information_bits:.0f} bits, {first.modes} modes with SNR > 1"
+    text = f"{source}: {first.information_bits:.0f} bits, {first.modes} modes with expected SNR > 1"
     if best.information_bits > first.information_bits:
         more = best.information_bits - first.information_bits
         text += f"; most: {best.variation.family}, {best.variation.name}: +{more:.0f} bits"

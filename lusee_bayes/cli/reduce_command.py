@@ -54,7 +54,7 @@ def reduce_command(
 
     console = Console(quiet=quiet, soft_wrap=True)
     run = run_reduce(
-        load(scenario, set_, frequencies, flight__clock=clock),
+        load(scenario, set_, frequencies, replaces=output if force else None, flight__clock=clock),
         files,
         output,
         replace=force,

@@ -82,7 +82,9 @@ def sample_command(
     from lusee_bayes.sampling.programs import load_program
 
     console = Console(quiet=quiet, soft_wrap=True)
-    resolved = load(scenario, set_, frequencies, flight__clock=clock)
+    resolved = load(
+        scenario, set_, frequencies, replaces=output if force else None, flight__clock=clock
+    )
     program = default_program(resolved) if model is None else load_program(model)
     sampler = Sampler(
         chains=chains, warmup=warmup, draws=draws, seed=resolved.seed, algorithm=algorithm

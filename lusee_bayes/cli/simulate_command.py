@@ -50,7 +50,10 @@ def simulate_command(
         key.path=value; overrides an entry of the scenario, as often as needed.
     """
     console = Console(quiet=quiet, soft_wrap=True)
-    loaded, stages = load(scenario, set_), Stages(console, verbose=verbose)
+    loaded, stages = (
+        load(scenario, set_, replaces=output if force else None),
+        Stages(console, verbose=verbose),
+    )
     channels = () if frequencies is None else parse_frequencies(frequencies)
     if flight:
         from lusee_bayes.runs.flight_run import run_simulate_flight

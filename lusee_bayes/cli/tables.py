@@ -20,7 +20,7 @@ def forecast_table(forecasts: list[Forecast]) -> Table:
     """The forecasts of one scenario as a table for the terminal."""
     source = forecasts[0].variation.source
     text = Table(title=escape(source), title_justify="left", title_style="bold")
-    text.caption = "modes: with SNR > 1; ell: the first with SNR < 1; deg: resolution"
+    text.caption = "expected: modes with SNR > 1; ell, the first with SNR < 1; deg, resolution"
     text.add_column("variation", no_wrap=True)
     for name in ("days", "data", "bits", "more", "modes", "ell", "deg"):
         text.add_column(name, justify="right")
@@ -49,7 +49,8 @@ def checks_table(checks: list[Check]) -> Table:
     table = Table("check", "value", "allowed", "", "what it is")
     for check in checks:
         verdict = "ok" if check.passed else "FAILED"
-        table.add_row(check.name, f"{check.value:.4g}", allowed(check), verdict, check.meaning)
+        meaning = escape(check.meaning)
+        table.add_row(escape(check.name), f"{check.value:.4g}", allowed(check), verdict, meaning)
     return table
 
 

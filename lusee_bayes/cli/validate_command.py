@@ -98,7 +98,10 @@ def validate_command(
     from lusee_bayes.results.cost import demand_of, posterior_cost
 
     console = Console(quiet=quiet, soft_wrap=True)
-    resolved, stages = load(scenario, set_, flight__clock=clock), Stages(console, verbose=verbose)
+    resolved, stages = (
+        load(scenario, set_, replaces=output if force else None, flight__clock=clock),
+        Stages(console, verbose=verbose),
+    )
     if skies is not None:
         demand = demand_of([posterior_cost(resolved)] * max(1, len(skies)))
         with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:

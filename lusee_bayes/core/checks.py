@@ -19,6 +19,26 @@ def is_traced(*arrays: Any) -> bool:
     return any(isinstance(a, jax.core.Tracer) for a in arrays)
 
 
+def require_whole(name: str, value: Any, least: int, most: int) -> None:
+    """Check that a number is whole and in a range.
+
+    Parameters
+    ----------
+    name : str
+        Name of the number, for the error message.
+    value : object
+    least, most : int
+
+    Raises
+    ------
+    InputError
+        If it is not; libraries in C may end the process for such a number.
+    """
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not (whole and least <= value <= most):
+        raise InputError(f"{name} is {value!r}, expected a whole number from {least} to {most}")
+
+
 def require_float64(name: str, array: Any) -> None:
     """Check that an array holds 64-bit floats; Lambda's condition number is about 1e10.
 

@@ -23,14 +23,21 @@ from platformdirs import user_cache_path
 from lusee_bayes.core.files import remove_left_scratch, scratch_folder
 
 SWITCH, OFF = "LUSEE_BAYES_CACHE", "off"
+# the level of XLA's messages, and what JAX sets where it is imported before this package: XLA then
+# warns of every program that it finds in the cache, in red
+MESSAGES, CHATTY = "TF_CPP_MIN_LOG_LEVEL", "1"
 # the programs of one machine together; a map needs some 10 MB
 LARGEST_BYTES = 500_000_000
 PROGRAM = "-cache"
 
 
 def use_compilation_cache() -> None:
-    """Let JAX keep what it compiles from now on; does nothing when called again."""
-    if jax.config.jax_compilation_cache_dir is None:
+    """Let JAX keep what it compiles from now on; does nothing when called again.
+
+    Nothing either where JAX was imported before this package: XLA would warn of every program that
+    it finds, and reads the level of its messages no more.
+    """
+    if jax.config.jax_compilation_cache_dir is None and os.environ.get(MESSAGES) != CHATTY:
         _open()
 
 
@@ -107,7 +114,7 @@ def _machine() -> str:
     """A name for what programs are compiled for: those of one processor may fail on another."""
     features, info = platform.processor(), Path("/proc/cpuinfo")
     if info.is_file():
-        lines = info.read_text().splitlines()
+        lines = info.read_text(encoding="utf-8").splitlines()
         features = next((x for x in lines if x.startswith(("flags", "Features"))), features)
     described = f"{platform.machine()} {features} {jax.__version__} {jax.lib.__version__}"
     return hashlib.sha256(described.encode()).hexdigest()[:16]

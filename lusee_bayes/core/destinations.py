@@ -7,7 +7,7 @@ import os
 import socket
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -69,7 +69,7 @@ def require_target(path: str | Path) -> None:
         require_folder(path.parent)
 
 
-def require_new(path: str | Path, *, replace: bool) -> None:
+def require_new(path: str | Path, *, replace: bool, inputs: Iterable[str | Path] = ()) -> None:
     """As :func:`require_target`, for a file that another is only replaced by if that is asked for.
 
     Parameters
@@ -77,13 +77,18 @@ def require_new(path: str | Path, *, replace: bool) -> None:
     path : path
     replace : bool
         Replace what is there.
+    inputs : iterable of path
+        Files that are read for it, and not to be replaced.
 
     Raises
     ------
     InputError
-        If something is there, unless ``replace``; as :func:`require_target`.
+        If something is there, unless ``replace``; if it is one of ``inputs``; as
+        :func:`require_target`.
     """
     require_target(path)
+    if user_path(path).resolve() in [user_path(read).resolve() for read in inputs]:
+        raise InputError(f"'{path}' is an input of this run; give another name with -o")
     if not replace and user_path(path).exists():
         raise InputError(f"'{path}' is there already; give -o another name, or --force")
 

@@ -7,14 +7,16 @@ place, and where that is interrupted, whoever opens the folder next (:func:`reco
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import re
 import shutil
 import signal
 import socket
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
@@ -77,7 +79,8 @@ def transaction(
     recover(folder)
     stage = scratch_folder(folder)
     try:
-        yield stage
+        with _naming_last(folder, stage):
+            yield stage
         files = sorted(str(p.relative_to(stage)) for p in stage.rglob("*") if p.is_file())
         _require_free(folder, files)
         manifest = {
@@ -86,12 +89,25 @@ def transaction(
             "discard": list(discard),
             "origin": dict(origin or {}),
         }
-        (stage / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n")
+        (stage / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
         with uninterrupted():
             os.replace(stage, folder / COMMITTED)
             recover(folder)
     finally:
         shutil.rmtree(stage, ignore_errors=True)
+
+
+def require_apart(folder: Path, inputs: Iterable[str | Path]) -> None:
+    """InputError where a run would replace its inputs: results in its folder, or its file."""
+    manifest = read_manifest(folder)
+    names = manifest["files"] if manifest else ()
+    written = {folder.resolve(), *((folder / name).resolve() for name in names)}
+    for path in inputs:
+        if Path(path).resolve() in written:
+            raise InputError(
+                f"'{path}' is an input of this run, which would replace it; give another place "
+                "for the results with -o"
+            )
 
 
 def recover(folder: str | Path) -> None:
@@ -178,7 +194,7 @@ def read_manifest(folder: Path) -> dict | None:
     if not path.is_file():
         return None
     try:
-        manifest = json.loads(path.read_text())
+        manifest = json.loads(path.read_text(encoding="utf-8"))
         found = {name: manifest[name] for name in ("kind", "files", "discard")}
         if not isinstance(found["kind"], str):
             raise TypeError("the kind of the run is no text")
@@ -238,6 +254,35 @@ def uninterrupted() -> Iterator[None]:
 
 
 @contextmanager
+def naming_disk(path: Path) -> Iterator[None]:
+    """Put the name of the file that is written into an OSError of the block that has none.
+
+    HDF5 puts the error's number into its message alone, and astropy gives none.
+    """
+    try:
+        yield
+    except OSError as error:
+        number = re.search(r"errno = (\d+)", str(error))
+        full = errno.ENOSPC if "Not enough space on disk" in str(error) else None
+        code = error.errno or (int(number[1]) if number else full)
+        if code is None:
+            raise
+        raise OSError(code, os.strerror(code), error.filename or str(path)) from error
+
+
+@contextmanager
+def _naming_last(folder: Path, stage: Path) -> Iterator[None]:
+    """The same for several files in turn: the one that was written last, where it will lie."""
+    try:
+        yield
+    except OSError as error:
+        written = [path for path in stage.rglob("*") if path.is_file()]
+        last = max(written, key=lambda path: path.stat().st_mtime_ns, default=stage)
+        with naming_disk(folder / last.relative_to(stage)):
+            raise error
+
+
+@contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """Write a single file whole or not at all.
 
@@ -257,7 +302,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        yield partial
+        with naming_disk(path):
+            yield partial
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

@@ -18,11 +18,20 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import require_finite
+from lusee_bayes.core.checks import require_finite, require_whole
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import healpy, special
 
 SQRT2 = np.sqrt(2.0)
+# beyond these, indices and memory of libraries in C give out
+LARGEST_LMAX, LARGEST_NSIDE = 2047, 2048
+
+
+def require_nside(nside: object) -> None:
+    """InputError if it is no NSIDE of a HEALPix map."""
+    require_whole("nside", nside, 1, LARGEST_NSIDE)
+    if not healpy.isnsideok(nside, nest=True):
+        raise InputError(f"nside is {nside}, expected a power of two; use 64, for example")
 
 
 def n_modes(lmax: int) -> int:
@@ -47,6 +56,7 @@ def lmax_of(n: int) -> int:
 @lru_cache(maxsize=16)
 def mode_numbers(lmax: int) -> tuple[np.ndarray, np.ndarray]:
     """Return ``ell`` and ``m`` of every packed mode, two integer arrays of shape (modes,)."""
+    require_whole("lmax", lmax, 0, LARGEST_LMAX)
     ell = np.repeat(np.arange(lmax + 1), 2 * np.arange(lmax + 1) + 1)
     m = np.arange(n_modes(lmax)) - ell * (ell + 1)
     return ell, m
@@ -89,8 +99,10 @@ def map_to_modes(pixels: Float[np.ndarray, " pixels"], lmax: int) -> Float[np.nd
     Raises
     ------
     InputError
-        If the map has no valid NSIDE, holds NaN, or is too coarse (lmax > 3 NSIDE - 1).
+        If the map has no valid NSIDE, holds NaN, or is too coarse (lmax > 3 NSIDE - 1), or if lmax
+        is negative or no whole number.
     """
+    require_whole("lmax", lmax, 0, LARGEST_LMAX)
     pixels = np.asarray(pixels, dtype=np.float64)
     if not healpy.isnpixok(pixels.size):
         raise InputError(f"{pixels.size} pixels are not a HEALPix map: expected 12 NSIDE^2")
@@ -106,6 +118,7 @@ def map_to_modes(pixels: Float[np.ndarray, " pixels"], lmax: int) -> Float[np.nd
 
 def modes_to_map(modes: Float[Array, " modes"], nside: int) -> Float[np.ndarray, " pixels"]:
     """Synthesise the HEALPix RING map of packed coefficients."""
+    require_nside(nside)
     alm = to_healpy(modes)
     return healpy.alm2map(alm, nside, lmax=lmax_of(np.shape(modes)[-1]))
 
@@ -160,6 +173,7 @@ def synthesis_matrix(
 
 def pixel_matrix(nside: int, lmax: int) -> Float[np.ndarray, "pixels modes"]:
     """Return :func:`synthesis_matrix` at the centres of HEALPix RING pixels."""
+    require_nside(nside)
     theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
     return synthesis_matrix(theta, phi, lmax)
 
@@ -168,6 +182,7 @@ def columns_to_maps(
     modes: Float[np.ndarray, "modes maps"], nside: int
 ) -> Float[np.ndarray, "pixels maps"]:
     """Synthesise many HEALPix RING maps at once, a column each: products of matrices by ring."""
+    require_nside(nside)
     lmax = lmax_of(modes.shape[0])
     theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
     heights, first = np.unique(theta, return_index=True)

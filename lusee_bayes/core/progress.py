@@ -8,8 +8,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from threading import Lock
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -18,6 +20,9 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+# seconds and share of a stage between lines of its progress in a file
+LINE_S, LINE_SHARE = 10.0, 0.05
 
 
 @dataclass
@@ -45,13 +50,13 @@ class Stages:
         if self.console is None:
             yield
         else:
-            with self.console.status(f"{name} ..."):
+            with self.console.status(escape(f"{name} ...")):
                 yield
         self._finish(name, start)
 
     @contextmanager
     def progress(self, name: str, total: int) -> Iterator[Callable[[int, str], None]]:
-        """Run a ``with`` block as a stage with a progress bar.
+        """Run a ``with`` block as a stage with a progress bar, or lines where it is no terminal.
 
         Parameters
         ----------
@@ -67,19 +72,37 @@ class Stages:
         start = time.perf_counter()
         if self.console is None:
             yield lambda done, remark="": None
+        elif not self.console.is_terminal:
+            yield self._lines(name, total)
         else:
             columns = (
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),
                 BarColumn(),
                 MofNCompleteColumn(),
                 TimeElapsedColumn(),
                 TimeRemainingColumn(),
-                TextColumn("{task.fields[remark]}"),
+                TextColumn("{task.fields[remark]}", markup=False),
             )
             with Progress(*columns, console=self.console, transient=True) as bar:
                 task = bar.add_task(name, total=total, remark="")
                 yield lambda done, remark="": bar.update(task, completed=done, remark=remark)
         self._finish(name, start)
+
+    def _lines(self, name: str, total: int) -> Callable[[int, str], None]:
+        """Progress in a file: a line when 10 s and 5 % have passed since the last one."""
+        said, last = time.perf_counter(), 0
+        counting = Lock()
+
+        def update(done: int, remark: str = "") -> None:
+            nonlocal said, last
+            now = time.perf_counter()
+            with counting:
+                if now - said < LINE_S or done - last < LINE_SHARE * total or done >= total:
+                    return
+                said, last = now, done
+            self.say(f"  {name}: {done} of {total} ({done / total:.0%}) {remark}".rstrip())
+
+        return update
 
     def say(self, text: str) -> None:
         """Print a line."""
@@ -91,7 +114,7 @@ class Stages:
         if self.console is not None:
             memory = f"  {peak_memory_gb():6.2f} GB" if self.verbose else ""
             text = f"  {name:<28} {self.seconds[name]:7.2f} s{memory}"
-            self.console.print(text, highlight=False)
+            self.console.print(text, highlight=False, markup=False)
 
 
 def peak_memory_gb() -> float:

@@ -89,7 +89,7 @@ def reading(path: str | Path, what: str, hint: str = "") -> Iterator[Path]:
             # what is said of a damaged file is said by the error, if by anything
             warnings.simplefilter("ignore")
             yield path
-    except InputError:
+    except (InputError, MemoryError):
         raise
     except Exception as error:
         raise InputError(
@@ -100,7 +100,7 @@ def reading(path: str | Path, what: str, hint: str = "") -> Iterator[Path]:
 
 @contextmanager
 def naming(path: str | Path) -> Iterator[None]:
-    """Put the name of a file before the message of an InputError of the block."""
+    """Put the name of a file, or of what else is to blame, before an InputError of the block."""
     try:
         yield
     except InputError as error:

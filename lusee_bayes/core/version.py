@@ -1,11 +1,44 @@
 """Versions of the package and of the libraries that its numbers depend on."""
 
+import subprocess
+from functools import lru_cache
 from importlib import metadata
+from pathlib import Path
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 
-def versions() -> dict[str, str]:
-    """Return the versions of the package and of the libraries that its numbers depend on."""
+@lru_cache(maxsize=1)
+def commit() -> str | None:
+    """The commit of the clone that the package lies in, with -dirty if it was changed since.
+
+    None where it lies in none, or Git is not installed.
+    """
+    clone = Path(__file__).resolve().parents[2]
+    if not (clone / ".git").exists():
+        return None
+    command = ["git", "-C", str(clone), "describe", "--always", "--dirty", "--exclude=*"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def release() -> str:
+    """The version, and the commit where it is known."""
+    return f"{__version__} (commit {commit()})" if commit() else __version__
+
+
+def versions(*, with_commit: bool = True) -> dict[str, str]:
+    """Return the versions of the package and of the libraries that its numbers depend on.
+
+    Parameters
+    ----------
+    with_commit : bool
+        Include the package's commit, where it is known.
+    """
     libraries = ("jax", "numpyro", "arviz-stats", "numpy", "scipy", "healpy", "astropy", "lunarsky")
-    return {"lusee_bayes": __version__, **{name: metadata.version(name) for name in libraries}}
+    own = {"commit": commit()} if with_commit and commit() else {}
+    found = {name: metadata.version(name) for name in libraries}
+    return {"lusee_bayes": __version__, **own, **found}

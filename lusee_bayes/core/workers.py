@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import logging
 import os
@@ -17,7 +18,7 @@ from lusee_bayes.core.engine import SIDE_BY_SIDE, Demand, Engine, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import uninterrupted
 from lusee_bayes.core.memory import gigabytes, memory_limit
-from lusee_bayes.core.threads import processors
+from lusee_bayes.core.threads import processors, threads
 
 # the variable by which Dask's own programs are told of a cluster
 SCHEDULER = "DASK_SCHEDULER_ADDRESS"
@@ -31,8 +32,8 @@ OWN = {
     "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 32 << 20,
     "distributed.scheduler.worker-saturation": 1.0,
 }
-# how long a scheduler has to answer
-ANSWER = "10s"
+# seconds in which a scheduler has to answer
+ANSWER_S = 10.0
 
 
 @contextmanager
@@ -118,7 +119,10 @@ def _dask_is_there() -> bool:
 
 def _require_dask(option: str) -> None:
     if not _dask_is_there():
-        raise InputError(f"{option} needs Dask; install it: pip install 'lusee_bayes[cluster]'")
+        raise InputError(
+            f"{option} needs Dask; install it with pip install '.[cluster]' in the clone of "
+            "lusee_bayes"
+        )
 
 
 @contextmanager
@@ -180,15 +184,13 @@ def _connected(
     with _quiet():
         if isinstance(place, str):
             _require_address(place)
+            _require_answer(place)
         try:
             # one that is not finished complains when it is forgotten
             with uninterrupted():
-                client = distributed.Client(place, timeout=ANSWER, set_as_default=False)
+                client = distributed.Client(place, timeout=ANSWER_S, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise InputError(
-                f"no Dask scheduler answers at '{place}' ({' '.join(str(error).split())[:200]}); "
-                "start one with: dask scheduler"
-            ) from error
+            raise _no_answer(place, error) from error
         try:
             if verbose:
                 there = "dashboard" in client.scheduler_info()["services"]
@@ -214,6 +216,32 @@ def _require_address(address: str) -> None:
             f"'{address}' needs certificates; name them in Dask's configuration, under "
             "distributed.comm.tls"
         )
+
+
+def _require_answer(address: str) -> None:
+    """Ask a scheduler who it is; a Client waits for ever where connections meet silence."""
+    import distributed
+
+    async def ask() -> None:
+        arguments = distributed.Security().get_connection_args("client")
+        async with distributed.rpc(address, timeout=ANSWER_S, connection_args=arguments) as server:
+            await asyncio.wait_for(server.identity(), ANSWER_S)
+
+    try:
+        # in a thread: this one may have a loop that runs, as in a notebook
+        with threads(1) as pool:
+            pool.submit(asyncio.run, ask()).result()
+    except (OSError, ValueError, MemoryError) as error:
+        # MemoryError: Dask reads the length of a message from whatever a web server answers
+        raise _no_answer(address, error) from error
+
+
+def _no_answer(place: object, error: Exception) -> InputError:
+    why = " ".join(str(error).split())[:200] or f"silent for {ANSWER_S:g} s"
+    return InputError(
+        f"no Dask scheduler answers at '{place}' ({why}); start one with: dask scheduler. Its "
+        "address ends in 8786 by default, that of its dashboard in 8787"
+    )
 
 
 @contextmanager

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.memory import memory_limit
 from lusee_bayes.core.threads import in_threads
@@ -22,7 +21,7 @@ from lusee_bayes.linear.left_out_dense import DenseLeftOut
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.linear.residuals import HOURS_A_DAY
-from lusee_bayes.linear.split import WIDER, Split, widened
+from lusee_bayes.linear.split import WIDER, Split
 
 # of the times beyond the limit, those within this share of the worst go in one round
 WORST = 0.3
@@ -208,7 +207,7 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Compar
         return None
     if settle:
         model, posterior = on_host(_conditioned(setup, data))
-        prior = _wide(posterior, model.n_data).prior
+        prior = Split.of(posterior, 0.0, model.n_data).wide.prior
     else:
         model = on_host(model_about(setup, Around(data))[0])
         prior = model.prior.widened(WIDER)
@@ -225,21 +224,8 @@ def _memory(setup: Setup, data: Visibilities) -> float:
 
 def _conditioned(setup: Setup, data: Visibilities) -> tuple[LinearGaussian, Posterior]:
     """Model and posterior, in as many rounds as N needs; in one where bad data let none settle."""
-    try:
-        found = settled(setup, data)
-    except InputError:
+    found = settled(setup, data)
+    if found.unsettled:
         model, _ = model_about(setup, Around(data))
         return model, model.condition(data.data)
     return found.model, found.posterior
-
-
-def _wide(posterior: Posterior, n_data: int) -> Posterior:
-    """Under a prior that allows the sky, and what the worst data make of it where that is possible.
-
-    Bad data ask for a sky that is stronger by orders of magnitude. Under a prior for that, numbers
-    of 64 bits do not tell noise from sky; they stand out under a narrower one, too.
-    """
-    try:
-        return Split.of(posterior, 0.0, n_data).wide
-    except InputError:
-        return widened(posterior, WIDER)[0]

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.comparison import Comparison, Group, compared
 from lusee_bayes.experiment.rounds import rebuilds
@@ -159,7 +160,11 @@ def _higher_lmax(
     It is raised as long as chi^2 of the times falls and there is memory.
     """
     lmax, remark, size = setup.scenario.lmax, "", float(np.median(found.chi2))
+    enough = SMALL if found.refused else min(SMALL, found.share / 2.0)
     for higher in range(lmax + STEP, lmax + STEPS * STEP + 1, STEP):
+        if n_modes(higher) > data.layout.size / 2:
+            # so many modes fit anything
+            break
         try:
             wider = set_up(setup.scenario.model_copy(update={"lmax": higher}), data)
         except InputError:
@@ -167,8 +172,9 @@ def _higher_lmax(
             break
         again, before = _found(wider, data, false_alarm, stages), size
         size = float(np.median(again.chi2))
-        enough = found.share / 2.0 if found.groups or found.share else SMALL
-        if not again.refused and again.remark != NOT_JUDGED and again.share <= min(SMALL, enough):
+        if again.remark == NOT_JUDGED:
+            break
+        if not again.refused and again.share <= enough:
             return (
                 f"lmax={lmax} is too small for these data, so that none was flagged: lmax={higher} "
                 f"fits; use --set lmax={higher}"

@@ -260,7 +260,12 @@ def _read_yaml(source: str | Path) -> dict[str, Any]:
     if os.path.exists(user_path(source)):
         tree = read_yaml(user_path(source), "a scenario")
     elif str(source) in names:
-        tree = parse_yaml((FOLDER / f"{source}.yaml").read_text(), str(source))
+        tree = parse_yaml((FOLDER / f"{source}.yaml").read_text(encoding="utf-8"), str(source))
+    elif os.sep in str(source) or Path(source).suffix[1:2].isalpha():
+        raise InputError(
+            f"no scenario file at '{source}'; check the path, or give the name of a scenario of "
+            "the package"
+        )
     else:
         raise InputError(
             f"no scenario '{source}': neither a file nor a name; {nearest(str(source), names)}"

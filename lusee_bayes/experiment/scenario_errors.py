@@ -38,6 +38,9 @@ def one_sentence(error: ValidationError, source: str, model: type[BaseModel]) ->
     expected = expected[0].lower() + expected[1:]
     if first["type"] == "value_error" and isinstance(first["input"], (dict, BaseModel)):
         return f"{source}: {where}: {expected}{more}" if where else f"{source}: {expected}{more}"
+    if first["type"] in ("model_type", "model_attributes_type", "dict_type"):
+        # pydantic names the class
+        expected = "it should be a section with keys; lusee-bayes keys lists them"
     # YAML has lists where sections have tuples
     got = list(first["input"]) if isinstance(first["input"], tuple) else first["input"]
     return f"{source}: {where} is {got!r}, but {expected}{more}"

@@ -41,6 +41,8 @@ SIMULATIONS, FINAL_SIMULATIONS = 200, 500
 ROUNDING = 1e-4
 # of the factor of N that data that do not fit demand: what is tried, one after the other
 HIGHER = np.array([1.0, 1e2, 1e4])
+# how often a fixed prior is made ten times as wide where rounding leaves no posterior mean
+MOST_WIDENINGS = 4
 
 
 class NotSettled(InputError):
@@ -171,10 +173,12 @@ def learn_whatever_fits(
     for factor in demanded * HIGHER:
         try:
             found = learn(family, information.raised(factor), start, seed)
+            if factor > 1.0:  # a posterior under N itself is what it is for
+                information.posterior(found.prior)
         except InputError:
             continue
         return replace(found, noise_factor=float(factor))
-    return _fixed(family, information.raised(float(demanded * HIGHER[-1])))
+    return _fixed(family, information, float(demanded * HIGHER[-1]))
 
 
 def demanded_factor(information: Information, prior: Prior) -> float:
@@ -197,16 +201,25 @@ def demanded_factor(information: Information, prior: Prior) -> float:
     return 1.0 if fits else left.chi2 / left.degrees
 
 
-def _fixed(family: PriorFamily, information: Information) -> Learned:
-    """The family's prior before there are data, as wide as the data ask for; see ``settled``."""
-    start, prior, n_data = family.hyperprior.start(), family.expected(), int(information.n_data)
-    posterior = information.posterior(prior)
-    known = n_data - expected_chi2(posterior, n_data)
-    width = max(1.0, np.sqrt(float(posterior.prior_chi2()) / max(known, 1.0)))
-    prior = prior.widened(width)
-    evidence = float(information.posterior(prior).log_evidence)
-    none = np.zeros((0, 0))
-    return Learned(prior, (), start[:0], none, evidence, 0, settled=False)
+def _fixed(family: PriorFamily, information: Information, factor: float) -> Learned:
+    """The family's prior before there are data, as wide as data with N raised by a factor ask for.
+
+    Wider still, if under N itself no posterior mean can be computed: rounding grows with its
+    distance from the prior's, in the prior's standard deviations.
+    """
+    prior, n_data = family.expected(), int(information.n_data)
+    raised = information.raised(factor).posterior(prior)
+    known = max(n_data - expected_chi2(raised, n_data), 1.0)
+    prior = prior.widened(max(1.0, float(np.sqrt(float(raised.prior_chi2()) / known))))
+    for _ in range(MOST_WIDENINGS):
+        try:
+            evidence = float(information.posterior(prior).log_evidence)
+            break
+        except InputError as error:
+            prior, failed = prior.widened(10.0), error
+    else:
+        raise failed
+    return Learned(prior, (), np.zeros(0), np.zeros((0, 0)), evidence, 0, settled=False)
 
 
 def _at(

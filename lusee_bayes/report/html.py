@@ -9,6 +9,8 @@ from importlib import resources
 from pathlib import Path
 from urllib.parse import quote
 
+from lusee_bayes.core.command_line import printable
+
 TEMPLATE = """<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -29,14 +31,18 @@ TEMPLATE = """<!DOCTYPE html>
 
 
 def page(title: str, parts: Iterable[str]) -> str:
-    """A whole document that needs nothing but itself."""
+    """A whole document that needs nothing but itself.
+
+    Bytes of file names that are no UTF-8 are shown by their escapes.
+    """
     style = package_text("report.css")
-    return TEMPLATE.format(title=escape(title), style=style, body="\n".join(parts))
+    text = TEMPLATE.format(title=escape(title), style=style, body="\n".join(parts))
+    return printable(text)
 
 
 def package_text(name: str) -> str:
     """A file that lies beside this module."""
-    return (resources.files("lusee_bayes.report") / name).read_text()
+    return (resources.files("lusee_bayes.report") / name).read_text(encoding="utf-8")
 
 
 def contents(sections: Sequence[tuple[str, str]]) -> str:

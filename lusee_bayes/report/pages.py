@@ -48,7 +48,7 @@ def write_report(folder: str | Path) -> Path:
         )
     path = folder / REPORT
     with replacing(path) as partial:
-        partial.write_text(PAGES[kind](folder, folder.resolve().name))
+        partial.write_text(PAGES[kind](folder, folder.resolve().name), encoding="utf-8")
     return path
 
 

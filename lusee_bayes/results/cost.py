@@ -39,8 +39,10 @@ LEARNING_SQUARES, LEARNING_OPERATIONS = 4, 80
 COMPARING_OPERATIONS = 40
 # pixels of every map of a report, and of what each is made of
 MAPS = 12
-# seconds of everything that is not linear algebra
-OVERHEAD_S = 8.0
+# arrays of data for each source that is in the model
+SOURCE_ARRAYS = 3
+# seconds of everything that is not linear algebra: of a run, of each channel, of each datum
+OVERHEAD_S, CHANNEL_S, DATUM_S = 8.0, 0.8, 4e-5
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ class Cost:
     Attributes
     ----------
     n_data, n_unknowns, n_channels : int
+        Data and unknowns of one channel.
     memory : float
         Bytes.
     operations : float
@@ -65,7 +68,8 @@ class Cost:
     @property
     def seconds(self) -> float:
         """Wall-clock time on this machine, good to a factor of two or three."""
-        return OVERHEAD_S + self.operations / _operations_a_second()
+        each = CHANNEL_S + DATUM_S * self.n_data
+        return OVERHEAD_S + self.n_channels * each + self.operations / _operations_a_second()
 
     def line(self) -> str:
         """What a terminal shows."""
@@ -167,7 +171,14 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
         # N couples all times, and A is formed
         squares += 3.0 * n_data**2 + 3.0 * n_data * n_modes
         operations += n_channels * (float(n_data) ** 3 + 2.0 * n_data * float(n_modes) ** 2)
+    if scenario.sources.treatment != "ignored":
+        n_sources = len(scenario.sources.list)
+        squares += float(SOURCE_ARRAYS * n_data * n_sources)
+        operations += 2.0 * n_channels * n_data * n_sources * (n_modes + n_sources)
     pixels = 12.0 * scenario.map_nside**2
+    if not scenario.joint:
+        # means, errors and spectra of channels that are finished
+        squares += (n_channels - 1) * (3.0 * pixels + 4.0 * n_modes)
     kept = 3.0 * (n_draws + scenario.output.draws) * n_modes
     memory = BASE_BYTES + BYTES_A_DATUM * n_data + 8.0 * (squares + MAPS * pixels + kept)
     return Cost(n_data, n, n_channels, memory, operations)
@@ -203,7 +214,7 @@ def require_fits(
             break
     raise InputError(
         f"the run would need about {gigabytes(cost.memory)} of memory for {cost.n_data:,} data and "
-        f"{cost.n_unknowns:,} unknowns; this machine has {gigabytes(limit)}{advice}"
+        f"{cost.n_unknowns:,} unknowns; this process may use {gigabytes(limit)}{advice}"
     )
 
 

@@ -34,7 +34,7 @@ class ForecastFiles:
         """Read the forecast of a variation, or make it and write it, whole or not at all."""
         path = self.folder / f"{_digest(variation)}.json"
         if path.is_file():
-            kept = json.loads(path.read_text())
+            kept = json.loads(path.read_text(encoding="utf-8"))
             kept["snr_squared"] = np.array(kept["snr_squared"], dtype=np.float64)
             return Forecast(variation=variation, **kept)
         made = forecast(variation)
@@ -42,7 +42,7 @@ class ForecastFiles:
         kept = {name: getattr(made, name) for name in names}
         kept["snr_squared"] = np.asarray(made.snr_squared).tolist()
         with replacing(path) as partial:
-            partial.write_text(json.dumps(kept))
+            partial.write_text(json.dumps(kept), encoding="utf-8")
         return made
 
 

@@ -16,6 +16,7 @@ from lusee_bayes.experiment.scenario import Scenario
 # FITS keys have eight letters
 VERSION_KEYS = {
     "lusee_bayes": "V_LUSEE",
+    "commit": "V_COMMIT",
     "jax": "V_JAX",
     "numpyro": "V_NPYRO",
     "arviz-stats": "V_ARVIZ",

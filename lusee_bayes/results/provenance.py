@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lusee_bayes.core.command_line import COMMAND
 from lusee_bayes.core.reading import read_json
-from lusee_bayes.core.version import __version__
+from lusee_bayes.core.version import release
 from lusee_bayes.experiment.data_files import Data, names_of_data
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
@@ -41,7 +41,7 @@ class Provenance:
     command : str
         The command line; empty for a call of the library.
     version : str
-        Of the package.
+        Of the package, with its commit where that is known.
     made : str
         When, UTC.
     """
@@ -77,7 +77,7 @@ class Provenance:
             lat_deg=float(observation.lat_deg),
             lmax=scenario.lmax,
             command=COMMAND.get(),
-            version=__version__,
+            version=release(),
             made=datetime.now(UTC).isoformat(timespec="seconds").removesuffix("+00:00"),
         )
 
@@ -101,7 +101,7 @@ class Provenance:
 
     def write(self, folder: Path) -> None:
         """Write provenance.json."""
-        (folder / NAME).write_text(json.dumps(asdict(self), indent=2) + "\n")
+        (folder / NAME).write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
 
     def data_line(self) -> str:
         """Whether the data are measured or simulated, and from where."""

@@ -16,7 +16,7 @@ from numpyro.infer.hmc import HMCState
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages, peak_memory_gb
-from lusee_bayes.core.reading import reading
+from lusee_bayes.core.reading import naming, reading
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import infer
@@ -24,6 +24,7 @@ from lusee_bayes.experiment.pieces import program_pieces
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.simulate import true_values
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.results.convergence import warnings_of
 from lusee_bayes.sampling.chains import Chains
 from lusee_bayes.sampling.checkpoints import Checkpoints
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree
@@ -93,9 +94,13 @@ class SampleResult:
         modes = [(ell, m) for ell in range(min(lmax, 2) + 1) for m in range(-ell, ell + 1)]
         return others | sky_quantities(self.skies, pixels=LANDMARKS, ells=ells, modes=modes)
 
+    @cached_property
+    def _summary(self) -> pd.DataFrame:
+        return summary(self.quantities())
+
     def summary_table(self) -> pd.DataFrame:
         """ArviZ's summary of :meth:`quantities`."""
-        return summary(self.quantities())
+        return self._summary
 
     @cached_property
     def maps(self) -> dict[str, np.ndarray]:
@@ -124,7 +129,9 @@ class SampleResult:
 
     def lines(self) -> list[str]:
         """What a terminal shows."""
-        return [self.headline(), *self.experiment.doubts]
+        table = self.summary_table().rename_axis("quantity").reset_index()
+        reasons = warnings_of({name: table[name].to_numpy() for name in table}, self.figures())
+        return [self.headline(), *reasons, *self.experiment.doubts]
 
     def figures(self) -> dict[str, object]:
         """What sampling.json tells: sizes, speeds, times, memory, versions."""
@@ -186,7 +193,7 @@ def sample_result(
         "program": program.name,
         "program text": program.digest,
         **{f"sampler's {name}": value for name, value in sampler.identity().items()},
-        "versions": versions(),
+        "versions": versions(with_commit=False),
     }
     if resume and (finished := _finished(folder, identity, sampler)) is not None:
         return SampleResult(experiment, inference, finished, stages.seconds, None)
@@ -203,14 +210,15 @@ def sample_result(
             times.append((time.perf_counter(), iteration))
             update(iteration, _state_in_words(iteration, state, sampler))
 
-        chains = sample(
-            program.model,
-            {**arguments, "data": data.data},
-            sampler,
-            whitening,
-            checkpoints,
-            report,
-        )
+        with naming(f"the program '{program.path or program.name}'"):
+            chains = sample(
+                program.model,
+                {**arguments, "data": data.data},
+                sampler,
+                whitening,
+                checkpoints,
+                report,
+            )
     with stages("data tree"):
         tree = to_datatree(
             chains,

@@ -17,6 +17,7 @@ from lusee_bayes.instrument.averaging import averaged, product_live_s
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.results.cost import require_resources
 from lusee_bayes.results.forecast import expected_posterior
+from lusee_bayes.runs.origins import inputs_of
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,7 @@ def run_average(
             f"'{path}': the averages would replace the data that they are made of; give -o "
             "another name"
         )
-    require_new(path, replace=replace)
+    require_new(path, replace=replace, inputs=inputs_of(scenario, data))
     if scenario.frequencies_mhz:
         raise InputError(
             "averages are of one frequency; give a scenario with frequency_mhz and without "

@@ -30,7 +30,7 @@ from lusee_bayes.runs.folder import (
     run_folder,
     write_run,
 )
-from lusee_bayes.runs.origins import origin_of
+from lusee_bayes.runs.origins import inputs_of, origin_of
 
 # draws of a prior's parameters
 DRAWS = 100
@@ -102,7 +102,9 @@ def run_compare_priors(
     sections = {name: section.anchored() for name, section in sections.items()}
     names = ",".join(sections)
     origin = origin_of(scenario, data, truth=truth or None, priors=names, draws=draws)
-    with run_folder(folder, COMPARE_PRIORS, origin, replace=replace) as place:
+    with run_folder(
+        folder, COMPARE_PRIORS, origin, replace=replace, inputs=inputs_of(scenario, data)
+    ) as place:
         measured = None if data is None else read_data(data, scenario)
         require_resources(scenario, measured, stages)
         experiment = observed(scenario, measured, stages)
@@ -141,9 +143,11 @@ def _under(
 
 
 def _write_texts(result: PriorComparison, folder: Path) -> None:
-    (folder / "priors.json").write_text(json.dumps(result.as_json(), indent=2) + "\n")
-    (folder / "priors.md").write_text(result.as_markdown())
-    (folder / "scenario.yaml").write_text(result.scenario.to_yaml())
+    (folder / "priors.json").write_text(
+        json.dumps(result.as_json(), indent=2) + "\n", encoding="utf-8"
+    )
+    (folder / "priors.md").write_text(result.as_markdown(), encoding="utf-8")
+    (folder / "scenario.yaml").write_text(result.scenario.to_yaml(), encoding="utf-8")
 
 
 # what the folder of a comparison of priors holds; a new file is one line here

@@ -51,13 +51,15 @@ def run_compare(
     """
     stages = stages or Stages()
     origin = origin_of()
-    with run_folder(folder, COMPARISON, origin, replace=replace) as place:
+    with run_folder(folder, COMPARISON, origin, replace=replace, inputs=folders) as place:
         runs = read_runs(folders)
         return ComparisonRun(runs, place, write_run(place, runs, COMPARISON, origin, stages))
 
 
 def _write_page(runs: list[FinishedRun], folder: Path) -> None:
-    (folder / "comparison.html").write_text(comparison_page(runs, folder / FIGURES))
+    (folder / "comparison.html").write_text(
+        comparison_page(runs, folder / FIGURES), encoding="utf-8"
+    )
 
 
 # what the folder of a comparison holds; a new file is one line here

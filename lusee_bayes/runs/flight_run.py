@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from astropy.time import Time
 
-from lusee_bayes.core.destinations import require_folder
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import transaction
 from lusee_bayes.core.paths import user_path
@@ -20,11 +19,14 @@ from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.flight.clock import Clock
 from lusee_bayes.instrument.flight.gain_files import write_gain_table
 from lusee_bayes.instrument.flight.session_writing import write_session
+from lusee_bayes.runs.folder import RunKind, run_folder
+from lusee_bayes.runs.origins import inputs_of, origin_of
 
 SUFFIX = {"hdf5": "h5", "fits": "fits"}
 GAINS, CLOCK, TRUTH, SCENARIO = "gains.nc", "clock.json", "truth.npz", "scenario.yaml"
 # how long spectra are averaged for a map, where the scenario does not say it
 AVERAGE_S = 7200.0
+FLIGHT = RunKind("simulated sessions", outputs=(), figures={})
 
 
 @dataclass(frozen=True)
@@ -80,21 +82,31 @@ def run_simulate_flight(
         As :func:`.simulate_flight`, and if the folder holds sessions already, or cannot be written.
     """
     scenario, folder = load_scenario(scenario), user_path(folder)
-    require_folder(folder)
     _require_no_sessions(folder, replace)
     stages = stages or Stages()
     if frequencies_mhz:
         scenario = scenario.model_copy(update={"frequencies_mhz": tuple(frequencies_mhz)})
+    origin = origin_of(scenario)
+    inputs = inputs_of(scenario)
+    with run_folder(folder, FLIGHT, origin, replace=replace, inputs=inputs) as place:
+        return _simulated(scenario, place, origin, stages)
+
+
+def _simulated(
+    scenario: Scenario, folder: Path, origin: Mapping[str, str], stages: Stages
+) -> FlightFiles:
     made = simulate_flight(scenario, stages)
     suffix = SUFFIX[made.section.kind]
     names = [f"session_{number:03d}.{suffix}" for number in range(len(made.sessions))]
-    with transaction(folder, "simulated sessions") as stage:
+    with transaction(folder, FLIGHT.name, origin=origin) as stage:
         if flight_of(scenario).gain_table is None:
             write_gain_table(stage / GAINS, made.table)
         if made.section.clock == "unknown":
-            (stage / CLOCK).write_text(_clock_text(made.clock))
+            (stage / CLOCK).write_text(_clock_text(made.clock), encoding="utf-8")
         np.savez(stage / TRUTH, **_truth(made))
-        (stage / SCENARIO).write_text(_to_be_mapped(made, folder.resolve()).to_yaml())
+        (stage / SCENARIO).write_text(
+            _to_be_mapped(made, folder.resolve()).to_yaml(), encoding="utf-8"
+        )
         with stages.progress("spectra", made.observation.n_times) as done:
             for name, session in zip(names, made.sessions, strict=True):
                 write_session(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from lusee_bayes.core.compilation_cache import publish, use_compilation_cache
 from lusee_bayes.core.destinations import locked, require_folder
 from lusee_bayes.core.errors import InputError, WorkersLost
-from lusee_bayes.core.files import MANIFEST, recover, transaction
+from lusee_bayes.core.files import MANIFEST, recover, require_apart, transaction
 from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.report.figures.drawing import save
@@ -79,6 +79,7 @@ def run_folder(
     resume: str = "",
     *,
     replace: bool = False,
+    inputs: Iterable[str | Path] = (),
 ) -> Iterator[Path]:
     """Open a folder for a run, and say what it holds if the run is interrupted.
 
@@ -92,6 +93,8 @@ def run_folder(
         How the run is gone on with.
     replace : bool
         Replace results of another run.
+    inputs : iterable of path
+        Files that the run reads (:func:`.inputs_of`), which are not to be replaced.
 
     Yields
     ------
@@ -102,7 +105,7 @@ def run_folder(
     ------
     InputError
         If ``folder``, or what it would lie in, is a file; if another run works in it, or has left
-        its results there.
+        its results there; if one of ``inputs`` is among the results that would be replaced.
     RunInterrupted
         Instead of KeyboardInterrupt.
     WorkersLost
@@ -116,6 +119,8 @@ def run_folder(
             recover(folder)
             if not replace:
                 require_own(folder, (kind.name, *kind.after), origin)
+            else:
+                require_apart(folder, inputs)
             before = _written_at(folder)
             use_compilation_cache()
             try:
@@ -154,7 +159,7 @@ def _state(folder: Path, before: int | None, unfinished: str, resume: str) -> st
     now = _written_at(folder)
     if now is not None and now != before:
         return f"the new results in '{folder}' are complete"
-    earlier = "nothing has been written" if now is None else "the earlier results are as they were"
+    earlier = "no results are written" if now is None else "the earlier results are as they were"
     if unfinished and any((folder / unfinished).glob("*")):
         return f"{earlier} in '{folder}'; {resume}"
     return f"{earlier} in '{folder}'"
@@ -204,7 +209,7 @@ def write_run(
                 provenance.write(stage)
             if kind.name in PAGES:
                 page = PAGES[kind.name](stage, folder.resolve().name)
-                (stage / REPORT).write_text(page)
+                (stage / REPORT).write_text(page, encoding="utf-8")
         files = sorted(path.relative_to(stage) for path in stage.rglob("*") if path.is_file())
     return [folder / name for name in files]
 

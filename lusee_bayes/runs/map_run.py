@@ -48,7 +48,7 @@ from lusee_bayes.runs.folder import (
     run_folder,
     write_run,
 )
-from lusee_bayes.runs.origins import origin_of
+from lusee_bayes.runs.origins import inputs_of, origin_of
 from lusee_bayes.sky import write_alms
 
 
@@ -129,7 +129,8 @@ def run_map(
     origin = origin_of(scenario, data, truth=truth or None)
     cost = posterior_cost(scenario)
     require_fits(cost, scenario)
-    with run_folder(folder, CUBE, origin, resume, replace=replace) as place:
+    inputs = inputs_of(scenario, data)
+    with run_folder(folder, CUBE, origin, resume, replace=replace, inputs=inputs) as place:
         stages.say(cost.line())
         file, reduced = _one_file(data, scenario, place, stages)
         cube = cube_result(scenario, place, data=file, truth=truth, engine=engine, stages=stages)
@@ -149,7 +150,8 @@ def _run_single(
     stages: Stages,
 ) -> MapRun:
     origin = origin_of(scenario, data, truth=truth or None, onto=onto)
-    with run_folder(folder, MAP, origin, replace=replace) as place:
+    inputs = inputs_of(scenario, data, onto)
+    with run_folder(folder, MAP, origin, replace=replace, inputs=inputs) as place:
         reduced = None if data is None else reduced_of(data, scenario, stages)
         if reduced is not None:
             measured = visibilities_of(reduced, scenario)
@@ -236,11 +238,13 @@ def _write_cubes(result: CubeResult, folder: Path) -> None:
 
 
 def _write_scenario(result: MapResult | CubeResult, folder: Path) -> None:
-    (folder / "scenario.yaml").write_text(result.scenario.to_yaml())
+    (folder / "scenario.yaml").write_text(result.scenario.to_yaml(), encoding="utf-8")
 
 
 def _write_summary(result: MapResult | CubeResult, folder: Path) -> None:
-    (folder / "summary.json").write_text(json.dumps(result.summary(), indent=2) + "\n")
+    (folder / "summary.json").write_text(
+        json.dumps(result.summary(), indent=2) + "\n", encoding="utf-8"
+    )
 
 
 def _write_unknowns(result: MapResult | CubeResult, folder: Path) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import read_manifest
-from lusee_bayes.experiment.data_files import Data, digest_of, names_of_data
+from lusee_bayes.experiment.data_files import Data, digest_of, files_of, names_of_data
 from lusee_bayes.experiment.scenario import Scenario
 
 Origin = Mapping[str, str]
@@ -47,6 +48,19 @@ def origin_of(
         names = ", ".join(f"'{Path(name).name}'" for name in names_of_data(data))
         found["data"] = f"{names} ({digest_of(data)[:12]})"
     return found | {name: str(value) for name, value in others.items() if value is not None}
+
+
+def inputs_of(
+    scenario: Scenario, data: Data | None = None, *others: str | Path | None
+) -> list[str | Path]:
+    """The files that a run reads: data, those that its scenario names, and others if given.
+
+    For :func:`.run_folder`.
+    """
+    tree = scenario.model_dump(mode="json")
+    named = [value for _, value in _entries(tree) if isinstance(value, str)]
+    given = [] if data is None else files_of(data)
+    return [*given, *filter(os.path.isfile, named), *filter(None, others)]
 
 
 def _entries(tree: Mapping[str, Any], parents: str = "") -> Iterator[tuple[str, Any]]:

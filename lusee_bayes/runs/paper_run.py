@@ -126,7 +126,7 @@ def _write_cases(computed: _Computed, folder: Path) -> None:
 def _write_claims(computed: _Computed, folder: Path) -> None:
     claims = claim_table(computed.cases)
     write_csv(folder / "claims.csv", claims)
-    (folder / "claims.md").write_text(claims_as_markdown(claims))
+    (folder / "claims.md").write_text(claims_as_markdown(claims), encoding="utf-8")
 
 
 # what the folder of the paper's run holds; a new file is one line here

@@ -9,12 +9,14 @@ from pathlib import Path
 
 from lusee_bayes.core.engine import Engine, ThisProcess
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.reading import naming
 from lusee_bayes.core.tables import write_csv
 from lusee_bayes.report.figures import plan as plan_figures
+from lusee_bayes.results.cost import posterior_cost, require_fits
 from lusee_bayes.results.forecast import Forecast, Variation, forecast_rows
 from lusee_bayes.results.forecasts import ForecastFiles, forecasts_of
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
-from lusee_bayes.runs.origins import origin_of
+from lusee_bayes.runs.origins import inputs_of, origin_of
 
 UNFINISHED = "unfinished-forecasts"
 RESUME = "the same command continues from the finished forecasts"
@@ -57,13 +59,18 @@ def run_plan(
     Raises
     ------
     InputError
-        With the variation's name, for whatever is wrong with its scenario.
+        With the variation's name, for whatever is wrong with its scenario, and if its forecast
+        does not fit into the memory.
     """
     engine, stages = engine or ThisProcess(), stages or Stages()
+    for v in variations:
+        with naming(f"{v.source}, {v.family}, {v.name}"):
+            require_fits(posterior_cost(v.scenario), v.scenario)
     told = {f"{v.source}, {v.family}, {v.name}": v.scenario for v in variations}
     digests = {name: sha256(s.to_yaml().encode()).hexdigest()[:12] for name, s in told.items()}
     origin = origin_of(**digests)
-    with run_folder(folder, PLAN, origin, RESUME, replace=replace) as place:
+    inputs = [path for v in variations for path in inputs_of(v.scenario)]
+    with run_folder(folder, PLAN, origin, RESUME, replace=replace, inputs=inputs) as place:
         engine.work_in(place)
         files = ForecastFiles((place / UNFINISHED).resolve())
         forecasts = forecasts_of(variations, files, engine, stages)

@@ -16,6 +16,7 @@ from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.instrument.flight.reduced_file import write_reduced
+from lusee_bayes.runs.origins import inputs_of
 
 
 @dataclass(frozen=True)
@@ -77,9 +78,7 @@ def run_reduce(
     """
     scenario = load_scenario(scenario)
     stages, path = stages or Stages(), user_path(path)
-    if path.resolve() in [user_path(file).resolve() for file in files]:
-        raise InputError(f"'{path}' is one of the sessions; give -o another name")
-    require_new(path, replace=replace)
+    require_new(path, replace=replace, inputs=inputs_of(scenario, files))
     reduced = reduce_files(files, scenario, stages)
     if np.isnan(reduced.before).all():
         raise InputError(

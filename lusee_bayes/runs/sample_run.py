@@ -21,7 +21,7 @@ from lusee_bayes.results.map_files import write_cube, write_map
 from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult, sample_result
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
-from lusee_bayes.runs.origins import origin_of
+from lusee_bayes.runs.origins import inputs_of, origin_of
 from lusee_bayes.sampling.datatree import write_datatree
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.programs import Program, load_program
@@ -115,7 +115,8 @@ def run_sample(
         return _run_single(scenario, folder, program, sampler, data, resume, replace, stages)
     stages = stages or Stages()
     origin = sample_origin(scenario, data, program)
-    with run_folder(folder, CUBES, origin, RESUME, replace=replace) as place:
+    inputs = inputs_of(scenario, data, program.path)
+    with run_folder(folder, CUBES, origin, RESUME, replace=replace, inputs=inputs) as place:
         runs = []
         for channel in scenario.channels():
             where = place / f"{channel.frequency_mhz:.15g}MHz"
@@ -143,7 +144,8 @@ def _run_single(
 ) -> SampleRun:
     stages = stages or Stages()
     origin = sample_origin(scenario, data, program)
-    with run_folder(folder, SAMPLE, origin, RESUME, replace=replace) as place:
+    inputs = inputs_of(scenario, data, program.path)
+    with run_folder(folder, SAMPLE, origin, RESUME, replace=replace, inputs=inputs) as place:
         measured = None if data is None else read_data(data, scenario)
         require_resources(scenario, measured, stages, sampler.chains * sampler.draws)
         experiment = build(scenario, measured, stages)
@@ -159,7 +161,7 @@ def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Pat
     for name in ("mean", "std"):
         pixels = np.stack([result.maps[name] for result in results])
         write_cube(folder / f"{name}.fits", name, pixels, frequencies, scenario)
-    (folder / "scenario.yaml").write_text(scenario.to_yaml())
+    (folder / "scenario.yaml").write_text(scenario.to_yaml(), encoding="utf-8")
 
 
 def _write_maps(result: SampleResult, folder: Path) -> None:
@@ -169,8 +171,10 @@ def _write_maps(result: SampleResult, folder: Path) -> None:
 
 def _write_summaries(result: SampleResult, folder: Path) -> None:
     result.summary_table().to_csv(folder / "summary.csv", index_label="quantity")
-    (folder / "scenario.yaml").write_text(result.experiment.scenario.to_yaml())
-    (folder / "sampling.json").write_text(json.dumps(result.figures(), indent=2) + "\n")
+    (folder / "scenario.yaml").write_text(result.experiment.scenario.to_yaml(), encoding="utf-8")
+    (folder / "sampling.json").write_text(
+        json.dumps(result.figures(), indent=2) + "\n", encoding="utf-8"
+    )
 
 
 SAMPLE_OUTPUTS = (

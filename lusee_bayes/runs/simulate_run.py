@@ -17,6 +17,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import write_four_port, write_waterfall
 from lusee_bayes.instrument.waterfalls.writing import NO_ROOM
 from lusee_bayes.results.cost import require_fits, simulation_cost
+from lusee_bayes.runs.origins import inputs_of
 
 
 def run_simulate(
@@ -56,7 +57,7 @@ def run_simulate(
     scenario = load_scenario(scenario)
     path, channels = user_path(path), (scenario,)
     stages = stages or Stages()
-    require_new(path, replace=replace)
+    require_new(path, replace=replace, inputs=inputs_of(scenario))
     if path.suffix == ".fits" and scenario.observation.window != "instant":
         raise InputError(f"{path}: {NO_ROOM}")
     require_fits(simulation_cost(scenario, max(1, len(frequencies_mhz))), scenario)

@@ -29,7 +29,7 @@ from lusee_bayes.runs.folder import (
     write_run,
 )
 from lusee_bayes.runs.given_skies import GivenSky, given_skies
-from lusee_bayes.runs.origins import origin_of
+from lusee_bayes.runs.origins import inputs_of, origin_of
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,8 @@ def run_skies(
         raise InputError("--skies: name at least one sky, such as embedded:2, smooth or a file")
     names = ", ".join(f"{sky.name} {sky.digest}".strip() for sky in given)
     origin = origin_of(scenario, skies=names)
-    with run_folder(folder, SKIES, origin, replace=replace) as place:
+    inputs = inputs_of(scenario)
+    with run_folder(folder, SKIES, origin, replace=replace, inputs=inputs) as place:
         n_draws = draws_needed(len(given))
         require_resources(scenario, None, stages, n_draws)
         setup = set_up(scenario, None, stages)
@@ -108,9 +109,11 @@ def run_skies(
 
 
 def _write_texts(result: SkiesResult, folder: Path) -> None:
-    (folder / "coverage.json").write_text(json.dumps(result.as_json(), indent=2) + "\n")
-    (folder / "coverage.md").write_text(result.as_markdown())
-    (folder / "scenario.yaml").write_text(result.scenario.to_yaml())
+    (folder / "coverage.json").write_text(
+        json.dumps(result.as_json(), indent=2) + "\n", encoding="utf-8"
+    )
+    (folder / "coverage.md").write_text(result.as_markdown(), encoding="utf-8")
+    (folder / "scenario.yaml").write_text(result.scenario.to_yaml(), encoding="utf-8")
 
 
 # what the folder of a validation on given skies holds; a new file is one line here

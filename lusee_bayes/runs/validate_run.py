@@ -17,6 +17,7 @@ from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.results.sample_result import CHAINS, sample_result
 from lusee_bayes.results.validation_result import ValidationResult
 from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
+from lusee_bayes.runs.origins import inputs_of
 from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_origin
 from lusee_bayes.sampling.calibration import calibrate_sky
 from lusee_bayes.sampling.hmc import Sampler
@@ -85,7 +86,8 @@ def run_validate(
     require_simulations(simulations)
     require_draws(sampler.draws)
     origin = sample_origin(scenario, data, program)
-    with run_folder(folder, VALIDATION, origin, RESUME, replace=replace) as place:
+    inputs = inputs_of(scenario, data, program.path)
+    with run_folder(folder, VALIDATION, origin, RESUME, replace=replace, inputs=inputs) as place:
         measured = None if data is None else read_data(data, scenario)
         require_resources(scenario, measured, stages, sampler.chains * sampler.draws)
         experiment = build(scenario, measured, stages)
@@ -117,8 +119,10 @@ def _of_sampled(output: Output) -> Output:
 
 
 def _write_verdict(result: ValidationResult, folder: Path) -> None:
-    (folder / "validation.json").write_text(json.dumps(result.as_json(), indent=2) + "\n")
-    (folder / "validation.md").write_text(result.as_markdown())
+    (folder / "validation.json").write_text(
+        json.dumps(result.as_json(), indent=2) + "\n", encoding="utf-8"
+    )
+    (folder / "validation.md").write_text(result.as_markdown(), encoding="utf-8")
 
 
 # what the folder of a validation holds; a new file is one line here

@@ -107,7 +107,7 @@ class Checkpoints:
         else:
             self.folder.mkdir(parents=True, exist_ok=True)
             scratch = self.folder / f".partial-{IDENTITY}"
-            scratch.write_text(json.dumps(described, indent=2) + "\n")
+            scratch.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
             os.replace(scratch, marker)
 
     def _require_same(self, found: dict, described: dict, resume: bool) -> None:

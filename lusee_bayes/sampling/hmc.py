@@ -235,13 +235,16 @@ def draw_within(
     return _without_auxiliary(jax.vmap(kernel.postprocess_fn(inputs, {}))(z))
 
 
+NOT_FINITE = (
+    "the density is NaN or infinite where the chains begin; look for logarithms and roots of "
+    "negative numbers, for scales of zero, and for data outside a support"
+)
+
+
 def _require_finite(state: HMCState) -> None:
     """InputError if the density is NaN or infinite where the chains begin."""
     if not bool(jnp.isfinite(state.potential_energy).all()):
-        raise InputError(
-            "the program's density is NaN or infinite where its chains begin; look for logarithms "
-            "and roots of negative numbers, for scales of zero, and for data outside a support"
-        )
+        raise InputError(NOT_FINITE)
 
 
 def _without_auxiliary(sites: dict[str, Array]) -> dict[str, Array]:
@@ -285,7 +288,13 @@ class _Run:
         """The first state of every chain."""
         keys = jax.random.split(jax.random.PRNGKey(self.sampler.seed), self.sampler.chains)
         if not self.one_by_one:
-            state = self.kernel.init(keys, self.sampler.warmup, None, (self.dynamic,), {})
+            try:
+                state = self.kernel.init(keys, self.sampler.warmup, None, (self.dynamic,), {})
+            except RuntimeError as error:
+                # NumPyro's word for a density that is finite nowhere near the start
+                if "initial parameters" not in str(error):
+                    raise
+                raise InputError(NOT_FINITE) from error
             return self._shared_out(state)
 
         def first(keys, dynamic):

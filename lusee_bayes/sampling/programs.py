@@ -19,6 +19,7 @@ from jaxtyping import Float, Key, PRNGKeyArray
 from numpyro import handlers
 
 from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.command_line import printable
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import read_text, require_file
@@ -140,7 +141,7 @@ def load_program(source: str | Path) -> Program:
     # their module up by name
     sys.modules[module.__name__] = module
     try:
-        exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
+        exec(compile(text, printable(str(path)), "exec", dont_inherit=True), module.__dict__)
     except (Exception, SystemExit) as error:  # whatever a user's file may raise: not our failure
         del sys.modules[module.__name__]
         kind = type(error).__name__

@@ -19,6 +19,7 @@ from functools import lru_cache
 import numpy as np
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import require_nside
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.sky import free_free
 from lusee_bayes.sky.free_free import SUN_RADIUS_KPC
@@ -291,8 +292,7 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> n
             f"frequency_mhz is {frequency_mhz}, expected {MINIMUM_MHZ:g} to {MAXIMUM_MHZ:g}; "
             "give a frequency in MHz within LuSEE-Night's band"
         )
-    if not healpy.isnsideok(nside, nest=True):
-        raise InputError(f"nside is {nside}, expected a power of two; use 64, for example")
+    require_nside(nside)
     if seed is not None and seed < 0:
         raise InputError(f"seed is {seed}, expected an integer >= 0; use 1, for example")
 

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from lusee_bayes.core.checks import require_whole
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import LARGEST_LMAX
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.reading import read_text, require_file
 from lusee_bayes.sky.source import read_sky_file
@@ -42,10 +44,11 @@ def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:
     ------
     InputError
         If the file cannot be read, a line is not two numbers, C_ell is negative or not finite, or
-        an ell is missing or not in its place.
+        zero at every ell, or an ell is missing or not in its place.
     """
     rows: list[list[float]] = []
     named = False
+    require_whole("lmax", lmax, 0, LARGEST_LMAX)
     text = read_text(path, SPECTRUM.what, "check prior.spectrum_file")
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split("#")[0].replace(",", " ").split()
@@ -76,7 +79,10 @@ def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:
             f"{path} has no C_ell at ell = {missing[0]}{several}; give every ell from 0 to lmax, "
             "or lower lmax"
         )
-    return found["C_ell"][: lmax + 1]
+    spectrum = found["C_ell"][: lmax + 1]
+    if not spectrum.any():
+        raise InputError(f"{path}: C_ell is zero at every ell up to {lmax}; a prior needs variance")
+    return spectrum
 
 
 def read_mean(path: str | Path, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:

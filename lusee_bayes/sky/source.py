@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lusee_bayes.core.checks import require_whole
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import map_to_modes
 from lusee_bayes.core.reading import require_file
@@ -48,6 +49,7 @@ class SkySource(ABC):
 @lru_cache(maxsize=4)
 def _galaxy_modes(frequency_mhz: float, seed: int | None, lmax: int) -> np.ndarray:
     """Compute the diffuse sky's coefficients, read-only: variations of a scenario share one sky."""
+    require_whole("lmax", lmax, 0, 383)
     nside = 64 if lmax <= 95 else 128
     modes = map_to_modes(galaxy_map(frequency_mhz, nside=nside, seed=seed), lmax)
     modes.flags.writeable = False

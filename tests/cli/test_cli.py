@@ -1,12 +1,16 @@
 """The commands as a user meets them: files, figures, exit codes, messages."""
 
+import contextlib
 import csv
+import errno
 import hashlib
 import json
 import shutil
+import signal
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import healpy
 import jax
@@ -23,6 +27,7 @@ from lusee_bayes.experiment.schema import OutputSection
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.runs import map_run
 from lusee_bayes.runs import map_run as runs
+from lusee_bayes.runs.folder import Output
 
 SMALL = [
     argument
@@ -198,7 +203,17 @@ def test_data_without_truth(folder, tmp_path):
         (["map", "fiducial", "--set", "observation.start=soon"], "'soon' is not a date"),
         (["map", "fiducial", "--set", "noise.radiometer.factor=-1"], "greater than 0"),
         (["map", "fiducial", "--set", "observation.runs.0.cycles=0.0001"], "holds no sample"),
+        (
+            ["map", "fiducial", "--set", "noise.gain=3"],
+            "noise.gain is 3, but it should be a section",
+        ),
+        (["map", "three_cycle.yaml"], "no scenario file at 'three_cycle.yaml'; check the path"),
+        (["map", "three/cycles"], "no scenario file at 'three/cycles'; check the path"),
+        (["map", "three_cycle"], "did you mean 'three_cycles'"),
         (["info", "gone.fits"], "no file at 'gone.fits'"),
+        (["info", "[red]x[/red].nc"], "no file at '[red]x[/red].nc'"),
+        (["info", "x\udcff.nc"], r"no file at 'x\udcff.nc'"),
+        (["map", "fiducial", "--data", "x\udcff.nc"], r"no data at 'x\udcff.nc'"),
         (["mapp", "fiducial"], "mapp"),
         (["map"], "scenario"),
         (["map", "fiducial", "--draws", "many"], "many"),
@@ -212,7 +227,7 @@ def test_bad_input_is_one_sentence_and_exit_code_2(tmp_path, capsys, arguments, 
     error = capsys.readouterr().err.strip()
     assert message in error
     assert error.startswith("lusee-bayes: ")
-    assert "\n" not in error
+    assert "\n" not in error and "Section" not in error
     assert not out.exists()
 
 
@@ -239,7 +254,7 @@ def test_an_interrupted_write_leaves_the_previous_result_whole(
     assert content(out) == before
     assert not list(out.glob(".*"))
     assert run("map", "fiducial", *SMALL, "-o", tmp_path / "new", "-q") == 130
-    assert "interrupted; nothing has been written in" in capsys.readouterr().err
+    assert "interrupted; no results are written in" in capsys.readouterr().err
     assert content(tmp_path / "new") == {}
 
 
@@ -258,3 +273,73 @@ def test_help_and_version_do_not_load_the_heavy_libraries():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "map" in done.stdout
+
+
+def raises(error):
+    def fail(*_, **__):
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    ("fail", "code", "words"),
+    [
+        (lambda: signal.raise_signal(signal.SIGTERM), 143, "terminated; no results"),
+        (lambda: signal.raise_signal(signal.SIGHUP), 129, "terminated; no results"),
+        (raises(MemoryError("Unable to allocate 8 TiB")), 1, "not enough memory (Unable to alloc"),
+        (raises(RuntimeError("RESOURCE_EXHAUSTED: Out of memory")), 1, "not enough memory (RES"),
+        (raises(RuntimeError("can't start new thread")), 1, "not enough memory (can't start"),
+        (raises(OSError(errno.ENOSPC, "No space left on device")), 1, "mean.fits'); results"),
+        (
+            raises(OSError("Can't write data (errno = 28, error message = ...)")),
+            1,
+            "mean.fits'); r",
+        ),
+        (raises(OSError("Not enough space on disk: requested 839168")), 1, "mean.fits'); results"),
+    ],
+)
+def test_what_ends_a_run_is_one_sentence_and_leaves_nothing(
+    small_map, tmp_path, monkeypatch, capsys, fail, code, words
+):
+    def write(result, folder):
+        (folder / "mean.fits").write_text("half")
+        fail()
+
+    monkeypatch.setattr(runs, "map_result", lambda *_, **__: small_map.result)
+    monkeypatch.setattr(runs, "MAP", replace(runs.MAP, figures={}, outputs=[Output(write)]))
+    out = tmp_path / "out [red]"
+    assert run("map", "fiducial", *SMALL, "-o", out, "-q") == code
+    error = capsys.readouterr().err.strip()
+    assert words in error and "\n" not in error
+    assert not out.exists()
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_force_does_not_replace_what_the_run_reads(small_map, tmp_path, capsys):
+    out = Path(shutil.copytree(small_map.folder, tmp_path / "out"))
+    before = content(out)
+    for arguments in (
+        ["map", out / "scenario.yaml", "-o", out],
+        ["map", "fiducial", *SMALL, "--set", f"sky.file={out}/mean.fits", "-o", out],
+        ["map", "fiducial", *SMALL, "--data", out / "diagnostics.nc", "-o", out],
+        ["map", "fiducial", *SMALL, "--onto", out, "-o", out],
+        ["compare", out, small_map.folder, "-o", out],
+        ["simulate", out / "scenario.yaml", "-o", out / "scenario.yaml"],
+    ):
+        assert run(*arguments, "--force", "-q") == 2
+        assert "is an input of this run" in capsys.readouterr().err
+        assert content(out) == before
+
+
+def test_names_that_are_no_text_are_shown_by_their_escapes(small_map, tmp_path, capsys):
+    """In figures, pages, tables and the terminal."""
+    for name in ("a\udcff", "b[red]"):
+        shutil.copytree(small_map.folder, tmp_path / name)
+    with contextlib.chdir(tmp_path):
+        assert run("info", "a\udcff/mean.fits") == 0
+        assert run("compare", "a\udcff", "b[red]", "-o", "c\udcff") == 0
+    shown = capsys.readouterr().out
+    assert r"a\udcff" in shown and "b[red]" in shown
+    page = (tmp_path / "c\udcff" / "comparison.html").read_bytes().decode("utf-8")
+    assert r"a\udcff" in page

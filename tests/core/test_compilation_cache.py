@@ -91,3 +91,17 @@ def test_it_is_bounded_by_the_oldest(largest, tmp_path, monkeypatch):
     compilation_cache._kept(tmp_path)
     expected = [f"program{k}-cache" for k in range(min(6, largest // 100))]
     assert kept(tmp_path) == expected
+
+
+def test_a_program_that_imports_jax_first_sees_no_warnings_of_xla(tmp_path):
+    """JAX sets a level of messages at which XLA warns of every program that it finds."""
+    assert hits(start(tmp_path)) == 0
+    own = {k: v for k, v in os.environ.items() if not k.startswith(("JAX", "TF_CPP"))}
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM.format(factor=2.0, stay=False)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=own | {SWITCH: str(tmp_path)},
+    )
+    assert (done.stdout, done.stderr) == ("0\n", "")

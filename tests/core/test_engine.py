@@ -1,5 +1,6 @@
 """Tasks in threads of this process: order, progress, failures, and the tree of a sum."""
 
+import socketserver
 import threading
 from dataclasses import replace
 
@@ -115,7 +116,7 @@ def test_one_worker_is_this_process_which_needs_no_dask(monkeypatch):
         assert engine == ThisProcess(1)
     for given in ({"workers": 2}, {"cluster": "tcp://127.0.0.1:1"}):
         with (
-            pytest.raises(InputError, match=r"needs Dask; install it: pip install 'lusee_bayes\["),
+            pytest.raises(InputError, match=r"needs Dask; install it with pip install '\.\[clu"),
             open_engine(demand, **given),
         ):
             pass
@@ -150,3 +151,28 @@ def test_sums_of_channels_are_added_and_not_changed():
     np.testing.assert_array_equal(both.reference, one.reference)
     np.testing.assert_array_equal(one.matrices, before)
     assert both.misfit == one.misfit + other.misfit
+
+
+@pytest.mark.parametrize(
+    "answer", [b"", b"HTTP/1.0 400 Bad Request\r\n\r\n"], ids=["silent", "HTTP"]
+)
+def test_what_is_no_scheduler_is_refused_in_seconds(answer, monkeypatch):
+    """A Client would wait for ever, deaf to Ctrl-C, or ask for exabytes of memory."""
+    monkeypatch.setattr(workers, "ANSWER_S", 0.5)
+    demand = Demand(n_tasks=4, base_bytes=1e9, task_bytes=1e9, seconds=1.0)
+
+    class Answer(socketserver.BaseRequestHandler):
+        def handle(self):
+            self.request.sendall(answer)
+            self.request.recv(1 << 16)
+
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Answer) as server:
+        server.daemon_threads, server.block_on_close = True, False
+        threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+        address = f"tcp://127.0.0.1:{server.server_address[1]}"
+        with (
+            pytest.raises(InputError, match="no Dask scheduler answers"),
+            open_engine(demand, cluster=address),
+        ):
+            pass
+        server.shutdown()

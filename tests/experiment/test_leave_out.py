@@ -15,7 +15,7 @@ from lusee_bayes.experiment.leave_out import NOT_JUDGED, TOO_MANY, fitting, with
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.experiment.terms import measured_visibilities
+from lusee_bayes.experiment.terms.noise_about import measured_visibilities
 from lusee_bayes.instrument.calibration import Calibration
 from lusee_bayes.testing import assert_refused
 

@@ -71,6 +71,7 @@ def test_files_of_another_frequency_are_scaled(files):
         ("2 1\n3 2\n", "no C_ell at ell = 0"),
         ("0 1\n1 2\n", "no C_ell at ell = 2 and 4 more up to lmax = 6"),
         ("0 1\n0 2\n", "does not grow"),
+        ("".join(f"{ell} 0\n" for ell in range(9)), "cl.txt: C_ell is zero"),
         ("0 -1\n", "outside 0 to inf"),
         ("0 nan\n", "NaN"),
         ("0 1 2\n", "expected ell and C_ell"),

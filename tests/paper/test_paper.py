@@ -130,7 +130,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(
         return compute(scenario)
 
     monkeypatch.setattr(runs, "compute_case", interrupted)
-    state = "the earlier results are as they were" if earlier else "nothing has been written"
+    state = "the earlier results are as they were" if earlier else "no results are written"
     with pytest.raises(KeyboardInterrupt, match=f"{state} in '.*'; the same command continues"):
         run_cases(tmp_path)
     after = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}

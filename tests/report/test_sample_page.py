@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lusee_bayes.report.figures.drawing import number_of_tick
-from lusee_bayes.report.sample_page import warnings_of
+from lusee_bayes.results.convergence import warnings_of
 
 GOOD = {"r_hat": [1.0, 1.005], "ess_bulk": [900.0, 800.0], "ess_tail": [700.0, 600.0]}
 SAMPLED = {"chains": 4, "draws": 500, "divergences": 0}
@@ -27,6 +27,8 @@ def test_good_draws_are_not_warned_of():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        ({"r_hat": [1.002, 1.09]}, ("Not converged", "(1.090)")),
+        ({"r_hat": [np.inf, 1.0]}, ("Not converged", "(inf)")),
         ({"r_hat": [1.002, 1.03]}, ("R-hat", "1 of 2", "C_5 [K2] (1.030)", "--draws")),
         ({"ess_bulk": [399.0, 900.0]}, ("bulk", "below 400", "T(centre) [K] (399)")),
         ({"ess_tail": [399.0, 12.0]}, ("tail", "2 of 2", "C_5 [K2] (12)")),

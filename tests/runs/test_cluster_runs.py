@@ -195,7 +195,7 @@ def test_the_scheduler_killed(cluster, alone, tmp_path):
     assert process.returncode == 1
     assert errors == (
         f"lusee-bayes: the Dask scheduler at {cluster.address} is gone, or has forgotten this run; "
-        f"nothing has been written in '{tmp_path}/a'; the same command continues from the finished "
+        f"no results are written in '{tmp_path}/a'; the same command continues from the finished "
         "channels\n"
     )
     for worker in cluster.workers:

@@ -203,7 +203,7 @@ def test_an_interrupted_run_goes_on_where_it_was(
         patch.setattr(cube_channels, "inform", some)
         assert run(*command) == 130
     assert capsys.readouterr().err.strip() == (
-        f"lusee-bayes: interrupted; nothing has been written in '{tmp_path}'; the same command "
+        f"lusee-bayes: interrupted; no results are written in '{tmp_path}'; the same command "
         "continues from the finished channels"
     )
     assert made == [20, 25] and not (tmp_path / "posterior.nc").exists()

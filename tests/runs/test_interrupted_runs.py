@@ -217,7 +217,7 @@ def test_an_interrupt_says_what_the_folder_holds(command, with_earlier, tmp_path
     errors = process.communicate(timeout=600)[1].strip()
     assert process.returncode == 130, errors
     state = state_of(folder, it, earlier)
-    before = "the earlier results are as they were" if earlier else "nothing has been written"
+    before = "the earlier results are as they were" if earlier else "no results are written"
     sentence = {
         "new": f"the new results in '{folder}' are complete",
         "old": f"{before} in '{folder}'",

@@ -635,9 +635,9 @@ def test_an_interrupt_is_exit_code_130_and_a_sentence(killed, tmp_path, capsys, 
 
     monkeypatch.setattr(sample_run, "sample_result", interrupt)
     assert run("sample", *SMALL, "-q", "-o", tmp_path / "out") == 130
-    assert_one_sentence(capsys, f"interrupted; nothing has been written in '{tmp_path / 'out'}'")
+    assert_one_sentence(capsys, f"interrupted; no results are written in '{tmp_path / 'out'}'")
     assert run("sample", *SMALL, "-q", "-o", killed, "--resume") == 130
-    assert_one_sentence(capsys, f"nothing has been written in '{killed}'; go on with --resume")
+    assert_one_sentence(capsys, f"no results are written in '{killed}'; go on with --resume")
 
 
 # ---- validation of the same draws

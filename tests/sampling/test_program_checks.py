@@ -1,7 +1,11 @@
 """Programs that cannot be sampled are refused in a sentence, before anything is sampled."""
 
+from pathlib import Path
+
 import pytest
 
+import lusee_bayes
+from lusee_bayes.cli.main import main
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.inference import infer
@@ -9,6 +13,8 @@ from lusee_bayes.experiment.pieces import program_pieces
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.sampling.program_checks import require_sampleable
 from lusee_bayes.sampling.programs import load_program
+
+ROOT = Path(lusee_bayes.__file__).resolve().parents[1]
 
 HEAD = """
 import jax.numpy as jnp
@@ -106,3 +112,15 @@ def test_arguments_are_given_by_name(argument, tmp_path):
     path.write_text(f"def model({argument}data=None):\n    pass\n")
     with pytest.raises(InputError, match="does not run|by position, or as many as come"):
         load_program(path)
+
+
+def test_a_density_that_is_nan_names_the_program(tmp_path, capsys):
+    path = tmp_path / "bad.py"
+    lines = '    numpyro.factor("bad", jnp.log(-1.0) * sky.sum())\n'
+    path.write_text((ROOT / "models" / "sky.py").read_text() + lines + "import jax.numpy as jnp\n")
+    small = ["--set", "lmax=3", "--set", "observation.step_s=43200"]
+    short = ["--chains", "1", "--warmup", "20", "--draws", "10", "-q"]
+    out = str(tmp_path / "out")
+    assert main(["sample", "fiducial", *small, "--model", str(path), *short, "-o", out]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "bad.py" in error and "NaN" in error and "\n" not in error

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.sky import free_free, galaxy
 from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES
 
@@ -328,3 +330,21 @@ def test_random_component_has_the_stated_rms_and_large_scales_at_every_nside():
 def test_bad_input_is_named(arguments, word):
     with pytest.raises(InputError, match=f"is {word}, expected .*; (use|give) "):
         galaxy.galaxy_map(*arguments)
+
+
+@pytest.mark.parametrize("value", [-3, 10**12])
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda n: lb.galaxy_sky(25.0, lmax=n),
+        lambda n: galaxy.galaxy_map(25.0, nside=n),
+        lambda n: lb.monopole_beams(25.0, n),
+        lambda n: modes_to_map(np.zeros(16), n),
+        lambda n: lb.PixelPrior(np.ones(4), n),
+    ],
+    ids=["sky", "map", "beams", "synthesis", "prior"],
+)
+def test_sizes_that_would_end_the_process_are_refused(call, value):
+    """healpy's C code aborts for some of them."""
+    with pytest.raises(InputError, match="expected a whole number"):
+        call(value)

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from scipy.special import roots_legendre
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.checks import require_shape, require_whole
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import SQRT2, mode_numbers, polar_functions
+from lusee_bayes.core.harmonics import LARGEST_LMAX, SQRT2, mode_numbers, polar_functions
 
 
 class HemisphereGrid(eqx.Module):
@@ -51,6 +51,7 @@ class HemisphereGrid(eqx.Module):
         doubles (tests/instrument/test_monopoles.py). A loss tangent below 0.001 needs more nodes,
         since echoes from deep layers then vary quickly with the angle.
         """
+        require_whole("lmax", lmax, 0, LARGEST_LMAX)
         n = max(lmax, 63) + 1
         return cls.gauss_legendre(2 * n, 2 * n)
 

@@ -1,4 +1,4 @@
-"""pyuvdata's UVBeam as sampled beams; pyuvdata is optional (``pip install lusee_bayes[uvdata]``).
+"""pyuvdata's UVBeam as sampled beams; pyuvdata is optional (the extra ``uvdata``).
 
 A UVBeam of type efield holds, for every feed, the response to the components of the field along
 azimuth and zenith angle (``az_za``), or along phi and theta (``healpix``); azimuth is phi, from
@@ -47,7 +47,7 @@ def read_uvbeam(path: str | Path) -> SampledBeams:
     if find_spec("pyuvdata") is None:
         raise InputError(
             f"{path} is a beam file of pyuvdata, which is not installed; install it with "
-            "pip install 'lusee_bayes[uvdata]'"
+            "pip install '.[uvdata]' in the clone of lusee_bayes"
         )
     with reading(path, "a beam file of pyuvdata") as file:
         beam = pyuvdata.UVBeam.from_file(str(file))

@@ -15,8 +15,10 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from matplotlib.patches import Circle
+from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
+from lusee_bayes.core.command_line import printable
 from lusee_bayes.instrument.beams import HemisphereGrid
 
 # safe for colour-blind readers: perceptually uniform, and a blue-orange pair (Okabe-Ito) for lines
@@ -29,6 +31,8 @@ COMPRESSION = 2
 def save(figure: Figure, path: Path, dpi: int) -> None:
     """Write a figure as a PNG; laid out and drawn once, where savefig alone draws it twice."""
     figure.set_dpi(dpi)
+    for text in figure.findobj(Text):
+        text.set_text(printable(text.get_text()))
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     imsave(path, canvas.buffer_rgba(), dpi=dpi, pil_kwargs={"compress_level": COMPRESSION})

@@ -29,7 +29,7 @@ class Panel:
 
 PANELS = (
     Panel("information about the sky [bits]", "information_bits"),
-    Panel("modes with SNR > 1 [number]", "modes"),
+    Panel("modes with expected SNR > 1 [number]", "modes"),
     Panel(r"first $\ell$ with expected SNR$_\ell$ < 1", "ell_cross"),
 )
 

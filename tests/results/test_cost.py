@@ -1,0 +1,34 @@
+"""What a run is expected to take: more of everything takes more; what does not fit is refused."""
+
+import pytest
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.results import cost
+from lusee_bayes.results.forecast import AS_GIVEN, Variation
+from lusee_bayes.runs.plan_run import run_plan
+
+SOURCES = "sources.list=[{name: Cas A}, {name: Cyg A}]"
+
+
+def cost_of(*overrides):
+    return cost.posterior_cost(load_scenario("fiducial", ["lmax=8", *overrides]))
+
+
+@pytest.mark.parametrize(
+    "more",
+    ["observation.step_s=600", "frequencies_mhz=[20, 25]", SOURCES],
+)
+def test_times_channels_and_sources_cost_time_and_memory(more, monkeypatch):
+    monkeypatch.setattr(cost, "_operations_a_second", lambda: 1e9)
+    one, other = cost_of(), cost_of(more)
+    assert other.memory > one.memory
+    assert other.seconds > one.seconds
+
+
+def test_a_plan_that_does_not_fit_is_refused_before_it_starts(tmp_path, monkeypatch):
+    monkeypatch.setattr(cost, "memory_limit", lambda: 8e9)
+    scenario = load_scenario("fiducial", ["lmax=383"])
+    with pytest.raises(InputError, match="memory"):
+        run_plan([Variation("fiducial", AS_GIVEN, AS_GIVEN, scenario)], tmp_path / "plan")
+    assert not (tmp_path / "plan").exists()
