@@ -50,6 +50,7 @@ bench: $(VENV)/installed
 	$(BIN)/python benchmarks/pipeline.py
 	$(BIN)/python benchmarks/priors.py
 	$(BIN)/python benchmarks/structured_noise.py
+	$(BIN)/python benchmarks/diagnosis.py
 	$(BIN)/python benchmarks/sampling.py
 
 clean:

@@ -186,7 +186,7 @@ class Residuals:
                 "times, which would need the whole of A."
             ]
         parts, extremes, suspects = [], self.extremes(), self.suspects()
-        if extremes:
+        if suspects and extremes:
             named = [f"{kind} {g.name} (p {probability(g.p)})" for kind, g in extremes[:NAMED]]
             more = len(extremes) - NAMED
             named += [f"{more} more"] if more > 0 else []
@@ -204,7 +204,10 @@ class Residuals:
                     "data do not tell which."
                 )
         if not suspects:
-            parts.append("No single product, day or turntable angle is to blame.")
+            parts.append(
+                f"{len(extremes)} of {len(self.compared())} products, days and turntable angles "
+                "stand out, and no single one is to blame."
+            )
         return parts
 
 

@@ -59,6 +59,7 @@ def map_page(folder: Path, name: str) -> str:
         [
             html.contents(sections),
             head.verdict(found.attrs["level"], found.attrs["verdict"]),
+            *_mistakes(folder, summary),
             head.doubts(folder / "summary.json", summary),
             head.about(folder, f"{summary['frequency_mhz']:g} MHz"),
             html.section(*SECTIONS[0], *_map(folder, summary, found)),
@@ -215,7 +216,6 @@ def _data(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
         cells = [_group_row(found, int(row)) for row in rows]
         bad = [f"{name} {cell[0]}" in marked for cell in cells]
         parts += [html.paragraph(f"{title}{note}"), html.table(header, cells, bad)]
-    parts += _mistakes(folder, summary)
     parts += _pointing(folder)
     parts += map_unknowns(folder, summary)
     parts.append(
@@ -246,14 +246,16 @@ def _mistakes(folder: Path, summary: dict) -> list[str]:
     ]
     header = ("mistake", "what to do", "chi² without it", "expected", "p")
     text = (
-        "Signs, exchanged products and ports, angles, clocks, factors, constants, the noise level "
-        "and lmax were tried one by one. "
+        "Signs, exchanged products and ports, angles, clocks, factors, constants, noise level and "
+        "lmax were tried one by one. "
     )
-    if cells:
-        text += "Those that would explain the data, the best first:"
+    if not cells:
+        text += "None of them explains the data, or the data need none."
+    elif not found[0]["fits"]:
+        text += "None explains the data; the closest:"
     else:
-        text += "The data fit with none of them, or need none."
-    parts = [html.subsection("Usual mistakes"), html.paragraph(text)]
+        text += "Without one of these the data would fit, the best first:"
+    parts = [html.subsection("Did you mean?"), html.paragraph(text)]
     return [*parts, *([html.table(header, cells)] if cells else [])]
 
 

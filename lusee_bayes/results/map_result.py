@@ -143,7 +143,7 @@ class MapResult(Described):
         return self.pointing.offsets.to_dict("records")
 
     def verdict(self) -> str:
-        """Whether the data fit, and which usual mistakes would explain it if not."""
+        """Whether the data fit, in sentences."""
         return str(self.diagnostics.attrs["verdict"])
 
     def headline(self) -> str:
@@ -164,12 +164,14 @@ class MapResult(Described):
         return ", ".join(parts)
 
     def lines(self) -> list[str]:
-        """What a terminal shows: the verdict first, then prior and unknowns, and the figures."""
+        """What a terminal shows: verdict and causes first, then prior, unknowns and figures."""
         fluxes = [] if self.fluxes is None else flux_lines(self.fluxes)
         offsets = [] if self.pointing is None else self.pointing.lines()
         unknowns = [] if self.unknowns is None else self.unknowns.lines()
         told = [prior_sentence(self.experiment), *fluxes, *offsets, *unknowns]
-        return [self.verdict(), *told, self.headline(), RULE, *self.channel.doubts, *self._flags()]
+        causes = [] if self.diagnosis is None else self.diagnosis.sentences()
+        figures = [self.headline(), RULE, *self.channel.doubts, *self._flags()]
+        return [self.verdict(), *causes, *told, *figures]
 
     def _flags(self) -> list[str]:
         """How much of flight data was flagged, and what is doubtful about them."""
@@ -241,7 +243,6 @@ def map_result(
     if diagnosed or page.attrs["level"] == DOES_NOT_FIT:
         with stages("usual mistakes"):
             diagnosis = diagnose(experiment, alone, left)
-        page.attrs["verdict"] = " ".join([page.attrs["verdict"], *diagnosis.sentences()])
     if scenario.noise.pointing is not None or page.attrs["level"] == DOES_NOT_FIT:
         with stages("clock and pointing"):
             own = covariance if earlier is None else on_host(alone.posterior).covariance()

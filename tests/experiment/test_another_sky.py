@@ -7,18 +7,24 @@ freedom as there are modes.
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 import wrong_data
-from scipy import stats
+from scipy import linalg, stats
 
 from lusee_bayes.core.arrays import on_host
+from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.learned_prior import learned_prior
 from lusee_bayes.experiment.model import full_model, radiometer
 from lusee_bayes.experiment.rounds import settled
+from lusee_bayes.experiment.schema import FileSkySection
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.experiment.simulate import simulate
 from lusee_bayes.experiment.terms import Around, gains_about, radiometer_about
 from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.noise import GainDrift, with_gains
 from lusee_bayes.sky import Sky
 from lusee_bayes.sky.priors import HarmonicPrior
 
@@ -99,3 +105,48 @@ def test_what_n_is_built_around_by_default():
     setup = set_up(scenario, partly)
     assert radiometer_about(setup) == "posterior"
     assert np.isfinite(np.asarray(full_model(setup, Around(partly)).noise.diagonal())).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sigma", [0.001, 0.005, 0.02])
+def test_the_default_path_with_drifts(sigma, shared_data):
+    """ULSA's sky, the embedded one as model, the default prior, learned in the rounds of N.
+
+    The errors are those of a map whose N is built around the true visibilities; in the combinations
+    that it knows best, where the prior hardly matters, they are what is claimed.
+    """
+    file = shared_data / "ulsa" / "exp10.0MHz_sky_map_with_absorption.hdf5"
+    sky = FileSkySection(file=str(file)).source().at(10.0, 12)
+    scenario = wrong_data.scenario(12, f"noise.gain={{sigma: {sigma}}}", frequency_mhz=10.0)
+    total, known = 0.0, 0
+    for seed in (1, 2, 3):
+        seen = {}
+
+        def distort(setup, v, seen=seen, seed=seed):
+            seen["true"] = np.asarray(v)
+            key, hours = jax.random.key(100 + seed), setup.observation.hours
+            return with_gains(v, GainDrift(sigma, 10.0).sample(key, hours))
+
+        data = wrong_data.measured(scenario, sky, seed, distort=distort)
+        experiment = build(scenario, data)
+        found = infer(experiment)
+        around = Around(data, seen["true"])
+        setup = set_up(scenario, data)
+        information = full_model(setup, around).inform(data.data)[0]
+        prior = learned_prior(setup, setup.family, information).prior
+        ideal = replace(
+            found, posterior=full_model(replace(setup, prior=prior), around).condition(data.data)
+        )
+        n = len(sky.modes)
+        assert distance(found, sky.modes) / n == pytest.approx(
+            distance(ideal, sky.modes) / n, abs=0.1
+        )
+        posterior = on_host(found.posterior)
+        share, directions = linalg.eigh(
+            np.asarray(posterior.covariance()), np.asarray(posterior.prior.covariance())
+        )
+        best = share < 1e-3
+        off = directions.T @ (sky.modes - np.asarray(posterior.mean)) / np.sqrt(share)
+        total, known = total + float((off[best] ** 2).sum()), known + int(best.sum())
+    assert known > 60
+    assert 1.0 - 4.0 * np.sqrt(2.0 / known) < total / known < 1.0 + 4.0 * np.sqrt(2.0 / known)

@@ -12,7 +12,13 @@ from scipy.optimize import minimize
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.learning import ROUNDING, _root, learn
+from lusee_bayes.linear.learning import (
+    ROUNDING,
+    _root,
+    demanded_factor,
+    learn,
+    learn_whatever_fits,
+)
 from lusee_bayes.linear.marginal_information import marginalised
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
@@ -137,3 +143,56 @@ def test_a_root_of_what_rounding_has_spoilt():
         root = _root(q * values @ q.T)
         expected = q * np.clip(values, 0.0, 1.0) @ q.T
         np.testing.assert_allclose(root @ root.T, expected, atol=1.1 * ROUNDING)
+
+
+# --- data that do not fit -------------------------------------------------------------------------
+
+
+def test_raised_information_is_that_of_raised_noise():
+    """Of the same data under N times a factor."""
+    rng = np.random.default_rng(3)
+    n = (LMAX + 1) ** 2
+    coupling, data = rng.standard_normal((N_DATA, n)), 100.0 * rng.standard_normal(N_DATA)
+    plain, expected = (
+        LinearGaussian(
+            coupling,
+            HarmonicPrior(np.full(LMAX + 1, 1e4)),
+            DiagonalCovariance(np.full(N_DATA, variance)),
+        ).inform(data)[0]
+        for variance in (9.0, 63.0)
+    )
+    raised, sky = plain.raised(7.0), rng.standard_normal(n)
+    np.testing.assert_allclose(raised.matrix, expected.matrix, rtol=1e-12)
+    assert float(raised.chi2(sky)) == pytest.approx(float(expected.chi2(sky)), rel=1e-10)
+    assert float(raised.log_det) == pytest.approx(float(expected.log_det), rel=1e-12)
+
+
+def test_data_that_fit_demand_nothing(case):
+    """And the prior is that of learning without a question asked."""
+    assert demanded_factor(case.information, case.family.expected()) == 1.0
+    plain, found = (
+        learn(case.family, case.information),
+        learn_whatever_fits(case.family, case.information),
+    )
+    assert found.fits and found.noise_factor == 1.0
+    np.testing.assert_array_equal(found.parameters, plain.parameters)
+
+
+def test_what_no_sky_explains_raises_n(case):
+    """chi^2 of everything 50 times as large: N is raised by that."""
+    bad = replace(case.information, misfit=np.asarray(50.0 * case.information.misfit))
+    factor = demanded_factor(bad, case.family.expected())
+    assert 30.0 < factor < 80.0
+    found = learn_whatever_fits(case.family, bad)
+    assert found.noise_factor >= factor and not found.fits
+
+
+def test_where_nothing_settles_the_prior_is_fixed_and_wide(case, monkeypatch):
+    monkeypatch.setattr("lusee_bayes.linear.learning.MAX_STEPS", 0)
+    found = learn_whatever_fits(case.family, case.information)
+    assert not found.settled and not found.fits and found.as_rows() == []
+    expected = case.family.expected()
+    ratio = np.asarray(found.prior.variance()) / np.asarray(expected.variance())
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-10)
+    assert ratio[0] >= 1.0
+    assert np.isfinite(np.asarray(case.information.posterior(found.prior).mean)).all()

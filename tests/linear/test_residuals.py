@@ -217,4 +217,4 @@ def test_what_no_group_explains():
     bad = corrupted(data, slice(None), noise * rng.standard_normal((16, 24)))
     found = judged(model, bad)
     assert found.suspects() == []
-    assert "No single product, day or turntable angle" in found.fit().text
+    assert "no single one is to blame" in found.fit().text
