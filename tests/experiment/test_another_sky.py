@@ -109,13 +109,13 @@ def test_what_n_is_built_around_by_default():
 
 @pytest.mark.long
 @pytest.mark.parametrize("sigma", [0.001, 0.005, 0.02])
-def test_the_default_path_with_drifts(sigma, shared_data):
+def test_the_default_path_with_drifts(sigma, test_data):
     """ULSA's sky, the embedded one as model, the default prior, learned in the rounds of N.
 
     The errors are those of a map whose N is built around the true visibilities; in the combinations
     that it knows best, where the prior hardly matters, they are what is claimed.
     """
-    file = shared_data / "ulsa" / "exp10.0MHz_sky_map_with_absorption.hdf5"
+    file = test_data / "ulsa" / "exp10.0MHz_sky_map_with_absorption.hdf5"
     sky = FileSkySection(file=str(file)).source().at(10.0, 12)
     scenario = wrong_data.scenario(12, f"noise.gain={{sigma: {sigma}}}", frequency_mhz=10.0)
     total, known = 0.0, 0
