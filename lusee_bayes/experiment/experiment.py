@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.representation import Described
 from lusee_bayes.experiment.learned_prior import with_learned_prior
@@ -90,6 +93,17 @@ def build(
     """
     stages = stages or Stages()
     return _learned(_fitting(observed(scenario, data, stages), stages), stages)
+
+
+@contextmanager
+def explained(experiment: Experiment) -> Iterator[None]:
+    """Add why good data do not fit to the message of an InputError of the block, where known."""
+    try:
+        yield
+    except InputError as error:
+        if experiment.fitting is None or not experiment.fitting.cause:
+            raise
+        raise InputError(f"{experiment.fitting.cause} ({error})") from error
 
 
 def observed(

@@ -69,6 +69,8 @@ class Fitting:
         Of the values, flagged.
     refused : bool
         Whether so much would have to go that nothing does.
+    cause : str
+        Why good data do not fit, where that was found: also why a map of them may fail.
     """
 
     flagged: Bool[np.ndarray, "products times"]
@@ -78,6 +80,7 @@ class Fitting:
     groups: tuple[Group, ...] = ()
     share: float = 0.0
     refused: bool = False
+    cause: str = ""
 
     @property
     def times(self) -> Bool[np.ndarray, " times"]:
@@ -104,18 +107,14 @@ def fitting(
     Returns
     -------
     Fitting
-        With nothing flagged, and a remark, if so many data do not fit that it is not them, or a
-        higher lmax fits.
+        With nothing flagged, and a remark, if so many data do not fit that it is not them; with
+        what does not fit at a higher lmax either, if others do.
     """
     stages = stages or Stages()
     found = _found(setup, data, false_alarm, stages)
     if not found.refused and found.share <= SMALL:
         return found
-    remark = _higher_lmax(setup, data, false_alarm, found, stages)
-    if not remark:
-        return found
-    nothing = np.zeros_like(found.flagged)
-    return Fitting(nothing, found.rounds, found.chi2, remark, refused=True)
+    return _at_higher_lmax(setup, data, false_alarm, found, stages)
 
 
 def _found(setup: Setup, data: Visibilities, false_alarm: float, stages: Stages) -> Fitting:
@@ -152,14 +151,14 @@ def _found(setup: Setup, data: Visibilities, false_alarm: float, stages: Stages)
     return Fitting(nothing, rounds, before, remark, refused=True)
 
 
-def _higher_lmax(
+def _at_higher_lmax(
     setup: Setup, data: Visibilities, false_alarm: float, found: Fitting, stages: Stages
-) -> str:
-    """What is to be said where the data fit with a higher lmax; empty where they do not.
+) -> Fitting:
+    """What does not fit at a higher lmax, where others do; ``found`` where none is any better.
 
     It is raised as long as chi^2 of the times falls and there is memory.
     """
-    lmax, remark, size = setup.scenario.lmax, "", float(np.median(found.chi2))
+    lmax, best, size = setup.scenario.lmax, found, float(np.median(found.chi2))
     enough = SMALL if found.refused else min(SMALL, found.share / 2.0)
     for higher in range(lmax + STEP, lmax + STEPS * STEP + 1, STEP):
         if n_modes(higher) > data.layout.size / 2:
@@ -175,18 +174,22 @@ def _higher_lmax(
         if again.remark == NOT_JUDGED:
             break
         if not again.refused and again.share <= enough:
-            return (
-                f"lmax={lmax} is too small for these data, so that none was flagged: lmax={higher} "
-                f"fits; use --set lmax={higher}"
+            cause = (
+                f"lmax={lmax} is too small for these data: lmax={higher} fits; use --set "
+                f"lmax={higher}"
             )
+            remark = f"{cause}. {again.remark}".strip()
+            return replace(again, chi2=found.chi2, remark=remark, cause=cause)
         if not 0.0 < size < FALLS * before:
             break
-        remark = (
+        cause = (
             f"lmax={lmax} is too small for these data, so that none was flagged: with "
             f"lmax={higher} chi^2 of the times is {size / float(np.median(found.chi2)):.2g} of "
             f"what it is now; use --set lmax={higher} or more"
         )
-    return remark
+        nothing = np.zeros_like(found.flagged)
+        best = Fitting(nothing, found.rounds, found.chi2, f"{cause}.", refused=True, cause=cause)
+    return best
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data, anchored, read_data
-from lusee_bayes.experiment.experiment import build, with_truth
+from lusee_bayes.experiment.experiment import build, explained, with_truth
 from lusee_bayes.experiment.inference import inform
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.joint_skies import channel_sky
@@ -96,7 +96,8 @@ def cube_result(
         if truth:
             experiment = with_truth(experiment)
         n_perturbations = n_draws if iterative else 0
-        information, inference = inform(experiment, perturbation_key(channel), n_perturbations)
+        with explained(experiment):
+            information, inference = inform(experiment, perturbation_key(channel), n_perturbations)
         known = ChannelInformation.of(experiment, information, inference)
         if scenario.joint:
             files.write(channel, wanted, known.to_dataset())

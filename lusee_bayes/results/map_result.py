@@ -16,7 +16,7 @@ from lusee_bayes.core.progress import Stages, peak_memory_gb
 from lusee_bayes.core.representation import Described
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.diagnosis import Diagnosis, diagnose
-from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.experiment.experiment import Experiment, explained
 from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
@@ -215,7 +215,7 @@ def map_result(
         )
     earlier = None if onto is None else read_updatable(onto, scenario)
     digests = (data.digest(),)
-    with stages("posterior"):
+    with stages("posterior"), explained(experiment):
         found = judged = alone = infer(experiment)
         if earlier is not None:
             found, judged = _updated(earlier, found, experiment)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.linalg import LinAlgError
 
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment import comparison
-from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.experiment import build, explained
 from lusee_bayes.experiment.leave_out import NOT_JUDGED, TOO_MANY, fitting, without
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.scenario import load_scenario
@@ -176,6 +177,18 @@ def test_before_data_are_flagged_lmax_is_tried(experiment):
     found = fitting(setup, fine.data, FALSE_ALARM)
     assert not found.flagged.any()
     assert found.remark.startswith("lmax=6 is too small") and "--set lmax=14" in found.remark
+    # and if the map then fails, it is not the prior that is blamed
+    told = pytest.raises(InputError, match=r"^lmax=6 is .*lmax=14 \(no prior\)")
+    with told, explained(replace(fine, fitting=found)):
+        raise InputError("no prior")
+
+
+def test_what_does_not_fit_at_a_higher_lmax_either_is_flagged(experiment):
+    fine = build(experiment.scenario.model_copy(update={"lmax": 14}))
+    data = with_bursts(fine, [20], 30.0)
+    found = fitting(set_up(experiment.scenario, data), data, FALSE_ALARM)
+    assert np.flatnonzero(found.times).tolist() == [20] and found.flagged.sum() == 16
+    assert "lmax=14 fits" in found.remark and "1 of 65 times" in found.remark
 
 
 def test_data_go_without_another_fit(experiment, monkeypatch):
