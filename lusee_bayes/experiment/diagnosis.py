@@ -3,15 +3,9 @@
 Each is undone, and its residual chi^2, what a prior wide enough for any sky leaves
 (:mod:`lusee_bayes.linear.split`), tells whether the data would fit.
 
-Changes of the data mix the products of each time, d' = sum_jk W_jk x_jk, where x_jk has product k
-in the place of product j. With K the covariance of the data under the wide prior, and b the model
-without a sky, chi^2 of all of them comes from one matrix, ::
-
-    chi^2(W) = (X w - b)^T K^-1 (X w - b) = (w, -1)^T Q (w, -1),    Q = (X, b)^T K^-1 (X, b).
-
-Exchanges, signs and reversals then cost nothing; factors and constants are solved for. A change of
-the model needs a normal matrix of its own; these are compared up to ``SCREENED_LMAX`` first. The
-best of both are computed as the scenario has it, with N for the changed data.
+Changes of the data cost one matrix together (:mod:`.mixed_products`). A change of the model needs a
+normal matrix of its own; these are compared up to ``SCREENED_LMAX`` first. The best of both are
+computed as the scenario has it, with N for the changed data.
 """
 
 from __future__ import annotations
@@ -20,38 +14,22 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
-from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import lmax_of, mean_over_m, n_modes
-from lusee_bayes.core.linalg import solve_lower
+from lusee_bayes.experiment.any_sky import UnderAnySky
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.mistakes import (
-    DataMistake,
     ModelMistake,
-    data_mistakes,
     model_mistakes,
 )
-from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.mixed_products import MixedProducts
 from lusee_bayes.experiment.rounds import Inference
-from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.terms import Around
-from lusee_bayes.instrument.beams import ProductBeams
-from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.pointing_offsets import kind_of, offset_names, with_offsets
-from lusee_bayes.instrument.products import all_products, auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.fit import ChiSquare, stands_out, two_sided
-from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.metrics import expected_chi2
-from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.linear.residuals import Residuals
-from lusee_bayes.linear.split import WIDER, with_sky
-from lusee_bayes.sky.priors import HarmonicPrior
 
 # changes of the model are compared up to this ell
 SCREENED_LMAX = 12
@@ -62,8 +40,6 @@ TRIED, PROMISING = 3, 0.5
 EXPLAINED = 0.03
 # two mistakes are one for these antennas if their chi^2 differ by less, relative
 SAME = 1e-5
-# times that are tried one by one, the worst first
-TIMES = 32
 # lmax is tried with so many more
 MORE_ELLS = 8
 # offsets are solved for from so many degrees on either side, in steps that shrink
@@ -151,61 +127,6 @@ class Diagnosis:
         ]
 
 
-@dataclass(frozen=True)
-class _Data:
-    """Data with the model that their residual chi^2 is computed in.
-
-    setup : Setup; data : Visibilities; model : of them; spectrum : C_ell of the wide prior, in K^2
-    """
-
-    setup: Setup
-    data: Visibilities
-    model: LinearGaussian
-    spectrum: Float[np.ndarray, " ells"]
-
-    def wide(self, coupling: Coupling) -> tuple[ChiSquare, Posterior]:
-        """Residual chi^2, and the posterior under the wide prior."""
-        n_ells = lmax_of(coupling.shape[1]) + 1
-        more = max(0, n_ells - len(self.spectrum))
-        spectrum = np.pad(self.spectrum, (0, more), mode="edge")[:n_ells]
-        information, posterior = Information.of(
-            coupling,
-            HarmonicPrior(spectrum),
-            self.model.noise,
-            self.model.offset,
-            np.asarray(self.data.data),
-        )
-        posterior, n = on_host(posterior), self.model.n_data
-        chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
-        degrees = n - with_sky(n - expected_chi2(posterior, n))
-        return ChiSquare(chi2, float(degrees)), posterior
-
-    def under(self, beams: ProductBeams, observation: Observation, pointing: Pointing) -> ChiSquare:
-        """Residual chi^2 with other beams or another observation.
-
-        ``pointing`` is that of the data's own observation, up to the ell that counts.
-        """
-        lmax = len(pointing.pole_from_galactic.blocks) - 1
-        if (observation.times == self.setup.observation.times).all():
-            pointing = pointing.placed(observation)
-        else:
-            pointing = Pointing.of(observation, lmax)
-        modes = np.asarray(beams.modes)[:, : n_modes(lmax)]
-        beams = ProductBeams(modes, beams.frequency_mhz)
-        return self.wide(CouplingMatrix.build(beams, pointing, self.data.layout))[0]
-
-    def without(self, mistake: DataMistake) -> ChiSquare:
-        """Residual chi^2 of the data without a mistake, with N for them."""
-        layout = self.data.layout
-        right = np.asarray(layout.gather(mistake.undone(_filled(self.data))))
-        data = replace(self.data, data=right)
-        try:
-            model = on_host(full_model(self.setup, Around(data)))
-        except InputError:  # without it, some auto is not positive
-            return ChiSquare(np.inf, float(layout.size))
-        return replace(self, data=data, model=model).wide(model.coupling)[0]
-
-
 def diagnose(experiment: Experiment, inference: Inference, found: Residuals) -> Diagnosis:
     """Try the usual mistakes on the data of an experiment.
 
@@ -222,7 +143,7 @@ def diagnose(experiment: Experiment, inference: Inference, found: Residuals) -> 
     Diagnosis
     """
     setup, data = experiment.setup, experiment.data
-    here = _Data(setup, data, on_host(inference.model), _any_sky(setup, data))
+    here = UnderAnySky.of(setup, data, inference.model)
     base, posterior = here.wide(here.model.coupling)
 
     def best(tried: Sequence[tuple[float, object]], whole: ChiSquare) -> list:
@@ -231,7 +152,7 @@ def diagnose(experiment: Experiment, inference: Inference, found: Residuals) -> 
         found = sorted((one for one in tried if one[0] < most), key=lambda one: one[0])
         return [one for _, one in found[:TRIED]]
 
-    of_data = list(_Mixed.of(here, posterior).tried())
+    of_data = list(MixedProducts.of(here, posterior).tried())
     proposals = [Proposal(m.words, m.remedy, here.without(m)) for m in best(of_data, base)]
     low = Pointing.of(setup.observation, min(SCREENED_LMAX, setup.scenario.lmax))
     known = list(model_mistakes(setup))
@@ -260,29 +181,7 @@ def _merged(proposals: list[Proposal]) -> Iterator[Proposal]:
         yield replace(first, words=", or ".join(p.words for p in (first, *alike)))
 
 
-def _any_sky(setup: Setup, data: Visibilities) -> Float[np.ndarray, " ells"]:
-    """C_ell of a prior that allows any sky, as bright as the data ask for, in K^2."""
-    prior = on_host(setup.prior if setup.family is None else setup.family.expected())
-    power = np.asarray(prior.variance())
-    if prior.white_mean is not None:
-        power = power + np.asarray(prior.colour(prior.white_mean)) ** 2
-    autos = auto_indices(setup.beam_source.n_ports)
-    modelled = float(np.median(np.asarray(setup.signal)[autos]))
-    brighter = np.nanmedian(np.asarray(data.grid())[autos]) / modelled
-    return mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2
-
-
-def _filled(data: Visibilities) -> Float[np.ndarray, "products times"]:
-    """The data on the full grid, absent samples interpolated in time."""
-    grid = np.array(data.grid())
-    times = np.arange(grid.shape[1])
-    for row in grid:
-        there = np.isfinite(row)
-        row[~there] = np.interp(times[~there], times[there], row[there]) if there.any() else 0.0
-    return grid
-
-
-def _finer(here: _Data) -> Iterator[Proposal]:
+def _finer(here: UnderAnySky) -> Iterator[Proposal]:
     """A map of more ells."""
     setup, lmax = here.setup, here.setup.scenario.lmax + MORE_ELLS
     try:
@@ -293,7 +192,7 @@ def _finer(here: _Data) -> Iterator[Proposal]:
     yield Proposal("the sky has structure beyond lmax", f"use --set lmax={lmax}", chi2)
 
 
-def _offsets(here: _Data, low: Pointing) -> Iterator[tuple[float, ModelMistake]]:
+def _offsets(here: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMistake]]:
     """Angles that are off by what fits best: by parabolas through three values, ever closer."""
     setup = here.setup
     for name in offset_names(OFFSETS, setup.observation.n_runs):
@@ -333,152 +232,3 @@ def _noise_level(found: Residuals, data: Visibilities) -> Iterator[Proposal]:
         f"multiply noise.radiometer.factor by {factor:.3g}",
         ChiSquare(whole.degrees, whole.degrees),
     )
-
-
-@dataclass(frozen=True)
-class _Mixed:
-    """Q of the module's equations, of some data.
-
-    here : _Data; posterior : under the wide prior; grid : (products, times) array, in K; q :
-    (columns, columns) array, of every x_jk, ones in every product, the times reversed, and b
-    """
-
-    here: _Data
-    posterior: Posterior
-    grid: Float[np.ndarray, "products times"]
-    q: Float[np.ndarray, "columns columns"]
-
-    @classmethod
-    def of(cls, here: _Data, posterior: Posterior) -> _Mixed:
-        """Of data and their posterior under the wide prior."""
-        grid, layout, offset = _filled(here.data), here.data.layout, here.model.offset
-        n, product, time = len(grid), layout.product, layout.time
-        mixed = np.zeros((layout.size, n, n))
-        mixed[np.arange(layout.size), product] = grid[:, time].T
-        steady = np.zeros(layout.size) if offset is None else np.asarray(offset)
-        columns = [mixed.reshape(layout.size, -1), np.eye(n)[product]]
-        columns += [np.stack([grid[:, ::-1][product, time], steady], axis=1)]
-        return cls(here, posterior, grid, _gram(here, posterior, np.concatenate(columns, axis=1)))
-
-    def chi2(self, vector: Float[np.ndarray, " columns"]) -> float:
-        """chi^2 of (w, -1)."""
-        return float(vector @ self.q @ vector)
-
-    def vector(self, mixing: Float[np.ndarray, "products products"], b: float = -1.0) -> np.ndarray:
-        """(w, -1) of a mixing, or w of one that is added."""
-        return np.concatenate([mixing.ravel(), np.zeros(len(mixing) + 1), [b]])
-
-    def tried(self) -> Iterator[tuple[float, DataMistake]]:
-        """Every mistake with its chi^2."""
-        n_ports = self.here.setup.beam_source.n_ports
-        for mistake in data_mistakes(n_ports):
-            w = self.vector(mistake.mixing)
-            if mistake.reverses:
-                w = np.zeros(len(w))
-                w[-2:] = 1.0, -1.0
-            yield self.chi2(w), mistake
-        products = all_products(n_ports)
-        autos = np.array([p.i == p.j for p in products], dtype=np.float64)
-        for product, which in zip(products, np.eye(len(products)), strict=True):
-            yield self._factor(f"product {product.label}", which)
-        yield self._factor("every auto", autos)
-        for port in range(n_ports):
-            powers = np.array([float(p.i == port) + float(p.j == port) for p in products])
-            yield self._gain(port, powers)
-        yield self._constant(np.flatnonzero(autos))
-        yield from self._times()
-
-    def _factor(
-        self, name: str, which: Float[np.ndarray, " products"]
-    ) -> tuple[float, DataMistake]:
-        """A factor of some products: chi^2 is a parabola in what is missing."""
-        whole = self.vector(np.eye(len(which)))
-        step = self.vector(np.diag(which), 0.0)
-        curvature = float(step @ self.q @ step)
-        missing = -float(step @ self.q @ whole) / curvature
-        return self.chi2(whole + missing * step), DataMistake(
-            f"{name} is {_number(1.0 / (1.0 + missing), curvature**-0.5)} times what the others "
-            "predict",
-            f"look at the calibration of {name}",
-            np.diag(1.0 + missing * which),
-        )
-
-    def _gain(self, port: int, powers: Float[np.ndarray, " products"]) -> tuple[float, DataMistake]:
-        """A gain of a port's voltage, squared in its auto: chi^2 is of fourth order in it."""
-        parts = [self.vector(np.diag((powers == k) * 1.0), -1.0 * (k == 0)) for k in range(3)]
-        gram = np.array([[u @ self.q @ v for v in parts] for u in parts])
-        chi2 = np.polynomial.Polynomial(
-            [np.trace(gram[:, ::-1], offset=2 - order) for order in range(5)]
-        )
-        roots = chi2.deriv().roots()
-        real = roots.real[np.abs(roots.imag) <= 1e-6 * np.abs(roots.real)]
-        gain = real[np.argmin(chi2(real))]
-        return float(chi2(gain)), DataMistake(
-            f"the voltage of port {port} is {1.0 / gain:.5g} times what the others predict",
-            f"look at the calibration of port {port}",
-            np.diag(gain**powers),
-        )
-
-    def _constant(self, autos: np.ndarray) -> tuple[float, DataMistake]:
-        """A constant in every auto."""
-        n = len(self.grid)
-        whole = self.vector(np.eye(n))
-        places = n * n + autos
-        level = np.linalg.solve(self.q[np.ix_(places, places)], self.q[places] @ whole)
-        whole[places] -= level
-        constant = np.zeros(n)
-        constant[autos] = level
-        named = ", ".join(f"{x:.4g}" for x in level)
-        return self.chi2(whole), DataMistake(
-            f"the autos have a constant of {named} K besides the sky",
-            "give noise.receiver, or subtract it",
-            np.eye(n),
-            constant,
-        )
-
-    def _times(self) -> Iterator[tuple[float, DataMistake]]:
-        """A factor of all products of one time."""
-        here, layout, values = self.here, self.here.data.layout, np.asarray(self.here.data.data)
-        factor = here.model.noise.factor()
-        # K^-1 (d - b)
-        left = np.asarray(
-            factor.solve(values - np.asarray(here.model.predict(self.posterior.mean)))
-        )
-        pull = np.bincount(layout.time, values * left, layout.n_times)
-        most = np.bincount(layout.time, values * np.asarray(factor.solve(values)), layout.n_times)
-        worst = np.argsort(-(pull**2) / np.where(most > 0.0, most, np.inf))[:TIMES]
-        worst = worst[most[worst] > 0.0]
-        columns = np.where(layout.time[:, None] == worst, values[:, None], 0.0)
-        curvature = np.diagonal(_gram(here, self.posterior, columns))
-        whole = self.chi2(self.vector(np.eye(len(self.grid))))
-        for time, bend in zip(worst.tolist(), curvature.tolist(), strict=True):
-            if not bend > 0.0:  # the others predict nothing
-                continue
-            missing = -pull[time] / bend
-            when = here.data.observation.times[time].isot[:19]
-            yield (
-                whole - pull[time] ** 2 / bend,
-                DataMistake(
-                    f"all products at {when} are {_number(1.0 / (1.0 + missing), bend**-0.5)} "
-                    "times what the other times predict",
-                    "leave this time out",
-                    (1.0 + missing) * np.eye(len(self.grid)),
-                    time=time,
-                ),
-            )
-
-
-def _number(factor: float, std: float) -> str:
-    """A factor with the error of its inverse."""
-    return f"{factor:.5g} +- {std * factor**2:.1g}"
-
-
-def _gram(
-    here: _Data, posterior: Posterior, columns: Float[np.ndarray, "data n"]
-) -> Float[np.ndarray, "n n"]:
-    """X^T K^-1 X, K^-1 = N^-1 - N^-1 A C A^T N^-1."""
-    solved = np.asarray(here.model.noise.factor().solve(columns))
-    seen = np.stack([np.asarray(here.model.coupling.transpose_mv(x)) for x in solved.T])
-    white = np.asarray(posterior.prior.colour_columns(seen)).T
-    half = solve_lower(posterior.lower, white, transpose=False)
-    return columns.T @ solved - half.T @ half

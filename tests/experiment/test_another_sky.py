@@ -61,7 +61,13 @@ def distance(inference, truth):
     return float(off @ np.linalg.solve(np.asarray(posterior.covariance()), off))
 
 
-@pytest.mark.parametrize("term", TERMS)
+ESSENTIAL = [pytest.mark.long, pytest.mark.essential]
+
+
+@pytest.mark.parametrize(
+    "term",
+    [pytest.param(t, marks=[] if t in ("radiometer", "beam") else ESSENTIAL) for t in TERMS],
+)
 def test_the_errors_are_what_is_claimed(term):
     scenario = wrong_data.scenario(LMAX, *TERMS[term])
     total, modes = 0.0, 0
@@ -75,6 +81,8 @@ def test_the_errors_are_what_is_claimed(term):
     assert p > 1e-3, total / modes
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_about_the_model_sky_the_map_is_wrong():
     """What the default was: with drifts of 1 % about the model sky the test above fails."""
     scenario = wrong_data.scenario(LMAX, *TERMS["gain drifts"], "noise.gain.visibilities=model")

@@ -8,11 +8,12 @@ import wrong_data
 
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.harmonics import lmax_of, synthesis_matrix
-from lusee_bayes.experiment import diagnosis as module
+from lusee_bayes.experiment.any_sky import UnderAnySky
 from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.mistakes import data_mistakes, model_mistakes, port_mixing
+from lusee_bayes.experiment.mixed_products import MixedProducts
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.products import to_matrix, to_real
 from lusee_bayes.linear.residuals import residuals
@@ -20,15 +21,10 @@ from lusee_bayes.sky.priors import HarmonicPrior
 
 LMAX = 8
 QUICK = (
-    "imaginary parts conjugated",
-    "ports 0 and 3 exchanged",
     "azimuth from North",
     "01R and 02R exchanged",
-    "port 2 3 % too high",
     "one time 2 % too high",
-    "latitude's sign",
     "noise 4 times as large",
-    "lmax too small",
 )
 
 
@@ -104,7 +100,7 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
     experiment = build(scenario, data)
     model = on_host(infer(experiment).model)
     spectrum = 1e2 * np.asarray(setup.sky.spectrum())
-    here = module._Data(setup, data, model, spectrum)
+    here = UnderAnySky(setup, data, model, spectrum)
     base, posterior = here.wide(model.coupling)
     a, s = np.asarray(model.coupling.dense()), np.asarray(HarmonicPrior(spectrum).variance())
     inverse = np.linalg.inv(a @ np.diag(s) @ a.T + np.asarray(model.noise.dense()))
@@ -115,7 +111,7 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
 
     grid = np.asarray(data.grid())
     assert base.chi2 == pytest.approx(expected(grid), rel=1e-4)
-    mixed = module._Mixed.of(here, posterior)
+    mixed = MixedProducts.of(here, posterior)
     tried = list(mixed.tried())
     for chi2, mistake in tried[:40:5] + tried[-40::7]:
         right = expected(mistake.undone(grid))

@@ -99,7 +99,7 @@ def test_independent_channels_are_maps_of_each_frequency(independent):
 def test_runs_take_names_strings_and_data_in_memory(tmp_path, monkeypatch, numbers_alone):
     """A cube of sets in memory is that of the same data simulated; ~ is the user's folder."""
     monkeypatch.setenv("HOME", str(tmp_path))
-    scenario = three(frequencies="[20, 25]")
+    scenario = three("noise.radiometer.temperature=model", frequencies="[20, 25]")
     sets = [build(channel).data for channel in scenario.channels()]
     file = tmp_path / "three.yaml"
     file.write_text(scenario.to_yaml())

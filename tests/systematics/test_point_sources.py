@@ -244,15 +244,19 @@ def test_a_source_below_the_horizon_is_known_from_its_prior_only():
     assert said == [False, False, False, False, True]
     assert lines[4].startswith("Polaris: 2e+04 +- 1e+04 Jy")
     assert [line.split(":")[0] for line in lines[1:4]] == ["For A", "For A (1)", "For A (2)"]
-    assert result.lines()[2:] == [*lines, result.verdict(), RULE]
+    assert result.lines()[2:] == [*lines, result.headline(), RULE]
 
 
 def test_ignored_sources_have_no_fluxes():
     result = map_result(experiment("ignored"))
     assert result.fluxes is None
-    headline, prior, *others = result.lines()
-    assert headline == result.headline() and prior.startswith("Prior isotropic, C_ell of the")
-    assert others == [result.verdict(), RULE]
+    lines = result.lines()
+    # sources that the model ignores are not what it sees: causes follow the verdict
+    causes = result.diagnosis.sentences()
+    assert lines[: 1 + len(causes)] == [result.verdict(), *causes]
+    prior, *others = lines[1 + len(causes) :]
+    assert prior.startswith("Prior isotropic, C_ell of the")
+    assert others == [result.headline(), RULE]
 
 
 # --- sampled --------------------------------------------------------------------------------------
