@@ -32,22 +32,24 @@ def unit() -> float:
 
 def main(lmax: int = 47) -> None:
     scenario = lb.load_scenario("fiducial", [f"lmax={lmax}"])
-    data = simulated(scenario).data
-    conjugated = np.array([p.part == "I" for p in all_products()])[data.layout.product]
-    data = replace(data, data=np.where(conjugated, -1.0, 1.0) * np.asarray(data.data))
-    experiment = observed(scenario, data)
-    found = infer(experiment)
-    model, posterior = found.model, found.posterior
-    chi2 = float(model.chi2(posterior.mean, data.data)) + float(posterior.prior_chi2())
-    left = residuals(model, posterior, data, chi2)
-    for run in ("first", "again"):
-        before = unit()
-        start = time.perf_counter()
-        diagnosis = diagnose(experiment, found, left)
-        seconds = time.perf_counter() - start
-        ratio = 2.0 * seconds / (before + unit())
-        print(f"{run}: {diagnosis.n_tried} mistakes, {seconds:.1f} s, {ratio:.1f} units")
-    print(*diagnosis.sentences())
+    good = simulated(scenario).data
+    conjugated = np.array([p.part == "I" for p in all_products()])[good.layout.product]
+    rising = 1.0 + 1e-3 * np.linspace(-1.0, 1.0, good.layout.n_times)[good.layout.time]
+    for name, factor in (("conjugated", np.where(conjugated, -1.0, 1.0)), ("rising gain", rising)):
+        data = replace(good, data=factor * np.asarray(good.data))
+        experiment = observed(scenario, data)
+        found = infer(experiment)
+        model, posterior = found.model, found.posterior
+        chi2 = float(model.chi2(posterior.mean, data.data)) + float(posterior.prior_chi2())
+        left = residuals(model, posterior, data, chi2)
+        for run in ("first", "again"):
+            before = unit()
+            start = time.perf_counter()
+            diagnosis = diagnose(experiment, found, left)
+            seconds = time.perf_counter() - start
+            ratio = 2.0 * seconds / (before + unit())
+            print(f"{name}, {run}: {diagnosis.n_tried} tried, {seconds:.1f} s, {ratio:.1f} units")
+        print(*diagnosis.sentences())
 
 
 if __name__ == "__main__":

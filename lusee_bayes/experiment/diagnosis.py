@@ -35,7 +35,7 @@ from lusee_bayes.linear.residuals import Residuals
 SCREENED_LMAX = 12
 # computed as the scenario has it: so many of the data and of the model, the best first, that leave
 # less than this share of what is too much
-TRIED, PROMISING = 3, 0.5
+TRIED, PROMISING = 3, 0.1
 # where nothing makes the data fit, those are listed that leave less than this share
 EXPLAINED = 0.03
 # two mistakes are one for these antennas if their chi^2 differ by less, relative
@@ -166,10 +166,12 @@ def diagnose(experiment: Experiment, inference: Inference, found: Residuals) -> 
     excess = EXPLAINED * abs(base.chi2 - base.degrees)
     nearly = [one for one in proposals if one.excess < excess]
     # these always absorb some of what is wrong, and count only if they absorb all of it
-    proposals += [*_finer(here), *_noise_level(found, data)]
+    proposals += _noise_level(found, data)
+    finer = [] if any(one.fits for one in proposals) else list(_finer(here))
+    proposals += finer
     listed = [one for one in proposals if one.fits] or nearly
     listed.sort(key=lambda one: one.excess)
-    return Diagnosis(base, tuple(_merged(listed)), len(of_data) + len(of_model) + 2)
+    return Diagnosis(base, tuple(_merged(listed)), len(of_data) + len(of_model) + 1 + len(finer))
 
 
 def _merged(proposals: list[Proposal]) -> Iterator[Proposal]:
