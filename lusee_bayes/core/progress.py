@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import resource
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from threading import Lock
 
 from rich.console import Console
 from rich.markup import escape
@@ -91,7 +91,7 @@ class Stages:
     def _lines(self, name: str, total: int) -> Callable[[int, str], None]:
         """Progress in a file: a line when 10 s and 5 % have passed since the last one."""
         said, last = time.perf_counter(), 0
-        counting = Lock()
+        counting = threading.Lock()
 
         def update(done: int, remark: str = "") -> None:
             nonlocal said, last
