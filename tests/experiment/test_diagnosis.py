@@ -56,7 +56,6 @@ def test_the_cause_is_named(name):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_all_wrong_data_make_a_map_and_most_causes_are_named():
     named = 0
     for wrong in wrong_data.WRONG:
