@@ -69,9 +69,10 @@ def with_learned_prior(
         learned = learned_prior(setup, setup.family, information, start)
         setup = replace(setup, prior=learned.prior)
         before, found = found, settled(setup, data, found.around)
-        if float(found.posterior.rms_shift_from(before.posterior)) < SETTLED:
-            break
-    return setup, learned, found.around
+        moved = float(found.posterior.rms_shift_from(before.posterior))
+        if moved < SETTLED:
+            return setup, learned, found.around
+    return setup, replace(learned, still_moves=moved), found.around
 
 
 def about_sky(setup: Setup, data: Visibilities) -> Information:

@@ -70,6 +70,9 @@ class Learned:
         Factor of N with which the parameters were learned; above 1 where the data do not fit.
     settled : bool
         Whether the parameters are learned; otherwise the prior is a fixed, wide one.
+    still_moves : float
+        By which part of its standard deviations (rms) the map still moves in the last round, where
+        prior and N are found together; 0 where they have settled.
     """
 
     prior: Prior
@@ -80,6 +83,7 @@ class Learned:
     steps: int
     noise_factor: float = field(default=1.0, kw_only=True)
     settled: bool = field(default=True, kw_only=True)
+    still_moves: float = field(default=0.0, kw_only=True)
 
     @property
     def fits(self) -> bool:

@@ -120,6 +120,11 @@ def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
             f"The prior was learned with N times {learned.noise_factor:.2g}, as the residual chi^2 "
             "demands; the map has the scenario's N."
         )
+    if learned is not None and learned.still_moves > 0.0:
+        found.append(
+            f"The map still moves by {learned.still_moves:.2g} of its standard deviations from one "
+            "round of learning its prior to the next."
+        )
     if inference.unsettled:
         found.append(inference.unsettled)
     return (*found, *(() if experiment.positive is None else experiment.positive.doubts()))

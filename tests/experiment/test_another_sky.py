@@ -25,6 +25,7 @@ from lusee_bayes.experiment.simulate import simulate
 from lusee_bayes.experiment.terms import Around, gains_about, radiometer_about
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.noise import GainDrift, with_gains
+from lusee_bayes.results.draws import doubts
 from lusee_bayes.sky import Sky
 from lusee_bayes.sky.priors import HarmonicPrior
 
@@ -162,3 +163,14 @@ def test_the_default_path_with_drifts(sigma, test_data):
         total, known = total + float((off[best] ** 2).sum()), known + int(best.sum())
     assert known > 60
     assert 1.0 - 4.0 * np.sqrt(2.0 / known) < total / known < 1.0 + 4.0 * np.sqrt(2.0 / known)
+
+
+def test_a_prior_that_does_not_settle_with_n_is_said_to(monkeypatch):
+    """Rounds that may never end are cut short, and the map says by how much it still moves."""
+    monkeypatch.setattr("lusee_bayes.experiment.learned_prior.SETTLED", 0.0)
+    monkeypatch.setattr("lusee_bayes.experiment.learned_prior.MAX_ROUNDS", 1)
+    scenario = wrong_data.scenario(4, "observation.step_s=60000", *TERMS["gain drifts"])
+    data = wrong_data.measured(scenario, wrong_data.Mixed(1).at(25.0, 4), 1)
+    experiment = build(scenario, data)
+    assert experiment.learned.still_moves > 0.0
+    assert "still moves" in " ".join(doubts(experiment, infer(experiment)))
