@@ -141,12 +141,6 @@ def test_live_time_times_value_is_conserved(to_s):
     assert product_live_s(after) == pytest.approx(product_live_s(data), rel=1e-12)
 
 
-def test_touching_windows_become_one():
-    found = averaged(data_of(observed(windows="whole", runs=RUNS[:1])), 5 * STEP)
-    windows = found.observation.windows
-    np.testing.assert_array_equal(windows.sample, np.arange(3))
-    np.testing.assert_allclose(windows.bounds_s, [[-2.5 * STEP, 2.5 * STEP]] * 3, atol=1e-8)
-    np.testing.assert_allclose(windows.live_s, 5 * STEP, atol=1e-8)
 
 
 @pytest.mark.parametrize("to_s", [1.5 * STEP, 2.5 * STEP, 3.25 * STEP])
@@ -183,32 +177,30 @@ def flagged(*absent, n=4):
     )
 
 
-def test_a_product_that_is_rarely_there_is_left_out():
-    """Of 4 samples: product 5 in one, less than half; product 2 in three, so that one is lost."""
-    data = flagged((5, 0), (5, 1), (5, 2), (2, 3))
+@pytest.mark.parametrize(
+    ("absent", "kept", "lost"),
+    [
+        # product 5 in one of 4 samples, less than half; product 2 in three, so that one is lost
+        ([(5, 0), (5, 1), (5, 2), (2, 3)], [0, 1, 2], [5]),
+        # half of the samples is enough
+        ([(5, 0), (5, 1)], [2, 3], []),
+        # samples without any product do not count: the last one is all that there is
+        ([(p, k) for p in range(16) for k in range(3)], [3], []),
+    ],
+)
+def test_products_that_are_rarely_there_are_left_out(absent, kept, lost):
+    data = flagged(*absent)
     found = averaged(data, 4 * STEP)
-    grid = data.grid()
-    expected = grid[:, :3].mean(axis=1)
-    expected[5] = np.nan
+    expected = data.grid()[:, kept].mean(axis=1)
+    expected[lost] = np.nan
     np.testing.assert_allclose(found.grid()[:, 0], expected, rtol=1e-12)
-    assert found.observation.live_s == pytest.approx(3 * STEP)
-    # 15 products of 3 samples remain of 64 - 4
-    assert product_live_s(found) / product_live_s(data) == pytest.approx(45 / 60)
+    assert found.observation.live_s == pytest.approx(len(kept) * STEP)
+    share = len(kept) * (16 - len(lost)) / (64 - len(absent))
+    assert product_live_s(found) / product_live_s(data) == pytest.approx(share)
 
 
-def test_half_of_the_samples_is_enough():
-    data = flagged((5, 0), (5, 1))
-    found = averaged(data, 4 * STEP)
-    np.testing.assert_allclose(found.grid()[:, 0], data.grid()[:, 2:].mean(axis=1), rtol=1e-12)
-    assert found.n_missing == 0
 
 
-def test_samples_without_any_product_do_not_count():
-    """Three of four are gone: the last one is all that there is, not less than half of it."""
-    data = flagged(*((p, k) for p in range(16) for k in range(3)))
-    found = averaged(data, 4 * STEP)
-    np.testing.assert_array_equal(found.grid()[:, 0], data.grid()[:, 3])
-    assert found.observation.live_s == pytest.approx(STEP)
 
 
 def test_bins_of_which_nothing_remains_are_dropped():

@@ -138,14 +138,6 @@ def test_bad_matrices_are_refused():
         DenseCoupling(jnp.eye(3)).plus(jnp.ones(()), DenseCoupling(jnp.ones((3, 2))))
 
 
-@pytest.mark.long
-def test_rows_are_those_of_the_matrix(coupling):
-    dense = np.asarray(coupling.dense())
-    assert dense.shape == coupling.shape == (16 * two_runs().n_times, n_modes(LMAX))
-    rng = np.random.default_rng(4)
-    product, time = rng.integers(0, 16, 40), rng.integers(0, two_runs().n_times, 40)
-    rows = coupling.rows(product, time)
-    np.testing.assert_allclose(rows, dense[product * two_runs().n_times + time], rtol=0, atol=1e-12)
 
 
 def test_dense_rows_are_each_times_own_rotation(coupling):

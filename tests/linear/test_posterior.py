@@ -121,15 +121,6 @@ def test_information_is_the_shrinkage_of_the_covariance(n_data, form):
     assert float(post.information_bits()) == pytest.approx(bits, rel=TOL)
 
 
-def test_information_of_one_number():
-    """Variance 3 known with a noise of variance 1: 1/2 log2(1 + 3) = 1 bit."""
-    noise = DenseCovariance(jnp.array([[1.0]]))
-    model = LinearGaussian(jnp.array([[1.0]]), HarmonicPrior(jnp.array([3.0])), noise)
-    for form in FORMS:
-        post = model.condition(jnp.array([0.3]), form)
-        assert float(post.information_bits()) == pytest.approx(1.0, rel=1e-15)
-
-
 def blind_or_not(n_data, form):
     for blind in (False, True):
         yield conditioned(n_data, form, blind=blind)

@@ -88,16 +88,6 @@ def test_exact_form_is_what_complex_gaussian_voltages_do():
         assert np.abs(z).max() < z_of(N_PRODUCTS**2), f"row {k}: {np.abs(z).max():.1f} sigma"
 
 
-def test_averaging_n_products_divides_the_exact_form_by_n():
-    # df dt = 50 independent samples in every visibility; 4000 visibilities are nearly Gaussian
-    per_mean, n = 50, 4000
-    x = simulated_products(per_mean * n, seed=6).reshape(n, per_mean, N_PRODUCTS).mean(1)
-    block = np.asarray(noise("exact", bandwidth_hz=5.0, step_s=10.0).blocks)[0]
-    white = np.linalg.solve(np.linalg.cholesky(block), (x - real_products(T[0])).T)
-    # chi^2 of 64000 squared unit normals: scatter sqrt(2/64000), raised by the excess kurtosis of a
-    # product (6 at most) over 50
-    scatter = np.sqrt((2 + 6 / per_mean) / white.size)
-    assert abs((white**2).mean() - 1.0) < 4 * scatter
 
 
 def test_exact_variances_have_closed_forms():
@@ -112,21 +102,8 @@ def test_exact_variances_have_closed_forms():
     np.testing.assert_allclose(variance[4], (auto - v.real**2 + v.imag**2) / 2, rtol=1e-13)
 
 
-def test_the_two_forms_agree_on_autos_and_differ_on_crosses():
-    paper = np.asarray(noise().diagonal()).reshape(N_PRODUCTS, N_TIMES)
-    exact = np.asarray(noise("exact").diagonal()).reshape(N_PRODUCTS, N_TIMES)
-    np.testing.assert_allclose(paper[AUTOS], exact[AUTOS], rtol=1e-14)
-    crosses = np.delete(np.arange(N_PRODUCTS), AUTOS)
-    assert (np.abs(paper / exact - 1.0)[crosses] > 1e-3).any()
 
 
-def test_exact_blocks_are_symmetric_and_positive_definite():
-    blocks = np.asarray(exact_blocks(VISIBILITIES))
-    assert blocks.shape == (N_TIMES, N_PRODUCTS, N_PRODUCTS)
-    # entries kl and lk are the same products of four numbers in another order
-    largest = np.abs(blocks).max()
-    np.testing.assert_allclose(blocks, blocks.swapaxes(1, 2), rtol=0, atol=1e-15 * largest)
-    assert (np.linalg.eigvalsh(blocks).min(1) > 1e-6 * np.linalg.eigvalsh(blocks).max(1)).all()
 
 
 def test_a_fully_polarised_point_leaves_no_noise_in_one_direction():
@@ -156,11 +133,12 @@ def test_scalings(form):
     np.testing.assert_allclose(doubled.dense(), 4.0 * base, rtol=1e-14)
 
 
+
+
 def test_defaults_are_the_fiducial_experiment():
     got = radiometer_noise(VISIBILITIES, LAYOUT)
-    np.testing.assert_allclose(
-        got.diagonal()[:N_TIMES], T[:, 0, 0].real ** 2 / (1e6 * 7200.0), rtol=1e-14
-    )
+    expected = T[:, 0, 0].real ** 2 / (1e6 * 7200.0)
+    np.testing.assert_allclose(got.diagonal()[:N_TIMES], expected, rtol=1e-14)
 
 
 @pytest.mark.parametrize("form", ["paper", "exact"])
@@ -199,9 +177,6 @@ def test_bad_visibilities_are_refused():
         radiometer_noise(VISIBILITIES, DataLayout(N_PRODUCTS, 4))
     with pytest.raises(InputError, match="visibilities must be a float64 array.*float32"):
         radiometer_noise(VISIBILITIES.astype(jnp.float32), LAYOUT)
-
-
-# --- known problems of the package: remove the mark when they are mended --------------------------
 
 
 @pytest.mark.parametrize("form", ["paper", "exact"])

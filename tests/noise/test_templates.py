@@ -5,12 +5,11 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference_linear import assert_draws_follow, random_covariance
+from reference_linear import random_covariance
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.noise import template_noise
-from lusee_bayes.noise.covariance import DiagonalCovariance, LowRankUpdate
 
 FLAGS = np.zeros((4, 5), dtype=bool)
 FLAGS[:, 2] = FLAGS[1, 0] = True
@@ -40,23 +39,8 @@ def test_the_term_is_t_p_t(prior, matrix):
     assert got.root.shape == (15, 3)
 
 
-def test_draws_of_the_amplitudes_have_this_covariance():
-    """T a with a ~ N(0, P) by numpy, on top of independent noise."""
-    rng = np.random.default_rng(0)
-    amplitudes = rng.multivariate_normal(np.zeros(3), P, 40_000)
-    draws = amplitudes @ T.T + rng.normal(size=(40_000, 15)) * 0.1
-    noise = DiagonalCovariance(jnp.full(15, 0.01)) + template_noise(
-        jnp.asarray(T), jnp.asarray(P), LAYOUT
-    )
-    assert isinstance(noise, LowRankUpdate)
-    assert_draws_follow(draws, np.zeros(15), noise.dense())
 
 
-def test_the_prior_is_not_its_root_nor_its_transpose():
-    """One strong correlation: P of (1, 2) decides, and nothing else."""
-    p = np.array([[4.0, 1.9], [1.9, 1.0]])
-    got = template_noise(jnp.asarray(np.eye(15)[:, :2]), jnp.asarray(p), LAYOUT)
-    np.testing.assert_allclose(np.asarray(got.dense())[:2, :2], p, rtol=1e-14)
 
 
 @pytest.mark.parametrize(

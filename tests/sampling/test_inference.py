@@ -120,16 +120,12 @@ def test_the_comparison_notices_a_posterior_that_is_ten_percent_too_wide(nuts, e
         assert_follows(shifted, exact)
 
 
-def test_only_the_programs_own_sites_come_back(nuts):
-    chains, _ = nuts
-    assert set(chains.sites) == {"sky"}
-    assert set(chains.statistics) == set(STATISTICS)
-    assert all(values.shape == (4, 1000) for values in chains.statistics.values())
-
-
 def test_statistics_belong_to_the_draws_beside_them(nuts, gaussian, data):
     """lp is ln p(m, d) + ln|det R|, by scipy, draw by draw; energies hold the momenta's too."""
     chains, whitening = nuts
+    assert set(chains.sites) == {"sky"} and set(chains.statistics) == set(STATISTICS)
+    # no chain is a copy of another
+    assert np.unique(chains.sites["sky"][..., 0]).size > 3000
     a, s, n = (np.asarray(x) for x in (
         gaussian.coupling.dense(), gaussian.prior.covariance(), gaussian.noise.dense()
     ))  # fmt: skip
@@ -147,12 +143,6 @@ def test_statistics_belong_to_the_draws_beside_them(nuts, gaussian, data):
     assert kinetic.mean() == pytest.approx(N_MODES / 2, abs=0.6)
     assert (chains.statistics["step_size"] == chains.statistics["step_size"][:, :1]).all()
     assert chains.gradients == chains.statistics["n_steps"].sum()
-
-
-def test_chains_are_not_copies_of_each_other(nuts):
-    first_modes = nuts[0].sites["sky"][..., 0]
-    for i, j in [(0, 1), (0, 2), (1, 3), (2, 3)]:
-        assert not np.isin(first_modes[i], first_modes[j]).any()
 
 
 def test_hmc_in_wrong_coordinates_follows_the_analytic_posterior(gaussian, data, exact):

@@ -370,13 +370,3 @@ def test_calibration_notices_what_is_wrong(wrong, witness):
     assert not found.passed
     assert p_values(found)[witness] < found.threshold
 
-
-@pytest.mark.long
-def test_calibrated_over_200_data_sets_of_16_modes():
-    """By NUTS, the package's own choice; every third draw is kept."""
-    settings = (of_no_data(3, 20, 15.0), Sampler(warmup=150, draws=N_DRAWS), 3, 200, 100)
-    found = ranks(*settings)
-    assert found.passed, p_values(found)
-    assert_covers(found)
-    # noise 20 % too strong
-    assert not ranks(*settings, noise_factor=1.44).passed

@@ -14,7 +14,6 @@ from reference_linear import assert_draws_follow, posterior, random_covariance
 
 import lusee_bayes as lb
 from lusee_bayes.sampling.programs import (
-    PIECES,
     collapsed_skies,
     is_collapsed,
     load_program,
@@ -146,64 +145,34 @@ def test_no_such_program(tmp_path):
         assert_one_sentence(error, str(source), "sky_marginal", "prior_amplitude")
 
 
-def test_only_python_files_are_programs(write):
-    path = write("def model(data=None):\n    pass\n", "mine.txt")
-    with pytest.raises(lb.InputError, match="give the path of a Python file"):
-        load_program(path)
-
-
 @pytest.mark.parametrize(
-    ("text", "reason"),
+    ("text", "message", "more"),
     [
-        ("def model(:\n", "line 1"),
-        ("import nowhere_to_be_found\n", "nowhere_to_be_found"),
-        ("unknown_name + 1\n", "unknown_name"),
-        ("scale = 1 / 0\n", "division by zero"),
-        ("raise RuntimeError('no device')\n", "no device"),
-        ("open('/nonexistent/table.txt')\n", "/nonexistent/table.txt"),
-        ("{}['missing key']\n", "missing key"),
-        ("assert 1 > 2, 'not so'\n", "not so"),
+        ("def model(:\n", "does not run", "line 1"),
+        ("import nowhere_to_be_found\n", "does not run", "nowhere_to_be_found"),
+        ("scale = 1 / 0\n", "does not run", "division by zero"),
+        ("raise RuntimeError('no device')\n", "does not run", "no device"),
+        ("open('/nonexistent/table.txt')\n", "does not run", "/nonexistent/table.txt"),
+        ("{}['missing key']\n", "does not run", "missing key"),
+        ("assert 1 > 2, 'not so'\n", "does not run", "not so"),
+        *(
+            (text, "has no function 'model'", "def model(")
+            for text in ("x = 1\n", "model = 3\n", "def Model(data=None):\n    pass\n")
+        ),
+        ("def model(coupling, prior):\n    pass\n", "has no argument 'data'", "mine.py"),
+        # prior predictive draws need it; better refused now than after the sampling
+        ("def model(coupling, data):\n    pass\n", "data=None", "mine.py"),
+        ("def model(coupling, nois, data=None):\n    pass\n", "asks for 'nois'", "mean 'noise'?"),
+        ("def model(xyz, data=None):\n    pass\n", "asks for 'xyz'", "noise"),
     ],
 )
-def test_a_file_that_does_not_run(write, text, reason):
+def test_files_that_are_no_programs(write, text, message, more):
     path = write(text)
-    with pytest.raises(lb.InputError, match="does not run") as error:
+    with pytest.raises(lb.InputError, match=message) as error:
         load_program(path)
-    assert_one_sentence(error, str(path), reason)
-
-
-@pytest.mark.parametrize("text", ["x = 1\n", "model = 3\n", "def Model(data=None):\n    pass\n"])
-def test_a_file_without_model(write, text):
-    path = write(text)
-    with pytest.raises(lb.InputError, match="has no function 'model'") as error:
-        load_program(path)
-    assert_one_sentence(error, str(path), "def model(")
-
-
-def test_a_model_without_data(write):
-    path = write("def model(coupling, prior):\n    pass\n")
-    with pytest.raises(lb.InputError, match="has no argument 'data'") as error:
-        load_program(path)
-    assert_one_sentence(error, str(path))
-
-
-def test_a_model_that_cannot_be_called_without_data(write):
-    """The prior predictive draws need it; better refused now than after the sampling."""
-    path = write("def model(coupling, data):\n    pass\n")
-    with pytest.raises(lb.InputError, match="data=None") as error:
-        load_program(path)
-    assert_one_sentence(error, str(path))
-
-
-def test_an_unknown_argument_and_what_may_be_meant(write):
-    path = write("def model(coupling, nois, data=None):\n    pass\n")
-    with pytest.raises(lb.InputError, match="asks for 'nois'") as error:
-        load_program(path)
-    assert_one_sentence(error, str(path), "did you mean 'noise'?")
-    path = write("def model(xyz, data=None):\n    pass\n")
-    with pytest.raises(lb.InputError, match="asks for 'xyz'") as error:
-        load_program(path)
-    assert_one_sentence(error, *PIECES)
+    assert_one_sentence(error, str(path), more)
+    with pytest.raises(lb.InputError, match="give the path of a Python file"):
+        load_program(write(text, "mine.txt"))
 
 
 # --- what they ask for ----------------------------------------------------------------------------

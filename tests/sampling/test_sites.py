@@ -12,14 +12,13 @@ import numpyro
 import pytest
 from numpyro import distributions as dist
 from numpyro import handlers
-from numpyro.infer import MCMC, NUTS, Predictive
+from numpyro.infer import Predictive
 from numpyro.infer.util import log_density
 from reference_linear import z_of
 from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
 from lusee_bayes.linear.model import FORMS
-from lusee_bayes.sampling.hmc import Sampler, sample
 from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.promotion import numpyro_promotion
 from lusee_bayes.sampling.whitening import Whitening, whitened
@@ -100,52 +99,6 @@ def test_handlers_and_predictive(gaussian):
     drawn = Predictive(program("sky"), num_samples=7)(jax.random.key(4), *arguments)
     assert drawn["sky"].shape == (7, 9)
     assert drawn["data"].shape == (7, N_DATA)
-
-
-@pytest.mark.long
-def test_nuts_finds_the_analytic_posterior(gaussian):
-    _, data = gaussian.sample(jax.random.key(5))
-    posterior = gaussian.condition(data)
-    mcmc = MCMC(
-        NUTS(program("sky")), num_warmup=500, num_samples=2000, num_chains=2,
-        chain_method="vectorized", progress_bar=False,
-    )  # fmt: skip
-    with numpyro_promotion():
-        noise = gaussian.noise.factor()
-        mcmc.run(jax.random.key(6), gaussian.coupling, NO_OFFSET, gaussian.prior, noise, data=data)
-    draws = np.asarray(mcmc.get_samples()["sky"])
-    std = np.asarray(posterior.std())
-    # NUTS makes at least a tenth of its 4000 draws count: 400 independent ones, 5 sigma
-    assert np.abs((draws.mean(0) - np.asarray(posterior.mean)) / std).max() < 5 / np.sqrt(400)
-    assert np.abs(draws.std(0) / std - 1.0).max() < 5 / np.sqrt(2 * 400)
-    assert int(mcmc.get_extra_fields()["diverging"].sum()) == 0
-
-
-@pytest.mark.long
-def test_the_marginal_program_finds_the_noise_level(gaussian):
-    """Against the density of the noise level on a grid, normalised by the trapezoidal rule."""
-    _, data = gaussian.sample(jax.random.key(7))
-    mcmc = MCMC(NUTS(program("sky_marginal")), num_warmup=300, num_samples=2000, progress_bar=False)
-    with numpyro_promotion():
-        arguments = (gaussian.coupling, NO_OFFSET, gaussian.prior, gaussian.noise)
-        mcmc.run(jax.random.key(8), *arguments, data=data)
-    draws = np.asarray(mcmc.get_samples()["noise_level"])
-    logs = np.linspace(-3.0, 3.0, 121)
-
-    def log_density(x):
-        scaled = lb.LinearGaussian(
-            gaussian.coupling, gaussian.prior, gaussian.noise.scaled(jnp.exp(x))
-        )
-        return scaled.log_prob(data) - 0.5 * x**2
-
-    values = np.array([float(log_density(jnp.asarray(x))) for x in logs])
-    weights = np.exp(values - values.max())
-    weights /= weights.sum()
-    mean = weights @ logs
-    spread = np.sqrt(weights @ (logs - mean) ** 2)
-    # at least 400 of 2000 draws count; 5 sigma
-    assert abs(np.log(draws).mean() - mean) < 5 * spread / np.sqrt(400)
-    assert abs(np.log(draws).std() / spread - 1.0) < 5 / np.sqrt(2 * 400)
 
 
 # --- white coordinates ----------------------------------------------------------------------------
@@ -338,22 +291,3 @@ def test_predictions_from_draws_of_z(gaussian, case):
     assert np.abs(delta.mean(0) / np.sqrt(variance / n)).max() < limit
     assert np.abs((delta**2).mean(0) / variance - 1.0).max() < limit * np.sqrt(2 / n)
 
-
-@pytest.mark.long
-def test_wrong_coordinates_slow_the_chains_down_and_leave_the_posterior_right(gaussian, case):
-    """z from other data and three times the noise: still the analytic posterior, by NUTS."""
-    arguments, _ = case
-    posterior = gaussian.condition(arguments["data"])
-    other = lb.LinearGaussian(gaussian.coupling, gaussian.prior, gaussian.noise.scaled(3.0))
-    wrong = Whitening.of(other.condition(1.0 + arguments["data"]))
-    # coordinates that differ by standard deviations, or the test would say nothing
-    assert np.abs((wrong.mean - posterior.mean) / posterior.std()).max() > 1.0
-    chains = sample(program("sky"), arguments, Sampler(chains=2, draws=1000), wrong)
-    draws = chains.sites["sky"].reshape(-1, 9)
-    white = np.asarray(posterior.whiten(draws))
-    # at least a fifth of the 2000 draws count
-    limit = z_of(2 * 9)
-    assert np.abs(white.mean(0)).max() < limit / np.sqrt(400)
-    assert np.abs((white**2).mean(0) - 1.0).max() < limit * np.sqrt(2 / 400)
-    # what those coordinates would give if their density were left out is seen by the same measure
-    assert np.abs(np.asarray(posterior.whiten(wrong.mean[None]))).max() > limit / np.sqrt(400)

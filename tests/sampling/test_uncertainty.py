@@ -210,10 +210,6 @@ def test_quantities_against_direct_computation(skies):
     np.testing.assert_allclose(found["T(pole) [K]"], expected, rtol=1e-12, atol=1e-13)
 
 
-def test_nothing_asked_for_is_nothing_given(skies):
-    assert sky_quantities(skies) == {}
-
-
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
