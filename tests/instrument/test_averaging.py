@@ -141,8 +141,6 @@ def test_live_time_times_value_is_conserved(to_s):
     assert product_live_s(after) == pytest.approx(product_live_s(data), rel=1e-12)
 
 
-
-
 @pytest.mark.parametrize("to_s", [1.5 * STEP, 2.5 * STEP, 3.25 * STEP])
 def test_no_bin_is_longer_than_asked_for(to_s):
     """Samples that do not fit: bins of whole samples, none across a run, all of them there."""
@@ -197,10 +195,6 @@ def test_products_that_are_rarely_there_are_left_out(absent, kept, lost):
     assert found.observation.live_s == pytest.approx(len(kept) * STEP)
     share = len(kept) * (16 - len(lost)) / (64 - len(absent))
     assert product_live_s(found) / product_live_s(data) == pytest.approx(share)
-
-
-
-
 
 
 def test_bins_of_which_nothing_remains_are_dropped():

@@ -309,10 +309,7 @@ def break_gain(images):
     ("options", "message"),
     [
         ({"without": ("EPhi_imag",)}, "has no EPhi_imag"),
-        (
-            {"change": break_shape},
-            r"EPhi_imag has shape \(5, 45, 61\), expected 5 \(freq\) x 46",
-        ),
+        ({"change": break_shape}, r"EPhi_imag has shape \(5, 45, 61\), expected 5 \(freq\) x 46"),
         ({"change": break_order}, "freq does not grow: 40 follows 50"),
         ({"change": break_numbers}, "EPhi_real"),
         ({"change": break_gain}, r"gain_conv has shape \(4,\), expected 5 \(freq\)"),

@@ -138,8 +138,6 @@ def test_bad_matrices_are_refused():
         DenseCoupling(jnp.eye(3)).plus(jnp.ones(()), DenseCoupling(jnp.ones((3, 2))))
 
 
-
-
 def test_dense_rows_are_each_times_own_rotation(coupling):
     """V = b . D(topocentric <- galactic at t) a, with one dense rotation for every time."""
     o = two_runs()

@@ -176,7 +176,7 @@ def test_times_inside_the_ephemeris_work(start):
         # the Sun is up for two weeks from 1 February 2027 at this site
         (
             {"runs": [Run(0.1, night_only=True)], "start": "2027-02-05T00:00:00"},
-            "run 0 holds no lunar night",
+            "holds no lunar night",
         ),
     ],
 )

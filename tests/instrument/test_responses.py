@@ -338,7 +338,7 @@ def test_open_ports_and_turns(tmp_path):
         ({"change": lambda i: i.update(freq=i["freq"][::-1].copy()) if "freq" in i else None},
          "freq does not grow: 20 follows 40"),
         ({"change": lambda i: i.update(ZA_real=i["ZA_real"][:, :3]) if "ZA_real" in i else None},
-         r"ZA_real has shape \(3, 3, 4\), expected 3 \(freq\) x 4 x 4"),
+         r"ZA_real has shape \(3, 3, 4\)"),
         ({"change": lambda i: i.update(Rmoon=2 * i["Rmoon"]) if "Rmoon" in i else None},
          "Rsky . Rmoon . Rloss differ"),
         ({"change": lambda i: i.update(theta=2 * i["theta"]) if "theta" in i else None},

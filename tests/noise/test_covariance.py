@@ -325,18 +325,6 @@ def test_gradients_reach_the_entries():
 # --- refusals ---------------------------------------------------------------------------------
 
 
-
-
-
-
-
-
-
-
-
-
-
-
 LAYOUT = DataLayout(2, 3)
 BAND = jnp.zeros((3, 2, 2, 2)).at[:, 0].set(jnp.eye(2))
 BLOCKS = jnp.tile(jnp.eye(2)[None], (3, 1, 1))
@@ -354,7 +342,7 @@ MAKERS = {
     ("kind", "entries", "message"),
     [
         *(
-            ("diagonal", jnp.array([1.0, bad, 2.0]), r"variance must be positive, .* first at \(1,\)")
+            ("diagonal", jnp.array([1.0, bad, 2.0]), r"must be positive, .* first at \(1,\)")
             for bad in (0.0, -1.0, np.nan, np.inf)
         ),
         ("diagonal", jnp.ones(3, dtype=jnp.float32), "noise variance must be a float64 array"),
@@ -416,10 +404,6 @@ def test_indefinite_bands_are_named_with_their_lowest_eigenvalue(update):
             use()
 
 
-
-
-
-
 def test_indefinite_blocks_are_refused():
     blocks = jnp.stack([jnp.eye(6), _indefinite()])
     with pytest.raises(InputError, match=r"not positive definite: .* eigenvalue is -0\.25 "):
@@ -447,11 +431,7 @@ def test_blocks_with_other_flags_are_refused():
             a + b
 
 
-
-
 def test_a_dense_term_can_be_built_inside_jit_from_known_numbers():
     matrix = jnp.asarray(random_covariance(np.random.default_rng(0), 3))
     got = jax.jit(lambda x: DenseCovariance(matrix).solve(x))(jnp.ones(3))
     close(got, np.linalg.solve(np.asarray(matrix), np.ones(3)))
-
-

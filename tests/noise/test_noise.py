@@ -88,8 +88,6 @@ def test_exact_form_is_what_complex_gaussian_voltages_do():
         assert np.abs(z).max() < z_of(N_PRODUCTS**2), f"row {k}: {np.abs(z).max():.1f} sigma"
 
 
-
-
 def test_exact_variances_have_closed_forms():
     cov = noise("exact")
     assert isinstance(cov, TimeBlockCovariance)
@@ -100,10 +98,6 @@ def test_exact_variances_have_closed_forms():
     v, auto = T[:, 0, 2], autos[0] * autos[2]
     np.testing.assert_allclose(variance[3], (auto + v.real**2 - v.imag**2) / 2, rtol=1e-13)
     np.testing.assert_allclose(variance[4], (auto - v.real**2 + v.imag**2) / 2, rtol=1e-13)
-
-
-
-
 
 
 def test_a_fully_polarised_point_leaves_no_noise_in_one_direction():
@@ -131,8 +125,6 @@ def test_scalings(form):
         2.0 * VISIBILITIES, LAYOUT, form=form, bandwidth_hz=BANDWIDTH, step_s=STEP
     )
     np.testing.assert_allclose(doubled.dense(), 4.0 * base, rtol=1e-14)
-
-
 
 
 def test_defaults_are_the_fiducial_experiment():

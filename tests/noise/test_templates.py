@@ -39,10 +39,6 @@ def test_the_term_is_t_p_t(prior, matrix):
     assert got.root.shape == (15, 3)
 
 
-
-
-
-
 @pytest.mark.parametrize(
     ("templates", "prior", "message"),
     [

@@ -367,10 +367,7 @@ def test_brackets_are_values_not_markup(tmp_path, capsys):
         (["fiducial", "--vary", "lmax=]"], "--vary lmax=] is not valid YAML"),
         (["fiducial", "--vary", "lmx=3,4"], "unknown key 'lmx'; did you mean 'lmax'?"),
         (["fiducial", "--vary", "lmax=3,0"], "greater than or equal to 1"),
-        (
-            ["fiducial", "--set", "sky.file=/gone/a.fits"],
-            "fiducial, as given: no sky map at '/gone/a.fits'",
-        ),
+        (["fiducial", "--set", "sky.file=/gone/a.fits"], "fiducial, as given: no sky map at"),
         (["fiducial", "--set", "observation.start=soon"], "fiducial, as given: start 'soon'"),
         ([], "scenario"),
     ],

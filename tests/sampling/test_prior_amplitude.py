@@ -369,4 +369,3 @@ def test_calibration_notices_what_is_wrong(wrong, witness):
     found = ranks(*QUICK, **wrong)
     assert not found.passed
     assert p_values(found)[witness] < found.threshold
-

@@ -290,4 +290,3 @@ def test_predictions_from_draws_of_z(gaussian, case):
     limit = z_of(2 * N_DATA)
     assert np.abs(delta.mean(0) / np.sqrt(variance / n)).max() < limit
     assert np.abs((delta**2).mean(0) / variance - 1.0).max() < limit * np.sqrt(2 / n)
-

@@ -56,45 +56,21 @@ def assert_one_sentence(caught):
     [
         (
             ["sources.list=[{name: Cas A}, {name: Vir A}, {name: Cas A}]"],
-            "fiducial: sources: the source 'Cas A' is there twice",
+            "source 'Cas A' is there twice",
         ),
-        pytest.param(
-            ["sky.sources=true", CAS_A],
-            "the embedded sky holds the catalogue's sources already; .* set sky.sources=false",
-        ),
+        (["sky.sources=true", CAS_A], "set sky.sources=false"),
         (["sources.list=[{name: X, ra_deg: 10}]"], "give both ra_deg and dec_deg, or none"),
         (["sources.list=[{name: X, dec_deg: 10}]"], "give both ra_deg and dec_deg, or none"),
-        (
-            ["sources.list=[{name: X, ra_deg: 10, dec_deg: 91}]"],
-            "sources.list.0.dec_deg is 91, but .*less than or equal to 90",
-        ),
-        (
-            ["sources.list=[{name: Cas A, stokes_v: 1.5}]"],
-            "sources.list.0.stokes_v is 1.5, but .*less than or equal to 1",
-        ),
-        (
-            ["sources.list=[{name: Cas A, stokes_v: -1.01}]"],
-            "stokes_v is -1.01, but .*greater than or equal to -1",
-        ),
+        (["sources.list=[{name: X, ra_deg: 10, dec_deg: 91}]"], "sources.list.0.dec_deg is 91,"),
+        (["sources.list=[{name: Cas A, stokes_v: 1.5}]"], "sources.list.0.stokes_v is 1.5, but"),
+        (["sources.list=[{name: Cas A, stokes_v: -1.01}]"], "stokes_v is -1.01, but .*greater"),
         (["sources.list=[{name: Cas A, flux_jy: 0}]"], "flux_jy is 0, but .*greater than 0"),
-        (
-            ["sources.list=[{name: Cas A, relative_std: -1}]"],
-            "relative_std is -1, but .*greater than 0",
-        ),
+        (["sources.list=[{name: Cas A, relative_std: -1}]"], "relative_std is -1, but .*greater"),
         (["sources.list=[{name: Cas A, block_h: 0}]"], "block_h is 0, but .*greater than 0"),
-        (
-            ["sources.list=[{name: Cas A, flux: 3}]"],
-            "unknown key 'sources.list.0.flux'; did you mean 'flux_jy'?",
-        ),
+        (["sources.list=[{name: Cas A, flux: 3}]"], "did you mean 'flux_jy'?"),
         (["sources.list=[{flux_jy: 3}]"], "sources.list.0.name is missing"),
-        (
-            ["sources.treatment=[marginalised, sampled]"],
-            r"sources.treatment is \['marginalised', 'sampled'\], but .*'sampled' or 'ignored'",
-        ),
-        (
-            ["noise.gain.treatment=[marginalised, sampled]"],
-            r"noise.gain.treatment is \['marginalised', 'sampled'\], but .*'sampled' or 'ignored'",
-        ),
+        (["sources.treatment=[marginalised, sampled]"], r"sources.treatment is \['marginalised',"),
+        (["noise.gain.treatment=[marginalised, sampled]"], r"noise.gain.treatment is"),
         (
             ["noise.beam={shift_mhz: 4, treatment: [marginalised, sampled]}"],
             r"noise.beam.treatment is \['marginalised', 'sampled'\], but .*'sampled' or 'ignored'",
@@ -106,19 +82,13 @@ def assert_one_sentence(caught):
         ),
         (
             ["noise.gain={log_correlation_std: 1.5, treatment: sampled}"],
-            "log_correlation_std is 1.5, but .*less than or equal to 1",
+            "log_correlation_std is 1.5",
         ),
         (["prior.band_edges=[3, 3]"], "band_edges must grow from one to the next"),
         (["prior.band_edges=[4, 2]"], "band_edges must grow from one to the next"),
         (["prior.band_edges=[0, 2]"], "band_edges.0 is 0, but .*greater than or equal to 1"),
-        (
-            ["prior.band_edges=[2, 4]", "prior.tilt_std=0.5"],
-            "give either band_edges or log_amplitude_std and tilt_std",
-        ),
-        (
-            ["prior={band_edges: [2, 4], log_amplitude_std: 0.5}"],
-            "give either band_edges or log_amplitude_std and tilt_std",
-        ),
+        (["prior.band_edges=[2, 4]", "prior.tilt_std=0.5"], "give either band_edges or"),
+        (["prior={band_edges: [2, 4], log_amplitude_std: 0.5}"], "give either band_edges or"),
         (["prior.tilt_std=0"], "prior.tilt_std is 0, but .*greater than 0"),
         (["noise.radiometer.log_factor_std=-1"], "log_factor_std is -1, but .*greater than 0"),
         (["noise.beam.parameters={length_m: 0}"], "length_m is 0, but .*greater than 0"),
@@ -183,17 +153,11 @@ def test_sources_that_cannot_be(columns, std, message):
         ("{surface_permitivity: 0.1}", "did you mean 'surface_permittivity'?"),
         ("{x: 1}", "unknown beam parameter 'x'; known: deep_permittivity, .*zenith_angle_deg"),
         # 1 lies 2.7 / 5 standard deviations below: Phi(-0.54) = 29.5 %
-        (
-            "{surface_permittivity: 5}",
-            r"prior of surface_permittivity, 3.7 \+- 5, has 29.5% .*at least 1",
-        ),
+        ("{surface_permittivity: 5}", "surface_permittivity.* 29.5% .*at least 1"),
         # Phi(-0.1) = 46 %
         ("{loss_tangent: 0.1}", r"prior of loss_tangent, 0.01 \+- 0.1, has 46.0% .*at least 0"),
         # 105 / 60 standard deviations to 180 degrees, 75 / 60 to 0: 10.6 % and 4.0 %
-        (
-            "{zenith_angle_deg: 60}",
-            r"prior of zenith_angle_deg, 75 \+- 60, has 14.6% .*at least 0",
-        ),
+        ("{zenith_angle_deg: 60}", r"prior of zenith_angle_deg, 75 \+- 60, has 14.6% .*at least 0"),
     ],
 )
 def test_antennas_that_cannot_be_sampled(parameters, message):
