@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from closeness import close
 from numpyro import handlers
 from scipy.stats import norm, truncnorm
 
@@ -51,7 +52,7 @@ def test_turned_blocks_are_the_coupling_matrix(pointing, layout):
     expected = np.asarray(CouplingMatrix.build(beams, pointing, layout).dense())
     got = BeamOperator.of(pointing, layout).coupling(beams)
     assert got.shape == (layout.size, 81)
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+    close(got, expected, 1e-13)
 
 
 def test_a_of_placed_antennas_is_that_of_antennas_built_so(instrument, pointing, layout):
@@ -75,7 +76,7 @@ def test_a_of_placed_antennas_is_that_of_antennas_built_so(instrument, pointing,
     expected = np.asarray(CouplingMatrix.build(beams, pointing, layout).dense())
     placed = {name: jnp.asarray(value) for name, value in values.items()}
     for got in (instrument.dense(placed), instrument.coupling(placed).dense()):
-        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+        close(got, expected, 1e-13)
     # and every one of them matters
     for name, value in values.items():
         others = placed | {name: instrument.value(name)}
@@ -149,9 +150,7 @@ def test_the_amplitude_of_a_beam_error(instrument, base):
         scale = np.abs(np.asarray(expected @ sky)).max()
         np.testing.assert_allclose(model.coupling @ sky, expected @ sky, rtol=0, atol=1e-12 * scale)
         dense = np.asarray(expected.dense())
-        np.testing.assert_allclose(
-            model.coupling.dense(), dense, rtol=0, atol=1e-13 * np.abs(dense).max()
-        )
+        close(model.coupling.dense(), dense, 1e-13)
         fn = trace["beam_amplitude"]["fn"]
         assert float(fn.log_prob(amplitude)) == pytest.approx(norm.logpdf(amplitude))
     term = np.asarray(error.marginalised(base).noise.dense() - base.noise.dense())

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from astropy.io import fits
+from closeness import close, within
 from fits_files import write_images, write_response
 from reference import hemisphere, real_harmonics
 from scipy.constants import Boltzmann, c, physical_constants
@@ -134,9 +135,7 @@ def test_kelvin_and_volts_are_one_thing(luseepy):
     root = np.sqrt(response.per_kelvin(25.0))
     kelvin = np.asarray(to_matrix(response.beams(25.0, 8).modes))
     volts = np.asarray(to_matrix(response.beams(25.0, 8, unit="V2/Hz").modes))
-    np.testing.assert_allclose(
-        kelvin * (root[:, None] * root[None])[..., None], volts, rtol=0, atol=1e-12 * volts.max()
-    )
+    within(kelvin * (root[:, None] * root[None])[..., None], volts, 1e-12 * volts.max())
     moon = np.asarray(response.background(25.0, MOON)) / np.asarray(response.background(25.0, 1.0))
     np.testing.assert_allclose(moon, MOON, rtol=1e-12)
 
@@ -207,13 +206,12 @@ def test_volts_of_short_dipoles(tmp_path):
     expected = m @ open_ @ m.conj().T
     beams = response.beams(f, 2, unit="V2/Hz")
     got = np.asarray(to_matrix(beams.modes))[..., 0] * np.sqrt(4 * np.pi)
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    close(got, expected, 1e-6)
     # half sky, half Moon
-    np.testing.assert_allclose(
+    close(
         np.asarray(to_matrix(response.background(f, 1.0, unit="V2/Hz")[:, None]))[..., 0],
         expected,
-        rtol=0,
-        atol=1e-6 * np.abs(expected).max(),
+        1e-6,
     )
 
 
@@ -258,7 +256,7 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
     assert np.abs(np.asarray(to_matrix(splined.modes)) - expected).max() > 1e-2 * largest
     warm = 4 * Boltzmann * 250.0 * m @ between(response.moon_resistance, part) @ m.conj().T
     got = np.asarray(to_matrix(response.background(f, 250.0, unit="V2/Hz")[:, None]))[..., 0]
-    np.testing.assert_allclose(got, warm, rtol=0, atol=1e-12 * np.abs(warm).max())
+    close(got, warm, 1e-12)
     enclosure = 4 * Boltzmann * m @ ((za + za.conj().T) / 2) @ m.conj().T
     np.testing.assert_allclose(response.per_kelvin(f), enclosure.diagonal().real, rtol=1e-12)
     # nothing is interpolated where the file has the frequency, to luseepy's 1e-6 MHz
@@ -267,7 +265,7 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
     near = opened.beams(20.0 + 9e-7, 3, unit="V2/Hz").modes
     np.testing.assert_array_equal(near, exact)
     splined = replace(opened, interpolation="spline").beams(20.0, 3, unit="V2/Hz").modes
-    np.testing.assert_allclose(splined, exact, rtol=0, atol=1e-13 * np.abs(exact).max())
+    close(splined, exact, 1e-13)
 
 
 def test_receivers(tmp_path):
@@ -315,7 +313,7 @@ def test_losses_emit_at_the_antennas_temperature(tmp_path):
     m = response.circuit(20.0).loading
     expected = 4 * Boltzmann * 300.0 * 0.5 * m @ m.conj().T
     got = np.asarray(to_matrix(response.background(20.0, 0.0, 300.0, unit="V2/Hz")[:, None]))
-    np.testing.assert_allclose(got[..., 0], expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+    close(got[..., 0], expected, 1e-9)
 
 
 def test_open_ports_and_turns(tmp_path):

@@ -13,6 +13,7 @@ from functools import lru_cache
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from closeness import close
 from experiments import program_arguments, small_experiment
 from numpyro.infer.util import log_density
 from reference_linear import exact_posterior
@@ -155,10 +156,8 @@ def test_marginalised_they_are_in_the_noise_and_the_offset():
     model = sources.marginalised(base)
     t, (mean, std) = columns(), priors()
     expected = np.diag(np.asarray(base.noise.diagonal())) + (t * std**2) @ t.T
-    np.testing.assert_allclose(
-        model.noise.dense(), expected, rtol=0, atol=1e-14 * np.abs(expected).max()
-    )
-    np.testing.assert_allclose(model.offset, t @ mean, rtol=0, atol=1e-13 * np.abs(t @ mean).max())
+    close(model.noise.dense(), expected, 1e-14)
+    close(model.offset, t @ mean, 1e-13)
     # an offset that is there already stays
     twice = sources.marginalised(replace(base, offset=jnp.ones(96)))
     np.testing.assert_allclose(twice.offset, 1.0 + model.offset, rtol=1e-14)
