@@ -8,20 +8,18 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.instrument.averaging import averaged, product_live_s
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, Run
-from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.windows import Windows
 
 STEP = 600.0
-RUNS = [Run(0.004), Run(0.003, turntable_deg=30.0)]
+RUNS = [lb.Run(0.004), lb.Run(0.003, turntable_deg=30.0)]
 
 
 def observed(keep=None, windows="odd", runs=RUNS):
     """15 and 11 samples; every third is made of two pieces."""
-    observation = Observation.from_runs(runs, step_s=STEP, window="mean")
+    observation = lb.Observation.from_runs(runs, step_s=STEP, window="mean")
     rng = np.random.default_rng(7)
     n = observation.n_times
     if windows == "odd":
@@ -41,7 +39,7 @@ def data_of(observation, flagged=0.0, seed=1):
     rng = np.random.default_rng(seed)
     layout = DataLayout.from_flags(rng.random((16, observation.n_times)) < flagged)
     values = rng.normal(3e4, 1e3, layout.size)
-    return Visibilities(values, layout, observation, 25.0, truth=rng.normal(size=9))
+    return lb.Visibilities(values, layout, observation, 25.0, truth=rng.normal(size=9))
 
 
 def seconds_of(observation, origin):
@@ -164,13 +162,13 @@ def test_no_bin_is_longer_than_asked_for(to_s):
 
 def flagged(*absent, n=4):
     """``n`` samples of one run, of equal live times, without some (product, sample)."""
-    observation = Observation.from_runs([Run(0.02)], step_s=STEP, window="mean")
+    observation = lb.Observation.from_runs([lb.Run(0.02)], step_s=STEP, window="mean")
     observation = observation.select(np.arange(observation.n_times) < n)
     flags = np.zeros((16, n), dtype=bool)
     for product, sample in absent:
         flags[product, sample] = True
     layout = DataLayout.from_flags(flags)
-    return Visibilities(
+    return lb.Visibilities(
         np.random.default_rng(3).normal(size=layout.size), layout, observation, 25.0
     )
 
@@ -205,7 +203,7 @@ def test_bins_of_which_nothing_remains_are_dropped():
     rarely = flagged(*((p, k) for p in range(16) for k in range(4) if p % 4 != k))
     halves = flagged(*((p, k) for p in range(16) for k in range(4) if p % 2 != k % 2))
     for data in (rarely, halves):
-        with pytest.raises(InputError, match="nothing is left of the data in bins of 2400 s"):
+        with pytest.raises(lb.InputError, match="nothing is left of the data in bins of 2400 s"):
             averaged(data, 4 * STEP)
 
 
@@ -214,7 +212,7 @@ def test_a_run_of_which_nothing_remains_is_gone():
     flags = np.zeros((16, observation.n_times), dtype=bool)
     flags[:, observation.run == 0] = True
     layout = DataLayout.from_flags(flags)
-    data = Visibilities(np.ones(layout.size), layout, observation, 25.0)
+    data = lb.Visibilities(np.ones(layout.size), layout, observation, 25.0)
     found = averaged(data, 3 * STEP).observation
     assert found.turntable_deg == (30.0,) and set(found.run) == {0}
 
@@ -230,8 +228,8 @@ def test_a_run_of_which_nothing_remains_is_gone():
     ],
 )
 def test_what_cannot_be_averaged(windows, to_s, words):
-    observation = Observation.from_runs([Run(0.01)], step_s=STEP, window=windows)
-    with pytest.raises(InputError) as caught:
+    observation = lb.Observation.from_runs([lb.Run(0.01)], step_s=STEP, window=windows)
+    with pytest.raises(lb.InputError) as caught:
         averaged(data_of(observation), to_s)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)

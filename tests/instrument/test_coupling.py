@@ -5,14 +5,11 @@ import pytest
 from closeness import close
 from reference import arm_response, hemisphere, visibilities
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, n_modes
 from lusee_bayes.core.rotations import Rotation, turn_about_z
-from lusee_bayes.instrument.beams import Monopoles, ProductBeams, monopole_beams
 from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, as_coupling
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, Run
-from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import auto_indices, labels, to_matrix
 from lusee_bayes.testing import check_coupling
 
@@ -31,11 +28,11 @@ def steep_sky(lmax, seed=0, monopole=1e4):
 
 def random_beams(seed, lmax=LMAX, n_products=16):
     modes = np.random.default_rng(seed).standard_normal((n_products, n_modes(lmax)))
-    return ProductBeams(jnp.asarray(modes), 25.0)
+    return lb.ProductBeams(jnp.asarray(modes), 25.0)
 
 
 def two_runs():
-    return Observation.from_runs([Run(0.3), Run(0.2, 30.0)], step_s=30000.0)
+    return lb.Observation.from_runs([lb.Run(0.3), lb.Run(0.2, 30.0)], step_s=30000.0)
 
 
 @pytest.fixture(scope="module")
@@ -48,13 +45,13 @@ def coupling():
 )
 def test_visibilities_agree_with_an_integral_over_the_sky_in_lunartopo(lmax, turntable):
     frequency = 25.0
-    o = Observation.from_runs([Run(1.0, turntable)])
+    o = lb.Observation.from_runs([lb.Run(1.0, turntable)])
     sky = steep_sky(lmax)
-    got = CouplingMatrix.observe(monopole_beams(frequency, lmax), o) @ sky
+    got = CouplingMatrix.observe(lb.monopole_beams(frequency, lmax), o) @ sky
     got = np.asarray(got).reshape(16, -1)
     grid = theta, phi, solid_angle = hemisphere(32, 64)
     # the antennas one direction at a time, reflection included
-    s, p = Monopoles().regolith.reflection(np.cos(theta), frequency)
+    s, p = lb.Monopoles().regolith.reflection(np.cos(theta), frequency)
     tilt, voltages = np.radians(75.0), []
     for azimuth in np.radians([90.0, 0.0, 270.0, 180.0]):  # North, East, South, West
         arm = np.array(
@@ -93,7 +90,7 @@ def flagged_coupling():
     """Two runs of random beams with three samples in ten missing."""
     o = two_runs()
     layout = DataLayout.from_flags(np.random.default_rng(6).random((16, o.n_times)) < 0.3)
-    return CouplingMatrix.build(random_beams(5), Pointing.of(o, LMAX), layout)
+    return CouplingMatrix.build(random_beams(5), lb.Pointing.of(o, LMAX), layout)
 
 
 def by_rows(coupling):
@@ -131,11 +128,11 @@ def test_arrays_are_wrapped_and_couplings_left_alone(coupling):
 
 
 def test_bad_matrices_are_refused():
-    with pytest.raises(InputError, match=r"the coupling matrix holds NaN .*\(1, 2\)"):
+    with pytest.raises(lb.InputError, match=r"the coupling matrix holds NaN .*\(1, 2\)"):
         DenseCoupling(jnp.eye(3).at[1, 2].set(jnp.nan))
-    with pytest.raises(InputError, match="the coupling matrix must be a float64 array"):
+    with pytest.raises(lb.InputError, match="the coupling matrix must be a float64 array"):
         DenseCoupling(jnp.eye(3, dtype=jnp.float32))
-    with pytest.raises(InputError, match="the direction has shape"):
+    with pytest.raises(lb.InputError, match="the direction has shape"):
         DenseCoupling(jnp.eye(3)).plus(jnp.ones(()), DenseCoupling(jnp.ones((3, 2))))
 
 
@@ -157,7 +154,9 @@ def test_dense_rows_are_each_times_own_rotation(coupling):
 def test_flagged_samples_are_left_out(coupling):
     o = two_runs()
     flags = np.random.default_rng(8).random((16, o.n_times)) < 0.3
-    some = CouplingMatrix.build(random_beams(1), Pointing.of(o, LMAX), DataLayout.from_flags(flags))
+    some = CouplingMatrix.build(
+        random_beams(1), lb.Pointing.of(o, LMAX), DataLayout.from_flags(flags)
+    )
     keep = ~flags.ravel()
     assert some.shape == (keep.sum(), n_modes(LMAX))
     np.testing.assert_array_equal(some.dense(), np.asarray(coupling.dense())[keep])
@@ -174,9 +173,9 @@ def test_flagged_samples_are_left_out(coupling):
 @pytest.mark.essential
 def test_a_quarter_turn_of_the_turntable_permutes_the_products():
     lmax = 12
-    beams, sky = monopole_beams(25.0, lmax), steep_sky(lmax)
+    beams, sky = lb.monopole_beams(25.0, lmax), steep_sky(lmax)
     straight, turned = (
-        CouplingMatrix.observe(beams, Observation.from_runs([Run(0.1, angle)])) @ sky
+        CouplingMatrix.observe(beams, lb.Observation.from_runs([lb.Run(0.1, angle)])) @ sky
         for angle in (0.0, 90.0)
     )
     v, w = (np.asarray(to_matrix(x.reshape(16, -1))) for x in (straight, turned))
@@ -193,7 +192,7 @@ def test_a_second_run_is_an_observation_of_its_own(coupling):
     both = np.asarray(coupling @ a).reshape(16, -1)
     for run in (0, 1):
         keep = o.run == run
-        alone = Observation(
+        alone = lb.Observation(
             o.lon_deg,
             o.lat_deg,
             o.times[keep],
@@ -208,8 +207,8 @@ def test_a_second_run_is_an_observation_of_its_own(coupling):
 
 def test_a_smaller_lmax_is_a_slice(coupling):
     low = 5
-    beams = ProductBeams(random_beams(1).modes[:, : n_modes(low)], 25.0)
-    pointing = Pointing.of(two_runs(), low, order=coupling.pointing.order)
+    beams = lb.ProductBeams(random_beams(1).modes[:, : n_modes(low)], 25.0)
+    pointing = lb.Pointing.of(two_runs(), low, order=coupling.pointing.order)
     small = CouplingMatrix.build(beams, pointing)
     full = np.asarray(coupling.dense())
     np.testing.assert_allclose(small.dense(), full[:, : n_modes(low)], rtol=0, atol=1e-12)
@@ -223,8 +222,8 @@ def test_linearity(coupling):
 
 
 def test_a_uniform_sky_of_one_kelvin_gives_autos_of_one_kelvin():
-    o = Observation.from_runs([Run(0.1, 20.0)])
-    c = CouplingMatrix.observe(monopole_beams(10.0, LMAX), o)
+    o = lb.Observation.from_runs([lb.Run(0.1, 20.0)])
+    c = CouplingMatrix.observe(lb.monopole_beams(10.0, LMAX), o)
     sky = jnp.zeros(n_modes(LMAX)).at[0].set(np.sqrt(4 * np.pi))
     v = np.asarray(c @ sky).reshape(16, -1)
     np.testing.assert_allclose(v[auto_indices()].mean(axis=0), 1.0, rtol=1e-13)
@@ -236,11 +235,11 @@ def test_a_uniform_sky_of_one_kelvin_gives_autos_of_one_kelvin():
 @pytest.mark.parametrize(("cycles", "lmax"), [pytest.param(1, 47, marks=pytest.mark.long), (3, 12)])
 def test_the_moons_axis_is_not_fixed(cycles, lmax, monkeypatch):
     """Orders of the tilt expansion in units of the fiducial radiometer noise (DESIGN 5)."""
-    o = Observation.from_runs([Run(1.0)] * cycles, step_s=20000.0)
-    beams, sky = monopole_beams(25.0, lmax), steep_sky(lmax)
+    o = lb.Observation.from_runs([lb.Run(1.0)] * cycles, step_s=20000.0)
+    beams, sky = lb.monopole_beams(25.0, lmax), steep_sky(lmax)
 
     def visibilities_at(order=None):
-        pointing = Pointing.of(o, lmax, order)
+        pointing = lb.Pointing.of(o, lmax, order)
         return np.asarray(CouplingMatrix.build(beams, pointing) @ sky)
 
     monkeypatch.setattr("lusee_bayes.instrument.window_average.TOLERANCE", 1e-14)
@@ -265,11 +264,11 @@ def test_the_moons_axis_is_not_fixed(cycles, lmax, monkeypatch):
 
 def test_differentiable_in_the_beams():
     o = two_runs()
-    pointing, sky = Pointing.of(o, LMAX), steep_sky(LMAX, monopole=1.0)
+    pointing, sky = lb.Pointing.of(o, LMAX), steep_sky(LMAX, monopole=1.0)
     weights = jnp.asarray(np.random.default_rng(9).standard_normal(16 * o.n_times))
 
     def f(modes):
-        return weights @ (CouplingMatrix.build(ProductBeams(modes, 25.0), pointing) @ sky)
+        return weights @ (CouplingMatrix.build(lb.ProductBeams(modes, 25.0), pointing) @ sky)
 
     modes, direction = random_beams(1).modes, random_beams(2).modes
     slope = jnp.sum(jax.jit(jax.grad(f))(modes) * direction)
@@ -278,16 +277,20 @@ def test_differentiable_in_the_beams():
 
 
 def test_bad_input_is_refused(coupling):
-    pointing = Pointing.of(two_runs(), LMAX)
-    with pytest.raises(InputError, match=r"the beam coefficients has shape \(16, 36\), expected"):
+    pointing = lb.Pointing.of(two_runs(), LMAX)
+    with pytest.raises(
+        lb.InputError, match=r"the beam coefficients has shape \(16, 36\), expected"
+    ):
         CouplingMatrix.build(random_beams(0, lmax=5), pointing)
-    with pytest.raises(InputError, match="the data layout has 4 products x 7 times"):
+    with pytest.raises(lb.InputError, match="the data layout has 4 products x 7 times"):
         CouplingMatrix.build(random_beams(0), pointing, DataLayout(4, 7))
-    with pytest.raises(InputError, match=r"the sky has shape \(80,\), expected \(81,\)"):
+    with pytest.raises(lb.InputError, match=r"the sky has shape \(80,\), expected \(81,\)"):
         coupling @ jnp.zeros(80)
-    with pytest.raises(InputError, match=r"the data has shape \(3,\)"):
+    with pytest.raises(lb.InputError, match=r"the data has shape \(3,\)"):
         coupling.transpose_mv(jnp.zeros(3))
-    with pytest.raises(InputError, match="the sky must be a float64 array, got an array of float"):
+    with pytest.raises(
+        lb.InputError, match="the sky must be a float64 array, got an array of float"
+    ):
         coupling @ jnp.zeros(81, dtype=jnp.float32)
 
 
@@ -296,5 +299,5 @@ def test_bad_input_is_refused(coupling):
     [(16, 0, r"product numbers must lie in 0..15"), (0, -1, r"time numbers must lie in 0\.\.")],
 )
 def test_rows_that_do_not_exist_are_refused(coupling, product, time, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(lb.InputError, match=message):
         coupling.rows(np.array([product]), np.array([time]))

@@ -7,9 +7,8 @@ from astropy.time import Time
 from closeness import within
 from lunarsky import MCMF, LunarTopo, MoonLocation
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.instrument.ephemeris import BODIES, MOON_RADIUS_KM, body_direction
-from lusee_bayes.instrument.observation import Observation, Run
 from lusee_bayes.instrument.times import unannounced_leap_seconds
 
 AU_KM = 149597870.7
@@ -24,7 +23,7 @@ def angle(a, b):
 
 def dates(*isot, lon_deg=182.258, lat_deg=-23.814):
     run = np.zeros(len(isot), dtype=int)
-    return Observation(lon_deg, lat_deg, Time(list(isot)), run, (0.0,), 60.0)
+    return lb.Observation(lon_deg, lat_deg, Time(list(isot)), run, (0.0,), 60.0)
 
 
 def by_erfa_and_lunartopo(planet, time, lon_deg, lat_deg):
@@ -90,7 +89,7 @@ def test_directions_agree_with_erfa_and_lunartopo(body, planet):
 
 
 def test_the_sun_is_where_the_observation_says():
-    observation = Observation.from_runs([Run(1.0)], step_s=40000.0)
+    observation = lb.Observation.from_runs([lb.Run(1.0)], step_s=40000.0)
     up = np.sum(observation.zenith_galactic() * body_direction("Sun", observation), axis=1)
     # 1737 km at 1 au are 2.4 arcseconds, the barycentric Sun moves 0.01 km/s x 499 s = 0.01
     within(np.degrees(np.arcsin(up)), observation.sun_altitude_deg(), 2.5 / 3600)
@@ -157,5 +156,5 @@ def test_every_body_is_known_in_any_case():
     ],
 )
 def test_unknown_bodies_are_refused(body, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(lb.InputError, match=message):
         body_direction(body, dates("2027-01-15T00:00:00"))

@@ -10,9 +10,6 @@ import pytest
 from astropy.time import Time
 
 import lusee_bayes as lb
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.instrument.visibilities_file import read_visibilities
 
 N = 5
 START = datetime(2027, 1, 15)
@@ -37,9 +34,9 @@ def columns(pairs) -> np.ndarray:
     return np.stack([MATRIX[:, i, j] for i, j in pairs], axis=1)
 
 
-def make(data=None, times=TIMES, frequency_mhz=25.0, **options) -> Visibilities:
+def make(data=None, times=TIMES, frequency_mhz=25.0, **options) -> lb.Visibilities:
     data = columns(PAIRS) if data is None else data
-    return Visibilities.from_arrays(data, times, frequency_mhz, **options)
+    return lb.Visibilities.from_arrays(data, times, frequency_mhz, **options)
 
 
 def test_complex_correlations_in_the_packages_order():
@@ -118,7 +115,7 @@ def test_angles_are_runs_and_sites_are_places(tmp_path):
     np.testing.assert_array_equal(observation.run, [0, 0, 1, 1, 2])
     assert observation.turntable_deg == (0.0, 30.0, 0.0)
     assert (observation.lon_deg, observation.lat_deg, observation.step_s) == (10.0, 5.0, 600.0)
-    again = read_visibilities(made.write(tmp_path / "mine.nc"))
+    again = lb.read_visibilities(made.write(tmp_path / "mine.nc"))
     assert again.digest() == made.digest()
     assert again.observation.turntable_deg == (0.0, 30.0, 0.0)
 
@@ -159,7 +156,7 @@ def test_angles_are_runs_and_sites_are_places(tmp_path):
     ],
 )
 def test_what_is_wrong_is_said_in_a_sentence(options, words):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(lb.InputError) as caught:
         make(**options)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -13,14 +13,8 @@ from numpyro import handlers
 from scipy.stats import norm, truncnorm
 
 import lusee_bayes as lb
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beam_operator import BeamOperator
-from lusee_bayes.instrument.beams import Monopoles, ProductBeams, Regolith, monopole_beams
-from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.instrument import Instrument
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, Run
-from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.systematics import BeamError, InstrumentParameters
 
 LMAX, FREQUENCY = 8, 25.0
@@ -30,8 +24,8 @@ STDS = {"surface_permittivity": 0.3, "zenith_angle_deg": 2.0, "turntable_offset_
 @pytest.fixture(scope="module")
 def pointing():
     """Two runs at two turntable angles: 18 samples."""
-    observation = Observation.from_runs([Run(0.3, 0.0), Run(0.4, 40.0)], step_s=86400.0)
-    return Pointing.of(observation, LMAX)
+    observation = lb.Observation.from_runs([lb.Run(0.3, 0.0), lb.Run(0.4, 40.0)], step_s=86400.0)
+    return lb.Pointing.of(observation, LMAX)
 
 
 @pytest.fixture(scope="module")
@@ -43,13 +37,13 @@ def layout(pointing):
 
 @pytest.fixture(scope="module")
 def instrument(pointing, layout):
-    return Instrument(Monopoles(), pointing, layout, FREQUENCY, LMAX).prepared()
+    return lb.Instrument(lb.Monopoles(), pointing, layout, FREQUENCY, LMAX).prepared()
 
 
 def test_turned_blocks_are_the_coupling_matrix(pointing, layout):
     """For beams of every order, with flags and two runs; sums of 17 numbers in another order."""
-    beams = ProductBeams(jax.random.normal(jax.random.key(0), (16, 81)), FREQUENCY)
-    expected = np.asarray(CouplingMatrix.build(beams, pointing, layout).dense())
+    beams = lb.ProductBeams(jax.random.normal(jax.random.key(0), (16, 81)), FREQUENCY)
+    expected = np.asarray(lb.CouplingMatrix.build(beams, pointing, layout).dense())
     got = BeamOperator.of(pointing, layout).coupling(beams)
     assert got.shape == (layout.size, 81)
     close(got, expected, 1e-13)
@@ -65,15 +59,15 @@ def test_a_of_placed_antennas_is_that_of_antennas_built_so(instrument, pointing,
         "deep_permittivity": 6.5,
         "loss_tangent": 0.02,
     }
-    antennas = Monopoles(
-        Regolith(3.5, 6.5, 0.02),
+    antennas = lb.Monopoles(
+        lb.Regolith(3.5, 6.5, 0.02),
         length_m=3.1,
         height_m=1.7,
         zenith_angle_deg=73.0,
         azimuths_deg=np.array([90.0, 0.0, -90.0, 180.0]) + 5.0,
     )
-    beams = monopole_beams(FREQUENCY, LMAX, antennas)
-    expected = np.asarray(CouplingMatrix.build(beams, pointing, layout).dense())
+    beams = lb.monopole_beams(FREQUENCY, LMAX, antennas)
+    expected = np.asarray(lb.CouplingMatrix.build(beams, pointing, layout).dense())
     placed = {name: jnp.asarray(value) for name, value in values.items()}
     for got in (instrument.dense(placed), instrument.coupling(placed).dense()):
         close(got, expected, 1e-13)
@@ -85,7 +79,7 @@ def test_a_of_placed_antennas_is_that_of_antennas_built_so(instrument, pointing,
 
 
 def test_a_that_was_not_prepared(instrument):
-    with pytest.raises(InputError, match="prepare the instrument first"):
+    with pytest.raises(lb.InputError, match="prepare the instrument first"):
         replace(instrument, operator=None).dense({})
 
 
@@ -135,16 +129,16 @@ def test_marginalised_parameters_are_derivatives_of_a(instrument, base):
 
 
 def test_the_amplitude_of_a_beam_error(instrument, base):
-    other = monopole_beams(29.0, LMAX)
+    other = lb.monopole_beams(29.0, LMAX)
     own = instrument.beams()
-    direction = ProductBeams(other.modes - own.modes, FREQUENCY)
+    direction = lb.ProductBeams(other.modes - own.modes, FREQUENCY)
     error = BeamError(instrument.coupling_of(direction))
     sky = base.prior.sample(jax.random.key(3))
     for amplitude in (0.0, 0.7, 1.0):
         value = {"beam_amplitude": jnp.asarray(amplitude)}
         with handlers.trace() as trace, handlers.seed(rng_seed=0), handlers.substitute(data=value):
             model = error.sampled(base)
-        mixed = ProductBeams((1 - amplitude) * own.modes + amplitude * other.modes, FREQUENCY)
+        mixed = lb.ProductBeams((1 - amplitude) * own.modes + amplitude * other.modes, FREQUENCY)
         expected = instrument.coupling_of(mixed)
         # linear in the beams, as a product and as a matrix
         scale = np.abs(np.asarray(expected @ sky)).max()
@@ -162,10 +156,10 @@ def test_the_amplitude_of_a_beam_error(instrument, base):
 
 def test_a_direction_has_no_gains_and_the_same_samples(instrument, base, pointing):
     error = instrument.coupling_of(instrument.beams())
-    with pytest.raises(InputError, match="no response of its own"):
+    with pytest.raises(lb.InputError, match="no response of its own"):
         base.coupling.plus(jnp.ones(()), error.with_response(jnp.ones(error.shape[0])))
-    complete = CouplingMatrix.build(instrument.beams(), pointing)
-    with pytest.raises(InputError, match="hold different samples"):
+    complete = lb.CouplingMatrix.build(instrument.beams(), pointing)
+    with pytest.raises(lb.InputError, match="hold different samples"):
         base.coupling.plus(jnp.ones(()), complete)
 
 

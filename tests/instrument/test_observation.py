@@ -14,19 +14,18 @@ from closeness import within
 from lunarsky import MCMF, LunarTopo, MoonLocation
 from reference import galactic_directions
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.instrument.moon import CYCLE_DAYS
-from lusee_bayes.instrument.observation import Observation, Run
 
 # the leap seconds of years far ahead are unknown; astropy says so whenever it converts them
 
 
 def test_the_fiducial_cycle_and_three_of_them():
-    one = Observation.from_runs()
+    one = lb.Observation.from_runs()
     assert one.n_times == 327
     assert one.times[0].isot == "2027-01-15T00:00:00.000"
     within(one.hours, 2.0 * np.arange(327), 1e-6)  # a double JD: 20 ns
-    three = Observation.from_runs([Run(1.0, angle) for angle in (0.0, 30.0, 60.0)])
+    three = lb.Observation.from_runs([lb.Run(1.0, angle) for angle in (0.0, 30.0, 60.0)])
     assert (three.n_times, three.n_runs) == (981, 3)
     np.testing.assert_array_equal(np.bincount(three.run), [327, 327, 327])
     starts = three.hours[np.searchsorted(three.run, [0, 1, 2])]
@@ -34,8 +33,8 @@ def test_the_fiducial_cycle_and_three_of_them():
 
 
 def test_runs_of_any_length_follow_one_another():
-    runs = [Run(0.25, 10.0), Run(0.5, -20.0)]
-    o = Observation.from_runs(runs, start="2026-06-01", step_s=3600.0)
+    runs = [lb.Run(0.25, 10.0), lb.Run(0.5, -20.0)]
+    o = lb.Observation.from_runs(runs, start="2026-06-01", step_s=3600.0)
     np.testing.assert_array_equal(np.bincount(o.run), [163, 327])  # floor(cycles 655.72)
     assert o.turntable_deg == (10.0, -20.0)
     assert o.hours[163] == pytest.approx(0.25 * CYCLE_DAYS * 24, abs=1e-6)
@@ -44,8 +43,8 @@ def test_runs_of_any_length_follow_one_another():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_directions_agree_with_lunartopo(seed):
     rng = np.random.default_rng(seed)
-    o = Observation.from_runs(
-        [Run(0.6), Run(0.5)],
+    o = lb.Observation.from_runs(
+        [lb.Run(0.6), lb.Run(0.5)],
         start=["2027-01-15T00:00:00", "1999-03-04T05:06:07"][seed],
         lon_deg=rng.uniform(-180, 360),
         lat_deg=rng.uniform(-90, 90),
@@ -67,7 +66,7 @@ def test_directions_agree_with_lunartopo(seed):
 
 
 def test_the_rotations_are_rotations_and_the_moon_turns():
-    o = Observation.from_runs([Run(1.0)])
+    o = lb.Observation.from_runs([lb.Run(1.0)])
     r = o.mcmf_from_galactic()
     within(r @ r.swapaxes(1, 2), np.tile(np.eye(3), (327, 1, 1)), 1e-13)
     np.testing.assert_allclose(np.linalg.det(r), 1.0, rtol=0, atol=1e-13)
@@ -81,7 +80,7 @@ def test_the_rotations_are_rotations_and_the_moon_turns():
 
 
 def test_zenith():
-    o = Observation.from_runs([Run(0.3)])
+    o = lb.Observation.from_runs([lb.Run(0.3)])
     for k in (0, 50):
         zero = np.zeros(1)
         colatitude, longitude = galactic_directions(zero, zero, o.times[k], o.lon_deg, o.lat_deg)
@@ -94,7 +93,7 @@ def test_zenith():
 
 
 def test_sun_altitude_agrees_with_lunarsky_and_with_the_sun_seen_from_the_earth():
-    o = Observation.from_runs([Run(1.0)], step_s=40000.0)
+    o = lb.Observation.from_runs([lb.Run(1.0)], step_s=40000.0)
     got = o.sun_altitude_deg()
     site = MoonLocation.from_selenodetic(lon=o.lon_deg, lat=o.lat_deg)
     sun, moon = (get_body_barycentric(b, o.times, ephemeris="builtin") for b in ("sun", "moon"))
@@ -113,8 +112,8 @@ def test_sun_altitude_agrees_with_lunarsky_and_with_the_sun_seen_from_the_earth(
 
 
 def test_night_only_keeps_the_samples_with_the_sun_down():
-    everything = Observation.from_runs([Run(1.0), Run(1.0)])
-    mixed = Observation.from_runs([Run(1.0), Run(1.0, night_only=True)])
+    everything = lb.Observation.from_runs([lb.Run(1.0), lb.Run(1.0)])
+    mixed = lb.Observation.from_runs([lb.Run(1.0), lb.Run(1.0, night_only=True)])
     site = MoonLocation.from_selenodetic(lon=everything.lon_deg, lat=everything.lat_deg)
     sun, moon = (
         get_body_barycentric(b, everything.times, ephemeris="builtin") for b in ("sun", "moon")
@@ -133,7 +132,7 @@ def test_night_only_keeps_the_samples_with_the_sun_down():
 
 
 def test_select():
-    o = Observation.from_runs([Run(0.1), Run(0.1, 30.0)])
+    o = lb.Observation.from_runs([lb.Run(0.1), lb.Run(0.1, 30.0)])
     keep = np.arange(o.n_times) % 3 == 0
     some = o.select(keep)
     np.testing.assert_array_equal(some.times.jd, o.times.jd[keep])
@@ -150,13 +149,13 @@ def test_select():
     ],
 )
 def test_times_outside_the_ephemeris_are_refused(start, at):
-    with pytest.raises(InputError, match=rf"outside the ephemeris \(1900-2050\): {at}"):
-        Observation.from_runs([Run(1.0)], start=start)
+    with pytest.raises(lb.InputError, match=rf"outside the ephemeris \(1900-2050\): {at}"):
+        lb.Observation.from_runs([lb.Run(1.0)], start=start)
 
 
 @pytest.mark.parametrize("start", ["1900-01-02T00:00:00", "2049-11-20T00:00:00"])
 def test_times_inside_the_ephemeris_work(start):
-    r = Observation.from_runs([Run(0.1)], start=start).mcmf_from_galactic()
+    r = lb.Observation.from_runs([lb.Run(0.1)], start=start).mcmf_from_galactic()
     np.testing.assert_allclose(np.linalg.det(r), 1.0, rtol=0, atol=1e-12)
 
 
@@ -166,20 +165,20 @@ def test_times_inside_the_ephemeris_work(start):
         ({"start": "next tuesday"}, "'next tuesday' is not a date; write it as 2027-01-15"),
         ({"step_s": 0.0}, "step_s must be positive, got 0.0"),
         ({"lat_deg": 95.0}, r"lat_deg must lie in -90..90, got 95.0"),
-        ({"runs": [Run(), Run(1e-3)]}, "run 1 of 0.001 cycles holds no sample of 7200.0 s"),
+        ({"runs": [lb.Run(), lb.Run(1e-3)]}, "run 1 of 0.001 cycles holds no sample of 7200.0 s"),
         ({"runs": []}, "at least one run"),
-        ({"runs": [Run(turntable_deg=float("nan"))]}, "turntable_deg holds NaN"),
-        ({"runs": [Run(-1.0)]}, "length in cycles of run 0 must be positive, got -1.0"),
+        ({"runs": [lb.Run(turntable_deg=float("nan"))]}, "turntable_deg holds NaN"),
+        ({"runs": [lb.Run(-1.0)]}, "length in cycles of run 0 must be positive, got -1.0"),
         # the Sun is up for two weeks from 1 February 2027 at this site
         (
-            {"runs": [Run(0.1, night_only=True)], "start": "2027-02-05T00:00:00"},
+            {"runs": [lb.Run(0.1, night_only=True)], "start": "2027-02-05T00:00:00"},
             "holds no lunar night",
         ),
     ],
 )
 def test_bad_input_is_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        Observation.from_runs(**options)
+    with pytest.raises(lb.InputError, match=message):
+        lb.Observation.from_runs(**options)
 
 
 @pytest.mark.parametrize(
@@ -193,5 +192,5 @@ def test_bad_input_is_refused(options, message):
 )
 def test_inconsistent_samples_are_refused(run, turntable, message):
     times = Time("2027-01-15") + np.arange(3.0) * u.hour
-    with pytest.raises(InputError, match=message):
-        Observation(0.0, 0.0, times, np.array(run), turntable, 3600.0)
+    with pytest.raises(lb.InputError, match=message):
+        lb.Observation(0.0, 0.0, times, np.array(run), turntable, 3600.0)

@@ -6,9 +6,8 @@ import pytest
 from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.core.rotations import generators, tilt_powers
-from lusee_bayes.instrument.observation import Observation, Run
 from lusee_bayes.instrument.pointing import (
     LEAST_ORDER,
     TILT_TOLERANCE,
@@ -41,7 +40,7 @@ def test_split_of_a_turn_about_z_has_no_tilt():
 
 
 def test_split_reproduces_the_moon():
-    moon = Observation.from_runs([Run(1.0)]).mcmf_from_galactic()
+    moon = lb.Observation.from_runs([lb.Run(1.0)]).mcmf_from_galactic()
     frame = mean_pole_frame(moon)
     # lunarsky's matrices are orthogonal to 1e-15; the sample times add nothing
     np.testing.assert_allclose(rebuilt(*split(moon @ frame.T)) @ frame, moon, rtol=0, atol=1e-12)
@@ -51,7 +50,7 @@ def test_split_reproduces_the_moon():
 
 @pytest.mark.parametrize(("cycles", "wander"), [(1, 0.044), (3, 0.083)])
 def test_the_axis_wanders_as_far_as_the_moons_pole_does(cycles, wander):
-    o = Observation.from_runs([Run(1.0)] * cycles)
+    o = lb.Observation.from_runs([lb.Run(1.0)] * cycles)
     pole = o.mcmf_from_galactic()[:, 2]  # the Moon's z axis in Galactic coordinates
     mean = pole.mean(axis=0)
     angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(pole, mean), axis=1), pole @ mean))
@@ -82,12 +81,14 @@ def test_sufficient_order_is_the_lowest_that_bounds_the_series(size, lmax):
 
 
 def test_a_negative_order_is_refused():
-    with pytest.raises(InputError, match="order of the tilt expansion must be 0, 1, ..., got -1"):
-        Pointing.of(Observation.from_runs([Run(0.1)]), 3, order=-1)
+    with pytest.raises(
+        lb.InputError, match="order of the tilt expansion must be 0, 1, ..., got -1"
+    ):
+        Pointing.of(lb.Observation.from_runs([lb.Run(0.1)]), 3, order=-1)
 
 
 def test_runs_and_fixed_rotations():
-    o = Observation.from_runs([Run(0.1, 0.0), Run(0.2, 90.0)])
+    o = lb.Observation.from_runs([lb.Run(0.1, 0.0), lb.Run(0.2, 90.0)])
     p = Pointing.of(o, 3, order=1)
     assert p.n_times == o.n_times
     assert p.order == 1
@@ -106,7 +107,7 @@ def test_runs_and_fixed_rotations():
 def test_functions_and_factors_expand_the_transposed_tilt(monkeypatch):
     monkeypatch.setattr("lusee_bayes.instrument.window_average.TOLERANCE", 1e-15)
     lmax, order = 3, 6
-    o = Observation.from_runs([Run(0.05)])
+    o = lb.Observation.from_runs([lb.Run(0.05)])
     p = Pointing.of(o, lmax, order=order)
     # instants: every order m alike, and nothing imaginary
     factors = np.asarray(p.factors)

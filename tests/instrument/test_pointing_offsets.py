@@ -9,14 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, n_modes
 from lusee_bayes.core.rotations import Rotation, turn_about_x, turn_about_y
-from lusee_bayes.instrument.beams import monopole_beams
-from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, Run
-from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.pointing_offsets import (
     OFFSETS,
     offset_names,
@@ -40,7 +36,7 @@ VALUES = {
 
 
 def two_runs():
-    return Observation.from_runs([Run(0.3), Run(0.4, 30.0)], step_s=20000.0, window="mean")
+    return lb.Observation.from_runs([lb.Run(0.3), lb.Run(0.4, 30.0)], step_s=20000.0, window="mean")
 
 
 def sky():
@@ -53,7 +49,7 @@ def sky():
 
 def seen(pointing, beams):
     layout = DataLayout(16, pointing.n_times)
-    return np.asarray(CouplingMatrix.of_modes(beams.modes, pointing, layout) @ sky())
+    return np.asarray(lb.CouplingMatrix.of_modes(beams.modes, pointing, layout) @ sky())
 
 
 def sigma(v, o):
@@ -71,10 +67,10 @@ def test_turns_about_horizontal_axes(axis):
 
 @pytest.mark.parametrize("names", [(name,) for name in VALUES] + [tuple(VALUES)])
 def test_inside_a_compiled_function_as_exactly_shifted(names):
-    o, beams = two_runs(), monopole_beams(25.0, LMAX)
+    o, beams = two_runs(), lb.monopole_beams(25.0, LMAX)
     values = {name: VALUES[name] for name in names}
-    exact = seen(Pointing.of(with_offsets(o, values), LMAX), beams)
-    nominal = Pointing.of(o, LMAX)
+    exact = seen(lb.Pointing.of(with_offsets(o, values), LMAX), beams)
+    nominal = lb.Pointing.of(o, LMAX)
     got = seen(turned_by_offsets(nominal, o.hours, values), beams)
     before = seen(nominal, beams)
     moved = np.abs((exact - before) / sigma(exact, o)).max()
@@ -86,15 +82,15 @@ def test_inside_a_compiled_function_as_exactly_shifted(names):
 
 
 def test_offsets_are_differentiable():
-    o, beams = two_runs(), monopole_beams(25.0, LMAX)
-    nominal = Pointing.of(o, LMAX)
+    o, beams = two_runs(), lb.monopole_beams(25.0, LMAX)
+    nominal = lb.Pointing.of(o, LMAX)
     a = jnp.asarray(sky())
     names = list(VALUES)
 
     def total(values):
         pointing = turned_by_offsets(nominal, o.hours, dict(zip(names, values, strict=True)))
         layout = DataLayout(16, o.n_times)
-        v = CouplingMatrix.of_modes(jnp.asarray(beams.modes), pointing, layout) @ a
+        v = lb.CouplingMatrix.of_modes(jnp.asarray(beams.modes), pointing, layout) @ a
         return (v * jnp.cos(jnp.arange(v.size))).sum()
 
     at = jnp.asarray(list(VALUES.values()))
@@ -109,7 +105,7 @@ def test_offsets_are_differentiable():
 
 def test_a_leaning_lander_by_hand():
     """Its zenith leans towards East and North, and a source stands lower on the other side."""
-    o = replace(Observation.from_runs([Run(0.01)]), tilt_deg=(2.0, 0.0))
+    o = replace(lb.Observation.from_runs([lb.Run(0.01)]), tilt_deg=(2.0, 0.0))
     up = o.topocentric_from_mcmf() @ o.lander_from_mcmf().T @ [0.0, 0.0, 1.0]
     np.testing.assert_allclose(up, [np.sin(np.radians(2)), 0, np.cos(np.radians(2))], atol=1e-15)
     north = replace(o, tilt_deg=(0.0, 3.0))
@@ -135,5 +131,5 @@ def test_names():
     every = offset_names(tuple(OFFSETS), 2)
     assert every == tuple(VALUES)
     assert offset_names(("turntable_deg",), 1) == ("turntable_deg",)
-    with pytest.raises(InputError, match="no offset 'clock'; did you mean 'clock_s'"):
+    with pytest.raises(lb.InputError, match="no offset 'clock'; did you mean 'clock_s'"):
         offset_names(("clock",), 1)

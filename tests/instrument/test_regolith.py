@@ -4,18 +4,17 @@ import pytest
 from closeness import within
 from reference import layered_reflection
 
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.beams import Regolith
+import lusee_bayes as lb
 
 COSINES = np.cos(np.radians([0.0, 20.0, 45.0, 70.0, 85.0, 89.9]))
 
 
 def uniform(permittivity, loss_tangent):
-    return Regolith(permittivity, permittivity, loss_tangent)
+    return lb.Regolith(permittivity, permittivity, loss_tangent)
 
 
 def test_permittivity_rises_linearly_over_the_layers():
-    eps = np.asarray(Regolith(3.7, 6.1, 0.01).permittivities())
+    eps = np.asarray(lb.Regolith(3.7, 6.1, 0.01).permittivities())
     np.testing.assert_allclose(eps.real, 3.7 + 2.4 * np.arange(8) / 7, rtol=1e-15)
     np.testing.assert_allclose(eps.imag, -0.01 * eps.real, rtol=1e-15)
 
@@ -60,7 +59,7 @@ def test_a_perfect_conductor():
 
 
 def test_grazing_incidence_reflects_everything_with_reversed_sign():
-    s, p = Regolith().reflection(np.array([1e-9]), 25.0)
+    s, p = lb.Regolith().reflection(np.array([1e-9]), 25.0)
     # 2 eps cos theta / n: 4e-9
     np.testing.assert_allclose(s, -1.0, rtol=0, atol=1e-8)
     np.testing.assert_allclose(p, -1.0, rtol=0, atol=1e-8)
@@ -69,7 +68,7 @@ def test_grazing_incidence_reflects_everything_with_reversed_sign():
 @pytest.mark.parametrize("seed", range(5))
 def test_no_more_comes_back_than_arrives(seed):
     rng = np.random.default_rng(seed)
-    ground = Regolith(rng.uniform(1, 10), rng.uniform(1, 10), 10 ** rng.uniform(-4, 1))
+    ground = lb.Regolith(rng.uniform(1, 10), rng.uniform(1, 10), 10 ** rng.uniform(-4, 1))
     for frequency in (1.0, 7.0, 50.0):
         s, p = ground.reflection(rng.uniform(0, 1, 50), frequency)
         assert np.abs(s).max() <= 1.0
@@ -79,7 +78,7 @@ def test_no_more_comes_back_than_arrives(seed):
 @pytest.mark.parametrize("frequency", [1.0, 5.0, 25.0])
 @pytest.mark.parametrize("ground", [(3.7, 6.1, 0.01), (8.0, 2.0, 0.02), (1.5, 9.0, 0.0)])
 def test_layers_agree_with_characteristic_matrices(ground, frequency):
-    regolith = Regolith(*ground)
+    regolith = lb.Regolith(*ground)
     s, p = regolith.reflection(COSINES, frequency)
     eps = np.asarray(regolith.permittivities())
     for k, cosine in enumerate(COSINES):
@@ -90,11 +89,11 @@ def test_layers_agree_with_characteristic_matrices(ground, frequency):
 
 @pytest.mark.parametrize("bad", [(0.0, 6.1), (3.7, -1.0), (np.nan, 6.1)])
 def test_permittivities_are_positive(bad):
-    with pytest.raises(InputError, match="permittivity must be positive"):
-        Regolith(*bad)
-    assert Regolith(jnp.asarray(2.0)).surface_permittivity == 2.0
+    with pytest.raises(lb.InputError, match="permittivity must be positive"):
+        lb.Regolith(*bad)
+    assert lb.Regolith(jnp.asarray(2.0)).surface_permittivity == 2.0
 
 
 def test_a_ground_that_amplifies_is_refused():
-    with pytest.raises(InputError, match="loss_tangent must not be negative, got -0.01"):
-        Regolith(loss_tangent=-0.01)
+    with pytest.raises(lb.InputError, match="loss_tangent must not be negative, got -0.01"):
+        lb.Regolith(loss_tangent=-0.01)

@@ -17,11 +17,7 @@ from scipy.constants import Boltzmann, c, physical_constants
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import from_healpy
-from lusee_bayes.experiment.data_files import read_data
-from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.instrument.beams import (
     CapacitorReceiver,
@@ -31,7 +27,6 @@ from lusee_bayes.instrument.beams import (
 )
 from lusee_bayes.instrument.beams.circuit import loading_matrix
 from lusee_bayes.instrument.products import labels, to_matrix
-from lusee_bayes.instrument.waterfalls import read_waterfall
 from lusee_bayes.testing import small_scenario
 
 VACUUM = physical_constants["characteristic impedance of vacuum"][0]
@@ -75,7 +70,7 @@ def simulated(luseepy, test_data, frequency, times, *, fixed_axis=False) -> np.n
     with np.load(test_data / "luseepy" / "sky_alm.npz") as file:
         sky = dict(file)
     modes = from_healpy(sky["alm"][list(sky["freq"]).index(frequency)])
-    observation = replace(read_waterfall(path).observation.select(times), fixed_axis=fixed_axis)
+    observation = replace(lb.read_waterfall(path).observation.select(times), fixed_axis=fixed_axis)
     beams = response.beams(frequency, LMAX, grid=response.luseepy_grid, unit="V2/Hz")
     seen = np.asarray(lb.CouplingMatrix.observe(beams, observation) @ jnp.asarray(modes))
     moon = np.asarray(response.background(frequency, MOON, unit="V2/Hz"))
@@ -294,7 +289,7 @@ def test_receivers(tmp_path):
     measured = read_receiver(write_images(tmp_path / "zl.fits", images, {}))
     zl = 0.45 * loads[0] + 0.55 * loads[1]
     np.testing.assert_allclose(measured.load(21.0), zl, rtol=1e-13)
-    with pytest.raises(InputError, match=r"zl.fits has values from 10 to 30 MHz, not at 31"):
+    with pytest.raises(lb.InputError, match=r"zl.fits has values from 10 to 30 MHz, not at 31"):
         measured.load(31.0)
     response = replace(read_beam(write(tmp_path / "response.fits")), receiver=measured)
     za = 0.95 * response.impedance[1] + 0.05 * response.impedance[2]
@@ -346,15 +341,15 @@ def test_open_ports_and_turns(tmp_path):
     ],
 )  # fmt: skip
 def test_files_that_cannot_be_used(tmp_path, options, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(lb.InputError, match=message):
         read_beam(write(tmp_path / "response.fits", **options))
 
 
 def test_no_extrapolation_and_no_other_unit(tmp_path):
     response = read_beam(write(tmp_path / "response.fits"))
-    with pytest.raises(InputError, match="from 10 to 40 MHz, not at 50"):
+    with pytest.raises(lb.InputError, match="from 10 to 40 MHz, not at 50"):
         response.beams(50.0, 4)
-    with pytest.raises(InputError, match="unknown unit 'mK'"):
+    with pytest.raises(lb.InputError, match="unknown unit 'mK'"):
         response.fields.__wrapped__(response, 20.0, unit="mK")
 
 
@@ -365,7 +360,7 @@ def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
     path = write(tmp_path / "response.fits")
     given = ["frequency_mhz=20", f"beam.file={path}", "beam.moon_temperature_k=5e4"]
     cold_scenario = small_scenario(*given[:-1], cycles=0.05)
-    warm, cold = build(small_scenario(*given, cycles=0.05)), build(cold_scenario)
+    warm, cold = lb.build(small_scenario(*given, cycles=0.05)), lb.build(cold_scenario)
     setup, data = warm.setup, warm.data
     np.testing.assert_array_equal(setup.beams.modes, read_beam(path).beams(20.0, 6).modes)
     moon = np.asarray(read_beam(path).background(20.0, 5e4))
@@ -378,10 +373,10 @@ def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
     assert data.data.mean() > cold.data.data.mean()
     levels = [float(radiometer(e.setup).diagonal().sum()) for e in (warm, cold)]
     assert levels[0] > levels[1]
-    sky, posterior = np.asarray(setup.sky.modes), infer(warm).posterior
+    sky, posterior = np.asarray(setup.sky.modes), lb.infer(warm).posterior
     off_by = (np.asarray(posterior.mean) - sky) / np.asarray(posterior.std())
     assert np.sqrt((off_by**2).mean()) < 1.5
-    wrong = infer(build(cold_scenario, data)).posterior
+    wrong = lb.infer(lb.build(cold_scenario, data)).posterior
     off_by = (np.asarray(wrong.mean) - sky) / np.asarray(wrong.std())
     assert off_by[0] > 5.0  # a warm Moon looks like a warmer sky
 
@@ -399,14 +394,14 @@ def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
 def test_data_of_another_instrument(luseepy, overrides, message):
     response, path, _ = luseepy
     given = ["frequency_mhz=10", *(o.format(response=response.path) for o in overrides)]
-    with pytest.raises(InputError, match=message):
-        read_data(path, lb.load_scenario("fiducial", given))
+    with pytest.raises(lb.InputError, match=message):
+        lb.read_data(path, lb.load_scenario("fiducial", given))
 
 
 def test_luseepys_data_in_kelvin(luseepy):
     response, path, images = luseepy
     given = ["frequency_mhz=10", f"beam.file={response.path}", "beam.moon_temperature_k=250"]
-    data = read_data(path, lb.load_scenario("fiducial", given))
+    data = lb.read_data(path, lb.load_scenario("fiducial", given))
     assert (data.n_missing, data.frequency_mhz) == (0, 10.0)
     enclosure = matrix(images, "blackbody_normalization", 1).diagonal().real
     for place, label in enumerate(labels()):
@@ -477,7 +472,7 @@ def test_headers_that_contradict_the_reader_are_refused(tmp_path, words):
     path = write_response(tmp_path / "response.fits")
     for key, value in words.items():
         fits.setval(path, f"HIERARCH {key}", value=value)
-    with pytest.raises(InputError, match="|".join([*words, "unit"])) as refused:
+    with pytest.raises(lb.InputError, match="|".join([*words, "unit"])) as refused:
         read_beam(path)
     assert "expected" in str(refused.value) or "known" in str(refused.value)
 

@@ -10,7 +10,7 @@ from reference import galactic_directions, hemisphere, real_harmonics
 from scipy.signal import hilbert
 from scipy.special import eval_legendre
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.instrument.beams import (
     HemisphereGrid,
     Monopoles,
@@ -21,8 +21,6 @@ from lusee_bayes.instrument.beams import (
 )
 from lusee_bayes.instrument.beams.fields import unit_vectors
 from lusee_bayes.instrument.beams.product_beams import mean_auto_integral, stokes_pairs
-from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.observation import Observation, Run
 from lusee_bayes.instrument.products import labels, to_matrix, to_real
 from lusee_bayes.instrument.source_response import antenna_directions, source_response
 
@@ -37,7 +35,7 @@ def vectors(theta, phi):
 
 
 def observation(turntable=(0.0, 35.0, -110.0), step_s=10800.0, cycles=0.35):
-    return Observation.from_runs([Run(cycles, angle) for angle in turntable], step_s=step_s)
+    return lb.Observation.from_runs([lb.Run(cycles, angle) for angle in turntable], step_s=step_s)
 
 
 # samples of that observation
@@ -276,7 +274,7 @@ def test_a_smoothed_source_agrees_with_the_coupling_matrix():
     n0 = o.zenith_galactic()[2] + np.array([0.1, 0.25, -0.2])
     n0 /= np.linalg.norm(n0)
     modes, g = smoothed_source(n0, sigma, lmax)
-    coupling = CouplingMatrix.observe(monopole_beams(FREQUENCY, lmax), o)
+    coupling = lb.CouplingMatrix.observe(monopole_beams(FREQUENCY, lmax), o)
     expected = np.asarray(coupling @ jnp.asarray(modes)).reshape(16, o.n_times)
     n, weights = around(n0, g, 6.0 * sigma, 28, 36)
     np.testing.assert_allclose(weights.sum(), 1.0, rtol=0, atol=1e-6)
@@ -284,7 +282,7 @@ def test_a_smoothed_source_agrees_with_the_coupling_matrix():
     def integral(turntable):
         # every sample once for each direction, microseconds apart: the Moon turns by 3e-9 meanwhile
         apart = np.tile(1e-6 * np.arange(len(n)), o.n_times)
-        copies = Observation(
+        copies = lb.Observation(
             o.lon_deg,
             o.lat_deg,
             Time(np.repeat(o.times.jd, len(n)), format="jd", scale="utc") + apart * u.s,
@@ -354,12 +352,12 @@ def test_the_circularly_polarised_part_enters_by_the_v_beam():
     ],
 )
 def test_bad_directions_are_refused(arguments, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(lb.InputError, match=message):
         beams_towards(*arguments)
 
 
 def test_unknown_stokes_parameters_are_refused():
-    with pytest.raises(InputError, match="unknown Stokes parameter 'v'"):
+    with pytest.raises(lb.InputError, match="unknown Stokes parameter 'v'"):
         beams_towards(25.0, ZENITH, stokes="v")
 
 
@@ -376,5 +374,5 @@ def test_unknown_stokes_parameters_are_refused():
     ],
 )
 def test_bad_sources_are_refused(galactic, options, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(lb.InputError, match=message):
         source_response(observation(), galactic, FREQUENCY, **options)

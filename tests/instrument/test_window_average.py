@@ -8,13 +8,9 @@ import pytest
 from astropy.coordinates import ICRS, CartesianRepresentation, Galactic
 from lunarsky import LunarTopo, MoonLocation
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, n_modes
 from lusee_bayes.core.rotations import Rotation
-from lusee_bayes.instrument.beams import monopole_beams
-from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.observation import Observation, Run
-from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.times import unannounced_leap_seconds
 from lusee_bayes.instrument.window_average import sufficient_nodes
 from lusee_bayes.instrument.windows import Windows
@@ -49,7 +45,7 @@ def partly_filled(n, step_s, seed=1):
 
 def observation(step_s, filled):
     """Eight samples across a cycle, so that the pole has wandered between them."""
-    whole = Observation.from_runs([Run(1.0, 20.0)], step_s=step_s, window="mean")
+    whole = lb.Observation.from_runs([lb.Run(1.0, 20.0)], step_s=step_s, window="mean")
     keep = np.zeros(whole.n_times, dtype=bool)
     keep[np.linspace(0, whole.n_times - 1, 8).astype(int)] = True
     some = whole.select(keep)
@@ -77,8 +73,8 @@ def sigma_of(v, o):
 @pytest.mark.parametrize("filled", [False, True])
 @pytest.mark.parametrize("step_s", [10.0, 600.0, 7200.0, 43200.0])
 def test_equals_the_mean_of_200_instants(step_s, filled, lmax):
-    o, beams, sky = observation(step_s, filled), monopole_beams(25.0, lmax), galactic_sky(lmax)
-    got = np.asarray(CouplingMatrix.observe(beams, o) @ sky).reshape(16, -1)
+    o, beams, sky = observation(step_s, filled), lb.monopole_beams(25.0, lmax), galactic_sky(lmax)
+    got = np.asarray(lb.CouplingMatrix.observe(beams, o) @ sky).reshape(16, -1)
     expected = np.zeros_like(got)
     for k in range(o.n_times):
         offsets, weights = nodes_of(o.windows, k, 200)
@@ -86,13 +82,13 @@ def test_equals_the_mean_of_200_instants(step_s, filled, lmax):
             times = o.times[k] + offsets * u.s
         run = np.zeros(len(times), dtype=int)
         instants = replace(o, times=times, run=run, windows=None)
-        pointing = Pointing.of(instants, lmax, order=4)
-        v = np.asarray(CouplingMatrix.build(beams, pointing) @ sky).reshape(16, -1)
+        pointing = lb.Pointing.of(instants, lmax, order=4)
+        v = np.asarray(lb.CouplingMatrix.build(beams, pointing) @ sky).reshape(16, -1)
         expected[:, k] = v @ weights
     off = (got - expected) / sigma_of(expected, o)
     assert np.abs(off).max() < 1e-6
     # and instants at the same times would not do
-    instants = np.asarray(CouplingMatrix.observe(beams, replace(o, windows=None)) @ sky)
+    instants = np.asarray(lb.CouplingMatrix.observe(beams, replace(o, windows=None)) @ sky)
     wrong = np.abs((instants.reshape(16, -1) - expected) / sigma_of(expected, o)).max()
     assert wrong > {10.0: 1e-8, 600.0: 1e-4, 7200.0: 0.1, 43200.0: 10.0}[step_s]
 
@@ -116,8 +112,8 @@ def antenna_frame(o, time):
     [(7200.0, False, 20), pytest.param(43200.0, True, 47, marks=pytest.mark.long)],
 )
 def test_equals_the_mean_of_20_instants_by_lunarsky(step_s, filled, lmax):
-    o, beams, sky = observation(step_s, filled), monopole_beams(25.0, lmax), galactic_sky(lmax)
-    got = np.asarray(CouplingMatrix.observe(beams, o) @ sky).reshape(16, -1)
+    o, beams, sky = observation(step_s, filled), lb.monopole_beams(25.0, lmax), galactic_sky(lmax)
+    got = np.asarray(lb.CouplingMatrix.observe(beams, o) @ sky).reshape(16, -1)
     for k in (1, 2, 7):
         offsets, weights = nodes_of(o.windows, k, 20)
         expected = 0.0
@@ -132,12 +128,12 @@ def test_equals_the_mean_of_20_instants_by_lunarsky(step_s, filled, lmax):
 
 def test_a_fixed_axis_gives_a_factor_for_each_order():
     """sin(m h) / (m h), h half of the angle of a window, where nothing wanders."""
-    o = Observation.from_runs([Run(0.2)], step_s=7200.0, window="mean")
-    p = Pointing.of(o, 30, order=0)
+    o = lb.Observation.from_runs([lb.Run(0.2)], step_s=7200.0, window="mean")
+    p = lb.Pointing.of(o, 30, order=0)
     # the Moon's own turn, from its orientations at the ends of the windows
     with unannounced_leap_seconds():
         edges = replace(o, times=o.times - 3600.0 * u.s, windows=None)
-    half = np.diff(np.unwrap(np.asarray(Pointing.of(edges, 2).azimuth))) / 2.0
+    half = np.diff(np.unwrap(np.asarray(lb.Pointing.of(edges, 2).azimuth))) / 2.0
     got = np.asarray(p.functions)[:-1] @ np.asarray(p.factors)[:, 0, :, 0]
     m = np.arange(31)
     # what functions of time leave out
@@ -155,28 +151,34 @@ def test_nodes_suffice(angle):
 
 def test_windows_that_cannot_be():
     one = np.array([1.0])
-    with pytest.raises(InputError, match="sample 0 ends -1 s from its time, not after its start"):
+    with pytest.raises(
+        lb.InputError, match="sample 0 ends -1 s from its time, not after its start"
+    ):
         Windows.whole(one, -one)
-    with pytest.raises(InputError, match="sample 0 was live for 3 s of a window of 2 s"):
+    with pytest.raises(lb.InputError, match="sample 0 was live for 3 s of a window of 2 s"):
         Windows.whole(-one, one, 3 * one)
-    with pytest.raises(InputError, match="sample 0 has a live time of 0 s"):
+    with pytest.raises(lb.InputError, match="sample 0 has a live time of 0 s"):
         Windows.whole(-one, one, 0 * one)
-    with pytest.raises(InputError, match="sample 0 has a piece that begins at 0.5 s, before"):
+    with pytest.raises(lb.InputError, match="sample 0 has a piece that begins at 0.5 s, before"):
         Windows(np.array([0, 0]), np.array([0.0, 0.5]), np.array([1.0, 2.0]), np.ones(2))
-    with pytest.raises(InputError, match="must count the samples 0, 1"):
+    with pytest.raises(lb.InputError, match="must count the samples 0, 1"):
         Windows(np.array([0, 2]), np.zeros(2), np.ones(2), np.ones(2))
     none = np.zeros(0)
-    with pytest.raises(InputError, match="same length, with at least one piece"):
+    with pytest.raises(lb.InputError, match="same length, with at least one piece"):
         Windows(none.astype(int), none, none, none)
-    o = Observation.from_runs([Run(0.05)], window="mean")
+    o = lb.Observation.from_runs([lb.Run(0.05)], window="mean")
     n = np.ones(o.n_times)
-    with pytest.raises(InputError, match="the window of sample 0 lasts 8000 s, longer than the st"):
+    with pytest.raises(
+        lb.InputError, match="the window of sample 0 lasts 8000 s, longer than the st"
+    ):
         replace(o, windows=Windows.whole(-4000 * n, 4000 * n))
-    with pytest.raises(InputError, match=r"samples 0 and 1 \(2027-01-15T01:00:00\) overlap by 600"):
+    with pytest.raises(
+        lb.InputError, match=r"samples 0 and 1 \(2027-01-15T01:00:00\) overlap by 600"
+    ):
         replace(o, windows=Windows.whole(-3600 * n, 3600 * n + 600 * (o.hours == 0)), step_s=8e3)
-    with pytest.raises(InputError, match="windows of 3 samples for 16 times"):
+    with pytest.raises(lb.InputError, match="windows of 3 samples for 16 times"):
         replace(o, windows=Windows.whole(-n[:3], n[:3]))
-    with pytest.raises(InputError, match="samples are instants; use observation.window=instant"):
+    with pytest.raises(lb.InputError, match="samples are instants; use observation.window=instant"):
         replace(o, fixed_axis=True)
 
 

@@ -12,11 +12,8 @@ import xarray as xr
 from astropy.time import Time
 from closeness import within
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, Run
-from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.instrument.visibilities_file import read_visibilities
 from lusee_bayes.instrument.windows import Windows
 from lusee_bayes.report.describe import describe
 
@@ -27,7 +24,7 @@ VALUES = np.arange(4.0 * 16).reshape(4, 16)
 
 
 def made(times=STARTS, **options):
-    return Visibilities.from_arrays(VALUES[: len(times)], times, 25.0, **options)
+    return lb.Visibilities.from_arrays(VALUES[: len(times)], times, 25.0, **options)
 
 
 def bounds_of(observation):
@@ -39,7 +36,9 @@ def bounds_of(observation):
 @pytest.fixture
 def data():
     """Windows in pieces of odd lengths, and flags."""
-    observation = Observation.from_runs([Run(0.01), Run(0.01, turntable_deg=30.0)], window="mean")
+    observation = lb.Observation.from_runs(
+        [lb.Run(0.01), lb.Run(0.01, turntable_deg=30.0)], window="mean"
+    )
     n = observation.n_times
     rng = np.random.default_rng(5)
     edges = np.sort(rng.uniform(-3600.0, 3600.0, (n, 4)), axis=1)
@@ -48,11 +47,11 @@ def data():
     windows = Windows(np.repeat(np.arange(n), 2), start, end, live)
     observation = replace(observation, windows=windows)
     layout = DataLayout.from_flags(rng.random((16, n)) < 0.1)
-    return Visibilities(rng.normal(size=layout.size), layout, observation, 25.0)
+    return lb.Visibilities(rng.normal(size=layout.size), layout, observation, 25.0)
 
 
 def test_windows_come_back_to_the_last_bit(data, tmp_path):
-    again = read_visibilities(data.write(tmp_path / "data.nc"))
+    again = lb.read_visibilities(data.write(tmp_path / "data.nc"))
     for name in ("sample", "start_s", "end_s", "live_s"):
         there, here = (getattr(d.observation.windows, name) for d in (data, again))
         np.testing.assert_array_equal(here, there)
@@ -110,7 +109,7 @@ def test_bounds_of_other_software_are_windows(tmp_path, units):
     path = rewritten(made(timestamp="start"), tmp_path / "foreign.nc", foreign)
     with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as raw:
         assert "units" not in raw["time_bounds"].attrs
-    again = read_visibilities(path)
+    again = lb.read_visibilities(path)
     expected = STEP * np.stack([np.arange(4), np.arange(1, 5)], axis=1)
     # days in double precision since New Year: 3e-7 s, and a Julian date in two parts
     np.testing.assert_allclose(bounds_of(again.observation), expected, rtol=0, atol=1e-6)
@@ -123,7 +122,7 @@ def test_instants_and_silent_files(data, tmp_path):
     instants = made(timestamp="instant")
     assert instants.observation.windows is None
     path = instants.write(tmp_path / "instants.nc")
-    again = read_visibilities(path)
+    again = lb.read_visibilities(path)
     assert again.says_window and again.observation.windows is None
     assert "times are instants" in describe(path)
 
@@ -132,16 +131,16 @@ def test_instants_and_silent_files(data, tmp_path):
         return dataset
 
     path = rewritten(instants, tmp_path / "silent.nc", silent)
-    again = read_visibilities(path)
+    again = lb.read_visibilities(path)
     assert not again.says_window and again.observation.windows is None
     assert "does not say what its times are" in describe(path)
     # what does not say it does not learn it by being written
-    assert not read_visibilities(again.write(tmp_path / "again.nc")).says_window
+    assert not lb.read_visibilities(again.write(tmp_path / "again.nc")).says_window
     assert "it is not known what the times are" in repr(again)
     assert "not known" not in repr(instants)
     started = again.stamped("start")
     np.testing.assert_allclose(bounds_of(started.observation)[:, 0], STEP * np.arange(4), atol=1e-6)
-    with pytest.raises(InputError, match="the data have windows"):
+    with pytest.raises(lb.InputError, match="the data have windows"):
         started.stamped("end")
 
 
@@ -206,8 +205,8 @@ def bounds_alone(change):
 )
 def test_windows_that_a_file_cannot_have(tmp_path, change, words):
     path = rewritten(made(), tmp_path / "bad.nc", change)
-    with pytest.raises(InputError) as caught:
-        read_visibilities(path)
+    with pytest.raises(lb.InputError) as caught:
+        lb.read_visibilities(path)
     assert words in str(caught.value)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
@@ -267,7 +266,7 @@ def test_rounded_times_make_no_overlaps():
         {"step_s": 60.0, "live_s": np.full(400, 60.0)},
         {"bounds": edges},
     ):
-        observation = Visibilities.from_arrays(
+        observation = lb.Visibilities.from_arrays(
             data, rounded, 25.0, timestamp="start", **options
         ).observation
         found = bounds_of(observation)
@@ -303,7 +302,7 @@ PAIRS = [[s, s + timedelta(seconds=STEP)] for s in STARTS]
     ],
 )
 def test_what_is_wrong_is_said_in_a_sentence(options, words):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(lb.InputError) as caught:
         made(**options)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -15,13 +15,8 @@ import pytest
 from reference_linear import assert_draws_follow
 from scipy.stats import chi2, kstest
 
-from lusee_bayes.instrument.beams import monopole_beams
-from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.observation import Observation, Run
+import lusee_bayes as lb
 from lusee_bayes.linear.model import FORMS, LinearGaussian
-from lusee_bayes.noise import radiometer_noise
-from lusee_bayes.noise.covariance import Covariance, DenseCovariance, TimeBlockCovariance
-from lusee_bayes.sky.priors import HarmonicPrior
 
 LMAX, N_MODES, N_DRAWS, SEED = 8, 81, 4000, 20270115
 SPECTRUM = 1e8 * (1.0 + np.arange(LMAX + 1.0)) ** -2.5  # K^2; the monopole is 20000 K below
@@ -32,26 +27,26 @@ class Setup:
     """A of a short run and the noise terms of a 20000 K sky."""
 
     def __init__(self, beams, cycles: float):
-        observation = Observation.from_runs([Run(cycles)])
-        self.coupling = CouplingMatrix.observe(beams, observation)
+        observation = lb.Observation.from_runs([lb.Run(cycles)])
+        self.coupling = lb.CouplingMatrix.observe(beams, observation)
         layout = self.coupling.layout
         monopole = jnp.zeros(N_MODES).at[0].set(2e4 * np.sqrt(4 * np.pi))
         fiducial = self.coupling @ monopole
         grid = layout.scatter(fiducial)
-        paper, exact = (radiometer_noise(grid, layout, form=form) for form in ("paper", "exact"))
+        paper, exact = (lb.radiometer_noise(grid, layout, form=form) for form in ("paper", "exact"))
         # gains that drift together over 10 h, of the radiometer noise's own size
         hours = observation.hours[layout.time]
         kernel = np.exp(-((hours[:, None] - hours[None]) ** 2) / (2 * 10.0**2))
         signal = np.asarray(fiducial)
-        gain = DenseCovariance(jnp.asarray(1e-10 * np.outer(signal, signal) * kernel), "gain")
+        gain = lb.DenseCovariance(jnp.asarray(1e-10 * np.outer(signal, signal) * kernel), "gain")
         self.noise = {
             "paper": paper,
             "exact": exact,
-            "dense": DenseCovariance(exact.dense() + gain.dense()),
+            "dense": lb.DenseCovariance(exact.dense() + gain.dense()),
             "diagonal+dense": paper + gain,
         }
 
-    def simulate(self, noise: Covariance):
+    def simulate(self, noise: lb.Covariance):
         """(skies, data) of N_DRAWS skies from the prior and noise from N, by numpy."""
         rng = np.random.default_rng(SEED)
         skies = rng.normal(size=(N_DRAWS, N_MODES)) * PRIOR_STD
@@ -59,10 +54,10 @@ class Setup:
         added = rng.normal(size=(N_DRAWS, noise.size)) @ root.T
         return skies, skies @ np.asarray(self.coupling.dense()).T + added
 
-    def standardised(self, truth: Covariance, assumed: Covariance, form: str) -> np.ndarray:
+    def standardised(self, truth: lb.Covariance, assumed: lb.Covariance, form: str) -> np.ndarray:
         """C^-1/2 (m - mean), shape (draws, modes), of data with noise ``truth``."""
         skies, data = self.simulate(truth)
-        prior = HarmonicPrior(jnp.asarray(SPECTRUM))
+        prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM))
         solver = LinearGaussian(self.coupling, prior, assumed).factorise(form)
         means = jax.jit(jax.vmap(lambda d: solver.condition(d).mean))(jnp.asarray(data))
         covariance = np.asarray(solver.condition(jnp.asarray(data[0])).covariance())
@@ -78,7 +73,7 @@ def p_value(standardised: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def beams():
-    return monopole_beams(25.0, LMAX)
+    return lb.monopole_beams(25.0, LMAX)
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +128,7 @@ def test_notices_correlations_missing_at_one_time_of_32(long_run):
     exact = long_run.noise["exact"]
     blocks = np.array(exact.blocks)
     blocks[3] = np.diag(np.diag(blocks[3]))
-    wrong = TimeBlockCovariance(jnp.asarray(blocks), exact.layout)
+    wrong = lb.TimeBlockCovariance(jnp.asarray(blocks), exact.layout)
     assert p_value(long_run.standardised(exact, wrong, "map")) < 1e-4
 
 

@@ -4,9 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from lusee_bayes.experiment.experiment import build
+import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.results.map_result import map_result
 
@@ -15,8 +14,8 @@ pytestmark = pytest.mark.long
 
 @pytest.mark.parametrize("frequency", [5, 25, 45])
 def test_one_word_changes_the_frequency(frequency):
-    scenario = load_scenario("fiducial", [f"frequency_mhz={frequency}"])
-    result = map_result(build(scenario))
+    scenario = lb.load_scenario("fiducial", [f"frequency_mhz={frequency}"])
+    result = map_result(lb.build(scenario))
     spectra, summary = result.channel.spectra(), result.summary()
     assert spectra["rho"][1:11].min() > 0.9
     assert summary["ell_cross"] >= 20
@@ -28,8 +27,8 @@ def test_one_word_changes_the_frequency(frequency):
 
 @pytest.mark.parametrize("form", ["paper", "exact"])
 def test_both_forms_agree_at_the_fiducial_condition_number(form):
-    scenario = load_scenario("fiducial", [f"noise.radiometer.form={form}"])
-    experiment = build(scenario)
+    scenario = lb.load_scenario("fiducial", [f"noise.radiometer.form={form}"])
+    experiment = lb.build(scenario)
     model, data = full_model(experiment.setup), experiment.data
     by_map, by_data = (model.condition(data.data, form=f) for f in ("map", "data"))
     std = np.asarray(by_data.std())
@@ -42,7 +41,7 @@ def test_both_forms_agree_at_the_fiducial_condition_number(form):
 
 def test_skies_from_the_prior_are_calibrated_at_full_size():
     # chi^2 per mode over 20 skies: 1 +- sqrt(2 / (20 x 2304)), the design's 0.996 +- 0.012 for few
-    scenario = load_scenario("fiducial", ["noise.radiometer.form=exact"])
+    scenario = lb.load_scenario("fiducial", ["noise.radiometer.form=exact"])
     model = full_model(set_up(scenario))
     solver = model.factorise()
     total, n_skies = 0.0, 20

@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.linear.freedom import data_freedom
-from lusee_bayes.noise.covariance import DiagonalCovariance, LowRankCovariance
-from lusee_bayes.sky.priors import HarmonicPrior
 
 
 @pytest.mark.parametrize("dense", [0, 10**8])
@@ -18,8 +15,8 @@ def test_it_is_the_diagonal_of_a_product_of_matrices(monkeypatch, dense):
     rng = np.random.default_rng(0)
     a, v, other = rng.normal(size=(30, 9)), rng.normal(size=(30, 2)), rng.normal(size=(30, 1))
     spectrum, n = np.array([4.0, 1.0, 0.3]), rng.uniform(0.5, 2.0, 30)
-    noise = DiagonalCovariance(n) + LowRankCovariance(v) + LowRankCovariance(other)
-    model = lb.LinearGaussian(DenseCoupling(a), HarmonicPrior(spectrum), noise)
+    noise = lb.DiagonalCovariance(n) + lb.LowRankCovariance(v) + lb.LowRankCovariance(other)
+    model = lb.LinearGaussian(lb.DenseCoupling(a), lb.HarmonicPrior(spectrum), noise)
     signal = a @ np.diag(np.repeat(spectrum, [1, 3, 5])) @ a.T + v @ v.T
     whole = signal + np.diag(n) + other @ other.T
     expected = np.diag(signal @ np.linalg.inv(whole))

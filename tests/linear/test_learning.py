@@ -10,8 +10,7 @@ import pytest
 from jaxtyping import TypeCheckError
 from scipy.optimize import minimize
 
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.linear.information import Information
+import lusee_bayes as lb
 from lusee_bayes.linear.learning import (
     ROUNDING,
     _root,
@@ -20,24 +19,21 @@ from lusee_bayes.linear.learning import (
     learn_whatever_fits,
 )
 from lusee_bayes.linear.marginal_information import marginalised
-from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.sky.isotropic_family import IsotropicFamily
 from lusee_bayes.sky.local_scales import embedded_local_scales
-from lusee_bayes.sky.priors import HarmonicPrior
 
 LMAX, N_DATA = 6, 120
 
 
-def information_of(sky: np.ndarray, noise: float = 30.0, seed: int = 2) -> Information:
+def information_of(sky: np.ndarray, noise: float = 30.0, seed: int = 2) -> lb.Information:
     """Of data of a sky through a random A."""
     rng = np.random.default_rng(seed)
     coupling = rng.standard_normal((N_DATA, len(sky))) / np.sqrt(len(sky))
     data = coupling @ sky + noise * rng.standard_normal(N_DATA)
-    model = LinearGaussian(
+    model = lb.LinearGaussian(
         coupling,
-        HarmonicPrior(np.full(LMAX + 1, 1e8)),
-        DiagonalCovariance(np.full(N_DATA, noise**2)),
+        lb.HarmonicPrior(np.full(LMAX + 1, 1e8)),
+        lb.DiagonalCovariance(np.full(N_DATA, noise**2)),
     )
     return model.inform(data)[0]
 
@@ -45,7 +41,7 @@ def information_of(sky: np.ndarray, noise: float = 30.0, seed: int = 2) -> Infor
 @dataclass(frozen=True)
 class Case:
     family: IsotropicFamily
-    information: Information
+    information: lb.Information
     truth: np.ndarray
 
 
@@ -112,21 +108,21 @@ def test_learning_gains_over_the_start_under_local_scales():
 def test_others_integrated_out(case):
     """The evidence of the first modes alone, with the others' prior in it, is that of all."""
     spectrum = np.geomspace(1e8, 1e5, LMAX + 1)
-    prior = HarmonicPrior(spectrum)
+    prior = lb.HarmonicPrior(spectrum)
     everything = case.information.posterior(prior)
     n = 16
     few = marginalised(case.information, n, np.asarray(prior.variance())[n:])
-    found = few.posterior(HarmonicPrior(spectrum[:4]))
+    found = few.posterior(lb.HarmonicPrior(spectrum[:4]))
     assert float(found.log_evidence) == pytest.approx(float(everything.log_evidence), abs=1e-6)
     np.testing.assert_allclose(found.mean, everything.mean[:n], rtol=1e-7, atol=1e-4)
     np.testing.assert_allclose(found.std(), everything.std()[:n], rtol=1e-7)
-    with pytest.raises((InputError, TypeCheckError)):
+    with pytest.raises((lb.InputError, TypeCheckError)):
         marginalised(case.information, n, np.ones(3))
 
 
 def test_nothing_settles_without_steps(case, monkeypatch):
     monkeypatch.setattr("lusee_bayes.linear.learning.MAX_STEPS", 0)
-    with pytest.raises(InputError, match="did not settle in 0 steps"):
+    with pytest.raises(lb.InputError, match="did not settle in 0 steps"):
         learn(case.family, case.information)
     # a family far from its own start is still found
     far = replace(case.family, log_monopole=case.family.log_monopole + 1.0)
@@ -154,10 +150,10 @@ def test_raised_information_is_that_of_raised_noise():
     n = (LMAX + 1) ** 2
     coupling, data = rng.standard_normal((N_DATA, n)), 100.0 * rng.standard_normal(N_DATA)
     plain, expected = (
-        LinearGaussian(
+        lb.LinearGaussian(
             coupling,
-            HarmonicPrior(np.full(LMAX + 1, 1e4)),
-            DiagonalCovariance(np.full(N_DATA, variance)),
+            lb.HarmonicPrior(np.full(LMAX + 1, 1e4)),
+            lb.DiagonalCovariance(np.full(N_DATA, variance)),
         ).inform(data)[0]
         for variance in (9.0, 63.0)
     )

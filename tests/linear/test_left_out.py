@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from closeness import close
 
-from lusee_bayes.experiment.experiment import build
+import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.linear import left_out_structured
 from lusee_bayes.linear.held_out import held_out
 from lusee_bayes.linear.left_out_dense import DenseLeftOut
@@ -42,7 +41,7 @@ def test_it_is_what_matrices_say(size, kind, kept, monkeypatch):
     if kept and size is OFTEN:
         pytest.skip("smooth functions are not kept")
     monkeypatch.setattr(left_out_structured, "KEPT_BYTES", kept)
-    e = build(load_scenario("fiducial", [*size, NOISY, *KINDS[kind]]))
+    e = lb.build(lb.load_scenario("fiducial", [*size, NOISY, *KINDS[kind]]))
     model, observation = full_model(e.setup), e.data.observation
     structured = StructuredLeftOut(model, model.condition(e.data.data), e.data.data)
     dense = DenseLeftOut(model, e.data.data, e.data.layout)
@@ -59,7 +58,7 @@ def test_it_is_what_matrices_say(size, kind, kept, monkeypatch):
 
 def test_densities_of_groups_are_what_the_covariance_of_the_data_says():
     """ln p(d_s | others) = ln p(d) - ln p(others), each of K = A S A^T + N as a matrix."""
-    e = build(load_scenario("fiducial", [*FEW, NOISY]))
+    e = lb.build(lb.load_scenario("fiducial", [*FEW, NOISY]))
     model = full_model(e.setup)
     a, n = (np.asarray(x) for x in (model.coupling.dense(), model.noise.dense()))
     k = a @ np.diag(model.prior.variance()) @ a.T + n
@@ -89,7 +88,7 @@ def test_densities_of_groups_are_what_the_covariance_of_the_data_says():
 def test_what_is_taken_out_leaves_the_model_of_the_rest(kind):
     """K = A S A^T + N of the others as a matrix: their u, and a time's chi^2 given the rest."""
     drift = ["noise.gain={sigma: 0.01, visibilities: model}"]
-    e = build(load_scenario("fiducial", [*FEW, NOISY, *KINDS.get(kind, drift)]))
+    e = lb.build(lb.load_scenario("fiducial", [*FEW, NOISY, *KINDS.get(kind, drift)]))
     model, layout = full_model(e.setup), e.data.layout
     gone = np.zeros((layout.n_products, layout.n_times), dtype=bool)
     gone[:, 4] = gone[6, 9] = gone[2] = True

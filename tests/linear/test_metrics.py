@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import lusee_bayes as lb
 from lusee_bayes.core.harmonics import to_healpy
-from lusee_bayes.instrument.observation import Observation, Run
 from lusee_bayes.linear.metrics import (
     correlation,
     effective_resolution_deg,
@@ -17,9 +17,6 @@ from lusee_bayes.linear.metrics import (
     prior_fraction_per_ell,
     signal_to_noise,
 )
-from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.noise.covariance import DiagonalCovariance
-from lusee_bayes.sky.priors import HarmonicPrior
 
 LMAX = 5
 
@@ -64,9 +61,9 @@ def solved():
     rng = np.random.default_rng(5)
     n_data = 60
     coupling = jnp.asarray(rng.standard_normal((n_data, 16)))
-    noise = DiagonalCovariance(jnp.asarray(rng.uniform(0.5, 2.0, n_data)))
-    prior = HarmonicPrior(jnp.asarray([4.0, 2.0, 1.0, 0.5]))
-    model = LinearGaussian(coupling, prior, noise)
+    noise = lb.DiagonalCovariance(jnp.asarray(rng.uniform(0.5, 2.0, n_data)))
+    prior = lb.HarmonicPrior(jnp.asarray([4.0, 2.0, 1.0, 0.5]))
+    model = lb.LinearGaussian(coupling, prior, noise)
     return model, model.factorise()
 
 
@@ -97,7 +94,7 @@ def test_prior_fraction_per_ell(solved):
 def test_the_sky_that_never_rises_is_a_cap_round_the_north_pole():
     # from latitude -23.8 the Moon's north pole stays 23.8 degrees below the horizon; the site sees
     # all but a cap of that radius about it in one cycle (paper: "within ~24 degrees of the NCP")
-    observation = Observation.from_runs([Run()], step_s=3600.0)
+    observation = lb.Observation.from_runs([lb.Run()], step_s=3600.0)
     nside = 32
     highest = highest_altitude(observation, nside)
     hidden = highest < 0

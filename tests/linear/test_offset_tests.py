@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 
-from lusee_bayes.instrument.coupling import DenseCoupling
-from lusee_bayes.linear.model import LinearGaussian
+import lusee_bayes as lb
 from lusee_bayes.linear.offset_tests import preferences
-from lusee_bayes.noise.covariance import DiagonalCovariance, LowRankCovariance
-from lusee_bayes.sky.priors import HarmonicPrior
 
 N_DATA, LMAX, N = 60, 4, 5
 
@@ -16,11 +13,11 @@ N_DATA, LMAX, N = 60, 4, 5
 def test_amplitudes_errors_and_gains(low_rank):
     rng = np.random.default_rng(8)
     a = rng.standard_normal((N_DATA, (LMAX + 1) ** 2))
-    noise = DiagonalCovariance(rng.uniform(0.5, 2.0, N_DATA))
+    noise = lb.DiagonalCovariance(rng.uniform(0.5, 2.0, N_DATA))
     if low_rank:
-        noise = noise + LowRankCovariance(rng.standard_normal((N_DATA, 2)))
-    prior = HarmonicPrior(np.full(LMAX + 1, 4.0), mean=rng.standard_normal((LMAX + 1) ** 2))
-    model = LinearGaussian(DenseCoupling(a), prior, noise, rng.standard_normal(N_DATA))
+        noise = noise + lb.LowRankCovariance(rng.standard_normal((N_DATA, 2)))
+    prior = lb.HarmonicPrior(np.full(LMAX + 1, 4.0), mean=rng.standard_normal((LMAX + 1) ** 2))
+    model = lb.LinearGaussian(lb.DenseCoupling(a), prior, noise, rng.standard_normal(N_DATA))
     data = 3.0 * rng.standard_normal(N_DATA)
     # the last one is a sky that the prior allows, but for a small part
     templates = rng.standard_normal((N_DATA, N))
@@ -45,8 +42,8 @@ def test_what_the_sky_takes_up_is_not_told():
     """A template that the prior's wide sky explains altogether: NaN, not a rounding error."""
     rng = np.random.default_rng(9)
     a = rng.standard_normal((N_DATA, (LMAX + 1) ** 2))
-    prior = HarmonicPrior(np.full(LMAX + 1, 1e14))
-    model = LinearGaussian(DenseCoupling(a), prior, DiagonalCovariance(np.ones(N_DATA)))
+    prior = lb.HarmonicPrior(np.full(LMAX + 1, 1e14))
+    model = lb.LinearGaussian(lb.DenseCoupling(a), prior, lb.DiagonalCovariance(np.ones(N_DATA)))
     data = rng.standard_normal(N_DATA)
     posterior = model.condition(data)
     template = a @ rng.standard_normal((a.shape[1], 1))

@@ -9,15 +9,11 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
+import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.learning import Learned
-from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.parameter_draws import draws_with_parameters, information_behind
-from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.sky.isotropic_family import IsotropicFamily
-from lusee_bayes.sky.priors import DensePrior, HarmonicPrior
 
 LMAX = 3
 SIZE = (LMAX + 1) ** 2
@@ -30,17 +26,17 @@ SIZE = (LMAX + 1) ** 2
 @pytest.mark.parametrize("dense", [False, True], ids=["independent", "dense with a mean"])
 def test_another_prior_gives_the_posterior_that_the_data_give(n_data, dense):
     rng = np.random.default_rng(3)
-    prior = HarmonicPrior(np.geomspace(1e8, 1e6, LMAX + 1))
+    prior = lb.HarmonicPrior(np.geomspace(1e8, 1e6, LMAX + 1))
     if dense:
         root = 3e3 * rng.standard_normal((SIZE, SIZE))
         mean = 1e4 * rng.standard_normal(SIZE)
-        prior = DensePrior.of_covariance(root @ root.T + 1e6 * np.eye(SIZE), mean)
+        prior = lb.DensePrior.of_covariance(root @ root.T + 1e6 * np.eye(SIZE), mean)
     coupling = rng.standard_normal((n_data, SIZE))
     data = 1e4 * rng.standard_normal(n_data)
-    noise = DiagonalCovariance(np.geomspace(1.0, 1e6, n_data))
-    behind = information_behind(on_host(LinearGaussian(coupling, prior, noise).condition(data)))
-    other = HarmonicPrior(np.full(LMAX + 1, 3e7))
-    expected = LinearGaussian(coupling, other, noise).condition(data)
+    noise = lb.DiagonalCovariance(np.geomspace(1.0, 1e6, n_data))
+    behind = information_behind(on_host(lb.LinearGaussian(coupling, prior, noise).condition(data)))
+    other = lb.HarmonicPrior(np.full(LMAX + 1, 3e7))
+    expected = lb.LinearGaussian(coupling, other, noise).condition(data)
     found = behind.posterior(other)
     std = np.asarray(expected.std())
     # M is what is left of Lambda of up to 1e8 when 1 is taken off: 1e-8 of what the prior says
@@ -67,7 +63,7 @@ class Strength(IsotropicFamily):
         return Member(np.exp(parameters[0]) * SCALE**2 * np.eye(SIZE))
 
     def prior(self, covariance):
-        return HarmonicPrior(np.diagonal(covariance)[np.arange(LMAX + 1) ** 2])
+        return lb.HarmonicPrior(np.diagonal(covariance)[np.arange(LMAX + 1) ** 2])
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +73,7 @@ def one_parameter():
     noise = np.geomspace(0.1, 10.0, SIZE) * SCALE
     seen = 2.0 * SCALE * np.ones(SIZE)
     unknown = np.asarray(0.0)
-    information = Information(
+    information = lb.Information(
         np.diag(noise**-2.0), seen / noise**2, np.zeros(SIZE), unknown, unknown, unknown
     )
     prior = family.prior(family.at(np.array([0.4])).covariance)
@@ -109,7 +105,7 @@ def test_draws_are_those_of_the_integral_over_the_parameter(one_parameter):
 
 def test_tails_are_those_of_uncertain_strength():
     """Modes that the data do not see: exp(theta) of N(0, 1/4) makes the kurtosis 3 exp(1/4)."""
-    information = Information(
+    information = lb.Information(
         1e-18 * np.eye(SIZE), np.zeros(SIZE), np.zeros(SIZE), *[np.asarray(0.0)] * 3
     )
     family = Strength.around(2e4, LMAX)
@@ -131,7 +127,7 @@ def test_few_draws_and_none():
     family = IsotropicFamily.around(2e4, LMAX)
     theta = family.hyperprior.start()
     prior = family.prior(family.at(theta).covariance)
-    information = Information(
+    information = lb.Information(
         np.eye(SIZE) * 1e-8, np.ones(SIZE), np.zeros(SIZE), *[np.ones(())] * 3
     )
     learned = Learned(prior, (), theta, 0.1 * np.eye(len(theta)), 0.0, 0)
@@ -147,16 +143,18 @@ class Hopeless(Strength):
     """No theta has an S."""
 
     def prior(self, covariance):
-        return DensePrior.of_covariance(-covariance)
+        return lb.DensePrior.of_covariance(-covariance)
 
 
 def test_parameters_without_a_covariance_are_drawn_anew_and_then_refused():
     family = Strength.around(2e4, LMAX)
     prior = family.prior(family.at(np.zeros(1)).covariance)
-    information = Information(
+    information = lb.Information(
         np.eye(SIZE) * 1e-8, np.ones(SIZE), np.zeros(SIZE), *[np.ones(())] * 3
     )
     learned = Learned(prior, (), np.zeros(1), np.eye(1), 0.0, 0)
     posterior = information.posterior(prior)
-    with pytest.raises(InputError, match="no sky can be drawn with the uncertainty of the prior's"):
+    with pytest.raises(
+        lb.InputError, match="no sky can be drawn with the uncertainty of the prior's"
+    ):
         draws_with_parameters(Hopeless.around(2e4, LMAX), learned, posterior, jax.random.key(1), 3)

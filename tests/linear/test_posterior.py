@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from reference_linear import assert_draws_follow, posterior, random_covariance
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.linear import posterior as posterior_module
 from lusee_bayes.linear.model import FORMS, LinearGaussian
-from lusee_bayes.noise.covariance import DenseCovariance
-from lusee_bayes.sky.priors import HarmonicPrior, PixelPrior
 
 SPECTRUM = np.array([4.0, 1.0, 0.5, 0.25])
 PER_MODE = np.repeat(SPECTRUM, [1, 3, 5, 7])
@@ -28,10 +26,10 @@ def conditioned(n_data, form, prior=None, blind=False):
     if blind:
         a[:, 9:] = 0.0
     n, d = random_covariance(rng, n_data), rng.normal(size=n_data)
-    prior = HarmonicPrior(jnp.asarray(SPECTRUM)) if prior is None else prior
+    prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM)) if prior is None else prior
     a = jnp.asarray(a)
-    a = prior.coupling(a) if isinstance(prior, PixelPrior) else a
-    model = LinearGaussian(a, prior, DenseCovariance(jnp.asarray(n)))
+    a = prior.coupling(a) if isinstance(prior, lb.PixelPrior) else a
+    model = LinearGaussian(a, prior, lb.DenseCovariance(jnp.asarray(n)))
     return model.condition(jnp.asarray(d), form), posterior(a, prior.covariance(), n, d)
 
 
@@ -87,7 +85,7 @@ def test_the_draw_test_notices_sqrt_two():
 
 def test_draws_in_pixels():
     """More unknowns than normals behind them: the covariance has rank 16 of 48."""
-    prior = PixelPrior(jnp.asarray(SPECTRUM), 2)
+    prior = lb.PixelPrior(jnp.asarray(SPECTRUM), 2)
     for form in FORMS:
         post, expected = conditioned(9, form, prior)
         draws = post.sample(jax.random.key(5), 20_000)
@@ -139,12 +137,12 @@ def test_the_root_times_its_transpose_is_the_covariance(n_data, form):
 def test_the_root_of_a_singular_covariance():
     """Over pixels (rank 16 of 48), and with C_1 = 0: no inverse, but draws are mean + R z."""
     for form in FORMS:
-        post, expected = conditioned(9, form, PixelPrior(jnp.asarray(SPECTRUM), 2))
+        post, expected = conditioned(9, form, lb.PixelPrior(jnp.asarray(SPECTRUM), 2))
         root = np.asarray(post.root())
         assert root.shape == (48, 16)
         np.testing.assert_allclose(root @ root.T, expected.covariance, atol=TOL)
         spectrum = SPECTRUM * np.array([1.0, 0.0, 1.0, 1.0])
-        post, expected = conditioned(9, form, HarmonicPrior(jnp.asarray(spectrum)))
+        post, expected = conditioned(9, form, lb.HarmonicPrior(jnp.asarray(spectrum)))
         root = np.asarray(post.root())
         assert (root[1:4] == 0).all()
         np.testing.assert_allclose(root @ root.T, expected.covariance, atol=TOL)
@@ -186,10 +184,10 @@ def test_whitening_in_a_traced_program():
 
 @pytest.mark.parametrize("form", FORMS)
 def test_what_has_no_inverse_is_not_whitened(form):
-    pixels, _ = conditioned(9, form, PixelPrior(jnp.asarray(SPECTRUM), 2))
-    with pytest.raises(InputError, match="prior over pixels is singular"):
+    pixels, _ = conditioned(9, form, lb.PixelPrior(jnp.asarray(SPECTRUM), 2))
+    with pytest.raises(lb.InputError, match="prior over pixels is singular"):
         pixels.whiten(pixels.sample(jax.random.key(0), 2))
     spectrum = jnp.asarray([4.0, 0.0, 0.5, 0.25])
-    powerless, _ = conditioned(9, form, HarmonicPrior(spectrum))
-    with pytest.raises(InputError, match="zero at ell = 1 and has no density"):
+    powerless, _ = conditioned(9, form, lb.HarmonicPrior(spectrum))
+    with pytest.raises(lb.InputError, match="zero at ell = 1 and has no density"):
         powerless.whiten(powerless.sample(jax.random.key(0), 2))

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from lusee_bayes.experiment.experiment import build
+import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.linear import residuals as residuals_module
 from lusee_bayes.linear.left_out_dense import DenseLeftOut
@@ -26,10 +25,10 @@ def simulated(*overrides, flags=None):
     # noise a thousand times larger than the telescope's: the sky's covariance, on which arithmetic
     # by hand cancels, is then only 1e4 times that of the noise
     given = ["lmax=4", "noise.radiometer.factor=1e6", RUNS, *overrides]
-    scenario = load_scenario("fiducial", given)
-    e = build(scenario)
+    scenario = lb.load_scenario("fiducial", given)
+    e = lb.build(scenario)
     if flags is not None:
-        e = build(scenario, flagged(e.data, flags))
+        e = lb.build(scenario, flagged(e.data, flags))
     model = full_model(e.setup)
     rng = np.random.default_rng(8)
     sky = np.sqrt(np.asarray(model.prior.variance())) * rng.standard_normal(model.prior.size)

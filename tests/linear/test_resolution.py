@@ -8,7 +8,6 @@ import pytest
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import pixel_matrix
-from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.linear.resolution import resolution_rows
 
@@ -18,7 +17,7 @@ from lusee_bayes.linear.resolution import resolution_rows
 def test_a_row_is_what_the_map_shows_there_of_each_source(cycles, form):
     # the best mode's signal-to-noise squared times 1e-16 is what is lost: 1e-9
     given = ["lmax=12", f"observation.runs.0.cycles={cycles}", "noise.radiometer.factor=1e5"]
-    experiment = build(lb.load_scenario("fiducial", given))
+    experiment = lb.build(lb.load_scenario("fiducial", given))
     model = base_model(experiment.setup)
     solver = model.factorise(form)
     posterior = solver.condition(experiment.data.data)

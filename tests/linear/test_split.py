@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.split import WIDER, Split, widened
-from lusee_bayes.noise.covariance import DenseCovariance, DiagonalCovariance
-from lusee_bayes.sky.priors import DensePrior, HarmonicPrior
 
 N_MODES = 25
 # the seed is fixed: what is right fails once in 10,000 seeds
@@ -26,13 +24,13 @@ def model_of(n_data=60, prior="harmonic", seed=1):
     a = (left * np.geomspace(1e3, 1e-4, left.shape[1])) @ right.T
     spectrum = jnp.asarray([4.0, 2.0, 1.0, 0.5, 0.3])
     if prior == "harmonic":
-        s = HarmonicPrior(spectrum)
+        s = lb.HarmonicPrior(spectrum)
     else:
         root = np.tril(0.1 * rng.standard_normal((N_MODES, N_MODES)), -1) + np.eye(N_MODES)
-        s = DensePrior(jnp.asarray(root), mean=jnp.asarray(rng.standard_normal(N_MODES)))
+        s = lb.DensePrior(jnp.asarray(root), mean=jnp.asarray(rng.standard_normal(N_MODES)))
     noise = rng.standard_normal((n_data, n_data))
-    n = DenseCovariance(jnp.asarray(noise @ noise.T / n_data + np.eye(n_data)))
-    return LinearGaussian(jnp.asarray(a), s, n, jnp.asarray(rng.standard_normal(n_data)))
+    n = lb.DenseCovariance(jnp.asarray(noise @ noise.T / n_data + np.eye(n_data)))
+    return lb.LinearGaussian(jnp.asarray(a), s, n, jnp.asarray(rng.standard_normal(n_data)))
 
 
 def drawn(model, rng, strength=1.0):
@@ -51,7 +49,7 @@ def split_of(model, data, form="map"):
 
 
 def with_prior(model, prior):
-    return LinearGaussian(model.coupling, prior, model.noise, model.offset)
+    return lb.LinearGaussian(model.coupling, prior, model.noise, model.offset)
 
 
 @pytest.mark.parametrize("form", ["map", "root", "data"])
@@ -117,18 +115,18 @@ def test_no_sky_makes_the_instrument_look_wrong():
 def test_noise_that_is_wrong_is_no_matter_of_the_prior():
     """Data with 1.5 times the noise variance."""
     model = model_of(n_data=200)
-    noise = DenseCovariance(1.5 * model.noise.dense())
-    truth = LinearGaussian(model.coupling, model.prior, noise, model.offset)
+    noise = lb.DenseCovariance(1.5 * model.noise.dense())
+    truth = lb.LinearGaussian(model.coupling, model.prior, noise, model.offset)
     instrument, _ = p_values(model, 1.0, n=20, truth=truth).T
     assert np.median(instrument) < 1e-3
 
 
 def test_data_that_are_fewer_than_the_modes_leave_little():
     """Every sky explains them: what is left has few degrees of freedom, and no verdict."""
-    model = LinearGaussian(
+    model = lb.LinearGaussian(
         jnp.asarray(100.0 * np.random.default_rng(1).standard_normal((9, N_MODES))),
-        HarmonicPrior(jnp.ones(5)),
-        DiagonalCovariance(jnp.ones(9)),
+        lb.HarmonicPrior(jnp.ones(5)),
+        lb.DiagonalCovariance(jnp.ones(9)),
     )
     found, _, _ = split_of(model, drawn(model, np.random.default_rng(2)), form="data")
     assert found.instrument.degrees == pytest.approx(0.01 * 9, rel=1e-3)

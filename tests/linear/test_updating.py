@@ -6,20 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.terms import Around
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.updating import deviation_model, updated
 from lusee_bayes.results.updatable import read_updatable
-from lusee_bayes.sky.priors import HarmonicPrior
 
 
-def of_run(data: Visibilities, run: int) -> Visibilities:
+def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:
     """The data of one run by themselves."""
     keep = data.observation.run == run
     observation = data.observation.select(keep)
@@ -30,11 +26,11 @@ def of_run(data: Visibilities, run: int) -> Visibilities:
 
 
 def two_cycles(*overrides):
-    scenario = load_scenario("two_cycles", list(overrides))
-    experiment = build(scenario)
+    scenario = lb.load_scenario("two_cycles", list(overrides))
+    experiment = lb.build(scenario)
     data = experiment.data
     parts = [of_run(data, run) for run in (0, 1)]
-    models = [full_model(build(scenario, part).setup, Around(part)) for part in parts]
+    models = [full_model(lb.build(scenario, part).setup, Around(part)) for part in parts]
     return full_model(experiment.setup, Around(data)), data, models, parts
 
 
@@ -75,11 +71,11 @@ def test_what_does_not_fit_is_refused():
     runs = "observation.runs=[{cycles: 0.2}, {cycles: 0.1, turntable_deg: 30}]"
     _, _, models, parts = two_cycles("lmax=4", runs)
     first = models[0].condition(parts[0].data, form="root")
-    other = replace(models[1], prior=HarmonicPrior(2.0 * models[1].prior.spectrum))
-    with pytest.raises(InputError, match=r"has another prior: a variance of .* K\^2 at ell = 0"):
+    other = replace(models[1], prior=lb.HarmonicPrior(2.0 * models[1].prior.spectrum))
+    with pytest.raises(lb.InputError, match=r"has another prior: a variance of .* K\^2 at ell = 0"):
         deviation_model(first, other)
     few = models[1].condition(parts[1].data, form="data")
-    with pytest.raises(InputError, match="condition with form='root'"):
+    with pytest.raises(lb.InputError, match="condition with form='root'"):
         deviation_model(few, models[1])
 
 
@@ -99,7 +95,7 @@ def test_from_the_command_line(tmp_path, capsys):
     assert run(*mapped, "--data", tmp_path / "a.nc", "--updatable", "-o", first) == 0
     add = ("--onto", first, "--updatable", "-o", both)
     assert run(*mapped, "--data", tmp_path / "b.nc", *add) == 0
-    scenario = load_scenario("fiducial", list(SMALL[1::2]))
+    scenario = lb.load_scenario("fiducial", list(SMALL[1::2]))
     saved = read_updatable(both, scenario)
     assert len(saved.digests) == 2
     before = read_updatable(first, scenario).posterior

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from reference_linear import z_of
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.noise import exact_blocks, paper_variance, radiometer_noise
-from lusee_bayes.noise.covariance import DiagonalCovariance, TimeBlockCovariance
 
 N_ANTENNAS, N_PRODUCTS, N_TIMES = 4, 16, 3
 BANDWIDTH, STEP = 2.0e5, 600.0
@@ -57,7 +56,7 @@ def test_paper_form_is_the_papers_formula():
                     expected[k, t] = (auto + value**2) / (2 * BANDWIDTH * STEP)
                     k += 1
     got = noise()
-    assert isinstance(got, DiagonalCovariance)
+    assert isinstance(got, lb.DiagonalCovariance)
     # a handful of roundings
     np.testing.assert_allclose(got.variance, expected.ravel(), rtol=2e-15)
     np.testing.assert_allclose(
@@ -90,7 +89,7 @@ def test_exact_form_is_what_complex_gaussian_voltages_do():
 
 def test_exact_variances_have_closed_forms():
     cov = noise("exact")
-    assert isinstance(cov, TimeBlockCovariance)
+    assert isinstance(cov, lb.TimeBlockCovariance)
     variance = np.asarray(cov.diagonal()).reshape(N_PRODUCTS, N_TIMES) * BANDWIDTH * STEP
     autos = np.diagonal(T, axis1=1, axis2=2).real.T
     np.testing.assert_allclose(variance[AUTOS], autos**2, rtol=1e-14)
@@ -146,28 +145,32 @@ def test_flagged_samples_are_left_out(form):
 @pytest.mark.parametrize("name", ["bandwidth_hz", "step_s", "factor", "duty_cycle"])
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), float("inf")])
 def test_parameters_must_be_positive(name, bad):
-    with pytest.raises(InputError, match=rf"the radiometer's {name} must be positive, got {bad}"):
+    with pytest.raises(
+        lb.InputError, match=rf"the radiometer's {name} must be positive, got {bad}"
+    ):
         noise(**{name: bad})
 
 
 def test_duty_cycle_beyond_one_is_refused():
-    with pytest.raises(InputError, match=r"duty_cycle must not exceed 1, got 1\.5"):
+    with pytest.raises(lb.InputError, match=r"duty_cycle must not exceed 1, got 1\.5"):
         noise(duty_cycle=1.5)
 
 
 def test_unknown_form_names_the_nearest():
-    with pytest.raises(InputError, match="radiometer form 'exakt'; did you mean 'exact'"):
+    with pytest.raises(lb.InputError, match="radiometer form 'exakt'; did you mean 'exact'"):
         noise("exakt")
 
 
 def test_bad_visibilities_are_refused():
-    with pytest.raises(InputError, match=r"antenna temperature .* must be positive.*\(1, 2\).*sky"):
+    with pytest.raises(
+        lb.InputError, match=r"antenna temperature .* must be positive.*\(1, 2\).*sky"
+    ):
         radiometer_noise(VISIBILITIES.at[7, 2].set(-1.0), LAYOUT)
-    with pytest.raises(InputError, match=r"the visibilities holds NaN .*\(5, 0\)"):
+    with pytest.raises(lb.InputError, match=r"the visibilities holds NaN .*\(5, 0\)"):
         radiometer_noise(VISIBILITIES.at[5, 0].set(jnp.nan), LAYOUT)
-    with pytest.raises(InputError, match=r"shape \(16, 3\), expected \(16, 4\)"):
+    with pytest.raises(lb.InputError, match=r"shape \(16, 3\), expected \(16, 4\)"):
         radiometer_noise(VISIBILITIES, DataLayout(N_PRODUCTS, 4))
-    with pytest.raises(InputError, match="visibilities must be a float64 array.*float32"):
+    with pytest.raises(lb.InputError, match="visibilities must be a float64 array.*float32"):
         radiometer_noise(VISIBILITIES.astype(jnp.float32), LAYOUT)
 
 
@@ -225,7 +228,7 @@ def test_an_auto_that_was_never_measured_is_refused():
     flags = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
     flags[7] = True
     seen = np.where(flags, 0.0, np.asarray(VISIBILITIES))
-    with pytest.raises(InputError, match="the auto 11R is absent at all times"):
+    with pytest.raises(lb.InputError, match="the auto 11R is absent at all times"):
         radiometer_noise(seen, DataLayout.from_flags(flags))
 
 
@@ -244,5 +247,5 @@ def test_every_sample_has_its_own_live_time(form):
     np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12 * expected.max())
     same = radiometer_noise(v[:, :1], one, step_s=live.sum(), form=form).dense()
     np.testing.assert_allclose(got, same, rtol=1e-15)
-    with pytest.raises(InputError, match=r"step_s has shape \(4,\), expected \(5,\)"):
+    with pytest.raises(lb.InputError, match=r"step_s has shape \(4,\), expected \(5,\)"):
         radiometer_noise(v, layout, step_s=live[:4], form=form)

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from reference_linear import random_covariance
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.noise import template_noise
 
 FLAGS = np.zeros((4, 5), dtype=bool)
 FLAGS[:, 2] = FLAGS[1, 0] = True
@@ -31,7 +30,7 @@ def by_hand(t, p):
 @pytest.mark.parametrize(("prior", "matrix"), [(VARIANCES, np.diag(VARIANCES)), (P, P)])
 def test_the_term_is_t_p_t(prior, matrix):
     expected = by_hand(T, matrix)
-    got = template_noise(jnp.asarray(T), jnp.asarray(prior), LAYOUT)
+    got = lb.template_noise(jnp.asarray(T), jnp.asarray(prior), LAYOUT)
     # products of a few numbers of order one
     atol = 1e-14 * np.abs(expected).max()
     np.testing.assert_allclose(got.dense(), expected, rtol=0, atol=atol)
@@ -56,5 +55,5 @@ def test_the_term_is_t_p_t(prior, matrix):
     ],
 )
 def test_bad_input_is_refused(templates, prior, message):
-    with pytest.raises(InputError, match=message):
-        template_noise(jnp.asarray(templates), jnp.asarray(prior), LAYOUT)
+    with pytest.raises(lb.InputError, match=message):
+        lb.template_noise(jnp.asarray(templates), jnp.asarray(prior), LAYOUT)

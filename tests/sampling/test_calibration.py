@@ -20,7 +20,6 @@ from scipy import stats
 
 import lusee_bayes as lb
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.sampling.calibration import (
     FALSE_ALARM,
@@ -32,8 +31,6 @@ from lusee_bayes.sampling.calibration import (
     calibrate_sky,
 )
 from lusee_bayes.sampling.hmc import Sampler, draw_within
-from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.whitening import Whitening
 
 SMALL = ("lmax=6", "observation.runs.0.cycles=0.02")
 NOISES = {
@@ -49,9 +46,9 @@ EVERY_NOISE = pytest.mark.parametrize(
 
 
 @lru_cache
-def experiment(noise: str) -> Experiment:
+def experiment(noise: str) -> lb.Experiment:
     scenario, *overrides = NOISES[noise]
-    return build(lb.load_scenario(scenario, [*SMALL, *overrides]))
+    return lb.build(lb.load_scenario(scenario, [*SMALL, *overrides]))
 
 
 @lru_cache
@@ -450,9 +447,9 @@ class HMCDraws(eqx.Module):
     solver: lb.solver.Solver
 
     def __call__(self, key, data):
-        program = load_program("sky")
+        program = lb.load_program("sky")
         arguments = {**program.arguments(self.model), "data": data}
-        whitening = Whitening.of(self.solver.condition(data))
+        whitening = lb.Whitening.of(self.solver.condition(data))
         sampler = Sampler(warmup=100, draws=N_DRAWS, algorithm="hmc")
         return draw_within(program.model, arguments, key, sampler, whitening, thin=2)["sky"]
 

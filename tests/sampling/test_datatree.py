@@ -15,11 +15,9 @@ from reference_linear import posterior as naive_posterior
 
 import lusee_bayes as lb
 from lusee_bayes.core import formats
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.sampling.chains import STATISTICS, Chains
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree, write_datatree
-from lusee_bayes.sampling.programs import load_program
 
 # two antennas, so four products
 PRODUCTS, N_TIMES, N_MODES = ("00R", "01R", "01I", "11R"), 4, 9
@@ -67,7 +65,7 @@ def drawn(setting):
     skies = np.asarray(posterior.sample(jax.random.key(3), N_CHAINS * N_DRAWS))
     chains = chains_of({"sky": skies.reshape(N_CHAINS, N_DRAWS, N_MODES)})
     tree = to_datatree(
-        chains, load_program("sky"), model, posterior, data,
+        chains, lb.load_program("sky"), model, posterior, data,
         n_predictive=N_CHAINS * N_DRAWS, attributes={"frequency_mhz": 25.0, "note": "µ = 1"},
     )  # fmt: skip
     return tree, chains
@@ -80,7 +78,7 @@ def collapsed(setting):
     levels = np.exp(np.random.default_rng(8).uniform(-2.3, 2.3, (N_CHAINS, N_DRAWS)))
     chains = chains_of({"noise_level": levels})
     tree = to_datatree(
-        chains, load_program("sky_marginal"), model, model.condition(data.data), data,
+        chains, lb.load_program("sky_marginal"), model, model.condition(data.data), data,
         n_predictive=N_CHAINS * N_DRAWS,
     )  # fmt: skip
     return tree, chains
@@ -198,7 +196,7 @@ def test_predictive_groups_are_thinned_and_know_which_draws_they_belong_to(setti
     model, data = setting
     posterior = model.condition(data.data)
     skies = np.asarray(posterior.sample(jax.random.key(1), 120)).reshape(4, 30, N_MODES)
-    program = load_program("sky")
+    program = lb.load_program("sky")
     # noise a million times smaller than the sky tells which sky the data belong to
     quiet = lb.LinearGaussian(model.coupling, model.prior, model.noise.scaled(1e-12))
     arguments = (program, quiet, posterior, data)
@@ -223,7 +221,7 @@ def test_another_seed_makes_other_predictive_draws_and_real_data_have_no_truth(s
     posterior = model.condition(data.data)
     chains = chains_of({"sky": np.asarray(posterior.sample(jax.random.key(1), 8))[None]})
     first, other = (
-        to_datatree(chains, load_program("sky"), model, posterior, d, seed=seed, n_predictive=8)
+        to_datatree(chains, lb.load_program("sky"), model, posterior, d, seed=seed, n_predictive=8)
         for seed, d in [(1, data), (2, real)]
     )
     for group, name in [
@@ -338,7 +336,7 @@ def test_files_that_are_no_samples_are_refused(setting, tmp_path):
         ("bare.nc", "its format is 'absent', expected"),
         (".", "is a folder; give a file: samples"),
     ]:
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(lb.InputError, match=message):
             read_datatree(tmp_path / name)
 
 
@@ -346,7 +344,7 @@ def test_a_tree_cut_short_is_refused(drawn, tmp_path):
     path = tmp_path / "samples.nc"
     write_datatree(drawn[0], path)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(InputError, match="cannot be read as HDF5"):
+    with pytest.raises(lb.InputError, match="cannot be read as HDF5"):
         read_datatree(path)
 
 

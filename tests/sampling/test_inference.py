@@ -21,14 +21,11 @@ from reference_linear import random_covariance, z_of
 from scipy.stats import lognorm, multivariate_normal
 
 import lusee_bayes as lb
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling import hmc as inference
 from lusee_bayes.sampling.chains import STATISTICS
 from lusee_bayes.sampling.checkpoints import Checkpoints
 from lusee_bayes.sampling.hmc import CHUNK, Sampler, draw_within, sample
 from lusee_bayes.sampling.program_sites import latent_sites
-from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.whitening import Whitening
 
 ROOT = Path(lb.__file__).resolve().parents[1]
 TESTS = Path(__file__).parent
@@ -64,18 +61,18 @@ def exact(gaussian, data):
 
 
 def arguments_of(gaussian, data, name="sky"):
-    return load_program(name).arguments(gaussian) | {"data": data}
+    return lb.load_program(name).arguments(gaussian) | {"data": data}
 
 
 def sky_chains(gaussian, data, sampler, whitening, **options):
-    program = load_program("sky").model
+    program = lb.load_program("sky").model
     return sample(program, arguments_of(gaussian, data), sampler, whitening, **options)
 
 
 @pytest.fixture(scope="module")
 def nuts(gaussian, data):
     """(chains, whitening): the No-U-Turn Sampler in the posterior's own coordinates."""
-    whitening = Whitening.of(gaussian.condition(data))
+    whitening = lb.Whitening.of(gaussian.condition(data))
     return sky_chains(gaussian, data, Sampler(draws=1000, seed=3), whitening), whitening
 
 
@@ -152,7 +149,7 @@ def test_hmc_in_wrong_coordinates_follows_the_analytic_posterior(gaussian, data,
     prior's or the likelihood's part of the change of coordinates would not pass.
     """
     other = lb.LinearGaussian(gaussian.coupling, gaussian.prior, gaussian.noise.scaled(3.0))
-    wrong = Whitening.of(other.condition(-data))
+    wrong = lb.Whitening.of(other.condition(-data))
     sampler = Sampler(chains=4, warmup=150, draws=1500, algorithm="hmc", trajectory=1.2)
     chains = sky_chains(gaussian, data, sampler, wrong)
     assert_follows(chains.sites["sky"], exact)
@@ -189,7 +186,7 @@ def by_quadrature(gaussian, data, noise, logs):
 @pytest.mark.essential
 def test_a_sky_in_white_coordinates_beside_a_site_in_none(gaussian, data, level_grid):
     """Against quadrature over the level: p(level | d), and the sky's mean and second moments."""
-    whitening = Whitening.of(gaussian.condition(data))
+    whitening = lb.Whitening.of(gaussian.condition(data))
     arguments = {
         "coupling": gaussian.coupling,
         "prior": gaussian.prior,
@@ -228,7 +225,7 @@ def test_the_marginal_program_finds_the_noise_level(gaussian, data, level_grid, 
     ))  # fmt: skip
     sampler = Sampler(chains=4, warmup=300, draws=1000, algorithm=algorithm)
     arguments = arguments_of(gaussian, data, "sky_marginal")
-    chains = sample(load_program("sky_marginal").model, arguments, sampler)
+    chains = sample(lb.load_program("sky_marginal").model, arguments, sampler)
     assert set(chains.sites) == {"noise_level"}
     levels = np.exp(level_grid)
     evidence = [
@@ -261,7 +258,7 @@ def test_the_marginal_program_finds_the_noise_level(gaussian, data, level_grid, 
     ],
 )
 def test_settings_that_cannot_be_used(settings, message):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(lb.InputError) as caught:
         Sampler(**settings)
     assert str(caught.value) == message
 
@@ -280,10 +277,10 @@ def test_the_number_of_draws_is_no_part_of_a_runs_identity():
 
 @pytest.mark.parametrize("site", ["data", "skies"])
 def test_a_site_to_whiten_that_the_program_does_not_sample(gaussian, data, site):
-    whitening = Whitening.of(gaussian.condition(data), site)
+    whitening = lb.Whitening.of(gaussian.condition(data), site)
     arguments = arguments_of(gaussian, data)
-    with pytest.raises(InputError, match=f"no latent site '{site}' to whiten; it has sky"):
-        sample(load_program("sky").model, arguments, Sampler(), whitening)
+    with pytest.raises(lb.InputError, match=f"no latent site '{site}' to whiten; it has sky"):
+        sample(lb.load_program("sky").model, arguments, Sampler(), whitening)
 
 
 def test_latent_sites_are_those_sampled_and_not_observed(gaussian, data):
@@ -399,13 +396,13 @@ def in_numpyros_types():
 def test_chains_within_a_program_follow_each_data_sets_posterior(gaussian):
     """64 data sets at once. In each one's white coordinates the draws' means are independent."""
     n_sets, sampler = 64, Sampler(warmup=100, draws=30, algorithm="hmc")
-    program, pieces = load_program("sky"), load_program("sky").arguments(gaussian)
+    program, pieces = lb.load_program("sky"), lb.load_program("sky").arguments(gaussian)
     solver = gaussian.factorise()
 
     def one(key):
         data_key, key = jax.random.split(key)
         data = gaussian.sample(data_key)[1]
-        whitening = Whitening.of(solver.condition(data))
+        whitening = lb.Whitening.of(solver.condition(data))
         arguments = pieces | {"data": data}
         return data, draw_within(program.model, arguments, key, sampler, whitening, thin=2)
 
@@ -508,7 +505,7 @@ def test_chains_are_shared_out_among_devices_and_draw_the_same(gaussian, data, t
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     shared = np.load(tmp_path / "chains.npz")
-    whitening = Whitening.of(gaussian.condition(data))
+    whitening = lb.Whitening.of(gaussian.condition(data))
     single = sky_chains(gaussian, data, DEVICES, whitening)
     # Sums are rounded in another order: 1e-16 of numbers of order ten in a step size or a position.
     # In white coordinates the motion is that of a harmonic oscillator, which carries an error on

@@ -5,14 +5,10 @@ from pathlib import Path
 import pytest
 
 import lusee_bayes
+import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.pieces import program_pieces
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.sampling.program_checks import require_sampleable
-from lusee_bayes.sampling.programs import load_program
 
 ROOT = Path(lusee_bayes.__file__).resolve().parents[1]
 
@@ -70,15 +66,15 @@ BAD = {
 
 @pytest.fixture(scope="module")
 def pieces():
-    scenario = load_scenario("fiducial", ["lmax=2", "observation.runs.0.cycles=0.05"])
-    experiment = build(scenario)
-    model = infer(experiment).model
+    scenario = lb.load_scenario("fiducial", ["lmax=2", "observation.runs.0.cycles=0.05"])
+    experiment = lb.build(scenario)
+    model = lb.infer(experiment).model
     return model, program_pieces(experiment), experiment.data.data
 
 
 def check(path, pieces):
     model, more, data = pieces
-    program = load_program(path)
+    program = lb.load_program(path)
     arguments = program.arguments(model, more)
     return require_sampleable(program, arguments, data, model.prior.variance().shape[0])
 
@@ -101,7 +97,7 @@ def test_bad_programs_are_one_sentence(name, tmp_path, pieces):
     body, message = BAD[name]
     path = tmp_path / "bad.py"
     path.write_text(HEAD + body)
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(lb.InputError, match=message) as caught:
         check(path, pieces)
     assert "\n" not in str(caught.value) and "bad.py" in str(caught.value)
 
@@ -110,8 +106,8 @@ def test_bad_programs_are_one_sentence(name, tmp_path, pieces):
 def test_arguments_are_given_by_name(argument, tmp_path):
     path = tmp_path / "bad.py"
     path.write_text(f"def model({argument}data=None):\n    pass\n")
-    with pytest.raises(InputError, match="does not run|by position, or as many as come"):
-        load_program(path)
+    with pytest.raises(lb.InputError, match="does not run|by position, or as many as come"):
+        lb.load_program(path)
 
 
 def test_a_density_that_is_nan_names_the_program(tmp_path, capsys):

@@ -19,9 +19,7 @@ from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
 from lusee_bayes.linear.model import FORMS
-from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.promotion import numpyro_promotion
-from lusee_bayes.sampling.whitening import Whitening, whitened
 
 LMAX = 2
 N_DATA = 30
@@ -29,7 +27,7 @@ NO_OFFSET = jnp.zeros(N_DATA)
 
 
 def program(name):
-    return load_program(name).model
+    return lb.load_program(name).model
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +128,7 @@ def case(gaussian):
         "fixed_noise": gaussian.noise.factor(),
         "data": data,
     }
-    return arguments, Whitening.of(gaussian.condition(data))
+    return arguments, lb.Whitening.of(gaussian.condition(data))
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +146,7 @@ def test_the_log_determinant_is_that_of_the_root(gaussian, n_data, form):
         lb.DenseCovariance(gaussian.noise.matrix[:n_data, :n_data]),
     )
     posterior = few.condition(few.sample(jax.random.key(1))[1], form)
-    whitening = Whitening.of(posterior)
+    whitening = lb.Whitening.of(posterior)
     # a sum of 9 logarithms of order one, and of a root with condition below 100
     log_det = np.linalg.slogdet(np.asarray(whitening.root))[1]
     assert float(whitening.log_det) == pytest.approx(log_det, abs=1e-12)
@@ -163,13 +161,13 @@ def test_a_prior_without_density_has_no_white_coordinates():
         a = jnp.asarray(np.random.default_rng(0).standard_normal((3, prior.size)))
         model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(3)))
         with pytest.raises(lb.InputError, match="has no density"):
-            Whitening.of(model.condition(jnp.ones(3)))
+            lb.Whitening.of(model.condition(jnp.ones(3)))
 
 
 def test_the_density_of_z_is_the_programs_own_times_the_determinant(gaussian, case, z):
     """For any coordinates, and a program for which they are the wrong ones."""
     arguments, right = case
-    wrong = Whitening.of(gaussian.condition(3.0 + 2.0 * arguments["data"], "data"))
+    wrong = lb.Whitening.of(gaussian.condition(3.0 + 2.0 * arguments["data"], "data"))
     wrong = eqx.tree_at(
         lambda w: (w.root, w.log_det), wrong, (2.0 * wrong.root, wrong.log_det + 9 * np.log(2.0))
     )
@@ -178,7 +176,7 @@ def test_the_density_of_z_is_the_programs_own_times_the_determinant(gaussian, ca
             sky = whitening.mean + whitening.root @ z
             plain = joint(model, arguments, {"sky": sky, **others})
             expected = plain + np.linalg.slogdet(np.asarray(whitening.root))[1]
-            model_of_z = whitened(model, whitening)
+            model_of_z = lb.whitened(model, whitening)
             got = joint(model_of_z, arguments, {"sky_white": z, **others})
             # terms up to 1e4, summed in another order: 1e4 x 10 x eps
             assert got == pytest.approx(expected, abs=1e-11, rel=1e-13)
@@ -195,13 +193,15 @@ def test_z_is_standard_normal_where_the_coordinates_are_the_posteriors(gaussian,
     for factor in (0.0, 1.0, -5.0):
         at = factor * np.asarray(z)
         expected = evidence + multivariate_normal(cov=np.eye(9)).logpdf(at)
-        got = joint(whitened(program("sky"), whitening), arguments, {"sky_white": jnp.asarray(at)})
+        got = joint(
+            lb.whitened(program("sky"), whitening), arguments, {"sky_white": jnp.asarray(at)}
+        )
         assert got == pytest.approx(expected, rel=1e-11)
 
 
 def test_sites_of_a_whitened_program(case, z):
     arguments, whitening = case
-    model = whitened(program("sky"), whitening)
+    model = lb.whitened(program("sky"), whitening)
     trace = handlers.trace(handlers.substitute(model, {"sky_white": z})).get_trace(**arguments)
     assert set(trace) == {"sky_white", "sky_density", "sky", "data"}
     white, sky = trace["sky_white"], trace["sky"]
@@ -219,7 +219,7 @@ def test_sites_of_a_whitened_program(case, z):
 def test_other_sites_are_left_alone(case, z):
     arguments, whitening = case
     values = {"sky_white": z, "amplitude": jnp.asarray(0.7)}
-    model = whitened(strong_sky, whitening)
+    model = lb.whitened(strong_sky, whitening)
     trace = handlers.trace(handlers.substitute(model, values)).get_trace(**arguments)
     assert isinstance(trace["amplitude"]["fn"], dist.LogNormal)
     assert float(trace["amplitude"]["value"]) == 0.7
@@ -232,7 +232,7 @@ def test_other_sites_are_left_alone(case, z):
 
 def test_conditioning_on_z_fixes_the_sky(case, z):
     arguments, whitening = case
-    model = whitened(program("sky"), whitening)
+    model = lb.whitened(program("sky"), whitening)
     free = {**arguments, "data": None}
     conditioned = handlers.condition(model, {"sky_white": z})
     trace = handlers.trace(handlers.seed(conditioned, 0)).get_trace(**free)
@@ -256,13 +256,13 @@ def test_an_observed_sky_is_not_whitened(case, z, how):
 
     model = observed if how == "obs" else handlers.condition(program("sky"), {"sky": z})
     with pytest.raises(lb.InputError, match="the site 'sky' is observed; only latent sites"):
-        handlers.substitute(whitened(model, whitening), {"sky_white": z})(**arguments)
+        handlers.substitute(lb.whitened(model, whitening), {"sky_white": z})(**arguments)
 
 
 def test_an_improper_site_is_never_drawn_from(case):
     """Prior draws of z do not exist; NumPyro says so, and makes nothing up."""
     arguments, whitening = case
-    model = whitened(program("sky"), whitening)
+    model = lb.whitened(program("sky"), whitening)
     free = {**arguments, "data": None}
     with numpyro_promotion():
         with pytest.raises(NotImplementedError):
@@ -279,7 +279,7 @@ def test_predictions_from_draws_of_z(gaussian, case):
     z = jax.random.normal(jax.random.key(3), (n, 9), dtype=jnp.float64)
     free = {**arguments, "data": None}
     with numpyro_promotion():
-        drawn = Predictive(whitened(program("sky"), whitening), {"sky_white": z})(
+        drawn = Predictive(lb.whitened(program("sky"), whitening), {"sky_white": z})(
             jax.random.key(4), **free
         )
     expected = np.asarray(whitening.mean) + np.asarray(z) @ np.asarray(whitening.root).T

@@ -11,7 +11,6 @@ import pytest
 from scipy import linalg, stats
 
 import lusee_bayes as lb
-from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling import validation
 from lusee_bayes.sampling.validation import FALSE_ALARM, NULL_RUNS, Check, validate_draws
 
@@ -64,12 +63,12 @@ class Truth:
         return self.mean + white @ self.root.T, energy
 
 
-def wrong_posterior(mean: np.ndarray, covariance: np.ndarray) -> Posterior:
+def wrong_posterior(mean: np.ndarray, covariance: np.ndarray) -> lb.Posterior:
     """N(mean, covariance), whatever they are: the prior is one, Lambda the covariance's inverse."""
     lower = np.linalg.cholesky(np.linalg.inv(covariance))
     prior = lb.HarmonicPrior(jnp.ones(LMAX + 1))
     zero = jnp.zeros(())
-    return Posterior(prior, jnp.asarray(mean), jnp.asarray(lower), None, zero, zero)
+    return lb.Posterior(prior, jnp.asarray(mean), jnp.asarray(lower), None, zero, zero)
 
 
 def judge(draws, energy, posterior, diverging=None, seed=0):

@@ -10,18 +10,14 @@ import pytest
 from experiments import program_arguments, small_experiment
 from numpyro import handlers
 
+import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.experiment.model import base_model, systematics
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.schema import SourceSection
 from lusee_bayes.experiment.setup import Setup, mean_flux, source_responses
 from lusee_bayes.experiment.simulate import simulate, true_values
 from lusee_bayes.experiment.terms import point_sources
 from lusee_bayes.sampling.program_sites import latent_sites
-from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sky.priors import HarmonicPrior
 from lusee_bayes.systematics import Source, SpectrumBands, normal_within
 from lusee_bayes.testing import small_scenario
 
@@ -37,9 +33,9 @@ def setup_of(*overrides: str) -> Setup:
     return replace(built(), scenario=small_scenario(CAS_A, *overrides))
 
 
-def experiment(*overrides: str) -> Experiment:
+def experiment(*overrides: str) -> lb.Experiment:
     setup = setup_of(*overrides)
-    return Experiment(setup, simulate(setup))
+    return lb.Experiment(setup, simulate(setup))
 
 
 def assert_one_sentence(caught):
@@ -95,8 +91,8 @@ def assert_one_sentence(caught):
     ],
 )
 def test_scenarios_that_contradict_themselves(overrides, message):
-    with pytest.raises(InputError, match=message) as caught:
-        load_scenario("fiducial", ["sky.sources=false", *overrides])
+    with pytest.raises(lb.InputError, match=message) as caught:
+        lb.load_scenario("fiducial", ["sky.sources=false", *overrides])
     assert_one_sentence(caught)
 
 
@@ -113,7 +109,7 @@ def test_scenarios_that_contradict_themselves(overrides, message):
 )
 def test_unknown_sources_name_the_nearest(source, message):
     scenario, setup = small_scenario(f"sources.list=[{source}]"), built()
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(lb.InputError, match=message) as caught:
         source_responses(scenario, setup.observation, setup.instrument.monopoles, 25.0)
     assert_one_sentence(caught)
 
@@ -121,11 +117,13 @@ def test_unknown_sources_name_the_nearest(source, message):
 def test_a_source_of_which_nothing_is_known_needs_a_flux():
     """Bodies have no flux in the catalogue; the whole experiment says so."""
     scenario = small_scenario("sources.list=[{name: Jupiter}]")
-    with pytest.raises(InputError, match="'Jupiter' is not in the catalogue.* give flux_jy") as c:
-        build(scenario)
+    with pytest.raises(
+        lb.InputError, match="'Jupiter' is not in the catalogue.* give flux_jy"
+    ) as c:
+        lb.build(scenario)
     assert_one_sentence(c)
     own = SourceSection(name="mine", ra_deg=1.0, dec_deg=2.0)
-    with pytest.raises(InputError, match="'mine' is not in the catalogue"):
+    with pytest.raises(lb.InputError, match="'mine' is not in the catalogue"):
         mean_flux(own, 25.0)
 
 
@@ -138,7 +136,7 @@ def test_a_source_of_which_nothing_is_known_needs_a_flux():
     ],
 )
 def test_sources_that_cannot_be(columns, std, message):
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(lb.InputError, match=message) as caught:
         Source(columns, 1.0, std, "X")
     assert_one_sentence(caught)
 
@@ -163,31 +161,31 @@ def test_sources_that_cannot_be(columns, std, message):
 def test_antennas_that_cannot_be_sampled(parameters, message):
     setup = setup_of(f"noise.beam.parameters={parameters}", "noise.beam.treatment=sampled")
     for ask in (true_values, systematics):
-        with pytest.raises(InputError, match=message) as caught:
+        with pytest.raises(lb.InputError, match=message) as caught:
             ask(setup)
         assert_one_sentence(caught)
 
 
 def test_the_nearer_end_is_named():
-    with pytest.raises(InputError, match="at most 180"):
+    with pytest.raises(lb.InputError, match="at most 180"):
         normal_within("angle", 170.0, 20.0, 0.0, 180.0)
     # a quarter of a percent is allowed: 2.81 standard deviations
     normal_within("angle", 180.0 - 2.82, 1.0, 0.0, 180.0)
-    with pytest.raises(InputError, match="0.3% of its weight"):
+    with pytest.raises(lb.InputError, match="0.3% of its weight"):
         normal_within("angle", 180.0 - 2.80, 1.0, 0.0, 180.0)
-    with pytest.raises(InputError, match="standard deviation of angle must be positive"):
+    with pytest.raises(lb.InputError, match="standard deviation of angle must be positive"):
         normal_within("angle", 1.0, 0.0)
 
 
 def test_bands_beyond_the_highest_ell():
     e = experiment("prior.band_edges=[3, 7]")
-    program = load_program("systematics")
+    program = lb.load_program("systematics")
     arguments = {n: v for n, v in program_arguments(program, e).items() if n != "data"}
-    with pytest.raises(InputError, match="a band begins at ell = 7, above lmax = 6") as caught:
+    with pytest.raises(lb.InputError, match="a band begins at ell = 7, above lmax = 6") as caught:
         latent_sites(program.model, arguments)
     assert_one_sentence(caught)
     # 6 is the highest ell itself
-    base = replace(base_model(e.setup), prior=HarmonicPrior(jnp.ones(7)))
+    base = replace(base_model(e.setup), prior=lb.HarmonicPrior(jnp.ones(7)))
     with handlers.seed(rng_seed=0):
         SpectrumBands((3, 6)).sampled(base)
 
@@ -207,10 +205,10 @@ def test_bands_beyond_the_highest_ell():
 )
 def test_nothing_is_counted_twice(program, overrides, section):
     """What a program samples must not be in N as well."""
-    asked = load_program(program)
+    asked = lb.load_program(program)
     e = experiment(*overrides)
     wanted = f"would count twice; set {section}.treatment=sampled"
-    with pytest.raises(InputError, match=wanted) as caught:
+    with pytest.raises(lb.InputError, match=wanted) as caught:
         program_arguments(asked, e)
     assert_one_sentence(caught)
     # either of the other treatments will do
@@ -222,18 +220,23 @@ def test_nothing_is_counted_twice(program, overrides, section):
 def test_what_the_scenario_does_not_have():
     bare = small_experiment()
     for ask, message in (
-        (lambda: program_arguments(load_program("gains"), bare), "the scenario has no noise.gain"),
-        (lambda: program_arguments(load_program("sources"), bare), "has no sources.list"),
+        (
+            lambda: program_arguments(lb.load_program("gains"), bare),
+            "the scenario has no noise.gain",
+        ),
+        (lambda: program_arguments(lb.load_program("sources"), bare), "has no sources.list"),
         (lambda: point_sources(bare.setup), "the scenario has no sources.list"),
     ):
-        with pytest.raises(InputError, match=message) as caught:
+        with pytest.raises(lb.InputError, match=message) as caught:
             ask()
         assert_one_sentence(caught)
 
 
 def test_pieces_of_an_experiment_need_one():
-    with pytest.raises(InputError, match="asks for 'gaussian', a piece of an experiment") as caught:
-        load_program("systematics").arguments(base_model(built()))
+    with pytest.raises(
+        lb.InputError, match="asks for 'gaussian', a piece of an experiment"
+    ) as caught:
+        lb.load_program("systematics").arguments(base_model(built()))
     assert_one_sentence(caught)
 
 

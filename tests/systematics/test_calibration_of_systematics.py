@@ -14,13 +14,10 @@ from numpyro import handlers
 from scipy import stats
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.pieces import program_pieces
 from lusee_bayes.sampling.calibration import FALSE_ALARM, LEVELS, N_DRAWS, Ranks, calibrate
 from lusee_bayes.sampling.hmc import Sampler, draw_within
-from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.promotion import numpyro_promotion
 from lusee_bayes.systematics import SCALES
 from lusee_bayes.systematics.chart import Chart
@@ -41,7 +38,7 @@ SOURCES = (
 
 def pieces(name: str, *overrides: str):
     """(program, its arguments without the data) of a scenario."""
-    e, program = build(lb.load_scenario("fiducial", overrides)), load_program(name)
+    e, program = lb.build(lb.load_scenario("fiducial", overrides)), lb.load_program(name)
     return program, program.arguments(full_model(e.setup), program_pieces(e))
 
 
@@ -67,7 +64,7 @@ class Draws(eqx.Module):
 
     def __call__(self, key, data):
         arguments = {**self.arguments, "data": data}
-        approximation = laplace_approximation(self.program.model, arguments, starts=self.starts)
+        approximation = lb.laplace_approximation(self.program.model, arguments, starts=self.starts)
         whitening = approximation.whitening
         return draw_within(self.program.model, arguments, key, self.sampler, whitening)
 
@@ -166,7 +163,7 @@ class SampledDrifts(eqx.Module):
     def __call__(self, key, data):
         arguments = {**self.arguments, "data": data}
         start = {"sky": marginalised(arguments, data).mean}
-        approximation = laplace_approximation(
+        approximation = lb.laplace_approximation(
             self.program.model, arguments, start, SCALES, chart=self.chart
         )
         sampler = Sampler(warmup=100, draws=N_DRAWS, algorithm="hmc")

@@ -13,14 +13,13 @@ import pytest
 from experiments import four_ports
 from scipy import stats
 
-from lusee_bayes.experiment.experiment import Experiment
+import lusee_bayes as lb
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.simulate import simulate, true_values
 from lusee_bayes.linear.templates import template_amplitudes
 from lusee_bayes.results.unknowns import GAIN, SKY, unknowns_report
 from lusee_bayes.sampling.calibration import N_DRAWS, Ranks
-from lusee_bayes.sky.priors import HarmonicPrior
 
 N = 100
 UNKNOWN = (
@@ -32,13 +31,13 @@ UNKNOWN = (
 MODES = (0, 2, 3, 6, 8, 12)
 
 
-def drawn(first: Setup, seed: int) -> tuple[Setup, Experiment]:
+def drawn(first: Setup, seed: int) -> tuple[Setup, lb.Experiment]:
     """The setup with a sky drawn from its prior, and data of it; N is that of the model sky."""
     z = np.random.default_rng(seed).standard_normal(first.prior.size)
     sky = replace(first.sky, modes=np.asarray(first.prior.colour(z)) + first.prior.mean)
     scenario = first.scenario.model_copy(update={"seed": seed})
     setup = replace(first, sky=sky, scenario=scenario)
-    return setup, Experiment(setup, simulate(setup))
+    return setup, lb.Experiment(setup, simulate(setup))
 
 
 @pytest.mark.long
@@ -47,7 +46,7 @@ def test_simulation_based_calibration(response_file):
     first = set_up(four_ports(response_file, *UNKNOWN))
     # known to a fifth, so that no sky is without a signal
     spectrum = 0.04 * np.asarray(first.prior.spectrum)
-    first = replace(first, prior=HarmonicPrior(spectrum, mean=first.sky.modes))
+    first = replace(first, prior=lb.HarmonicPrior(spectrum, mean=first.sky.modes))
     sky_std = np.sqrt(np.asarray(first.prior.variance()))
     ranks, null, shares = [], [], []
     for seed in range(N):

@@ -13,7 +13,6 @@ from jax.flatten_util import ravel_pytree
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.pieces import program_pieces
-from lusee_bayes.noise import GainDrift
 
 SCALES = {"log_sigma_std": 0.5, "log_correlation_std": 0.2}
 
@@ -52,7 +51,7 @@ def gains_of(drifts, values):
         reach = 3.0 * SCALES["log_correlation_std"]
         u = 1.0 / (1.0 + jnp.exp(-values["gain_log_correlation"]))
         correlation_h = 10.0 * jnp.exp(-reach + 2.0 * reach * u)
-    drift = GainDrift(sigma, correlation_h)
+    drift = lb.GainDrift(sigma, correlation_h)
     return drift.history(values["gain_noise"], np.asarray(drifts.hours), drifts.grid)
 
 
@@ -123,6 +122,6 @@ def test_drifts_too_strong_for_the_coordinates_have_none():
     """Where the mean gain may be -1 the scale has no logarithm: 0.1 exp(3 x 0.5) > 0.2."""
     gaussian, drifts, chart = pieces("log_sigma_std")
     assert chart is not None
-    strong = GainDrift(0.1, 10.0)
+    strong = lb.GainDrift(0.1, 10.0)
     kinder = lb.systematics.GainDrifts(**{**vars(drifts), "drift": strong})
     assert kinder.chart(gaussian) is None

@@ -16,12 +16,9 @@ from reference_linear import white_posterior, z_of
 from scipy.optimize import least_squares
 from scipy.stats import norm
 
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.experiment import Experiment, build
-from lusee_bayes.experiment.inference import infer
+import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model, radiometer, systematics
 from lusee_bayes.experiment.rounds import Inference, model_about, offset_posterior
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.simulate import simulate, true_signal, true_values
 from lusee_bayes.experiment.terms import Around, pointed
@@ -29,9 +26,6 @@ from lusee_bayes.experiment.terms.gain_table import table_errors
 from lusee_bayes.instrument.calibration import Calibration
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.linear.templates import template_amplitudes
-from lusee_bayes.sampling.hmc import Sampler, sample
-from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.promotion import numpyro_promotion
 
 TABLE = "noise.gain_table={std: 0.01, treatment: %s}"
@@ -67,8 +61,8 @@ def per_port(z: np.ndarray, n_times: int = 23) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def experiment(response_file) -> Experiment:
-    return build(four_ports(response_file, *UNKNOWN, "seed=5"))
+def experiment(response_file) -> lb.Experiment:
+    return lb.build(four_ports(response_file, *UNKNOWN, "seed=5"))
 
 
 # --- simulated data -------------------------------------------------------------------------------
@@ -154,7 +148,7 @@ def test_rounds_find_the_mode_and_the_first_order_does_not(experiment):
     K = F (A S A^T + T_l T_l^T) F + N_0 a matrix; the mode is where both cancel, to 1e-12.
     """
     setup, d = experiment.setup, np.asarray(experiment.data.data)
-    found = infer(experiment)
+    found = lb.infer(experiment)
     assert found.rounds > 2
     a, offset = np.asarray(setup.coupling.dense()), np.asarray(setup.offset)
     prior = np.sqrt(np.asarray(setup.prior.variance()))
@@ -222,7 +216,7 @@ def test_many_modes_do_not_pass_for_a_gain():
     deviations for each sky, 0.02 on average. About the joint mode it would be 121 x 0.005 = 0.6.
     """
     given = ["lmax=10", "prior={model: isotropic, spectrum: sky}", "noise.receiver={power_k: 2000}"]
-    first = set_up(load_scenario("fiducial", [*given, TABLE % "marginalised"]))
+    first = set_up(lb.load_scenario("fiducial", [*given, TABLE % "marginalised"]))
     found = []
     for seed in range(20):
         z = np.random.default_rng(seed).standard_normal(first.prior.size)
@@ -230,7 +224,7 @@ def test_many_modes_do_not_pass_for_a_gain():
         sky = replace(first.sky, modes=np.asarray(first.prior.colour(z)))
         setup = replace(first, sky=sky, scenario=scenario)
         data = simulate(setup)
-        it = infer(Experiment(setup, data))
+        it = lb.infer(lb.Experiment(setup, data))
         gains = it.systematics[-1]
         told = template_amplitudes(it.model, it.posterior, data.data, gains.columns)
         found.append(gains.common @ (gains.expected + told.mean))
@@ -242,8 +236,8 @@ def test_many_modes_do_not_pass_for_a_gain():
 def test_errors_that_data_name_are_found(response_file):
     setup = calibrated(set_up(four_ports(response_file, "noise.gain_table={}")))
     data = replace(simulate(setup), calibration=setup.calibration)
-    experiment = Experiment(setup, data)
-    found = infer(experiment)
+    experiment = lb.Experiment(setup, data)
+    found = lb.infer(experiment)
     (table,) = found.systematics
     assert table.names == ("gain_M0_PC1", "gain_M0_PC2", "gain_L3_PC1", "gain_M1_PC1")
     slope = slopes(23)[:4]
@@ -261,9 +255,9 @@ def test_errors_that_data_name_are_found(response_file):
 def test_clock_and_pointing_beside_it_settle_in_the_same_rounds(response_file):
     """The step of Gauss and Newton that is left, with derivatives of the exact model in all 26."""
     pointing = "noise.pointing={turntable_deg: 0.05, true_values: {turntable_deg: 0.08}}"
-    experiment = build(four_ports(response_file, *UNKNOWN, pointing, "seed=5"))
+    experiment = lb.build(four_ports(response_file, *UNKNOWN, pointing, "seed=5"))
     setup, d = experiment.setup, np.asarray(experiment.data.data)
-    found = infer(experiment)
+    found = lb.infer(experiment)
     assert [type(s).__name__ for s in found.moving] == ["PointingOffsets", "GainTable"]
     prior = np.sqrt(np.asarray(setup.prior.variance()))
     noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
@@ -312,9 +306,9 @@ def test_what_n_holds_of_the_others_is_seen_through_the_gains(response_file):
 
 def test_sampled_the_density_is_the_closed_form(response_file):
     """Factors by hand on the rows of A and on the offset."""
-    e = build(four_ports(response_file, TABLE % "sampled"))
+    e = lb.build(four_ports(response_file, TABLE % "sampled"))
     setup, z = e.setup, np.array([0.5, -1.5, 0.2, 1.1])
-    program = load_program("systematics")
+    program = lb.load_program("systematics")
     arguments = program_arguments(program, e)
     with numpyro_promotion():
         got, trace = log_density(program.model, (), arguments, {"gain_table": jnp.asarray(z)})
@@ -332,14 +326,14 @@ def test_sampled_the_density_is_the_closed_form(response_file):
 
 def test_beside_what_is_sampled_it_is_marginalised_in_its_place(response_file):
     """Receivers sampled, the gain table in N: the density is that of N about what data tell."""
-    e = build(four_ports(response_file, "noise.receiver={power_k: 2000, treatment: sampled}",
+    e = lb.build(four_ports(response_file, "noise.receiver={power_k: 2000, treatment: sampled}",
                          TABLE % "marginalised"))  # fmt: skip
-    program = load_program("systematics")
+    program = lb.load_program("systematics")
     arguments = program_arguments(program, e)
     values = {f"receiver_{port}_k": jnp.asarray(2000.0 + 50.0 * port) for port in range(4)}
     with numpyro_promotion():
         got = jax.jit(lambda x: log_density(program.model, (), arguments, x)[0])(values)
-    found = infer(e)
+    found = lb.infer(e)
     (table,) = found.moving
     factors = np.asarray(table.errors.factors(np.asarray(table.centre)))
     a = factors[:, None] * np.asarray(e.setup.coupling.dense())
@@ -365,8 +359,8 @@ def test_sampled_and_marginalised_tell_the_same(response_file):
     0.5 % of a standard deviation, a third of the Monte Carlo error of some 4000 draws.
     """
     loud = "noise.radiometer.factor=1e4"
-    e = build(four_ports(response_file, *UNKNOWN, loud, "seed=7"))
-    found = infer(e)
+    e = lb.build(four_ports(response_file, *UNKNOWN, loud, "seed=7"))
+    found = lb.infer(e)
     columns = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
     told = template_amplitudes(found.model, found.posterior, e.data.data, columns)
     centre = told.mean + np.append(np.zeros(5), found.systematics[-1].expected)
@@ -374,12 +368,12 @@ def test_sampled_and_marginalised_tell_the_same(response_file):
     for name in ("receiver", "regolith", "gain_table"):
         tree["noise"][name]["treatment"] = "sampled"
     e = replace(e, setup=replace(e.setup, scenario=type(e.scenario).model_validate(tree)))
-    program = load_program("systematics")
+    program = lb.load_program("systematics")
     arguments = program_arguments(program, e)
-    approximation = laplace_approximation(program.model, arguments)
+    approximation = lb.laplace_approximation(program.model, arguments)
     assert bool(approximation.converged)
-    sampler = Sampler(draws=1500, seed=3)
-    chains = sample(program.model, arguments, sampler, approximation.whitening)
+    sampler = lb.Sampler(draws=1500, seed=3)
+    chains = lb.sample(program.model, arguments, sampler, approximation.whitening)
     assert not chains.statistics["diverging"].any()
     powers = [(chains.sites[f"receiver_{port}_k"] - 2000.0) / 200.0 for port in range(4)]
     ground = (chains.sites["regolith_k"] - 250.0) / 30.0
@@ -398,7 +392,7 @@ def test_sampled_and_marginalised_tell_the_same(response_file):
 
 def refused(setup: Setup, message: str) -> None:
     for ask in (true_values, full_model):
-        with pytest.raises(InputError, match=message) as caught:
+        with pytest.raises(lb.InputError, match=message) as caught:
             ask(setup)
         assert "\n" not in str(caught.value)
 
@@ -436,5 +430,5 @@ def test_tables_that_are_hardly_known(response_file):
 
 @pytest.mark.parametrize("std", ["0", "-0.01", "0.2", "x"])
 def test_what_is_no_standard_deviation(response_file, std):
-    with pytest.raises(InputError, match=r"noise\.gain_table\.std"):
+    with pytest.raises(lb.InputError, match=r"noise\.gain_table\.std"):
         four_ports(response_file, f"noise.gain_table={{std: {std}}}")

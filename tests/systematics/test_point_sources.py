@@ -20,9 +20,8 @@ from reference_linear import exact_posterior
 from scipy.constants import Boltzmann, speed_of_light
 from scipy.stats import chi2, norm
 
+import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.model import (
     base_model,
     full_model,
@@ -36,7 +35,6 @@ from lusee_bayes.linear.fit import RULE
 from lusee_bayes.linear.templates import template_amplitudes
 from lusee_bayes.results.fluxes import flux_lines, flux_table
 from lusee_bayes.results.map_result import map_result
-from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.promotion import numpyro_promotion
 from lusee_bayes.sky import BRIGHT_SOURCES, galactic_unit_vector
 from lusee_bayes.testing import small_scenario
@@ -63,7 +61,7 @@ def setup_of(treatment: str = "marginalised", seed: int = 1) -> Setup:
 @lru_cache
 def experiment(treatment: str = "marginalised", seed: int = 1) -> Setup:
     setup = setup_of(treatment, seed)
-    return Experiment(setup, simulate(setup))
+    return lb.Experiment(setup, simulate(setup))
 
 
 def data(treatment: str = "marginalised", seed: int = 1):
@@ -202,7 +200,7 @@ def test_fluxes_with_the_sky_integrated_out():
 
 
 def test_the_table_is_in_jansky():
-    table = flux_table(experiment(), infer(experiment()))
+    table = flux_table(experiment(), lb.infer(experiment()))
     expected, (mean, std), truth = answer(), priors(), true_values(setup_of())
     jansky = 1.0 / kelvin_steradian(1.0)
     assert list(table["source"]) == ["Cas A", "For A", "For A", "For A", "Polaris"]
@@ -222,7 +220,7 @@ def test_the_table_is_in_jansky():
     assert np.abs(off).max() < 5.0
     # data without a truth have no such column
     real = replace(experiment(), data=replace(data(), truth=None))
-    assert "true_jy" not in flux_table(real, infer(real))
+    assert "true_jy" not in flux_table(real, lb.infer(real))
 
 
 @pytest.mark.long
@@ -263,7 +261,7 @@ def test_ignored_sources_have_no_fluxes():
 @pytest.mark.long
 def test_the_program_given_its_fluxes():
     """d ~ N(T f, A S A^T + N_0). ln det K of 49 squeezed modes: 1e-6 each."""
-    e, program = experiment("sampled"), load_program("sources")
+    e, program = experiment("sampled"), lb.load_program("sources")
     setup = e.setup
     t, (mean, std) = columns(), priors()
     arguments = program_arguments(program, e)
@@ -343,7 +341,7 @@ def test_the_map_command_writes_the_fluxes(tmp_path, capsys):
     assert "Polaris: 2e+04 +- 1e+04 Jy, the prior's: it is never above the horizon" in printed
     with (tmp_path / "sources.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    table = flux_table(experiment(), infer(experiment()))
+    table = flux_table(experiment(), lb.infer(experiment()))
     assert list(rows[0]) == list(table.columns)
     assert [row["source"] for row in rows] == list(table["source"])
     # written in full

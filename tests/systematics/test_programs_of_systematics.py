@@ -11,17 +11,15 @@ from reference_linear import exact_posterior
 from scipy.stats import lognorm, loguniform, norm, truncnorm, uniform
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.terms import Around, gain_drifts
 from lusee_bayes.instrument.products import all_products
-from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.promotion import numpyro_promotion
 
 
-def density(name: str, e: Experiment, values: dict) -> tuple[float, dict]:
+def density(name: str, e: lb.Experiment, values: dict) -> tuple[float, dict]:
     """ln p of everything at these values, and the trace."""
-    program = load_program(name)
+    program = lb.load_program(name)
     arguments = program_arguments(program, e)
     sites = {name: jnp.asarray(value) for name, value in values.items()}
     with numpyro_promotion():

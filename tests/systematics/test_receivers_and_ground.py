@@ -13,17 +13,12 @@ from numpyro.infer.util import log_density
 from reference_linear import white_posterior
 from scipy.stats import norm
 
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.experiment import Experiment, build
-from lusee_bayes.experiment.inference import infer
+import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model, radiometer
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.experiment.simulate import simulate, true_signal, true_values
-from lusee_bayes.instrument.beams import read_beam
 from lusee_bayes.instrument.products import labels
 from lusee_bayes.linear.templates import template_amplitudes
-from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.promotion import numpyro_promotion
 from lusee_bayes.testing import small_scenario
 
@@ -33,8 +28,8 @@ AUTOS = [labels().index(f"{port}{port}R") for port in range(4)]
 
 
 @pytest.fixture(scope="module")
-def experiment(response_file) -> Experiment:
-    return build(four_ports(response_file, RECEIVER % "marginalised", GROUND % "marginalised"))
+def experiment(response_file) -> lb.Experiment:
+    return lb.build(four_ports(response_file, RECEIVER % "marginalised", GROUND % "marginalised"))
 
 
 def columns(response_file, n_times: int) -> np.ndarray:
@@ -42,19 +37,19 @@ def columns(response_file, n_times: int) -> np.ndarray:
     grid = np.zeros((16, n_times, 5))
     for port, product in enumerate(AUTOS):
         grid[product, :, port] = 200.0
-    response = read_beam(response_file)
+    response = lb.read_beam(response_file)
     warmer = response.background(20.0, 280.0) - response.background(20.0, 250.0)
     grid[:, :, 4] = warmer[:, None]
     return grid.reshape(-1, 5)
 
 
-def joint(experiment: Experiment, response_file):
+def joint(experiment: lb.Experiment, response_file):
     """Sky and the five together: 21 unknowns with independent priors."""
     setup, data = experiment.setup, np.asarray(experiment.data.data)
     t = columns(response_file, setup.layout.n_times)
     a = np.concatenate([np.asarray(setup.coupling.dense()), t], axis=1)
     prior = np.append(np.sqrt(np.asarray(setup.prior.variance())), np.ones(5))
-    constant = np.asarray(read_beam(response_file).background(20.0, 250.0)).copy()
+    constant = np.asarray(lb.read_beam(response_file).background(20.0, 250.0)).copy()
     constant[AUTOS] += 2000.0
     noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     rest = data - np.repeat(constant, setup.layout.n_times)
@@ -63,7 +58,7 @@ def joint(experiment: Experiment, response_file):
 
 def test_marginalised_they_are_the_closed_form(experiment, response_file):
     """Means to 1e-5 standard deviations, covariances to 1e-5: Lambda's condition costs 1e-6."""
-    found, expected = infer(experiment), joint(experiment, response_file)
+    found, expected = lb.infer(experiment), joint(experiment, response_file)
     std, sky = expected.std, slice(16)
     off = (np.asarray(found.posterior.mean) - expected.mean[sky]) / std[sky]
     assert np.abs(off).max() < 1e-5
@@ -96,10 +91,10 @@ def test_the_mean_receiver_sets_the_noise_and_the_offset(experiment, response_fi
 
 def test_powers_in_volts_and_their_slope(response_file):
     """P / U_aa at the receiver's input, and a power law in frequency: (20 / 5)^-2 = 1/16."""
-    per_kelvin = read_beam(response_file).per_kelvin(20.0)
+    per_kelvin = lb.read_beam(response_file).per_kelvin(20.0)
     keys = "slope: -2, reference_mhz: 5"
     volts = set_up(four_ports(response_file, f"noise.receiver={{power_v2_hz: 1e-17, {keys}}}"))
-    ground = read_beam(response_file).background(20.0, 250.0)[AUTOS]
+    ground = lb.read_beam(response_file).background(20.0, 250.0)[AUTOS]
     np.testing.assert_allclose(volts.background[AUTOS] - ground, 1e-17 / 16 / per_kelvin, rtol=1e-9)
     kelvin = set_up(four_ports(response_file, f"noise.receiver={{power_k: 160, {keys}}}"))
     np.testing.assert_allclose(kelvin.background[AUTOS] - ground, 10.0, rtol=1e-9)
@@ -153,11 +148,11 @@ def test_ground_at_zero_kelvin_has_a_template_all_the_same(response_file):
 def test_sampled_the_density_is_the_closed_form(response_file):
     """Priors by scipy, and the evidence of the sky alone given the five."""
     given = four_ports(response_file, RECEIVER % "sampled", GROUND % "sampled")
-    e = build(given)
+    e = lb.build(given)
     setup, z = e.setup, np.array([0.3, -0.2, 0.1, 0.5, -1.2])
     values = {f"receiver_{port}_k": 2000.0 + 200.0 * z[port] for port in range(4)}
     values["regolith_k"] = 250.0 + 30.0 * z[4]
-    program = load_program("systematics")
+    program = lb.load_program("systematics")
     sites = {name: jnp.asarray(value) for name, value in values.items()}
     with numpyro_promotion():
         got, trace = log_density(program.model, (), program_arguments(program, e), sites)
@@ -185,6 +180,6 @@ def test_sampled_the_density_is_the_closed_form(response_file):
     ],
 )
 def test_refused_in_one_sentence(overrides, message):
-    with pytest.raises(InputError, match=message) as caught:
-        set_up(load_scenario("fiducial", ["lmax=2", "observation.step_s=1e5", *overrides]))
+    with pytest.raises(lb.InputError, match=message) as caught:
+        set_up(lb.load_scenario("fiducial", ["lmax=2", "observation.step_s=1e5", *overrides]))
     assert "\n" not in str(caught.value)

@@ -13,15 +13,9 @@ from reference_linear import z_of
 from scipy.stats import norm
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.model import full_model, radiometer
 from lusee_bayes.experiment.pieces import program_pieces
 from lusee_bayes.experiment.terms import Around, gain_drifts
-from lusee_bayes.noise import GainDrift
-from lusee_bayes.sampling.hmc import Sampler, sample
-from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.promotion import numpyro_promotion
 
 GAINS = "noise.gain={sigma: %g, correlation_h: 10, treatment: %s, visibilities: %s}"
@@ -30,7 +24,7 @@ PAIRS = [(0, 0), (0, 1), (0, 1), (0, 2), (0, 2), (0, 3), (0, 3), (1, 1), (1, 2),
          (1, 3), (2, 2), (2, 3), (2, 3), (3, 3)]  # fmt: skip
 
 
-def experiment(sigma=1e-3, treatment="sampled", around="model") -> Experiment:
+def experiment(sigma=1e-3, treatment="sampled", around="model") -> lb.Experiment:
     return small_experiment(GAINS % (sigma, treatment, around))
 
 
@@ -38,7 +32,7 @@ def test_the_program_is_the_exact_product_of_gains():
     """Density of sky and white noise against scipy's, with gains worked out antenna by antenna."""
     e = experiment(0.05)
     setup, data = e.setup, e.data
-    program = load_program("gains")
+    program = lb.load_program("gains")
     arguments = {**program.arguments(full_model(setup), program_pieces(e)), "data": data.data}
     drifts = arguments["gain_drifts"]
     rng = np.random.default_rng(0)
@@ -72,7 +66,7 @@ def test_white_noise_makes_drifts_of_the_right_covariance():
     drifts = gain_drifts(experiment().setup, Around())
     hours = np.asarray(drifts.hours)
     for correlation_h in (10.0, 14.0, 20.0):
-        drift = GainDrift(0.02, correlation_h)
+        drift = lb.GainDrift(0.02, correlation_h)
         # a margin for 10 hours cuts off longer ones at exp(-(60 / t)^2 2)
         unit = jnp.eye(drifts.grid.shape[0])
         root = np.asarray(drift.history(unit, hours, drifts.grid))
@@ -83,14 +77,14 @@ def test_white_noise_makes_drifts_of_the_right_covariance():
 
 
 def sampled(e, seed=3):
-    program, inference = load_program("gains"), infer(e)
+    program, inference = lb.load_program("gains"), lb.infer(e)
     posterior = inference.posterior
     pieces = program.arguments(inference.model, program_pieces(e))
     arguments = {**pieces, "data": e.data.data}
-    approximation = laplace_approximation(program.model, arguments, {"sky": posterior.mean})
+    approximation = lb.laplace_approximation(program.model, arguments, {"sky": posterior.mean})
     assert bool(approximation.converged)
-    sampler = Sampler(draws=1500, seed=seed)
-    return sample(program.model, arguments, sampler, approximation.whitening), posterior
+    sampler = lb.Sampler(draws=1500, seed=seed)
+    return lb.sample(program.model, arguments, sampler, approximation.whitening), posterior
 
 
 @pytest.mark.long
