@@ -144,24 +144,6 @@ def test_the_frequency_may_be_traced():
 # --- polarisation
 
 
-@pytest.mark.long
-@pytest.mark.essential
-@pytest.mark.parametrize("stokes_v", [1.0, pytest.param(-1.0, marks=pytest.mark.long)])
-def test_a_circular_wave_is_the_square_of_its_voltages(stokes_v):
-    theta, phi = np.array([0.2, 0.9, 1.4]), np.array([0.3, 2.0, -1.0])
-    m = Monopoles()
-    e_theta, e_phi = (np.asarray(e) for e in m.towards(FREQUENCY, theta, phi))
-    # I = 1 and V = 1: e_theta conj(e_phi) = -i V / 2
-    voltages = (e_theta + 1j * stokes_v * e_phi) / np.sqrt(2.0)
-    norm = float(mean_auto_integral(m.fields(FREQUENCY, HemisphereGrid.for_lmax(0))))
-    expected = np.einsum("ad,bd->abd", voltages, voltages.conj()) / norm
-    n = vectors(theta, phi)
-    total = towards(FREQUENCY, n) + stokes_v * towards(FREQUENCY, n, stokes="V")
-    total = np.asarray(to_matrix(jnp.asarray(total)))
-    close(total, expected, 1e-13)
-    assert np.linalg.matrix_rank(total[..., 0], tol=1e-12) == 1
-
-
 @pytest.mark.essential
 @pytest.mark.parametrize("stokes_v", [1.0, -1.0])
 def test_a_field_that_turns_in_time(stokes_v):

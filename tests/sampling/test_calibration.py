@@ -1,7 +1,7 @@
 """Simulation-based calibration: passes for right posteriors, and notices wrong ones.
 
-By the analytic posterior and by Hamiltonian Monte Carlo, with every kind of N. The data are so few
-(96 of 49 modes) that between 1 % and 80 % of the modes' variances is left from the prior.
+By the analytic posterior, with every kind of N. The data are so few (96 of 49 modes) that between
+1 % and 80 % of the modes' variances is left from the prior.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from scipy import stats
 import lusee_bayes as lb
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.sampling.calibration import (
     FALSE_ALARM,
     LEVELS,
@@ -30,7 +31,6 @@ from lusee_bayes.sampling.calibration import (
     calibrate,
     calibrate_sky,
 )
-from lusee_bayes.sampling.hmc import Sampler, draw_within
 
 SMALL = ("lmax=6", "observation.runs.0.cycles=0.02")
 NOISES = {
@@ -46,20 +46,9 @@ EVERY_NOISE = pytest.mark.parametrize(
 
 
 @lru_cache
-def experiment(noise: str) -> lb.Experiment:
-    scenario, *overrides = NOISES[noise]
-    return lb.build(lb.load_scenario(scenario, [*SMALL, *overrides]))
-
-
-@lru_cache
 def model(noise: str) -> lb.LinearGaussian:
-    return full_model(experiment(noise).setup)
-
-
-@lru_cache
-def dense_model(noise: str) -> lb.LinearGaussian:
-    """With A as a matrix, whose products take a fifth of the structured one's time at this size."""
-    return lb.LinearGaussian(model(noise).coupling.dense(), model(noise).prior, model(noise).noise)
+    scenario, *overrides = NOISES[noise]
+    return full_model(set_up(lb.load_scenario(scenario, [*SMALL, *overrides])))
 
 
 def p_values(ranks: Ranks) -> dict[str, float]:
@@ -318,16 +307,11 @@ def test_too_few_data_sets_are_refused():
 # --- calibrate_sky ----------------------------------------------------------------------------
 
 
-@lru_cache
-def right(noise: str) -> Ranks:
-    return calibrate_sky(model(noise), model(noise), seed=1)
-
-
 @pytest.mark.long
 @pytest.mark.essential
 @EVERY_NOISE
 def test_the_sky_is_calibrated(noise):
-    ranks = right(noise)
+    ranks = calibrate_sky(model(noise), model(noise), seed=1)
     assert ranks.n_simulations == 500
     assert ranks.passed, p_values(ranks)
     assert len(ranks.names) == len(set(ranks.names)) == 22
@@ -386,90 +370,4 @@ def test_a_noise_off_by_sqrt_2_is_noticed(noise, factor):
     assert max(p["distance"], p["log likelihood"]) < 1e-8
 
 
-class Draws(eqx.Module):
-    """Draws of a model's posterior whose random term is off by ``scale``."""
-
-    solver: lb.solver.Solver
-    scale: Float[Array, ""]
-
-    def __call__(self, key, data):
-        posterior = self.solver.condition(data)
-        mean = posterior.mean[None]
-        return mean + self.scale * (posterior.sample(key, N_DRAWS) - mean)
-
-
-class Quantities(eqx.Module):
-    """Every fifth mode, distance from the mean, and the likelihood of all the data."""
-
-    solver: lb.solver.Solver
-    model: lb.LinearGaussian
-
-    def __call__(self, sky, data):
-        residual = data - self.model.coupling @ sky
-        posterior = self.solver.condition(data)
-        return {
-            "mode": sky[::5],
-            "distance": (posterior.whiten(sky[None]) ** 2).sum(),
-            "log likelihood": -(self.solver.factor.whiten(residual) ** 2).sum(),
-        }
-
-
-@pytest.mark.parametrize("scale", [np.sqrt(2), pytest.param(np.sqrt(0.5), marks=pytest.mark.long)])
-def test_a_random_term_off_by_sqrt_2_is_noticed(scale):
-    truth = dense_model("exact")
-    solver = truth.factorise()
-    ranks = calibrate(
-        truth.sample,
-        Draws(solver, jnp.asarray(scale)),
-        Quantities(solver, truth),
-        regions=("distance",),
-    )
-    p = p_values(ranks)
-    assert max(p["distance"], p["log likelihood"]) < 1e-20
-    # every single mode notices, too
-    assert max(v for name, v in p.items() if name.startswith("mode")) < 1e-3
-    # chi^2 of 49 degrees is 49 +- 10, seldom half or twice of that: no truth, or all, are inside
-    assert abs(ranks.coverage()["distance"][0.5] - float(scale > 1)) < 0.02
-
-
 # --- by Hamiltonian Monte Carlo ---------------------------------------------------------------
-
-
-class HMCDraws(eqx.Module):
-    """Every second of 198 draws of one chain, of the program of ``models/sky.py``.
-
-    Ranks are uneven where draws hang together, and those of NUTS do in their distance from the
-    mean. A trajectory of a quarter of a turn forgets where a round Gaussian was, at every draw that
-    is accepted; 0.3 of them are not, so every second draw hangs together by 0.3^2.
-    """
-
-    model: lb.LinearGaussian
-    solver: lb.solver.Solver
-
-    def __call__(self, key, data):
-        program = lb.load_program("sky")
-        arguments = {**program.arguments(self.model), "data": data}
-        whitening = lb.Whitening.of(self.solver.condition(data))
-        sampler = Sampler(warmup=100, draws=N_DRAWS, algorithm="hmc")
-        return draw_within(program.model, arguments, key, sampler, whitening, thin=2)["sky"]
-
-
-@pytest.mark.long
-@EVERY_NOISE
-def test_draws_by_hmc_are_calibrated(noise):
-    truth = dense_model(noise)
-    solver = truth.factorise()
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        ranks = calibrate(
-            truth.sample,
-            HMCDraws(truth, solver),
-            Quantities(solver, truth),
-            regions=("distance",),
-            seed=2,
-        )
-    assert ranks.passed, p_values(ranks)
-    for level in LEVELS:
-        chance = 1 - FALSE_ALARM / (len(LEVELS) * len(ranks.names))
-        least, most = stats.binom.interval(chance, ranks.n_simulations, level)
-        for name, coverage in ranks.coverage().items():
-            assert least <= coverage[level] * ranks.n_simulations <= most, (name, level)

@@ -1,4 +1,4 @@
-"""The program prior_amplitude against its density on a grid, and against simulated truths.
+"""The program prior_amplitude against its density on a grid.
 
 The oracle knows the model from its docstring only: d ~ N(0, A S A^T + N), S = diag(C_ell) with
 C_ell = spectrum A ((ell + 1) / 10)^tilt, ln A ~ N(0, 0.5^2), tilt ~ N(0, 0.5^2).
@@ -8,20 +8,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
-from numpyro import handlers
 from numpyro.infer.util import log_density
 from reference_linear import posterior, random_covariance, z_of
 from scipy.stats import lognorm, norm
 
 import lusee_bayes as lb
-from lusee_bayes.sampling.calibration import N_DRAWS, Ranks, calibrate
-from lusee_bayes.sampling.hmc import Sampler, draw_within, sample
+from lusee_bayes.sampling.hmc import Sampler, sample
 from lusee_bayes.sampling.programs import collapsed_skies, load_program
 
 PROGRAM = load_program("prior_amplitude")
@@ -56,13 +53,13 @@ class Case:
         variance = spectrum_of(self.base, amplitude, tilt)[ell_of_mode(self.lmax)]
         return posterior(self.a, np.diag(variance), self.n, self.data)
 
-    def arguments(self, base_factor=1.0, noise_factor=1.0):
-        """What the program is called with; factors other than 1 make it a wrong one."""
+    def arguments(self):
+        """What the program is called with."""
         return {
             "coupling": jnp.asarray(self.a),
             "offset": jnp.zeros(len(self.a)),
-            "prior": lb.HarmonicPrior(jnp.asarray(base_factor * self.base)),
-            "noise": lb.DenseCovariance(jnp.asarray(noise_factor * self.n)),
+            "prior": lb.HarmonicPrior(jnp.asarray(self.base)),
+            "noise": lb.DenseCovariance(jnp.asarray(self.n)),
             "data": jnp.asarray(self.data),
         }
 
@@ -260,112 +257,3 @@ def test_skies_are_wider_where_their_prior_is_uncertain(poorly_known):
     frozen = {name: np.full((4, 2500), value) for name, value in means.items()}
     with pytest.raises(AssertionError, match="off"):
         assert_variances(skies_of(case, frozen, 5), grid.sky_mean, total)
-
-
-# --- over many data sets --------------------------------------------------------------------------
-
-
-def simulate(case: Case, key):
-    """A truth from the priors, and data of it, with nothing of the package's."""
-    keys = jax.random.split(key, 4)
-    amplitude = jnp.exp(0.5 * jax.random.normal(keys[0], dtype=jnp.float64))
-    tilt = 0.5 * jax.random.normal(keys[1], dtype=jnp.float64)
-    ell = np.arange(len(case.base))
-    std = jnp.sqrt(case.base * amplitude * jnp.power((ell + 1) / 10, tilt))[ell_of_mode(case.lmax)]
-    sky = std * jax.random.normal(keys[2], std.shape, dtype=jnp.float64)
-    noise = np.linalg.cholesky(case.n) @ jax.random.normal(keys[3], (len(case.a),), dtype=float)
-    return {"amplitude": amplitude, "tilt": tilt, "sky": sky}, case.a @ sky + noise
-
-
-def draw(sampler: Sampler, thin: int, arguments: dict, shift, key, data):
-    """Amplitudes and tilts by the package's HMC, skies from what the program returns.
-
-    ``shift``: skies are given to the draw so many places later; anything but 0 is wrong.
-    """
-    chain_key, sky_key = jax.random.split(key)
-    given = {**arguments, "data": data}
-    sites = draw_within(PROGRAM.model, given, chain_key, sampler, thin=thin)
-
-    def sky(inputs):
-        values, key = inputs
-        model = handlers.substitute(handlers.seed(PROGRAM.model, 0), values)
-        return model(**given).condition(data).sample(key)
-
-    skies = jax.lax.map(sky, (sites, jax.random.split(sky_key, N_DRAWS)))
-    return {**sites, "sky": jnp.roll(skies, shift, axis=0)}
-
-
-def quantities(case: Case, unknowns, data):
-    """The unknowns, and two that link them with each other and with the data."""
-    sky, ell = unknowns["sky"], np.arange(len(case.base))
-    spectrum = case.base * unknowns["amplitude"] * jnp.power((ell + 1) / 10, unknowns["tilt"])
-    residual = np.linalg.inv(np.linalg.cholesky(case.n)) @ (data - case.a @ sky)
-    return {
-        "amplitude": unknowns["amplitude"],
-        "tilt": unknowns["tilt"],
-        "mode": sky[np.array([0, len(sky) - 1])],
-        "power": (sky**2).sum(),
-        "prior": (sky**2 / spectrum[ell_of_mode(case.lmax)]).sum(),
-        "log likelihood": -0.5 * (residual**2).sum(),
-    }
-
-
-def ranks(case: Case, sampler: Sampler, thin: int, n: int, batch: int, shift=0, **wrong) -> Ranks:
-    """Right and wrong versions differ in arrays only, so that all run one compiled program."""
-    arguments = {k: v for k, v in case.arguments(**wrong).items() if k != "data"}
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        return calibrate(
-            eqx.Partial(simulate, case),
-            eqx.Partial(draw, sampler, thin, arguments, jnp.asarray(shift)),
-            eqx.Partial(quantities, case),
-            n_simulations=n,
-            seed=1,
-            batch=batch,
-        )
-
-
-def p_values(ranks: Ranks) -> dict[str, float]:
-    return dict(zip(ranks.names, ranks.p_values(), strict=True))
-
-
-def assert_covers(ranks: Ranks):
-    """Central intervals hold the truth as often as they say."""
-    limit = z_of(len(ranks.names) * 4)
-    for name, table in ranks.coverage().items():
-        for level, covered in table.items():
-            off = abs(covered - level) / ranks.coverage_error(level)
-            assert off < limit, f"{level:.0%} interval of {name} holds {covered:.1%}"
-
-
-def of_no_data(lmax, n_data, noise) -> Case:
-    rng = np.random.default_rng(lmax)
-    a, base = rng.normal(size=(n_data, (lmax + 1) ** 2)), 4.0 / (1.0 + np.arange(lmax + 1))
-    return Case(a, base, noise * random_covariance(rng, n_data), np.zeros(n_data))
-
-
-# sampler's every second draw, data sets, data sets at once
-QUICK = (of_no_data(1, 12, 15.0), Sampler(warmup=100, draws=N_DRAWS, algorithm="hmc"), 2, 200, 100)
-
-
-@pytest.mark.long
-def test_calibrated_over_200_data_sets():
-    found = ranks(*QUICK)
-    assert found.passed, p_values(found)
-    assert_covers(found)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("wrong", "witness"),
-    [
-        pytest.param({"base_factor": 2.0}, "prior", marks=pytest.mark.long),
-        pytest.param({"noise_factor": 2.0}, "log likelihood", marks=pytest.mark.long),
-        ({"noise_factor": 0.5}, "log likelihood"),
-        pytest.param({"shift": 17}, "prior", marks=pytest.mark.long),
-    ],
-)
-def test_calibration_notices_what_is_wrong(wrong, witness):
-    """A prior of twice the power, noise off by sqrt(2), skies that belong to other amplitudes."""
-    found = ranks(*QUICK, **wrong)
-    assert not found.passed
-    assert p_values(found)[witness] < found.threshold

