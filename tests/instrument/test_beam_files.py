@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from assertions import close
 from astropy.io import fits
 from astropy.time import Time
-from closeness import close
 from fits_files import write_images
 from reference import hemisphere, real_harmonics
 

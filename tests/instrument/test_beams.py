@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closeness import close
+from assertions import close
 from numpy.polynomial import Polynomial
 from numpy.polynomial.legendre import Legendre
 from reference import SPEED_OF_LIGHT, hemisphere, real_harmonics

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closeness import close, within
-from reference import SPEED_OF_LIGHT, arm_response, layered_reflection
+from assertions import close, within
+from reference import SPEED_OF_LIGHT, arm_response, layered_reflection, vectors
 
 import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
@@ -28,12 +28,9 @@ NO_GROUND = Regolith(1.0, 1.0, 0.0)
 CONDUCTOR = Regolith(4.0, 4.0, 1e16)
 
 
-def arms(zenith_angle_deg, azimuths_deg=PORT_AZIMUTHS_DEG):
-    tilt = np.radians(zenith_angle_deg)
-    return [
-        np.array([np.sin(tilt) * np.cos(a), np.sin(tilt) * np.sin(a), np.cos(tilt)])
-        for a in np.radians(azimuths_deg)
-    ]
+def arms(zenith_angle_deg):
+    tilt = np.full(4, np.radians(zenith_angle_deg))
+    return vectors(tilt, np.radians(PORT_AZIMUTHS_DEG))
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import astropy.units as u
 import erfa
 import numpy as np
 import pytest
+from assertions import within
 from astropy.coordinates import (
     GCRS,
     ICRS,
@@ -16,9 +17,8 @@ from astropy.coordinates import (
     get_sun,
 )
 from astropy.time import Time
-from closeness import within
 from lunarsky import MCMF, LunarTopo, MoonLocation
-from reference import galactic_directions
+from reference import galactic_directions, vectors
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.ephemeris import BODIES, MOON_RADIUS_KM, body_direction
@@ -59,16 +59,10 @@ def test_directions_agree_with_lunartopo(seed):
     )
     to_topo = o.topocentric_from_mcmf() @ o.mcmf_from_galactic()
     theta, phi = np.arccos(rng.uniform(-1, 1, 40)), rng.uniform(0, 2 * np.pi, 40)
-    topo = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    topo = vectors(theta, phi).T
     for k in rng.integers(0, o.n_times, 5):
         colatitude, longitude = galactic_directions(theta, phi, o.times[k], o.lon_deg, o.lat_deg)
-        there = np.stack(
-            [
-                np.sin(colatitude) * np.cos(longitude),
-                np.sin(colatitude) * np.sin(longitude),
-                np.cos(colatitude),
-            ]
-        )
+        there = vectors(colatitude, longitude).T
         # lunarsky goes through the same kernel; what is left is rounding of three rotations
         np.testing.assert_allclose(to_topo[k] @ there, topo, rtol=0, atol=1e-10)
 
@@ -92,11 +86,7 @@ def test_zenith():
     for k in (0, 50):
         zero = np.zeros(1)
         colatitude, longitude = galactic_directions(zero, zero, o.times[k], o.lon_deg, o.lat_deg)
-        expected = [
-            np.sin(colatitude[0]) * np.cos(longitude[0]),
-            np.sin(colatitude[0]) * np.sin(longitude[0]),
-            np.cos(colatitude[0]),
-        ]
+        expected = vectors(colatitude, longitude)[0]
         np.testing.assert_allclose(o.zenith_galactic()[k], expected, rtol=0, atol=1e-10)
 
 

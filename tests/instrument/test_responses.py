@@ -9,8 +9,8 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import close, within
 from astropy.io import fits
-from closeness import close, within
 from fits_files import write_images, write_response
 from reference import hemisphere, real_harmonics
 from scipy.constants import Boltzmann, c, physical_constants

@@ -9,8 +9,8 @@ import healpy
 import numpy as np
 import pytest
 import xarray as xr
+from assertions import close, refused
 from astropy.io import fits
-from closeness import close
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams import (
@@ -266,10 +266,8 @@ def nan_at_the_zenith():
     ],
 )
 def test_arrays_that_are_no_beams_are_refused(given, words):
-    with pytest.raises(lb.InputError) as caught:
+    with refused(words):
         sampled_beams(FREQUENCY, **given())
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_what_cannot_be_computed_is_refused():

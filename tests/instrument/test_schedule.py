@@ -3,9 +3,9 @@ from datetime import datetime, timedelta
 import astropy.units as u
 import numpy as np
 import pytest
+from assertions import within
 from astropy.coordinates import ICRS, CartesianRepresentation, get_body_barycentric
 from astropy.time import Time
-from closeness import within
 from lunarsky import MCMF, MoonLocation
 
 from lusee_bayes.core.errors import InputError

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import close, within
 from astropy.time import Time
-from closeness import close, within
-from reference import galactic_directions, hemisphere, real_harmonics
+from reference import galactic_directions, hemisphere, real_harmonics, vectors
 from scipy.signal import hilbert
 from scipy.special import eval_legendre
 
@@ -27,11 +27,6 @@ from lusee_bayes.instrument.source_response import antenna_directions, source_re
 FREQUENCY = 25.0
 SHORT = Monopoles(Regolith(1.0, 1.0, 0.0), length_m=1e-3, zenith_angle_deg=90.0)  # free space
 ZENITH = np.array([[0.0, 0.0, 1.0]])
-
-
-def vectors(theta, phi):
-    sin = np.sin(theta)
-    return np.stack([sin * np.cos(phi), sin * np.sin(phi), np.cos(theta)], axis=-1)
 
 
 def observation(turntable=(0.0, 35.0, -110.0), step_s=10800.0, cycles=0.35):

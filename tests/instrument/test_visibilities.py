@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from assertions import close, refused
 from astropy.time import Time
-from closeness import close
 
 import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
@@ -291,10 +291,8 @@ def test_angles_are_runs_and_sites_are_places(tmp_path):
     ],
 )
 def test_what_is_wrong_is_said_in_a_sentence(options, words):
-    with pytest.raises(lb.InputError) as caught:
+    with refused(words):
         make(**options)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 # --- layouts --------------------------------------------------------------------------------------

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from closeness import close
+from assertions import close
+from reference_linear import matrices
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
@@ -60,8 +61,8 @@ def test_densities_of_groups_are_what_the_covariance_of_the_data_says():
     """ln p(d_s | others) = ln p(d) - ln p(others), each of K = A S A^T + N as a matrix."""
     e = lb.build(lb.load_scenario("fiducial", [*FEW, NOISY]))
     model = full_model(e.setup)
-    a, n = (np.asarray(x) for x in (model.coupling.dense(), model.noise.dense()))
-    k = a @ np.diag(model.prior.variance()) @ a.T + n
+    a, s, n = matrices(model)
+    k = a @ s @ a.T + n
     less = e.data.data if model.offset is None else e.data.data - model.offset
 
     def log_density(chosen):
@@ -94,8 +95,8 @@ def test_what_is_taken_out_leaves_the_model_of_the_rest(kind):
     gone[:, 4] = gone[6, 9] = gone[2] = True
     left = DenseLeftOut(model, e.data.data, layout).without(gone)
     keep = ~gone[layout.product, layout.time]
-    a, n = (np.asarray(x) for x in (model.coupling.dense(), model.noise.dense()))
-    k = (a @ np.diag(model.prior.variance()) @ a.T + n)[np.ix_(keep, keep)]
+    a, s, n = matrices(model)
+    k = (a @ s @ a.T + n)[np.ix_(keep, keep)]
     rest = e.data.data if model.offset is None else e.data.data - model.offset
     inverse = np.linalg.inv(k)
     u = inverse @ np.asarray(rest)[keep]

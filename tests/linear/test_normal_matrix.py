@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closeness import close
+from assertions import close
 
 from lusee_bayes.core.arrays import on_device, on_host
 from lusee_bayes.core.errors import InputError

@@ -3,9 +3,9 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from assertions import within
 from astropy.coordinates import ICRS, CartesianRepresentation, Galactic
 from astropy.time import Time
-from closeness import within
 from lunarsky import MCMF
 from reference import (
     SPEED_OF_LIGHT,

@@ -7,6 +7,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference_linear import matrices
 from scipy import stats
 from scipy.stats import chi2
 
@@ -290,10 +291,7 @@ def test_the_two_parts_by_matrices(strength):
     model = model_of()
     data = drawn(model, np.random.default_rng(3), strength)
     found, posterior, chi2 = split_of(model, data)
-    a, s, n = (
-        np.asarray(x)
-        for x in (model.coupling.dense(), model.prior.covariance(), model.noise.dense())
-    )
+    a, s, n = matrices(model)
     d = np.asarray(data - model.offset)
     k = a @ s @ a.T + n
     # how strong the sky is: |u|^2 over its mean, tr (1 - C S^-1), at least 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closeness import close
+from assertions import close
 from reference import real_harmonics
 
 import lusee_bayes as lb

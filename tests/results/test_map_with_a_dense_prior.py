@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference_linear import random_covariance
+from reference_linear import matrices, random_covariance
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers
@@ -36,8 +36,7 @@ def mapped() -> MapResult:
 
 def test_the_channel_is_that_of_matrices(mapped):
     model, data = mapped.inference.model, np.asarray(mapped.experiment.data.data)
-    s, mean = np.asarray(model.prior.covariance()), np.asarray(model.prior.mean)
-    a, n = np.asarray(model.coupling.dense()), np.asarray(model.noise.dense())
+    (a, s, n), mean = matrices(model), np.asarray(model.prior.mean)
     covariance = np.asarray(mapped.inference.posterior.covariance())
     channel = mapped.channel
     # chi^2 of residuals: N_data less what the sky takes, tr(A C A^T N^-1)

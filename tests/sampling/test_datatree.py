@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from reference_linear import assert_draws_follow, random_covariance, z_of
+from reference_linear import assert_draws_follow, matrices, random_covariance, z_of
 from reference_linear import posterior as naive_posterior
 
 import lusee_bayes as lb
@@ -46,8 +46,7 @@ def setting():
 @pytest.fixture(scope="module")
 def exact(setting):
     model, data = setting
-    s, n = model.prior.covariance(), model.noise.dense()
-    return naive_posterior(model.coupling.dense(), s, n, data.data)
+    return naive_posterior(*matrices(model), data.data)
 
 
 def chains_of(sites):
@@ -82,13 +81,6 @@ def collapsed(setting):
         n_predictive=N_CHAINS * N_DRAWS,
     )  # fmt: skip
     return tree, chains
-
-
-def a_s_n(model):
-    return (
-        np.asarray(x)
-        for x in (model.coupling.dense(), model.prior.covariance(), model.noise.dense())
-    )
 
 
 def test_every_group_is_there_with_its_dimensions(drawn, setting):
@@ -173,7 +165,7 @@ def test_constants_against_the_textbook(drawn, setting, exact):
 
 def test_prior_groups_follow_the_prior(drawn, setting):
     """Skies N(0, S), data N(0, A S A^T + N), and the data are those of the skies beside them."""
-    a, s, n = a_s_n(setting[0])
+    a, s, n = matrices(setting[0])
     skies = drawn[0]["prior"]["sky"].values[0]
     data = drawn[0]["prior_predictive"]["data"].values[0]
     assert_draws_follow(skies, np.zeros(N_MODES), s)
@@ -183,7 +175,7 @@ def test_prior_groups_follow_the_prior(drawn, setting):
 
 def test_posterior_predictive_follows_the_posterior(drawn, setting, exact):
     """N(A mean, A C A^T + N); new noise on the very sky of the same chain and draw."""
-    a, _, n = a_s_n(setting[0])
+    a, _, n = matrices(setting[0])
     replicated = drawn[0]["posterior_predictive"]["data"].values
     flat = replicated.reshape(-1, len(n))
     assert_draws_follow(flat, a @ exact.mean, a @ exact.covariance @ a.T + n)
@@ -237,7 +229,7 @@ def test_another_seed_makes_other_predictive_draws_and_real_data_have_no_truth(s
 def test_a_program_without_the_sky_gets_it_drawn_given_each_of_its_draws(collapsed, setting):
     """Each in the coordinates of the posterior of its own noise level: unit normals."""
     model, data = setting
-    a, s, n = a_s_n(model)
+    a, s, n = matrices(model)
     tree, chains = collapsed
     levels = chains.sites["noise_level"]
     np.testing.assert_array_equal(tree["posterior"]["noise_level"], levels)
@@ -257,7 +249,7 @@ def test_a_program_without_the_sky_gets_it_drawn_given_each_of_its_draws(collaps
 def test_data_of_a_program_without_the_sky_are_replicated_with_its_skies(collapsed, setting):
     """(d - A m) / sqrt(level) ~ N(0, N), draw by draw; the prior predictive by its variance."""
     model, _ = setting
-    a, s, n = a_s_n(model)
+    a, s, n = matrices(model)
     tree, chains = collapsed
     noise = tree["posterior_predictive"]["data"].values - tree["posterior"]["sky"].values @ a.T
     scaled = noise / np.sqrt(chains.sites["noise_level"])[..., None]
@@ -275,7 +267,7 @@ def test_data_of_a_program_without_the_sky_are_replicated_with_its_skies(collaps
 
 
 def test_the_predictive_test_notices_noise_left_out(drawn, setting):
-    a, _, n = a_s_n(setting[0])
+    a, _, n = matrices(setting[0])
     with pytest.raises(AssertionError, match="sample covariance off"):
         silent = (
             np.zeros((2000, len(n)))

@@ -16,8 +16,8 @@ import numpyro
 import pytest
 from arviz_stats.base import array_stats
 from numpyro import distributions as dist
+from reference_linear import matrices, random_covariance, z_of
 from reference_linear import posterior as naive_posterior
-from reference_linear import random_covariance, z_of
 from scipy.stats import lognorm, multivariate_normal
 
 import lusee_bayes as lb
@@ -56,8 +56,7 @@ def data(gaussian):
 @pytest.fixture(scope="module")
 def exact(gaussian, data):
     """The textbook posterior, by explicit matrices in numpy."""
-    s, n = gaussian.prior.covariance(), gaussian.noise.dense()
-    return naive_posterior(gaussian.coupling.dense(), s, n, data)
+    return naive_posterior(*matrices(gaussian), data)
 
 
 def arguments_of(gaussian, data, name="sky"):
@@ -123,9 +122,7 @@ def test_statistics_belong_to_the_draws_beside_them(nuts, gaussian, data):
     assert set(chains.sites) == {"sky"} and set(chains.statistics) == set(STATISTICS)
     # no chain is a copy of another
     assert np.unique(chains.sites["sky"][..., 0]).size > 3000
-    a, s, n = (np.asarray(x) for x in (
-        gaussian.coupling.dense(), gaussian.prior.covariance(), gaussian.noise.dense()
-    ))  # fmt: skip
+    a, s, n = matrices(gaussian)
     skies = chains.sites["sky"].reshape(-1, N_MODES)
     expected = multivariate_normal(cov=s).logpdf(skies)
     expected += multivariate_normal(cov=n).logpdf(np.asarray(data) - skies @ a.T)
@@ -177,7 +174,7 @@ def level_grid():
 
 def by_quadrature(gaussian, data, noise, logs):
     """Weights of each ln level, and the sky's posterior given it."""
-    a, s = np.asarray(gaussian.coupling.dense()), np.asarray(gaussian.prior.covariance())
+    a, s, _ = matrices(gaussian)
     given = [naive_posterior(a, s, np.exp(x) * noise, data) for x in logs]
     return np.array([answer.log_prob for answer in given]), given
 
@@ -220,9 +217,7 @@ def test_a_sky_in_white_coordinates_beside_a_site_in_none(gaussian, data, level_
 @pytest.mark.parametrize("algorithm", ["nuts", "hmc"])
 def test_the_marginal_program_finds_the_noise_level(gaussian, data, level_grid, algorithm):
     """No site in white coordinates; p(level | d) by quadrature over scipy's evidence."""
-    a, s, n = (np.asarray(x) for x in (
-        gaussian.coupling.dense(), gaussian.prior.covariance(), gaussian.noise.dense()
-    ))  # fmt: skip
+    a, s, n = matrices(gaussian)
     sampler = Sampler(chains=4, warmup=300, draws=1000, algorithm=algorithm)
     arguments = arguments_of(gaussian, data, "sky_marginal")
     chains = sample(lb.load_program("sky_marginal").model, arguments, sampler)
@@ -411,10 +406,10 @@ def test_chains_within_a_program_follow_each_data_sets_posterior(gaussian):
         data, sites = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(1), n_sets))
     assert set(sites) == {"sky"}
     assert sites["sky"].shape == (n_sets, 30, N_MODES)
-    s, n = gaussian.prior.covariance(), gaussian.noise.dense()
+    textbook = matrices(gaussian)
     z = np.empty(sites["sky"].shape)
     for k in range(n_sets):
-        answer = naive_posterior(gaussian.coupling.dense(), s, n, data[k])
+        answer = naive_posterior(*textbook, data[k])
         centred = np.asarray(sites["sky"][k]) - answer.mean
         z[k] = np.linalg.solve(np.linalg.cholesky(answer.covariance), centred.T).T
     i, j = np.triu_indices(N_MODES)

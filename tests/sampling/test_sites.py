@@ -14,7 +14,7 @@ from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer import Predictive
 from numpyro.infer.util import log_density
-from reference_linear import z_of
+from reference_linear import matrices, z_of
 from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
@@ -43,8 +43,7 @@ def gaussian():
 
 def test_densities_against_scipy(gaussian):
     sky, data = gaussian.sample(jax.random.key(0))
-    s, n = np.asarray(gaussian.prior.covariance()), np.asarray(gaussian.noise.dense())
-    a = np.asarray(gaussian.coupling.dense())
+    a, s, n = matrices(gaussian)
     prior = lb.SkyPrior(gaussian.prior).log_prob(sky)
     assert float(prior) == pytest.approx(multivariate_normal(cov=s).logpdf(sky), rel=1e-12)
     given = lb.CorrelatedNormal(gaussian.coupling @ sky, gaussian.noise).log_prob(data)
@@ -187,8 +186,8 @@ def test_the_density_of_z_is_the_programs_own_times_the_determinant(gaussian, ca
 def test_z_is_standard_normal_where_the_coordinates_are_the_posteriors(gaussian, case, z):
     """p(d, m) |dm/dz| = p(d) N(z; 0, 1), with the evidence by scipy."""
     arguments, whitening = case
-    a, s = np.asarray(gaussian.coupling.dense()), np.asarray(gaussian.prior.covariance())
-    covariance = a @ s @ a.T + np.asarray(gaussian.noise.dense())
+    a, s, n = matrices(gaussian)
+    covariance = a @ s @ a.T + n
     evidence = multivariate_normal(cov=covariance).logpdf(arguments["data"])
     for factor in (0.0, 1.0, -5.0):
         at = factor * np.asarray(z)

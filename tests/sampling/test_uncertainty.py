@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
+from reference_linear import matrices, random_covariance, z_of
 from reference_linear import posterior as naive_posterior
-from reference_linear import random_covariance, z_of
 from scipy.stats import norm
 
 import lusee_bayes as lb
@@ -39,8 +39,7 @@ def gaussian():
         lb.DenseCovariance(jnp.asarray(random_covariance(rng, 10))),
     )
     _, data = model.sample(jax.random.key(0))
-    s, n = model.prior.covariance(), model.noise.dense()
-    return model.condition(data), naive_posterior(model.coupling.dense(), s, n, data)
+    return model.condition(data), naive_posterior(*matrices(model), data)
 
 
 @pytest.fixture(scope="module")

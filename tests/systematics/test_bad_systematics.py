@@ -7,6 +7,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import refused
 from experiments import program_arguments, small_experiment
 from numpyro import handlers
 
@@ -36,12 +37,6 @@ def setup_of(*overrides: str) -> Setup:
 def experiment(*overrides: str) -> lb.Experiment:
     setup = setup_of(*overrides)
     return lb.Experiment(setup, simulate(setup))
-
-
-def assert_one_sentence(caught):
-    text = str(caught.value)
-    assert "\n" not in text and len(text) < 300
-    assert "Traceback" not in text and "pydantic" not in text
 
 
 # --- in the scenario ------------------------------------------------------------------------------
@@ -91,9 +86,8 @@ def assert_one_sentence(caught):
     ],
 )
 def test_scenarios_that_contradict_themselves(overrides, message):
-    with pytest.raises(lb.InputError, match=message) as caught:
+    with refused(message):
         lb.load_scenario("fiducial", ["sky.sources=false", *overrides])
-    assert_one_sentence(caught)
 
 
 # --- sources --------------------------------------------------------------------------------------
@@ -109,19 +103,15 @@ def test_scenarios_that_contradict_themselves(overrides, message):
 )
 def test_unknown_sources_name_the_nearest(source, message):
     scenario, setup = small_scenario(f"sources.list=[{source}]"), built()
-    with pytest.raises(lb.InputError, match=message) as caught:
+    with refused(message):
         source_responses(scenario, setup.observation, setup.instrument.monopoles, 25.0)
-    assert_one_sentence(caught)
 
 
 def test_a_source_of_which_nothing_is_known_needs_a_flux():
     """Bodies have no flux in the catalogue; the whole experiment says so."""
     scenario = small_scenario("sources.list=[{name: Jupiter}]")
-    with pytest.raises(
-        lb.InputError, match="'Jupiter' is not in the catalogue.* give flux_jy"
-    ) as c:
+    with refused("'Jupiter' is not in the catalogue.* give flux_jy"):
         lb.build(scenario)
-    assert_one_sentence(c)
     own = SourceSection(name="mine", ra_deg=1.0, dec_deg=2.0)
     with pytest.raises(lb.InputError, match="'mine' is not in the catalogue"):
         mean_flux(own, 25.0)
@@ -136,9 +126,8 @@ def test_a_source_of_which_nothing_is_known_needs_a_flux():
     ],
 )
 def test_sources_that_cannot_be(columns, std, message):
-    with pytest.raises(lb.InputError, match=message) as caught:
+    with refused(message):
         Source(columns, 1.0, std, "X")
-    assert_one_sentence(caught)
 
 
 # --- antennas -------------------------------------------------------------------------------------
@@ -161,9 +150,8 @@ def test_sources_that_cannot_be(columns, std, message):
 def test_antennas_that_cannot_be_sampled(parameters, message):
     setup = setup_of(f"noise.beam.parameters={parameters}", "noise.beam.treatment=sampled")
     for ask in (true_values, systematics):
-        with pytest.raises(lb.InputError, match=message) as caught:
+        with refused(message):
             ask(setup)
-        assert_one_sentence(caught)
 
 
 def test_the_nearer_end_is_named():
@@ -181,9 +169,8 @@ def test_bands_beyond_the_highest_ell():
     e = experiment("prior.band_edges=[3, 7]")
     program = lb.load_program("systematics")
     arguments = {n: v for n, v in program_arguments(program, e).items() if n != "data"}
-    with pytest.raises(lb.InputError, match="a band begins at ell = 7, above lmax = 6") as caught:
+    with refused("a band begins at ell = 7, above lmax = 6"):
         latent_sites(program.model, arguments)
-    assert_one_sentence(caught)
     # 6 is the highest ell itself
     base = replace(base_model(e.setup), prior=lb.HarmonicPrior(jnp.ones(7)))
     with handlers.seed(rng_seed=0):
@@ -208,9 +195,8 @@ def test_nothing_is_counted_twice(program, overrides, section):
     asked = lb.load_program(program)
     e = experiment(*overrides)
     wanted = f"would count twice; set {section}.treatment=sampled"
-    with pytest.raises(lb.InputError, match=wanted) as caught:
+    with refused(wanted):
         program_arguments(asked, e)
-    assert_one_sentence(caught)
     # either of the other treatments will do
     for treatment in ("sampled", "ignored"):
         free = experiment(*overrides, f"{section}.treatment={treatment}")
@@ -227,17 +213,13 @@ def test_what_the_scenario_does_not_have():
         (lambda: program_arguments(lb.load_program("sources"), bare), "has no sources.list"),
         (lambda: point_sources(bare.setup), "the scenario has no sources.list"),
     ):
-        with pytest.raises(lb.InputError, match=message) as caught:
+        with refused(message):
             ask()
-        assert_one_sentence(caught)
 
 
 def test_pieces_of_an_experiment_need_one():
-    with pytest.raises(
-        lb.InputError, match="asks for 'gaussian', a piece of an experiment"
-    ) as caught:
+    with refused("asks for 'gaussian', a piece of an experiment"):
         lb.load_program("systematics").arguments(base_model(built()))
-    assert_one_sentence(caught)
 
 
 # --- commands -------------------------------------------------------------------------------------

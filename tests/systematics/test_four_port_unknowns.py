@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
-from closeness import within
-from experiments import four_ports, program_arguments
-from numpyro.infer.util import log_density
+from assertions import refused, within
+from experiments import density, four_ports, program_arguments
 from reference_linear import white_posterior, z_of
 from scipy.optimize import least_squares
 from scipy.stats import norm
@@ -26,7 +23,6 @@ from lusee_bayes.experiment.terms.gain_table import table_errors
 from lusee_bayes.instrument.calibration import Calibration
 from lusee_bayes.instrument.products import all_products, labels
 from lusee_bayes.linear.templates import template_amplitudes
-from lusee_bayes.sampling.promotion import numpyro_promotion
 from lusee_bayes.testing import small_scenario
 
 RECEIVER = "noise.receiver={power_k: 2000, relative_std: 0.1, treatment: %s}"
@@ -160,9 +156,7 @@ def test_receivers_sampled_have_the_density_of_the_closed_form(response_file):
     values = {f"receiver_{port}_k": 2000.0 + 200.0 * z[port] for port in range(4)}
     values["regolith_k"] = 250.0 + 30.0 * z[4]
     program = lb.load_program("systematics")
-    sites = {name: jnp.asarray(value) for name, value in values.items()}
-    with numpyro_promotion():
-        got, trace = log_density(program.model, (), program_arguments(program, e), sites)
+    got, trace = density(program, program_arguments(program, e), values)
     assert set(trace) == {*values, "data"}
     t = columns(response_file, setup.layout.n_times)
     rest = np.asarray(e.data.data) - np.asarray(setup.offset) - t @ z
@@ -172,7 +166,7 @@ def test_receivers_sampled_have_the_density_of_the_closed_form(response_file):
     expected = white_posterior(a, prior, noise, rest).log_prob
     expected += norm.logpdf(z).sum() - 4 * np.log(200.0) - np.log(30.0)
     # chi^2 of 1e7, each of whose squares is right to 1e-10 of itself
-    assert float(got) == pytest.approx(expected, rel=1e-8)
+    assert got == pytest.approx(expected, rel=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -187,9 +181,8 @@ def test_receivers_sampled_have_the_density_of_the_closed_form(response_file):
     ],
 )
 def test_refused_in_one_sentence(overrides, message):
-    with pytest.raises(lb.InputError, match=message) as caught:
+    with refused(message):
         set_up(lb.load_scenario("fiducial", ["lmax=2", "observation.step_s=1e5", *overrides]))
-    assert "\n" not in str(caught.value)
 
 
 # --- errors of the gain table ---------------------------------------------------------------------
@@ -476,9 +469,7 @@ def test_sampled_the_density_is_the_closed_form(response_file):
     e = lb.build(four_ports(response_file, TABLE % "sampled"))
     setup, z = e.setup, np.array([0.5, -1.5, 0.2, 1.1])
     program = lb.load_program("systematics")
-    arguments = program_arguments(program, e)
-    with numpyro_promotion():
-        got, trace = log_density(program.model, (), arguments, {"gain_table": jnp.asarray(z)})
+    got, trace = density(program, program_arguments(program, e), {"gain_table": z})
     assert set(trace) == {"gain_table", "data"}
     factors = per_port(z)
     a = factors[:, None] * np.asarray(setup.coupling.dense())
@@ -488,7 +479,7 @@ def test_sampled_the_density_is_the_closed_form(response_file):
     expected = white_posterior(a, prior, noise, rest).log_prob + norm.logpdf(z).sum()
     assert abs(expected) > 1e4
     # chi^2 of 1e7, each of whose squares is right to 1e-10 of itself
-    assert float(got) == pytest.approx(expected, rel=1e-8)
+    assert got == pytest.approx(expected, rel=1e-8)
 
 
 def test_beside_what_is_sampled_it_is_marginalised_in_its_place(response_file):
@@ -496,10 +487,8 @@ def test_beside_what_is_sampled_it_is_marginalised_in_its_place(response_file):
     e = lb.build(four_ports(response_file, "noise.receiver={power_k: 2000, treatment: sampled}",
                          TABLE % "marginalised"))  # fmt: skip
     program = lb.load_program("systematics")
-    arguments = program_arguments(program, e)
-    values = {f"receiver_{port}_k": jnp.asarray(2000.0 + 50.0 * port) for port in range(4)}
-    with numpyro_promotion():
-        got = jax.jit(lambda x: log_density(program.model, (), arguments, x)[0])(values)
+    values = {f"receiver_{port}_k": 2000.0 + 50.0 * port for port in range(4)}
+    got, _ = density(program, program_arguments(program, e), values)
     found = lb.infer(e)
     (table,) = found.moving
     factors = np.asarray(table.errors.factors(np.asarray(table.centre)))
@@ -515,7 +504,7 @@ def test_beside_what_is_sampled_it_is_marginalised_in_its_place(response_file):
     prior = np.append(np.sqrt(np.asarray(e.setup.prior.variance())), np.ones(4))
     expected = white_posterior(np.concatenate([a, t], axis=1), prior, noise, rest).log_prob
     expected += norm.logpdf([0.0, 0.25, 0.5, 0.75]).sum() - 4 * np.log(200.0)
-    assert float(got) == pytest.approx(expected, rel=1e-7)
+    assert got == pytest.approx(expected, rel=1e-7)
 
 
 @pytest.mark.long
@@ -557,22 +546,21 @@ def test_sampled_and_marginalised_tell_the_same(response_file):
 # --- refused --------------------------------------------------------------------------------------
 
 
-def refused(setup: Setup, message: str) -> None:
+def both_refuse(setup: Setup, message: str) -> None:
     for ask in (true_values, full_model):
-        with pytest.raises(lb.InputError, match=message) as caught:
+        with refused(message):
             ask(setup)
-        assert "\n" not in str(caught.value)
 
 
 def test_errors_that_nobody_says_and_errors_that_both_say(response_file):
     nothing = set_up(four_ports(response_file, "noise.gain_table={}"))
-    refused(nothing, r"say nothing of a gain table; give noise\.gain_table\.std")
+    both_refuse(nothing, r"say nothing of a gain table; give noise\.gain_table\.std")
     n = nothing.layout.n_times
-    refused(
+    both_refuse(
         replace(nothing, calibration=Calibration(np.full(n, 1e10))), r"give noise\.gain_table\.std"
     )
     both = calibrated(set_up(four_ports(response_file, TABLE % "marginalised")))
-    refused(
+    both_refuse(
         both, r"say the errors of their gain table themselves; leave out noise\.gain_table\.std"
     )
 
@@ -584,7 +572,7 @@ def test_without_a_table_each_port_is_off_as_the_levels_of_flight_files_are(resp
     own = set_up(four_ports(response_file, TABLE % "marginalised", "flight={gain_std: 0.03}"))
     assert (table_errors(own).slope == 0.01).all()
     wide = set_up(four_ports(response_file, "noise.gain_table={}", "flight={gain_std: 0.3}"))
-    refused(wide, r"flight\.gain_std is 0\.3, .* give a smaller noise\.gain_table\.std")
+    both_refuse(wide, r"flight\.gain_std is 0\.3, .* give a smaller noise\.gain_table\.std")
 
 
 def test_tables_that_are_hardly_known(response_file):
@@ -592,7 +580,9 @@ def test_tables_that_are_hardly_known(response_file):
     n = setup.layout.n_times
     slope = np.stack([np.full(n, 0.08), np.full(n, 0.07)])
     wide = Calibration(np.full(n, 1e10), ("a", "b"), np.array([1, 1]), slope)
-    refused(replace(setup, calibration=wide), "of port 1 is known to 0.11 of itself, expected at")
+    both_refuse(
+        replace(setup, calibration=wide), "of port 1 is known to 0.11 of itself, expected at"
+    )
 
 
 @pytest.mark.parametrize("std", ["0", "-0.01", "0.2", "x"])

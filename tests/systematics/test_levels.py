@@ -8,11 +8,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closeness import within
-from experiments import program_arguments, small_experiment
+from assertions import within
+from experiments import density, program_arguments, small_experiment
 from numpyro import handlers
 from numpyro.infer import init_to_median
-from numpyro.infer.util import log_density
 from reference_linear import exact_posterior, random_covariance
 from scipy.stats import lognorm, multivariate_normal, norm
 
@@ -63,14 +62,6 @@ class Case:
 @pytest.fixture(scope="module")
 def case():
     return Case()
-
-
-def density(program, arguments, values) -> tuple[float, dict]:
-    """ln p of everything at these values, and the trace."""
-    values = {name: jnp.asarray(value) for name, value in values.items()}
-    with numpyro_promotion():
-        got, trace = log_density(program.model, (), arguments, values)
-    return float(got), trace
 
 
 def general(case, systematics, values) -> float:

@@ -13,9 +13,8 @@ from functools import lru_cache
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closeness import close
-from experiments import program_arguments, small_experiment
-from numpyro.infer.util import log_density
+from assertions import close
+from experiments import density, program_arguments, small_experiment
 from reference_linear import exact_posterior
 from scipy.constants import Boltzmann, speed_of_light
 from scipy.stats import chi2, norm
@@ -35,7 +34,6 @@ from lusee_bayes.linear.fit import RULE
 from lusee_bayes.linear.templates import template_amplitudes
 from lusee_bayes.results.fluxes import flux_lines, flux_table
 from lusee_bayes.results.map_result import map_result
-from lusee_bayes.sampling.promotion import numpyro_promotion
 from lusee_bayes.sky import BRIGHT_SOURCES, galactic_unit_vector
 from lusee_bayes.testing import small_scenario
 
@@ -272,11 +270,9 @@ def test_the_program_given_its_fluxes():
         expected = exact_posterior(a, s, noise, np.asarray(data().data) - t @ flux).log_prob
         expected += norm.logpdf(flux, mean, std).sum()
         values = {"flux_Cas_A": flux[0], "flux_For_A": flux[1:4], "flux_Polaris": flux[4]}
-        values = {name: jnp.asarray(value) for name, value in values.items()}
-        with numpyro_promotion():
-            got, trace = log_density(program.model, (), arguments, values)
+        got, trace = density(program, arguments, values)
         assert set(trace) == {*SITES, "data"}
-        assert float(got) == pytest.approx(expected, rel=1e-9, abs=1e-4)
+        assert got == pytest.approx(expected, rel=1e-9, abs=1e-4)
 
 
 # --- simulated data -------------------------------------------------------------------------------

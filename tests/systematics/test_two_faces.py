@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
-from experiments import program_arguments, small_experiment
+from experiments import density, program_arguments, small_experiment
 from jax.flatten_util import ravel_pytree
-from numpyro.infer.util import log_density
 from reference_linear import exact_posterior, z_of
 from scipy.stats import lognorm, loguniform, norm, truncnorm, uniform
 
@@ -20,7 +19,6 @@ from lusee_bayes.experiment.model import full_model, radiometer
 from lusee_bayes.experiment.pieces import program_pieces
 from lusee_bayes.experiment.terms import Around, gain_drifts
 from lusee_bayes.instrument.products import all_products
-from lusee_bayes.sampling.promotion import numpyro_promotion
 
 GAINS = "noise.gain={sigma: %g, correlation_h: 10, treatment: %s, visibilities: %s}"
 # of the product (1 + g)(1 + g'), with the gains and the sky by hand
@@ -53,15 +51,9 @@ def test_the_program_is_the_exact_product_of_gains():
     expected += norm.logpdf(sky, 0, np.sqrt(np.asarray(setup.prior.variance()))).sum()
     sigma = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     expected += norm.logpdf(np.asarray(data.data), seen, sigma).sum()
-    with numpyro_promotion():
-        got, trace = log_density(
-            program.model,
-            (),
-            arguments,
-            {"sky": jnp.asarray(sky), "gain_noise": jnp.asarray(white)},
-        )
+    got, trace = density(program, arguments, {"sky": sky, "gain_noise": white})
     # residuals of many sigma: squares of 1e5 sigma, each to 1e-10 of itself
-    assert float(got) == pytest.approx(expected, rel=1e-9)
+    assert got == pytest.approx(expected, rel=1e-9)
     np.testing.assert_allclose(trace["gains"]["value"], gains, rtol=0, atol=1e-15)
 
 
@@ -235,16 +227,6 @@ def test_drifts_too_strong_for_the_coordinates_have_none():
 # --- models/instrument.py and models/gain_scales.py -----------------------------------------------
 
 
-def density(name: str, e: lb.Experiment, values: dict) -> tuple[float, dict]:
-    """ln p of everything at these values, and the trace."""
-    program = lb.load_program(name)
-    arguments = program_arguments(program, e)
-    sites = {name: jnp.asarray(value) for name, value in values.items()}
-    with numpyro_promotion():
-        got, trace = log_density(program.model, (), arguments, sites)
-    return float(got), trace
-
-
 @pytest.mark.long
 @pytest.mark.essential
 def test_the_instruments_program():
@@ -266,7 +248,8 @@ def test_the_instruments_program():
     expected += uniform.logpdf(3.4, 2.5, 2.5) + uniform.logpdf(6.6, 5.0, 3.0)
     expected += loguniform.logpdf(0.02, 1e-3, 1e-1) + lognorm.logpdf(1.7, 0.5)
     expected += norm.logpdf(76.5, 75.0, 2.0)
-    got, trace = density("instrument", e, values)
+    program = lb.load_program("instrument")
+    got, trace = density(program, program_arguments(program, e), values)
     assert set(trace) == {*values, "data"}
     # chi^2 of 1e8, of which A by two routes leaves 1e-13 of 2e4 K against 0.2 K, twice
     assert abs(expected) > 1e4
@@ -303,7 +286,8 @@ def test_the_program_of_gain_scales():
     expected += lognorm.logpdf(sigma, 0.5, scale=0.01)
     expected += truncnorm.logpdf(octaves, -1 / 0.7, 1 / 0.7, 0.0, 0.7)
     values = {"gain_sigma": sigma, "gain_octaves": octaves}
-    got, trace = density("gain_scales", e, values)
+    program = lb.load_program("gain_scales")
+    got, trace = density(program, program_arguments(program, e), values)
     assert set(trace) == {*values, "gain_correlation_h", "data"}
     assert float(trace["gain_correlation_h"]["value"]) == pytest.approx(correlation_h, rel=1e-14)
     # logarithms of 49 squeezed modes, each to 1e-6
