@@ -129,21 +129,6 @@ def test_beams_that_do_not_match_are_refused(beams, shape):
             use(other, beams)
 
 
-def test_placed_antennas():
-    got = placed(antennas(), {"length_m": 3.2, "zenith_angle_deg": 72.0, "deep_permittivity": 6.6})
-    expected = antennas(length_m=3.2, zenith_angle_deg=72.0, deep_permittivity=6.6)
-    for value, other in [
-        (got.length_m, expected.length_m),
-        (got.zenith_angle_deg, expected.zenith_angle_deg),
-        (got.height_m, expected.height_m),
-        (got.regolith.surface_permittivity, expected.regolith.surface_permittivity),
-        (got.regolith.deep_permittivity, expected.regolith.deep_permittivity),
-        (got.regolith.loss_tangent, expected.regolith.loss_tangent),
-    ]:
-        assert float(value) == float(other)
-    assert float(placed(antennas(), {}).length_m) == 3.0
-
-
 def test_a_turntable_offset_is_an_angle_of_the_turntable():
     observation = lb.Observation.from_runs([lb.Run(0.05, turntable_deg=30.0)])
     offset = monopole_beams(FREQUENCY, LMAX, antennas(turntable_offset_deg=12.5))

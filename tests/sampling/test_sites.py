@@ -229,23 +229,6 @@ def test_other_sites_are_left_alone(case, z):
     assert factor - float(whitening.log_det) == pytest.approx(prior, rel=1e-12)
 
 
-def test_conditioning_on_z_fixes_the_sky(case, z):
-    arguments, whitening = case
-    model = lb.whitened(program("sky"), whitening)
-    free = {**arguments, "data": None}
-    conditioned = handlers.condition(model, {"sky_white": z})
-    trace = handlers.trace(handlers.seed(conditioned, 0)).get_trace(**free)
-    assert trace["sky_white"]["is_observed"]
-    np.testing.assert_allclose(
-        trace["sky"]["value"], whitening.mean + whitening.root @ z, rtol=1e-14, atol=1e-14
-    )
-    # the data are drawn by the seed: the same again, and others with another seed
-    again = handlers.trace(handlers.seed(conditioned, 0)).get_trace(**free)
-    other = handlers.trace(handlers.seed(conditioned, 1)).get_trace(**free)
-    np.testing.assert_array_equal(trace["data"]["value"], again["data"]["value"])
-    assert (trace["data"]["value"] != other["data"]["value"]).all()
-
-
 @pytest.mark.parametrize("how", ["obs", "condition"])
 def test_an_observed_sky_is_not_whitened(case, z, how):
     arguments, whitening = case
@@ -256,18 +239,6 @@ def test_an_observed_sky_is_not_whitened(case, z, how):
     model = observed if how == "obs" else handlers.condition(program("sky"), {"sky": z})
     with pytest.raises(lb.InputError, match="the site 'sky' is observed; only latent sites"):
         handlers.substitute(lb.whitened(model, whitening), {"sky_white": z})(**arguments)
-
-
-def test_an_improper_site_is_never_drawn_from(case):
-    """Prior draws of z do not exist; NumPyro says so, and makes nothing up."""
-    arguments, whitening = case
-    model = lb.whitened(program("sky"), whitening)
-    free = {**arguments, "data": None}
-    with numpyro_promotion():
-        with pytest.raises(NotImplementedError):
-            handlers.seed(model, 0)(**free)
-        with pytest.raises(NotImplementedError):
-            Predictive(model, num_samples=3)(jax.random.key(0), **free)
 
 
 def test_predictions_from_draws_of_z(gaussian, case):

@@ -283,17 +283,3 @@ def test_the_level_is_that_of_the_radiometer_only():
     within(full_model(setup).noise.dense(), plain, 1e-13 * term.max())
     # and in simulated data it is the drawn one
     assert set(true_values(setup)) == {"noise_level", "beam_amplitude", "flux_Cas_A", "flux_For_A"}
-
-
-def test_a_term_that_is_already_there_is_scaled(case):
-    """By the definition of the level: of all noise that the model holds so far."""
-    root = np.random.default_rng(1).normal(size=(N_DATA, 2))
-    base = lb.LinearGaussian(
-        case.model.coupling,
-        case.model.prior,
-        case.model.noise + lb.LowRankCovariance(jnp.asarray(root)),
-    )
-    with handlers.substitute(data={"noise_level": jnp.asarray(4.0)}):
-        got = NoiseLevel(1.0).sampled(base).noise.dense()
-    expected = 4.0 * (case.n + root @ root.T)
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-14 * expected.max())

@@ -116,14 +116,6 @@ def test_the_columns_and_the_priors():
     assert [s.site for s in sources.sources] == SITES
 
 
-def test_the_columns_of_the_blocks_sum_to_that_of_one_amplitude():
-    whole = built().responses[1].reshape(-1)
-    blocks = point_sources(built()).sources[1].columns
-    np.testing.assert_array_equal(blocks.sum(1), whole)
-    # each datum belongs to one block
-    assert ((np.asarray(blocks) != 0).sum(1) == 1).all()
-
-
 def test_the_circularly_polarised_part_enters_linearly():
     """An auto sees the power in one polarisation, so it never is negative, whatever V is."""
     e = built()
