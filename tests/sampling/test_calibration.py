@@ -359,7 +359,7 @@ def test_fewer_data_than_modes_with_an_offset():
     assert not calibrate_sky(random_model(True), random_model(False)).passed
 
 
-@pytest.mark.parametrize("factor", [2.0, 0.5])
+@pytest.mark.parametrize("factor", [2.0, pytest.param(0.5, marks=pytest.mark.long)])
 @EVERY_NOISE
 def test_a_noise_off_by_sqrt_2_is_noticed(noise, factor):
     truth = model(noise)

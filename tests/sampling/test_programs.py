@@ -458,7 +458,7 @@ def test_a_density_that_is_nan_names_the_program(tmp_path, capsys):
     path = tmp_path / "bad.py"
     lines = '    numpyro.factor("bad", jnp.log(-1.0) * sky.sum())\n'
     path.write_text((ROOT / "models" / "sky.py").read_text() + lines + "import jax.numpy as jnp\n")
-    small = ["--set", "lmax=3", "--set", "observation.step_s=43200"]
+    small = ["--set", "lmax=2", "--set", "observation.step_s=172800"]
     short = ["--chains", "1", "--warmup", "20", "--draws", "10", "-q"]
     out = str(tmp_path / "out")
     assert main(["sample", "fiducial", *small, "--model", str(path), *short, "-o", out]) == 2
