@@ -55,7 +55,7 @@ def compare_priors_command(
         The given data are of the scenario's own sky: count how often error bars hold it.
     priors
         Two or more, with commas: isotropic, isotropic-sky (C_ell of the scenario's sky; simulated
-        data only), modulated, lognormal, local_scales. By default all that can be. The scenario's
+        data only), lognormal, local_scales. By default all that can be. The scenario's
         own section counts for the prior of its kind.
     draws
         Draws of learned parameters, to check Laplace's evidence by importance sampling; 0 for none.

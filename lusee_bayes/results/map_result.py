@@ -211,7 +211,7 @@ def map_result(
     if onto is not None and experiment.positive is not None:
         raise InputError(
             "a log-normal map cannot be updated: its posterior is not Gaussian; map all data "
-            "together, or use prior.model=modulated"
+            "together, or use another prior.model"
         )
     earlier = None if onto is None else read_updatable(onto, scenario)
     digests = (data.digest(),)

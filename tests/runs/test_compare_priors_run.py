@@ -85,7 +85,7 @@ def test_it_is_what_separate_maps_find(finished):
             assert row["rms"] == pytest.approx(other["rms"], rel=1e-3)
 
 
-@pytest.mark.parametrize("name", ["isotropic-sky", "modulated"])
+@pytest.mark.parametrize("name", ["isotropic-sky", "local_scales"])
 def test_data_of_a_prior_prefer_it(name, tmp_path):
     """A sky drawn from a prior; its mean is the model's, since antennas are warm."""
     scenario = small_scenario(**SIZES)
@@ -95,7 +95,7 @@ def test_data_of_a_prior_prefer_it(name, tmp_path):
     path = write_alms(tmp_path / "sky.fits", sky, {})
     drawn = small_scenario(f"sky={{model: file, file: {path}}}", "sky.sources=null", **SIZES)
     result = run_compare_priors(
-        drawn, tmp_path / "out", ["isotropic-sky", "modulated"], draws=0
+        drawn, tmp_path / "out", ["isotropic-sky", "local_scales"], draws=0
     ).result
     assert result.best.name == name
     assert f"The data prefer {name}" in result.headline()
@@ -107,7 +107,7 @@ def test_data_of_a_prior_prefer_it(name, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--priors", "isotropic,modulatd"], "no prior 'modulatd'; did you mean 'modulated'?"),
+        (["--priors", "isotropic,local"], "no prior 'local'; did you mean 'local_scales'?"),
         (["--priors", "isotropic"], "1 given, and a comparison needs two or more of isotropic"),
         (["--priors", "isotropic,isotropic"], "give each prior once"),
         (["--priors", "isotropic,isotropic-sky", "--data", "x.nc"], "C_ell of the scenario's sky"),

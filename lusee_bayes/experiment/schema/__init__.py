@@ -26,7 +26,6 @@ from lusee_bayes.experiment.schema.prior import (
     PRIOR_SECTIONS,
     IsotropicPriorSection,
     LocalScalesPriorSection,
-    ModulatedPriorSection,
     PriorSection,
 )
 from lusee_bayes.experiment.schema.section import Frequency, Section, Seed
@@ -60,7 +59,6 @@ __all__ = [
     "IsotropicPriorSection",
     "LocalScalesPriorSection",
     "LogNormalPriorSection",
-    "ModulatedPriorSection",
     "MonopoleBeamSection",
     "NoiseAbout",
     "NoiseSection",
