@@ -14,11 +14,10 @@ from lusee_bayes.experiment.rounds import first_order, rebuilds, rebuilds_gains,
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import Around
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.linear.importance import LogMean, sampled_evidence
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.learning import Learned, learn_whatever_fits
 from lusee_bayes.linear.marginal_information import marginalised
-from lusee_bayes.sampling.log_normal.learned import LearnedLogNormal, learn_log_normal
+from lusee_bayes.sampling.log_normal.learned import learn_log_normal
 from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
 from lusee_bayes.sky.prior_family import PriorFamily
 
@@ -131,33 +130,3 @@ def learned_prior(
     first = learn_whatever_fits(coarse, marginalised(information, n, variance), seed=seed)
     start = family.start_from(coarse, first.parameters) if first.settled else None
     return learn_whatever_fits(family, information, start=start, seed=seed)
-
-
-def evidence_by_sampling(
-    family: PriorFamily | LogNormalPrior,
-    information: Information,
-    learned: Learned,
-    n: int,
-    seed: int,
-) -> LogMean:
-    """Estimate ln p(d) with a family's parameters integrated out by importance sampling.
-
-    Parameters
-    ----------
-    family : PriorFamily or LogNormalPrior
-    information : Information
-        What the data say of the sky.
-    learned : Learned
-        Of this family.
-    n : int
-        Number of draws.
-    seed : int
-
-    Raises
-    ------
-    InputError
-        For fewer than two draws.
-    """
-    if isinstance(learned, LearnedLogNormal):
-        return learned.sampled_evidence(n, seed)
-    return sampled_evidence(family, information, learned, n, seed)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-UNKNOWN = "-"
-
 
 def prior_table(
     priors: Sequence[Mapping[str, Any]],
@@ -24,8 +22,6 @@ def prior_table(
         ("ln evidence", *_numbers(evidence)),
         ("less the best", *_less_best(evidence)),
         ("parameters learned", *(str(one["parameters"]) for one in priors)),
-        ("by sampling, less Laplace", *(_sampled(one) for one in priors)),
-        ("draws that count", *(_effective(one) for one in priors)),
     ]
     for k, held in enumerate(priors[0]["held_out"]):
         found = [one["held_out"][k] for one in priors]
@@ -77,18 +73,3 @@ def _less_best(values: Sequence[float]) -> list[str]:
 
 def _of(chi2: float, degrees: float) -> str:
     return f"{chi2:.0f} of {degrees:.0f}"
-
-
-def _sampled(one: Mapping[str, Any]) -> str:
-    """The difference, where enough draws count."""
-    found = one["sampled"]
-    if found is None:
-        return UNKNOWN
-    if not found["trusted"]:
-        return "too few"
-    return f"{found['log_evidence'] - one['log_evidence']:+.1f} ± {found['error']:.1f}"
-
-
-def _effective(one: Mapping[str, Any]) -> str:
-    found = one["sampled"]
-    return UNKNOWN if found is None else f"{found['effective']:.0f} of {found['draws']}"

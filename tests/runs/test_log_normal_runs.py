@@ -114,9 +114,6 @@ def test_it_is_one_of_the_priors_that_are_compared(tmp_path):
     found = {one.name: one for one in result.priors}["lognormal"]
     assert found.n_parameters == 2
     assert found.log_evidence == pytest.approx(lb.build(scenario).learned.log_evidence, abs=1e-3)
-    # Laplace's formula misses little where draws in straight coordinates have even weights
-    assert found.sampled.is_trusted
-    assert abs(found.sampled.value - found.log_evidence) < 1.0
 
 
 def dark_template(folder):

@@ -14,7 +14,7 @@ from lusee_bayes.sky.template import EmbeddedTemplate, HarmonicTemplate, Templat
 
 LMAX, OF_TEMPLATE = 4, 5
 N = n_modes(LMAX)
-TEMPLATE = HarmonicTemplate(np.random.default_rng(1).normal(size=n_modes(OF_TEMPLATE)))
+TEMPLATE = HarmonicTemplate(np.random.default_rng(1).normal(5.0, size=n_modes(OF_TEMPLATE)))
 
 
 def test_the_embedded_template_is_the_sky_without_its_random_part():

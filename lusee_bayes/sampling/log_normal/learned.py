@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.harmonics import modes_to_map
-from lusee_bayes.linear.importance import LogMean
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.learning import Learned
 from lusee_bayes.sampling.log_normal.gauss_newton import find_mode
@@ -132,23 +131,6 @@ class LearnedLogNormal(Learned):
             f"of {len(draws.white)} draws of the log-normal sky {draws.effective:.0f} count: its "
             "standard deviations and draws are rough; lusee-bayes sample has better ones",
         )
-
-    def sampled_evidence(self, n: int, seed: int) -> LogMean:
-        """Estimate ln p(d) with the sky, A and the tilt integrated out by importance sampling.
-
-        Parameters
-        ----------
-        n : int
-            Number of draws, two or more; odd ones are made even.
-        seed : int
-
-        Raises
-        ------
-        InputError
-            For fewer than two.
-        """
-        draws = self.posterior.sample(jax.random.key(seed), n + n % 2)
-        return LogMean.of(draws.log_weights + self.log_evidence)
 
 
 @dataclass(frozen=True)
