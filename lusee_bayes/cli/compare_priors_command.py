@@ -53,7 +53,7 @@ def compare_priors_command(
         The given data are of the scenario's own sky: count how often error bars hold it.
     priors
         Two or more, with commas: isotropic, isotropic-sky (C_ell of the scenario's sky; simulated
-        data only), lognormal, local_scales. By default all that can be. The scenario's
+        data only), local_scales. By default all that can be. The scenario's
         own section counts for the prior of its kind.
     output
         Folder for the results; by default output/NAME-priors.

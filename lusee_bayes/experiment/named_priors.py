@@ -9,7 +9,6 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import (
     IsotropicPriorSection,
     LocalScalesPriorSection,
-    LogNormalPriorSection,
     PriorSection,
 )
 
@@ -18,7 +17,6 @@ OF_TRUE_SKY = "isotropic-sky"
 NAMED: dict[str, PriorSection] = {
     "isotropic": IsotropicPriorSection(),
     OF_TRUE_SKY: IsotropicPriorSection(spectrum="sky"),
-    "lognormal": LogNormalPriorSection(),
     "local_scales": LocalScalesPriorSection(),
 }
 
@@ -35,7 +33,7 @@ def named_priors(
     ----------
     names : sequence of str or None
         Two or more of ``isotropic`` (C_ell learned), ``isotropic-sky`` (that of the scenario's
-        sky), ``lognormal`` and ``local_scales``; None for all that can be.
+        sky) and ``local_scales``; None for all that can be.
     scenario : Scenario
     known_sky : bool
         Whether the data are of the scenario's sky.

@@ -33,7 +33,7 @@ from lusee_bayes.sky.local_strength import (
 )
 from lusee_bayes.sky.prior_family import Hyperprior, Member, PriorFamily
 from lusee_bayes.sky.priors import DensePrior
-from lusee_bayes.sky.template import EmbeddedTemplate, Template
+from lusee_bayes.sky.template import EmbeddedTemplate
 
 # frequency in MHz at which the Galaxy is nearly transparent
 TRANSPARENT_MHZ = 50.0
@@ -74,8 +74,8 @@ class LocalScales(PriorFamily):
     @classmethod
     def of(
         cls,
-        template: Template,
-        transparent: Template,
+        template: EmbeddedTemplate,
+        transparent: EmbeddedTemplate,
         lmax: int,
         frequency_mhz: float,
         sources: tuple[PointSource, ...] = BRIGHT_SOURCES,
@@ -84,20 +84,15 @@ class LocalScales(PriorFamily):
 
         Parameters
         ----------
-        template : Template
+        template : EmbeddedTemplate
             T.
-        transparent : Template
+        transparent : EmbeddedTemplate
             The same sky where hardly anything is absorbed.
         lmax : int
         frequency_mhz : float
             Of the sources' fluxes.
         sources : tuple of PointSource
             The catalogue.
-
-        Raises
-        ------
-        InputError
-            If a template is not positive everywhere.
         """
         smoothed = [SmoothedTemplate.of(each) for each in (template, transparent)]
         bands = tuple(Band.of(window, *smoothed) for window in windows(lmax))

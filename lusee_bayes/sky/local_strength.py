@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy import sparse
 
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.sky.learned_spectrum import PIVOT
-from lusee_bayes.sky.template import Template
+from lusee_bayes.sky.template import EmbeddedTemplate
 
 # NSIDE at which templates are analysed and smoothed
 TEMPLATE_NSIDE, TEMPLATE_LMAX = 64, 96
@@ -123,10 +123,9 @@ class SmoothedTemplate:
     mean_log: float
 
     @classmethod
-    def of(cls, template: Template) -> SmoothedTemplate:
-        """Analyse a template; InputError if it is not positive everywhere."""
+    def of(cls, template: EmbeddedTemplate) -> SmoothedTemplate:
+        """Analyse a template."""
         pixels = template.pixels(TEMPLATE_NSIDE)
-        require_positive_template(pixels)
         alm = healpy.map2alm(pixels, lmax=TEMPLATE_LMAX, iter=3)
         return cls(alm, float(np.log(pixels).mean()))
 
@@ -140,7 +139,7 @@ class SmoothedTemplate:
         beam = healpy.gauss_beam(np.radians(fwhm_deg), lmax=TEMPLATE_LMAX)
         alm = healpy.almxfl(self.alm, beam)
         smooth = healpy.alm2map(alm, TEMPLATE_NSIDE, lmax=TEMPLATE_LMAX)
-        require_positive_template(smooth)
+        require_positive("the smoothed template", smooth)
         return np.log(healpy.get_interp_val(smooth, theta, phi)) - self.mean_log
 
 
@@ -154,12 +153,3 @@ def expected_covariates() -> tuple[
     centre = np.zeros(len(width))
     centre[0] = TEMPLATE_POWER
     return centre, width
-
-
-def require_positive_template(pixels: Float[np.ndarray, " pixels"]) -> None:
-    """Raise an InputError unless a template is positive everywhere."""
-    if not (pixels > 0.0).all():
-        raise InputError(
-            f"the template of the prior is {pixels.min():.3g} K somewhere, expected positive "
-            "temperatures everywhere; give prior.template a sky without holes"
-        )

@@ -240,7 +240,7 @@ def test_the_file_tells_which_beams_they_are(tmp_path, response, scalar):
         (["sky.model=file"], "sky.file is missing"),
         (["prior.spectrum=maps"], "prior.spectrum is 'maps', but .*'learned' or 'sky'"),
         (["prior.model=gaussian"], "prior.model is 'gaussian', which is unknown"),
-        (["prior.sources=false"], "sources is an entry of model local_scales, lognormal, not of"),
+        (["prior.sources=false"], "sources is an entry of model local_scales, not of"),
         (
             ["prior={model: local_scales, scale: 2}"],
             "scale is an entry of model isotropic, not of local_scales",

@@ -11,7 +11,7 @@ from lusee_bayes.experiment.schema.beam import (
 )
 from lusee_bayes.experiment.schema.flight import FlightSection
 from lusee_bayes.experiment.schema.flight_simulated import FlightSimulatedSection
-from lusee_bayes.experiment.schema.log_normal import LogNormalPriorSection
+from lusee_bayes.experiment.schema.log_normal import LogNormalSection
 from lusee_bayes.experiment.schema.noise import (
     BeamErrorSection,
     GainSection,
@@ -58,7 +58,7 @@ __all__ = [
     "GalaxySection",
     "IsotropicPriorSection",
     "LocalScalesPriorSection",
-    "LogNormalPriorSection",
+    "LogNormalSection",
     "MonopoleBeamSection",
     "NoiseAbout",
     "NoiseSection",

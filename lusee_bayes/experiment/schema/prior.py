@@ -12,9 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from lusee_bayes.experiment.schema.log_normal import LogNormalPriorSection
 from lusee_bayes.experiment.schema.section import Megahertz, Positive, Section, without_other_kinds
-from lusee_bayes.experiment.schema.template import LEARNED
 from lusee_bayes.sky import BRIGHT_SOURCES, Sky
 from lusee_bayes.sky.isotropic_family import IsotropicFamily
 from lusee_bayes.sky.local_scales import embedded_local_scales
@@ -22,6 +20,9 @@ from lusee_bayes.sky.prior_family import PriorFamily
 from lusee_bayes.sky.prior_files import read_mean, read_spectrum
 from lusee_bayes.sky.priors import HarmonicPrior, Prior
 from lusee_bayes.sky.template import EmbeddedTemplate
+
+# where C_ell comes from
+LEARNED = "learned from these data"
 
 
 class IsotropicPriorSection(Section):
@@ -179,7 +180,6 @@ PRIOR_SECTIONS = {
     for section in (
         LocalScalesPriorSection,
         IsotropicPriorSection,
-        LogNormalPriorSection,
     )
 }
 
