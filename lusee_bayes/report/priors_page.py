@@ -9,7 +9,7 @@ from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_json
 from lusee_bayes.report import head, html
 from lusee_bayes.report.run_details import details
-from lusee_bayes.results.prior_table import prior_table
+from lusee_bayes.results.prior_comparison import prior_table
 from lusee_bayes.results.saved import COVERAGE, HELD_OUT, PRIOR, PRIORS, SKY_ERRORS, SNR
 
 FIGURE = (

@@ -8,10 +8,8 @@ from scipy.integrate import quad
 
 from lusee_bayes.core.harmonics import n_modes, per_mode, synthesis_matrix
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.sky.isotropic_family import IsotropicFamily
-from lusee_bayes.sky.local_scales import embedded_local_scales
-from lusee_bayes.sky.local_strength import windows
-from lusee_bayes.sky.prior_family import Hyperprior, PriorFamily
+from lusee_bayes.sky.local_scales import embedded_local_scales, windows
+from lusee_bayes.sky.prior_family import Hyperprior, IsotropicFamily, PriorFamily
 
 LMAX = 5
 

@@ -11,7 +11,6 @@ from lusee_bayes.experiment.schema.beam import (
 )
 from lusee_bayes.experiment.schema.flight import FlightSection
 from lusee_bayes.experiment.schema.flight_simulated import FlightSimulatedSection
-from lusee_bayes.experiment.schema.log_normal import LogNormalSection
 from lusee_bayes.experiment.schema.noise import (
     BeamErrorSection,
     GainSection,
@@ -26,6 +25,7 @@ from lusee_bayes.experiment.schema.prior import (
     PRIOR_SECTIONS,
     IsotropicPriorSection,
     LocalScalesPriorSection,
+    LogNormalSection,
     PriorSection,
 )
 from lusee_bayes.experiment.schema.section import Frequency, Section, Seed
