@@ -12,7 +12,6 @@ from lusee_bayes.cli.options import (
     DataFiles,
     Flag,
     Force,
-    Number,
     Output,
     Overrides,
     Quiet,
@@ -33,7 +32,6 @@ def compare_priors_command(
     clock: Clock = None,
     truth: Flag = False,
     priors: str | None = None,
-    draws: Number = 100,
     output: Output = None,
     set_: Overrides | None = None,
     workers: Workers = None,
@@ -55,10 +53,8 @@ def compare_priors_command(
         The given data are of the scenario's own sky: count how often error bars hold it.
     priors
         Two or more, with commas: isotropic, isotropic-sky (C_ell of the scenario's sky; simulated
-        data only), modulated, lognormal, local_scales. By default all that can be. The scenario's
+        data only), local_scales. By default all that can be. The scenario's
         own section counts for the prior of its kind.
-    draws
-        Draws of learned parameters, to check Laplace's evidence by importance sampling; 0 for none.
     output
         Folder for the results; by default output/NAME-priors.
     set_
@@ -91,7 +87,6 @@ def compare_priors_command(
             names,
             data=data,
             truth=truth,
-            draws=draws,
             name=Path(scenario).stem,
             engine=engine,
             replace=force,

@@ -27,7 +27,7 @@ from lusee_bayes.experiment.schema import (
     GalaxySection,
     IsotropicPriorSection,
     LocalScalesPriorSection,
-    LogNormalPriorSection,
+    LogNormalSection,
     MonopoleBeamSection,
     NoiseSection,
     ObservationSection,
@@ -73,6 +73,8 @@ class Scenario(Section):
         Point sources apart from the map.
     spectral : SpectralSection
         Prior of joint channels.
+    log_normal : LogNormalSection
+        Prior of the program ``log_normal``.
     flight : FlightSection
         How sessions of the spectrometer become visibilities.
     output : OutputSection
@@ -93,6 +95,7 @@ class Scenario(Section):
     noise: NoiseSection = NoiseSection()
     sources: SourcesSection = SourcesSection()
     spectral: SpectralSection = SpectralSection()
+    log_normal: LogNormalSection = LogNormalSection()
     flight: FlightSection | None = None
     output: OutputSection = OutputSection()
     seed: Seed = 1
@@ -159,11 +162,6 @@ class Scenario(Section):
             raise ValueError(
                 "noise.receiver.smooth_octaves ties the receivers of channels that have a "
                 "posterior each; with joint, leave it out"
-            )
-        if isinstance(self.prior, LogNormalPriorSection):
-            raise ValueError(
-                "noise.receiver.smooth_octaves ties channels whose skies are Gaussian, not those "
-                "of prior.model=lognormal; leave it out, or take another prior"
             )
         return self
 

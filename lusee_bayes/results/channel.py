@@ -232,7 +232,6 @@ def channel_of_information(
     draws: Float[Array, "n modes"],
     *,
     compared: Float[np.ndarray, "more modes"] | None = None,
-    known_widths: tuple[np.ndarray, np.ndarray] | None = None,
     independent: Float[Array, " modes"] | None = None,
     log_evidence: float = np.nan,
     information_bits: float = np.nan,
@@ -254,8 +253,6 @@ def channel_of_information(
         In K.
     compared : (more, modes) array, optional
         Draws less mean for :class:`.Counts`, where the truth is known, in K.
-    known_widths : (modes,) and (pixels,) array, optional
-        Standard deviations other than the covariance's, in K.
     independent, log_evidence, information_bits, chi2_model, refinement
         See :class:`ChannelResult`.
     """
@@ -267,8 +264,6 @@ def channel_of_information(
         expected = float(information.n_data - np.vdot(information.matrix, covariance))
     std, unknowns = np.sqrt(np.diagonal(np.asarray(covariance))), observed.unknowns
     width, found = pixel_std(covariance, round(np.sqrt(observed.highest_altitude.size / 12))), ()
-    if known_widths is not None:
-        std, width = known_widths
     if compared is not None and observed.truth is not None:
         found = Counts.of_pixels(width, observed.truth - np.asarray(mean), compared).coverage()
     return ChannelResult(

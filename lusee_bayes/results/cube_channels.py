@@ -26,7 +26,6 @@ from lusee_bayes.results.draws import (
     draw_key,
     perturbation_key,
     posterior_draws,
-    widths,
 )
 from lusee_bayes.results.joint_channels import names_of
 from lusee_bayes.results.joint_components import (
@@ -124,7 +123,6 @@ def cube_result(
             covariance,
             draws,
             compared=compared,
-            known_widths=widths(experiment, covariance, channel.map_nside),
             **numbers,
         )
         files.write(channel, wanted, found.to_dataset())

@@ -15,9 +15,11 @@ from lusee_bayes.linear.positive_joint import MAX_ROUNDS, PositiveMode, find_joi
 from lusee_bayes.linear.positive_learning import COARSE_LMAX, learn_laws
 from lusee_bayes.results.joint_channels import ChannelsInFiles
 from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES
-from lusee_bayes.sky.modulated import DEVIATIONS
 from lusee_bayes.sky.positive_skies import PositiveSkies
 from lusee_bayes.sky.template import EmbeddedTemplate, galactic_share
+
+# highest ell of the fields, over that of the map
+FIELDS = 1.5
 
 
 def lmax_of_fields(scenario: Scenario, lmax: int | None = None) -> int:
@@ -46,7 +48,7 @@ def lmax_of_fields(scenario: Scenario, lmax: int | None = None) -> int:
             f"than the {DIRECT_UNKNOWNS} that are solved for directly; use lmax={highest}, fewer "
             "spectral.fields, or spectral.model=components"
         )
-    return min(round(DEVIATIONS * lmax), highest)
+    return min(round(FIELDS * lmax), highest)
 
 
 def positive_skies(scenario: Scenario) -> PositiveSkies:

@@ -201,14 +201,6 @@ PRIOR = Layout(
         **{f"{x}_{y}": NUMBER for x in ("chi2", "degrees") for y in ("instrument", "prior")},
     },
 )
-SAMPLED = Layout(
-    "an evidence by importance sampling",
-    attributes={
-        **dict.fromkeys(("log_evidence", "error", "effective"), NUMBER),
-        "draws": COUNT,
-        "trusted": Attribute("boolean"),
-    },
-)
 HELD_OUT = Layout(
     "groups of data that were left out",
     attributes={

@@ -48,18 +48,8 @@ class SampleRun:
 
 
 def default_program(scenario: Scenario) -> Program:
-    """``log_normal`` under such a prior, ``systematics`` where something is sampled, or ``sky``.
-
-    InputError for a log-normal prior with something else to sample.
-    """
-    if scenario.prior.model != "lognormal":
-        return load_program("systematics" if scenario.samples else "sky")
-    if scenario.samples:
-        raise InputError(
-            "with prior.model=lognormal the sky and its prior are sampled, and nothing else; set "
-            "treatment=marginalised, or give a program of your own"
-        )
-    return load_program("log_normal")
+    """``systematics`` where something is sampled, or ``sky``."""
+    return load_program("systematics" if scenario.samples else "sky")
 
 
 def run_sample(

@@ -107,14 +107,14 @@ def test_yaml_of_the_package_holds_only_known_keys():
 def test_anchored_scenarios_name_the_same_files_in_any_folder(tmp_path, monkeypatch):
     settings = (
         "sky={model: file, file: a.fits}",
-        "prior={model: lognormal, template: b.fits}",
+        "prior={model: isotropic, mean_file: b.fits}",
         "observation.schedule=c.csv",
         "beam.file=d.nc",
     )
     scenario = load_scenario("fiducial", list(settings))
     monkeypatch.chdir(tmp_path)
     found = scenario.anchored()
-    names = found.sky.file, found.prior.template, found.observation.schedule, found.beam.file
+    names = found.sky.file, found.prior.mean_file, found.observation.schedule, found.beam.file
     assert names == tuple(str(tmp_path / name) for name in ("a.fits", "b.fits", "c.csv", "d.nc"))
     assert found.anchored() == found
     # what is no file has another name nowhere
@@ -126,5 +126,5 @@ def test_every_entry_that_names_a_file_is_known():
     keys = {entry.path.split(".")[-1] for entry in scenario_keys()}
     files = {key for key in keys if key == "file" or key.endswith("_file")}
     assert files <= set(FILES) and set(FILES) - files == {
-        *("schedule", "template", "clock", "gain_table", "lines"),
+        *("schedule", "clock", "gain_table", "lines"),
     }

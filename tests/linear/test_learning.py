@@ -22,8 +22,8 @@ from lusee_bayes.linear.learning import (
 from lusee_bayes.linear.marginal_information import marginalised
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
-from lusee_bayes.sky.isotropic_family import IsotropicFamily
 from lusee_bayes.sky.local_scales import embedded_local_scales
+from lusee_bayes.sky.prior_family import IsotropicFamily
 from lusee_bayes.sky.priors import HarmonicPrior
 
 LMAX, N_DATA = 6, 120

@@ -16,7 +16,7 @@ from lusee_bayes.linear.learning import Learned
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.parameter_draws import draws_with_parameters, information_behind
 from lusee_bayes.noise.covariance import DiagonalCovariance
-from lusee_bayes.sky.isotropic_family import IsotropicFamily
+from lusee_bayes.sky.prior_family import IsotropicFamily
 from lusee_bayes.sky.priors import DensePrior, HarmonicPrior
 
 LMAX = 3

@@ -21,7 +21,7 @@ LMAX = 8
 SMALL = [
     f"lmax={LMAX}",
     "observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]",
-    "prior={model: modulated, amplitude: 0.04}",
+    "prior.model=local_scales",
 ]
 POINTS = [(0.0, 0.0), (280.0, -32.0), (123.4, 56.7), (180.0, 90.0)]
 
@@ -30,7 +30,7 @@ POINTS = [(0.0, 0.0), (280.0, -32.0), (123.4, 56.7), (180.0, 90.0)]
 def run(tmp_path_factory):
     output = "output={draws: 20, covariance: true, compact: true, updatable: true}"
     scenario = lb.load_scenario("fiducial", [*SMALL, output])
-    return lb.run_map(scenario, tmp_path_factory.mktemp("modulated") / "map")
+    return lb.run_map(scenario, tmp_path_factory.mktemp("correlated") / "map")
 
 
 def test_its_files_agree(run):
@@ -69,14 +69,3 @@ def test_point_spread_functions_of_its_page(run, tmp_path):
     variance = (y * width) ** 2 @ (step**2 / 12) @ ((there / width) ** 2).T
     assert (np.abs(kernels - expected) < 6 * np.sqrt(variance) + 1e-6 * expected.max()).all()
     assert np.abs(kernels - expected).max() < 0.03 * np.abs(expected).max()
-
-
-def test_it_beats_the_isotropic_prior_on_a_sky_of_planes(run):
-    """The embedded sky with another random part and without its sources."""
-    sky = "sky={seed: 7, sources: false}"
-    scenario = lb.load_scenario("fiducial", [*SMALL, sky])
-    evidence = []
-    for prior in (scenario.prior, lb.load_scenario("fiducial").prior):
-        given = scenario.model_copy(update={"prior": prior})
-        evidence.append(float(lb.infer(lb.build(given)).posterior.log_evidence))
-    assert evidence[0] > evidence[1] + 30.0
