@@ -52,8 +52,7 @@ STATES = [
     ["flight.simulated.navgf=3", "flight.simulated.levels=LMHM"],
     ["flight.simulated.navgf=4", "flight.convention=conj(s_i) s_j"],
     ["flight.simulated.levels=LLLL", "flight.simulated.kind=fits", "flight.bin_origin=edge"],
-    ["flight.simulated.layout=4", "flight.simulated.session_h=1.4"],
-    ["flight.simulated.layout=4", "flight.simulated.kind=fits", "flight.simulated.navgf=2"],
+    ["flight.simulated.kind=fits", "flight.simulated.session_h=1.4"],
     ["flight.simulated.switch_h=2.2", "flight.simulated.levels=HHHH"],
     ["flight.simulated.clock=unknown", "flight.convention=conj(s_i) s_j"],
 ]
@@ -212,18 +211,11 @@ def test_a_tone_that_no_bin_holds_is_refused():
 
 
 @pytest.mark.parametrize(
-    "change", ["navgf=5", "levels=MMMX", "levels=MMM", "layout=2", "saturated_share=0.9"]
+    "change", ["navgf=5", "levels=MMMX", "levels=MMM", "kind=netcdf", "saturated_share=0.9"]
 )
 def test_impossible_states_are_refused(change):
     with pytest.raises(InputError):
         load_scenario("fiducial", [*SMALL, "flight.simulated={}", f"flight.simulated.{change}"])
-
-
-@pytest.mark.parametrize("kind", ["hdf5", "fits"])
-def test_telemetry_of_layout_4_needs_a_clock(kind):
-    change = f"{{layout: 4, kind: {kind}, clock: unknown}}"
-    with pytest.raises(InputError, match="layout"):
-        load_scenario("fiducial", [*SMALL, f"flight.simulated={change}"])
 
 
 def test_gains_are_off_as_they_are_said_to_be(tmp_path):

@@ -6,6 +6,21 @@ import h5py
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.time import Time
+from layout_4 import (
+    GAINS,
+    LANDING,
+    NAMES,
+    NOTCH,
+    RAW_S,
+    SPECTROMETER_S,
+    WEIGHT,
+    N,
+    counts,
+    metadata,
+    telemetry,
+    write_layout_4,
+)
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.flight.sessions import is_session, read_session
@@ -190,3 +205,85 @@ def test_gains_in_letters_are_the_same(copy):
     with h5py.File(copy, "a") as file:
         change(file, "spectra/metadata/actual_gain", lambda x: np.full(x.shape, b"M"))
     np.testing.assert_array_equal(read_session(copy).level, numbers)
+
+
+@pytest.fixture
+def newer(tmp_path):
+    """A session of layout 4 that a test may change."""
+    return write_layout_4(tmp_path / "session_4.h5")
+
+
+def test_what_a_session_of_layout_4_says(newer):
+    session, rows = read_session(newer), metadata()
+    assert is_session(newer)
+    assert (session.n_rows, session.layout, session.kind) == (N, 4, "HDF5")
+    assert (session.lon_deg, session.lat_deg, session.software) == (182.258, -23.814, "0x307")
+    np.testing.assert_array_equal(session.raw_s, RAW_S)
+    np.testing.assert_array_equal(session.navgf, 2)
+    np.testing.assert_array_equal(session.frames, 2.0**14 * WEIGHT)
+    np.testing.assert_allclose(session.window_s, 2**20 * 40e-6, rtol=1e-12)
+    np.testing.assert_array_equal(session.level, np.array(list("LMH"))[GAINS])
+    np.testing.assert_array_equal(session.adc_low, rows["adc_min"])
+    np.testing.assert_array_equal(session.adc_high, rows["adc_max"])
+    np.testing.assert_array_equal(session.adc_invalid, rows["adc_invalid_count_max"])
+    np.testing.assert_array_equal(session.errors, rows["errors"])
+    np.testing.assert_array_equal(session.notch, NOTCH)
+    assert session.telemetry.keys() == set(NAMES[1:])
+    for name, values in session.telemetry.items():
+        np.testing.assert_allclose(values, telemetry(name, RAW_S), rtol=1e-9)
+    utc = session.clock.utc(RAW_S)
+    np.testing.assert_allclose((utc - Time(LANDING)).sec, RAW_S - SPECTROMETER_S, atol=1e-5)
+    with session.spectra() as read:
+        np.testing.assert_array_equal(read(1, 4), counts()[1:4])
+
+
+FIELDS = "spectra/metadata/fields"
+CONTRADICTIONS = {
+    "spectra/raw_time_valid": (False, "raw_time_valid"),
+    f"{FIELDS}/adc_min/variant_000/row_indices": (10**6, "row_indices"),
+    f"{FIELDS}/navgf/variant_000/data": (1, "navgf"),
+    "telemetry/mission_seconds": (7, "does not cover the spectra"),
+}
+
+
+@pytest.mark.parametrize("name", CONTRADICTIONS)
+def test_layout_4_that_contradicts_itself_is_refused(newer, name):
+    value, told = CONTRADICTIONS[name]
+    with h5py.File(newer, "a") as file:
+        file[name][...] = value
+    with pytest.raises(InputError, match=told):
+        read_session(newer)
+
+
+LACKING_4 = {
+    "spectra": "has no spectra/data",
+    "spectra/raw_seconds": "has no spectra/raw_times",
+    "constants": "has no constants.lun_lat_deg",
+    f"{FIELDS}/adc_min": "has no spectra/metadata/adc_min",
+    f"{FIELDS}/actual_gain": "has no spectra/metadata/actual_gain",
+    "telemetry/values": "telemetry has no values",
+}
+
+
+@pytest.mark.parametrize("name", LACKING_4)
+def test_what_layout_4_lacks_is_named(newer, name):
+    with h5py.File(newer, "a") as file:
+        del file[name]
+    with pytest.raises(InputError, match=LACKING_4[name]) as refused:
+        read_session(newer)
+    assert "\n" not in str(refused.value)
+
+
+def test_without_a_clock_reference_the_telemetry_of_layout_4_is_not_known(newer):
+    with h5py.File(newer, "a") as file:
+        file["clock_reference"].attrs["available"] = np.bool_(False)
+    session = read_session(newer)
+    assert session.clock is None and not session.telemetry
+
+
+def test_layout_4_in_fits_is_refused(tmp_path):
+    primary = fits.PrimaryHDU()
+    primary.header["LAYOUTV"] = 4
+    primary.writeto(tmp_path / "s.fits")
+    with pytest.raises(InputError, match="as HDF5"):
+        read_session(tmp_path / "s.fits")

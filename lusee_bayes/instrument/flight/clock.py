@@ -104,6 +104,13 @@ class Clock:
         whole = np.floor(days)
         return utc_of(self.jd1 + whole, self.jd2 + (days - whole), self.scale)
 
+    @property
+    def isot(self) -> str:
+        """The reference time as text, in its own scale."""
+        with unannounced_leap_seconds():
+            time = Time(self.jd1, self.jd2, format="jd", scale=self.scale, precision=9)
+            return str(time.isot)
+
     def correcting(self, said: Clock) -> Clock:
         """Return the clock of a session by what it says itself, corrected by this one."""
         with unannounced_leap_seconds():

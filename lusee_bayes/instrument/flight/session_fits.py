@@ -1,4 +1,4 @@
-"""Sessions of ``lusee.ingest`` in FITS: the same as in HDF5, layout 3 under other names."""
+"""Sessions of ``lusee.ingest`` in FITS, layout 3: the same as in HDF5, under other names."""
 
 from __future__ import annotations
 
@@ -14,10 +14,8 @@ from jaxtyping import Shaped
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.fits_files import IMAGE_DTYPES, opened
 from lusee_bayes.core.layouts import Unread
-from lusee_bayes.instrument.flight.fits_groups import FITSGroups
 from lusee_bayes.instrument.flight.session import Read, Session
 from lusee_bayes.instrument.flight.session_layout import META, require_version, session_of
-from lusee_bayes.instrument.flight.session_layout_4 import session_of_4
 
 WHAT = "a session of lusee.ingest in FITS"
 # tables, with what comes before the names of their columns in HDF5
@@ -73,7 +71,10 @@ def read_fits_session(path: Path) -> Session:
     with opened(path, WHAT) as hdus:
         version = require_version(path, hdus[0].header.get("LAYOUTV"))
         if version == 4:
-            return session_of_4(path, "FITS", FITSGroups(path, hdus), _opener_4(path))
+            raise InputError(
+                f"{path} is of layout 4 in FITS; this version reads layout 4 in HDF5: ingest the "
+                "session again with luseepy, as HDF5"
+            )
         names = [hdu.name for hdu in hdus]
         if "SPECTRA" not in names:
             raise InputError(
@@ -107,19 +108,5 @@ def _opener(path: Path) -> Callable[[], AbstractContextManager[Read]]:
                 return np.asarray(cube[first:last], dtype=np.float32)
 
             yield read
-
-    return spectra
-
-
-def _opener_4(path: Path) -> Callable[[], AbstractContextManager[Read]]:
-    @contextmanager
-    def spectra() -> Iterator[Read]:
-        with opened(path, WHAT) as hdus:
-            cube = FITSGroups(path, hdus).array("spectra/data")
-
-        def read(first: int, last: int) -> Shaped[np.ndarray, "rows products channels"]:
-            return np.asarray(cube.rows(first, last), dtype=np.float32)
-
-        yield read
 
     return spectra

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ def read_hdf5_session(path: Path) -> Session:
         with h5py.File(path) as file:
             version = require_version(path, file.attrs.get("layout_version"))
             if version == 4:
-                return session_of_4(path, "HDF5", _Tree(file), _opener(path))
+                return session_of_4(path, file, _opener(path))
             if "spectra" not in file or "data" not in file["spectra"]:
                 raise InputError(
                     f"{path} has no spectra/data: the session holds no spectra (it has "
@@ -51,29 +51,6 @@ def read_hdf5_session(path: Path) -> Session:
             arrays, values = _content(file)
             arrays |= _telemetry(path, file)
             return session_of(path, version, "HDF5", arrays, values, None, _opener(path))
-
-
-class _Tree:
-    """A :class:`.Tree` of an open file."""
-
-    def __init__(self, file: h5py.File):
-        self._file = file
-
-    def attributes(self, path: str) -> Mapping[str, Any]:
-        item = self._file.get(path)
-        return {} if item is None else dict(item.attrs)
-
-    def array(self, path: str) -> Unread | None:
-        item = self._file.get(path)
-        if not isinstance(item, h5py.Dataset):
-            return None
-        if h5py.check_string_dtype(item.dtype) is not None:
-            return np.array(item.asstr()[()], dtype=np.str_)
-        return item
-
-    def names(self, path: str) -> list[str]:
-        item = self._file.get(path or "/")
-        return list(item) if isinstance(item, h5py.Group) else []
 
 
 def _opener(path: Path) -> Callable[[], AbstractContextManager[Read]]:

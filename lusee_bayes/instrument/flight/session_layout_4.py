@@ -1,4 +1,4 @@
-"""Layout 4 of ``lusee.ingest``, which HDF5 and FITS share.
+"""Layout 4 of ``lusee.ingest`` in HDF5.
 
 It has row-aligned metadata as a union of fields (``metadata/fields/NAME/variant_000/data``), raw
 telemetry on its own clock, and a clock reference in place of an MJD offset; all is brought to the
@@ -7,11 +7,12 @@ names of layout 3.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
+import h5py
 import numpy as np
 from astropy.time import Time
 from jaxtyping import Float
@@ -47,31 +48,16 @@ FIELDS = {
 TICKS = 65536
 
 
-@runtime_checkable
-class Tree(Protocol):
-    """Groups and arrays of a file of layout 4, by paths such as ``spectra/metadata/fields``."""
-
-    def attributes(self, path: str) -> Mapping[str, Any]:
-        """Return what a group or an array says of itself; nothing where there is none."""
-
-    def array(self, path: str) -> Unread | None:
-        """Return an array, not yet read, or None."""
-
-    def names(self, path: str) -> list[str]:
-        """Return the names of all groups and arrays of a group; "" is the whole file."""
-
-
 def session_of_4(
-    path: Path, kind: str, tree: Tree, opener: Callable[[], AbstractContextManager[Read]]
+    path: Path, file: h5py.File, opener: Callable[[], AbstractContextManager[Read]]
 ) -> Session:
     """Make a session of a file of layout 4.
 
     Parameters
     ----------
     path : Path
-    kind : str
-        HDF5 or FITS.
-    tree : Tree
+    file : h5py.File
+        Open.
     opener : callable
         Opens the spectra.
 
@@ -80,32 +66,48 @@ def session_of_4(
     InputError
         If something is missing or not as it should be.
     """
-    cube = tree.array("spectra/data")
+    cube = _array(file, "spectra/data")
     if cube is None:
         raise InputError(
             f"{path} has no spectra/data: the session holds no spectra (it has "
-            f"{', '.join(tree.names('')) or 'nothing'})"
+            f"{', '.join(file) or 'nothing'})"
         )
     values = {
         f"{name}.{key}": value
         for name in ("constants", "session_invariants", "spectra/data")
-        for key, value in tree.attributes(name).items()
+        for key, value in _attributes(file, name).items()
     }
-    arrays = {"spectra/data": cube, **_metadata(path, tree, cube.shape[0] if cube.shape else 0)}
-    if (raw_s := tree.array("spectra/raw_seconds")) is not None:
+    arrays = {"spectra/data": cube, **_metadata(path, file, cube.shape[0] if cube.shape else 0)}
+    if (raw_s := _array(file, "spectra/raw_seconds")) is not None:
         arrays["spectra/raw_times"] = raw_s
-        _require_valid(path, tree.array("spectra/raw_time_valid"))
-    clock = _clock(path, tree)
+        _require_valid(path, _array(file, "spectra/raw_time_valid"))
+    clock = _clock(path, file)
     if clock is not None and raw_s is not None:
-        arrays |= _telemetry(path, tree, clock, np.asarray(raw_s))
-    return session_of(path, 4, kind, arrays, values, clock, opener)
+        arrays |= _telemetry(path, file, clock, np.asarray(raw_s))
+    return session_of(path, 4, "HDF5", arrays, values, clock, opener)
 
 
-def _metadata(path: Path, tree: Tree, n: int) -> dict[str, Unread]:
+def _attributes(file: h5py.File, path: str) -> dict[str, Any]:
+    """What a group or an array says of itself; nothing where there is none."""
+    item = file.get(path)
+    return {} if item is None else dict(item.attrs)
+
+
+def _array(file: h5py.File, path: str) -> Unread | None:
+    """An array, not yet read, or None."""
+    item = file.get(path)
+    if not isinstance(item, h5py.Dataset):
+        return None
+    if h5py.check_string_dtype(item.dtype) is not None:
+        return np.array(item.asstr()[()], dtype=np.str_)
+    return item
+
+
+def _metadata(path: Path, file: h5py.File, n: int) -> dict[str, Unread]:
     """Fields that all rows have, in one shape."""
     found: dict[str, Unread] = {}
     for ours, theirs in FIELDS.items():
-        values = tree.array(f"{META}/fields/{theirs}/variant_000/data")
+        values = _array(file, f"{META}/fields/{theirs}/variant_000/data")
         if values is None:
             continue
         if tuple(values.shape)[:1] != (n,):
@@ -113,14 +115,14 @@ def _metadata(path: Path, tree: Tree, n: int) -> dict[str, Unread]:
                 f"{path}: {META}/fields/{theirs} is there in the shape {tuple(values.shape)} for "
                 f"{n} spectra, or has several shapes; ingest the session again"
             )
-        rows = tree.array(f"{META}/fields/{theirs}/variant_000/row_indices")
+        rows = _array(file, f"{META}/fields/{theirs}/variant_000/row_indices")
         if rows is not None and not np.array_equal(np.asarray(rows), np.arange(n)):
             raise InputError(
                 f"{path}: row_indices of {META}/fields/{theirs} are not 0 to {n - 1}, a number for "
                 "each spectrum; ingest the session again"
             )
         found[f"{META}/{ours}"] = values
-    if (navgf := tree.array("spectra/navgf")) is not None:
+    if (navgf := _array(file, "spectra/navgf")) is not None:
         told = np.asarray(found.setdefault(f"{META}/Navgf", navgf))
         if not np.array_equal(told, np.asarray(navgf)):
             raise InputError(
@@ -145,12 +147,12 @@ def _require_valid(path: Path, valid: Unread | None) -> None:
         )
 
 
-def _clock(path: Path, tree: Tree) -> Clock | None:
-    said = tree.attributes("clock_reference")
+def _clock(path: Path, file: h5py.File) -> Clock | None:
+    said = _attributes(file, "clock_reference")
     if not bool(said.get("available")):
         return None
     scale = scale_of(f"{path}: time_scale", str(said["time_scale"]))
-    raw_s = _anchors(tree).get("spectrometer")
+    raw_s = _anchors(file).get("spectrometer")
     if raw_s is None:
         return None
     with unannounced_leap_seconds():
@@ -158,10 +160,10 @@ def _clock(path: Path, tree: Tree) -> Clock | None:
     return Clock(str(path), float(time.jd1), float(time.jd2), scale, raw_s)
 
 
-def _anchors(tree: Tree) -> dict[str, float]:
+def _anchors(file: h5py.File) -> dict[str, float]:
     """What each clock showed at the reference."""
-    names = tree.array("clock_reference/clock_sources")
-    raw_s = tree.array("clock_reference/clock_reference_raw_seconds")
+    names = _array(file, "clock_reference/clock_sources")
+    raw_s = _array(file, "clock_reference/clock_reference_raw_seconds")
     if names is None or raw_s is None:
         return {}
     values = np.asarray(raw_s, dtype=np.float64).tolist()
@@ -169,19 +171,19 @@ def _anchors(tree: Tree) -> dict[str, float]:
 
 
 def _telemetry(
-    path: Path, tree: Tree, clock: Clock, raw_s: Float[np.ndarray, " rows"]
+    path: Path, file: h5py.File, clock: Clock, raw_s: Float[np.ndarray, " rows"]
 ) -> dict[str, Unread]:
     """Telemetry at the times of the spectra, where both clocks have a reference."""
-    anchor = _anchors(tree).get("dcb")
-    if anchor is None or "telemetry" not in tree.names(""):
+    anchor = _anchors(file).get("dcb")
+    if anchor is None or "telemetry" not in file:
         return {}
     parts = ("field_names", "mission_seconds", "lusee_subsecs", "values")
-    found = {name: tree.array(f"telemetry/{name}") for name in parts}
+    found = {name: _array(file, f"telemetry/{name}") for name in parts}
     for name, array in found.items():
         if array is None:
             raise InputError(
                 f"{path}: telemetry has no {name} (it has "
-                f"{', '.join(tree.names('telemetry')) or 'nothing'}); ingest the session again "
+                f"{', '.join(file['telemetry']) or 'nothing'}); ingest the session again "
                 "with luseepy's present version"
             )
     names = np.asarray(found["field_names"]).tolist()

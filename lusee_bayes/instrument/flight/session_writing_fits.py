@@ -1,4 +1,4 @@
-"""Sessions as FITS, layouts 3 and 4."""
+"""Sessions as FITS."""
 
 from __future__ import annotations
 
@@ -10,20 +10,17 @@ from astropy.io import fits
 from jaxtyping import Float32
 
 from lusee_bayes.instrument.flight.cubes import N_PRODUCTS, whole_spectra
-from lusee_bayes.instrument.flight.fits_groups_writing import RECORD, Late, write_groups
-from lusee_bayes.instrument.flight.session_content_4 import CUBE, groups_of_4
 from lusee_bayes.instrument.flight.session_rows import SessionRows
 from lusee_bayes.instrument.flight.spectrometer import N_CHANNELS
 
+# files of FITS are made of records of this length
+RECORD = 2880
 # letters of FITS for types of columns
 FORMATS = {"i": "K", "f": "D"}
 
 
 def write_fits_session(
-    path: Path,
-    rows: SessionRows,
-    blocks: Iterable[Float32[np.ndarray, "_ products _"]],
-    layout: int,
+    path: Path, rows: SessionRows, blocks: Iterable[Float32[np.ndarray, "_ products _"]]
 ) -> None:
     """Write a session.
 
@@ -33,28 +30,12 @@ def write_fits_session(
     rows : SessionRows
     blocks : iterable of (some rows, 16, bins) array
         As :func:`.write_session`.
-    layout : {3, 4}
     """
-    spectra = whole_spectra(path, blocks, rows.n_rows)
-    if layout == 3:
-        _write_3(path, rows, spectra)
-        return
-    like = np.empty((0, N_PRODUCTS, N_CHANNELS), dtype=np.float32)
-    late = {"spectra": Late("data", like, spectra, CUBE)}
-    with path.open("wb") as file:
-        write_groups(file, groups_of_4(rows), late, {"ORIGIN": "lusee_bayes", "LAYOUTV": 4})
-
-
-def _write_3(
-    path: Path,
-    rows: SessionRows,
-    spectra: Iterable[tuple[int, Float32[np.ndarray, "_ products channels"]]],
-) -> None:
     _before(rows).writeto(path)
     with path.open("ab") as file:
         file.write(_cube_header(rows.n_rows).tostring().encode("ascii"))
         size = 0
-        for _, counts in spectra:
+        for _, counts in whole_spectra(path, blocks, rows.n_rows):
             size += file.write(counts.astype(">f4").tobytes())
         file.write(b"\0" * (-size % RECORD))
     with fits.open(path, mode="append") as hdus:

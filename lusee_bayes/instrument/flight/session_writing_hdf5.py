@@ -1,4 +1,4 @@
-"""Sessions as HDF5, layouts 3 and 4."""
+"""Sessions as HDF5."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from lusee_bayes.instrument.flight.cubes import (
     guessed_chunks,
     whole_spectra,
 )
-from lusee_bayes.instrument.flight.session_content_4 import CUBE, groups_of_4, isot
 from lusee_bayes.instrument.flight.session_hdf5 import INTERPOLATED
 from lusee_bayes.instrument.flight.session_layout import META
 from lusee_bayes.instrument.flight.session_rows import SessionRows
@@ -24,15 +23,18 @@ from lusee_bayes.instrument.flight.spectrometer import N_CHANNELS
 # as luseepy has it
 PACKED = {"compression": "gzip", "compression_opts": 1}
 
-# of what the spectra say of themselves
-TEXTS = ("units", "representation")
+# what the spectra say of themselves
+CUBE = {
+    "units": "SDU",
+    "representation": "gain_model_input_sdu",
+    "bitslice_restored": np.int64(1),
+    "bitslice_reference": np.int64(31),
+    "normalization_version": np.int64(1),
+}
 
 
 def write_hdf5_session(
-    path: Path,
-    rows: SessionRows,
-    blocks: Iterable[Float32[np.ndarray, "_ products _"]],
-    layout: int,
+    path: Path, rows: SessionRows, blocks: Iterable[Float32[np.ndarray, "_ products _"]]
 ) -> None:
     """Write a session.
 
@@ -42,33 +44,18 @@ def write_hdf5_session(
     rows : SessionRows
     blocks : iterable of (some rows, 16, bins) array
         As :func:`.write_session`.
-    layout : {3, 4}
     """
     chunks = guessed_chunks(rows.n_rows)
     with h5py.File(path, "w", **cache_for(chunks)) as file:
-        if layout == 3:
-            _all_but_spectra_3(file, rows)
-        else:
-            _all_but_spectra_4(file, rows)
+        _write_all_but_spectra(file, rows)
         shape = (rows.n_rows, N_PRODUCTS, N_CHANNELS)
         cube = file.create_dataset("spectra/data", shape, "f4", chunks=chunks, **PACKED)
-        for name, value in CUBE.items():
-            cube.attrs[name] = np.int64(value) if layout == 3 and name not in TEXTS else value
+        cube.attrs.update(CUBE)
         for first, counts in whole_spectra(path, blocks, rows.n_rows):
             cube[first : first + len(counts)] = counts
 
 
-def _all_but_spectra_4(file: h5py.File, rows: SessionRows) -> None:
-    for path, content in groups_of_4(rows).items():
-        group = file.require_group(path or "/")
-        group.attrs.update(content.attributes)
-        for name, values in content.arrays.items():
-            text = values.dtype.kind == "U"
-            dtype = h5py.string_dtype(encoding="utf-8") if text else values.dtype
-            group.create_dataset(name, data=values.astype(dtype), dtype=dtype, **PACKED)
-
-
-def _all_but_spectra_3(file: h5py.File, rows: SessionRows) -> None:
+def _write_all_but_spectra(file: h5py.File, rows: SessionRows) -> None:
     file.attrs["layout_version"] = np.int64(3)
     file.create_group("session_invariants").attrs["software_version"] = np.int64(rows.software)
     file.attrs["cdi_directory"] = ""
@@ -83,7 +70,7 @@ def _all_but_spectra_3(file: h5py.File, rows: SessionRows) -> None:
     constants["time_scale"] = scale
     constants["clock_source"] = source
     if rows.clock is not None:
-        constants["clock_epoch_isot"] = isot(rows.clock)
+        constants["clock_epoch_isot"] = rows.clock.isot
     spectra = file.create_group("spectra")
     spectra.attrs["count"] = np.int64(rows.n_rows)
     number = np.arange(rows.n_rows)
