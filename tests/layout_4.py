@@ -103,3 +103,11 @@ def write_telemetry(group):
     group["lusee_subsecs"] = (65536 * (dcb_s % 1.0)).astype(np.uint16)
     group["values"] = np.stack([telemetry(name, spectrometer_s) for name in NAMES], axis=1)
     group["valid"] = np.ones(group["values"].shape, dtype=bool)
+
+
+def write_families(path, **n_rows):
+    """Other families of data, by their groups, with so many rows."""
+    with h5py.File(path, "a") as file:
+        for name, n in n_rows.items():
+            write_rows(file.create_group(name.replace("__", "/")), RAW_S[0] + np.arange(n))
+    return path

@@ -19,9 +19,11 @@ from layout_4 import (
     counts,
     metadata,
     telemetry,
+    write_families,
     write_layout_4,
 )
 
+from lusee_bayes.cli.main import main
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.flight.sessions import is_session, read_session
 from lusee_bayes.instrument.flight.spectrometer import FLIGHT_PRODUCTS, OF_FLIGHT, averaging
@@ -235,6 +237,21 @@ def test_what_a_session_of_layout_4_says(newer):
     np.testing.assert_allclose((utc - Time(LANDING)).sec, RAW_S - SPECTROMETER_S, atol=1e-5)
     with session.spectra() as read:
         np.testing.assert_array_equal(read(1, 4), counts()[1:4])
+
+
+def test_families_that_are_not_used_are_named(newer, capsys):
+    def told():
+        assert main(["info", str(newer)]) == 0
+        return [line for line in capsys.readouterr().out.splitlines() if "not used" in line]
+
+    assert not told()
+    rows = {"calibrator__zoom_spectra": 12, "tr_spectra": 2, "calibrator__data": 3}
+    write_families(newer, **rows, grimm_spectra=1, housekeeping=4)
+    (line,) = told()
+    assert line.split("not used: ")[1] == (
+        "time-resolved spectra (2 rows), zoom spectra (12 rows), Grimm's spectra (1 row), "
+        "calibrator data (3 rows), housekeeping (4 rows)"
+    )
 
 
 FIELDS = "spectra/metadata/fields"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32, Int, Shaped
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import reading
-from lusee_bayes.core.representation import Described
+from lusee_bayes.core.representation import Described, counted
 from lusee_bayes.instrument.flight.clock import Clock
 from lusee_bayes.instrument.flight.spectrometer import (
     ADC_HIGH,
@@ -74,6 +74,8 @@ class Session(Described):
         Version of the flight software, as 0x307.
     opener : callable
         Opens the file: a context manager that gives a :data:`Read`.
+    unused : mapping of str to int
+        Other families of data in the file, and how many rows they have.
     """
 
     path: Path
@@ -95,6 +97,7 @@ class Session(Described):
     lat_deg: float
     software: str
     opener: Callable[[], AbstractContextManager[Read]]
+    unused: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self):
         back = np.flatnonzero(~(np.diff(self.raw_s) > 0.0))
@@ -156,6 +159,7 @@ class Session(Described):
         )
         notch = "not said" if self.notch is None else f"{int((self.notch > 0).sum())} with it"
         lacking = [name for name in TELEMETRY if name not in self.telemetry]
+        unused = [f"{name} ({counted(n, 'row')})" for name, n in self.unused.items()]
         return (
             f"{self.n_rows} spectra of 16 products, {N_CHANNELS} channels, {self.kind} layout "
             f"{self.layout}, flight software {self.software}",
@@ -167,4 +171,5 @@ class Session(Described):
             f"{int((self.errors != 0).sum())} with errors of the flight software, "
             f"{int((self.share < 1.0).sum())} partly averaged; notch: {notch}",
             "telemetry of the gain table: " + ("lacks " + ", ".join(lacking) if lacking else "all"),
+            *(["not used: " + ", ".join(unused)] if unused else []),
         )

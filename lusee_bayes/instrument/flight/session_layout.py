@@ -100,6 +100,7 @@ def session_of(
     values: Mapping[str, Any],
     clock: Clock | None,
     opener: Callable[[], AbstractContextManager[Read]],
+    unused: Mapping[str, int] | None = None,
 ) -> Session:
     """Check what a file holds, and make a session of it.
 
@@ -118,6 +119,8 @@ def session_of(
         What layout 4 says about the clock; layout 3 has it among the values.
     opener : callable
         Opens the spectra.
+    unused : mapping of str to int, optional
+        Rows of other families of data.
 
     Raises
     ------
@@ -167,6 +170,7 @@ def session_of(
         lat_deg=found.values["constants.lun_lat_deg"],
         software=_version(found.values.get("session_invariants.software_version", "unknown")),
         opener=opener,
+        unused=unused or {},
     )
 
 

@@ -44,6 +44,18 @@ FIELDS = {
         )
     },
 }
+# groups of data that are no spectra of all channels, and what they are called
+UNUSED = {
+    "tr_spectra": "time-resolved spectra",
+    "calibrator/zoom_spectra": "zoom spectra",
+    "grimm_spectra": "Grimm's spectra",
+    "calibrator/metadata": "calibrator metadata",
+    "calibrator/data": "calibrator data",
+    "calibrator/raw_pfb": "calibrator's raw filter bank",
+    "calibrator/debug": "calibrator debug pages",
+    "waveform": "waveforms",
+    "housekeeping": "housekeeping",
+}
 # ticks of the clock of the telemetry in a second
 TICKS = 65536
 
@@ -84,7 +96,16 @@ def session_of_4(
     clock = _clock(path, file)
     if clock is not None and raw_s is not None:
         arrays |= _telemetry(path, file, clock, np.asarray(raw_s))
-    return session_of(path, 4, "HDF5", arrays, values, clock, opener)
+    return session_of(path, 4, "HDF5", arrays, values, clock, opener, _unused(file))
+
+
+def _unused(file: h5py.File) -> dict[str, int]:
+    """How many rows the families have that maps do not use."""
+    return {
+        name: int(np.ravel(file[path].attrs.get("count", 0))[0])
+        for path, name in UNUSED.items()
+        if path in file
+    }
 
 
 def _attributes(file: h5py.File, path: str) -> dict[str, Any]:
