@@ -60,16 +60,16 @@ def burst_flags(
     -------
     (rows,) array of bool
     (spans,) array
-        Scatter over the noise expected, of every span of four hours that has enough spectra.
+        Scatter over the noise expected, of every span of four hours; NaN where there are not enough
+        spectra.
     """
     flagged, scatter = np.zeros(len(seconds), dtype=bool), []
     limit = threshold(false_alarm, n_tests(autos.shape[1]))
     autos = _filled(seconds, autos, np.isfinite(noise) & good[:, None])
     for at in _spans(seconds):
-        if good[at].sum() < LEAST:
-            continue
-        here, scale = _one_span(seconds[at], autos[at], noise[at], good[at], limit)
-        flagged[at] = here
+        scale = np.nan
+        if good[at].sum() >= LEAST:
+            flagged[at], scale = _one_span(seconds[at], autos[at], noise[at], good[at], limit)
         scatter.append(scale)
     return flagged, np.array(scatter)
 

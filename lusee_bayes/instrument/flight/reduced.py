@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,15 @@ from lusee_bayes.core.representation import Described, counted
 from lusee_bayes.instrument.averaging import binned
 from lusee_bayes.instrument.beams.gridded import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.calibration import Calibration
-from lusee_bayes.instrument.flight.gain_table import LETTERS
+from lusee_bayes.instrument.flight.gain_table import LETTERS, N_COMPONENTS
+from lusee_bayes.instrument.flight.spectrometer import PORTS
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import all_products
+from lusee_bayes.instrument.products import all_products, auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities
 
+AUTOS = auto_indices()
+N_PRODUCTS = len(all_products())
 # why a spectrum is not used in a band; the first is that it is
 REASONS = (
     "used",
@@ -64,7 +68,10 @@ class Curves:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Reduced(Described):
-    """Sessions, reduced.
+    """Spectra in bands, at every stage from single spectra to averages over time.
+
+    Numbers are for bands, products and bins of time. To begin with every spectrum is a bin of its
+    own; in the end a bin has all spectra of a few hours. Flags are those of spectra ("rows").
 
     Attributes
     ----------
@@ -90,19 +97,19 @@ class Reduced(Described):
         Counts for 1 nV^2/Hz.
     slope : (bands, ports, components, bins) array
         Change of the power gain with each component of the gain table, relative to it.
+    bend : (bands, ports, bins) array
+        What two further powers of the frequency would add to the autos, in standard deviations.
+        Of a file one number for a band, its :attr:`curvature`; so are the next two.
+    span_scatter : (bands, spans) array
+        Scatter in time over the radiometer noise, of spans of a few hours; NaN if not known.
+    slab_scatter : (bands, slabs) array
+        Scatter of the channels about a smooth spectrum over the radiometer noise, of some spectra.
+    lines : (bands, rows) array
+        Share of a spectrum's channels in a band that are flagged.
     component_std : (levels, ports, components) array or None
         By how much the components may be off.
     gain_std : float or None
         By how much the gains of a level of a port may be off, relative.
-    scatter : (bands,) array
-        Scatter of the spectra in time over the radiometer noise, median; NaN if not known.
-    line_scatter : (bands,) array
-        Likewise of the channels about a smooth spectrum.
-    curvature : (bands,) array
-        What two further powers of the frequency would change, rms over the bins of the autos, in
-        standard deviations of a bin, less what noise alone would.
-    lines : (bands, rows) array
-        Share of a spectrum's channels in a band that are flagged.
     curves : Curves
         Of the gains, for figures.
     sessions : tuple of mapping
@@ -123,15 +130,74 @@ class Reduced(Described):
     level: Shaped[np.ndarray, "bins ports"]
     gain: Float[np.ndarray, "bands ports bins"]
     slope: Float[np.ndarray, "bands ports components bins"]
+    bend: Float[np.ndarray, "bands _ _"]
+    span_scatter: Float[np.ndarray, "bands spans"]
+    slab_scatter: Float[np.ndarray, "bands slabs"]
+    lines: Float32[np.ndarray, "bands rows"]
     component_std: Float[np.ndarray, "levels ports components"] | None
     gain_std: float | None
-    scatter: Float[np.ndarray, " bands"]
-    line_scatter: Float[np.ndarray, " bands"]
-    curvature: Float[np.ndarray, " bands"]
-    lines: Float32[np.ndarray, "bands rows"]
     curves: Curves
     sessions: tuple[Mapping[str, Any], ...]
     recipe: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def blank(
+        cls,
+        like: Mapping[str, Any],
+        observation: Observation,
+        bin_of: Int[np.ndarray, " rows"],
+        level: Shaped[np.ndarray, "bins ports"],
+        n_slabs: int = 0,
+    ) -> Reduced:
+        """Begin with no numbers, to be filled in place.
+
+        Parameters
+        ----------
+        like : mapping of str to object
+            All that does not depend on the spectra.
+        observation : Observation
+        bin_of : (rows,) array of int
+        level : (bins, ports) array of str
+        n_slabs : int
+            Spectra are looked at in so many parts.
+        """
+        bands, rows, bins = len(like["frequencies_mhz"]), len(bin_of), len(level)
+        return cls(
+            observation=observation,
+            bin_of=bin_of,
+            level=level,
+            reason=np.zeros((bands, rows), dtype=np.uint8),
+            lines=np.zeros((bands, rows), dtype=np.float32),
+            values=np.full((bands, N_PRODUCTS, bins), np.nan),
+            before=np.full((bands, N_PRODUCTS, bins), np.nan),
+            n_averaged=np.zeros((bands, bins)),
+            gain=np.full((bands, PORTS, bins), np.nan),
+            slope=np.zeros((bands, PORTS, N_COMPONENTS, bins)),
+            bend=np.full((bands, PORTS, bins), np.nan),
+            span_scatter=np.empty((bands, 0)),
+            slab_scatter=np.full((bands, n_slabs), np.nan),
+            **like,
+        )
+
+    @cached_property
+    def scatter(self) -> Float[np.ndarray, " bands"]:
+        """Scatter of the spectra in time over the radiometer noise, median; NaN if not known."""
+        return _medians(self.span_scatter)
+
+    @cached_property
+    def line_scatter(self) -> Float[np.ndarray, " bands"]:
+        """Likewise of the channels about a smooth spectrum."""
+        return _medians(self.slab_scatter)
+
+    @cached_property
+    def curvature(self) -> Float[np.ndarray, " bands"]:
+        """The mean of :attr:`bend` over bins, which noise does not have, of the worst port."""
+        return np.array([_mean_abs(one) for one in self.bend])
+
+    def noise(self, band: int) -> Float[np.ndarray, "ports bins"]:
+        """Return the standard deviations of the autos, by the radiometer equation."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.abs(self.values[band, AUTOS]) / np.sqrt(self.n_averaged[band])
 
     def description(self) -> tuple[str, ...]:
         f = self.frequencies_mhz
@@ -320,7 +386,17 @@ class Reduced(Described):
         n_averaged[band, bins] = 0.0
         reason[band, bins[self.bin_of] & (reason[band] == USED)] = NO_FIT
         changed = {"values": values, "n_averaged": n_averaged, "reason": reason}
-        return Reduced(**{**self.__dict__, **changed})
+        return replace(self, **changed)
+
+
+def _medians(found: Float[np.ndarray, "bands parts"]) -> Float[np.ndarray, " bands"]:
+    clean = [one[np.isfinite(one)] for one in found]
+    return np.array([float(np.median(one)) if one.size else np.nan for one in clean])
+
+
+def _mean_abs(bend: Float[np.ndarray, "ports bins"]) -> float:
+    known = np.isfinite(bend).any(axis=1)
+    return float(np.abs(np.nanmean(bend[known], axis=1)).max()) if known.any() else np.nan
 
 
 def _one_run_an_angle(observation: Observation) -> Observation:
