@@ -15,9 +15,9 @@ from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.instrument.flight.clock import Clock
-from lusee_bayes.instrument.flight.gain_files import write_gain_table
-from lusee_bayes.instrument.flight.session_writing import write_session
+from lusee_bayes.flight.clock import Clock
+from lusee_bayes.flight.gain_model import write_gain_table
+from lusee_bayes.flight.session_files import write_session
 from lusee_bayes.runs.folder import RunKind, run_folder
 from lusee_bayes.runs.origins import inputs_of, origin_of
 

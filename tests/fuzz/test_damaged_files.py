@@ -21,10 +21,10 @@ from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.flight.gain_model import read_gain_table
+from lusee_bayes.flight.reduced import read_reduced, write_reduced
+from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.instrument.beams import read_beam, sampled_beams, write_sampled_beams
-from lusee_bayes.instrument.flight.gain_files import read_gain_table
-from lusee_bayes.instrument.flight.reduced_file import read_reduced, write_reduced
-from lusee_bayes.instrument.flight.sessions import read_session
 from lusee_bayes.instrument.visibilities_file import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.linear.compact import read_compact

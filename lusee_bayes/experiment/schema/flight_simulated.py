@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -74,3 +74,7 @@ class FlightSimulatedSection(Section):
     burst_every_h: Annotated[float, Field(ge=1e-3, le=LARGEST)] | None = None
     burst_s: Positive = 600.0
     burst_factor: Positive = 30.0
+
+    def disturbances(self) -> dict[str, Any]:
+        """Return gains and disturbances, as :meth:`.Disturbances.drawn` takes them."""
+        return self.model_dump(exclude={"kind", "session_h", "clock", "radiometer"})

@@ -1,10 +1,12 @@
-"""All spectra of some sessions in the order of their times, and what they have in common."""
+"""How sessions are reduced, and all their spectra in the order of their times."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
+from typing import Literal
 
 import astropy.units as u
 import numpy as np
@@ -13,14 +15,84 @@ from jaxtyping import Int
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import naming
+from lusee_bayes.flight.clock import Clock, clock_of
+from lusee_bayes.flight.flags import NO_LINES, KnownLines
+from lusee_bayes.flight.gain_model import GainModel
+from lusee_bayes.flight.session import BinOrigin, Session
 from lusee_bayes.instrument.averaging import bins_of
-from lusee_bayes.instrument.flight.clock import clock_of
-from lusee_bayes.instrument.flight.recipe import Recipe
-from lusee_bayes.instrument.flight.session import Session
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.times import unannounced_leap_seconds
-from lusee_bayes.instrument.timestamps import TO_MIDDLE
+from lusee_bayes.instrument.timestamps import TO_MIDDLE, Timestamp
 from lusee_bayes.instrument.windows import Windows
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """How sessions are reduced.
+
+    Attributes
+    ----------
+    table : GainModel
+    origin : {"centre", "edge"}
+        What of channel k lies at k times 25 kHz.
+    timestamp : {"start", "middle", "end", "instant"}
+        What the times of spectra are.
+    frequencies_mhz : tuple of float
+        Middles of the bands.
+    bandwidth_mhz : float
+    degree : int
+        Of the polynomial over a band (:mod:`.bands`).
+    average_s : float or None
+        Length of averages in time; None for spectra as they are.
+    shared_noise : tuple of float
+        Of neighbouring channels (:func:`.shared_noise`).
+    sign : {1, -1}
+        Turns the imaginary parts of the spectrometer into those of <s_i conj(s_j)>.
+    turntable_deg : float
+        From East towards North.
+    lines : KnownLines
+    comb : {"found", "always", "never"}
+        Whether the calibrator's comb is looked for, or known to be on or off.
+    false_alarm : float
+        Chance that a value of pure noise is flagged, for each kind of test.
+    gain_std : float or None
+        By how much every level of every port may be off, relative to its power gain, the same at
+        all frequencies of a band; None if it is not known.
+    clock : Clock or None
+        From outside.
+    site : (float, float) or None
+        Longitude and latitude in degrees, in place of those of the files.
+    """
+
+    table: GainModel
+    origin: BinOrigin
+    timestamp: Timestamp
+    frequencies_mhz: tuple[float, ...]
+    bandwidth_mhz: float = 1.0
+    degree: int = 2
+    average_s: float | None = None
+    shared_noise: tuple[float, ...] = (1.0,)
+    sign: int = 1
+    turntable_deg: float = 0.0
+    lines: KnownLines = NO_LINES
+    comb: Literal["found", "always", "never"] = "found"
+    false_alarm: float = 1e-4
+    gain_std: float | None = None
+    clock: Clock | None = None
+    site: tuple[float, float] | None = None
+
+    def words(self) -> dict[str, str]:
+        """Return how sessions are reduced, a line for each choice."""
+        bin_part = {"centre": "centre", "edge": "lower edge"}[self.origin]
+        times = "instants" if self.timestamp == "instant" else f"{self.timestamp} of integrations"
+        return {
+            "gain table": f"{Path(self.table.path).name} ({self.table.kind})",
+            "frequencies": f"the {bin_part} of channel k is at k times 25 kHz",
+            "bands": f"polynomial of degree {self.degree} over {self.bandwidth_mhz:g} MHz",
+            "times": times,
+            "site": "of the scenario" if self.site else "of the sessions",
+        }
+
 
 SAME_SITE_DEG = 1e-6
 

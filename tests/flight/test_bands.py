@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from lusee_bayes.instrument.flight.band import Band
-from lusee_bayes.instrument.flight.filter_bank import FRAME, impulse_response, shared_noise
-from lusee_bayes.instrument.flight.spectrometer import AVERAGING, channel_mhz
+from lusee_bayes.flight.bands import FRAME, ChannelBand, impulse_response, shared_noise
+from lusee_bayes.flight.session import AVERAGING, channel_mhz
 from lusee_bayes.testing import assert_refused
 
 
@@ -30,7 +29,7 @@ def binned(averaging, per_channel):
 @pytest.mark.parametrize("degree", [0, 1, 2, 4])
 def test_polynomials_of_the_degree_are_exact_in_the_middle(navgf, degree, origin):
     averaging, mhz = AVERAGING[navgf], channel_mhz(origin)
-    band = Band.of(10.0, 2.0, degree, averaging, mhz)
+    band = ChannelBand.of(10.0, 2.0, degree, averaging, mhz)
     values = binned(averaging, spectrum(mhz, [3.0, 0.5, -0.2, 0.1, 0.05][: degree + 1]))
     here = values[band.first : band.last]
     rng = np.random.default_rng(2)
@@ -57,7 +56,7 @@ def test_what_the_degree_leaves_out_is_told_by_two_more_powers():
     law = np.append(law[0], law)
     off = {}
     for degree in (0, 2):
-        band = Band.of(10.0, 1.0, degree, AVERAGING[1], mhz)
+        band = ChannelBand.of(10.0, 1.0, degree, AVERAGING[1], mhz)
         here = law[None, band.first : band.last]
         good = np.ones(here.shape, dtype=bool)
         found, _, further = band.values(here[:, None], here, good)
@@ -73,7 +72,7 @@ def test_noise_of_independent_channels_in_closed_form():
     """A parabola's middle has 9/4 of the variance of a mean, times (1 + O(1/n^2))."""
     mhz = channel_mhz("centre")
     for navgf in (1, 4):
-        band = Band.of(25.0, 4.0, 2, AVERAGING[navgf], mhz)
+        band = ChannelBand.of(25.0, 4.0, 2, AVERAGING[navgf], mhz)
         n = band.last - band.first
         flat = np.ones((1, n))
         _, variance, _ = band.values(flat[:, None], flat, flat > 0)
@@ -83,7 +82,7 @@ def test_noise_of_independent_channels_in_closed_form():
 
 def test_noise_of_steep_spectra_and_shared_channels_by_drawing_it():
     shared = shared_noise(1, "hann")
-    band = Band.of(10.0, 1.0, 1, AVERAGING[2], channel_mhz("centre"), shared)
+    band = ChannelBand.of(10.0, 1.0, 1, AVERAGING[2], channel_mhz("centre"), shared)
     n = band.last - band.first
     shape = np.linspace(1.3, 0.7, n)[None]
     good = np.ones((1, n), dtype=bool)
@@ -101,7 +100,7 @@ def test_noise_of_steep_spectra_and_shared_channels_by_drawing_it():
 
 
 def test_too_many_flags_leave_nothing():
-    band = Band.of(10.0, 1.0, 2, AVERAGING[1], channel_mhz("centre"))
+    band = ChannelBand.of(10.0, 1.0, 2, AVERAGING[1], channel_mhz("centre"))
     n = band.last - band.first
     good = np.zeros((3, n), dtype=bool)
     good[1, :3] = True  # no more than terms
@@ -112,8 +111,8 @@ def test_too_many_flags_leave_nothing():
 
 
 def test_bands_with_too_few_bins_are_refused():
-    assert_refused(lambda: Band.of(10.0, 0.1, 2, AVERAGING[1], channel_mhz("centre")))
-    assert_refused(lambda: Band.of(70.0, 1.0, 2, AVERAGING[1], channel_mhz("centre")))
+    assert_refused(lambda: ChannelBand.of(10.0, 0.1, 2, AVERAGING[1], channel_mhz("centre")))
+    assert_refused(lambda: ChannelBand.of(70.0, 1.0, 2, AVERAGING[1], channel_mhz("centre")))
 
 
 def test_windows_share_noise_as_their_transforms_say():

@@ -25,8 +25,8 @@ from layout_4 import (
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.flight.sessions import is_session, read_session
-from lusee_bayes.instrument.flight.spectrometer import FLIGHT_PRODUCTS, OF_FLIGHT, averaging
+from lusee_bayes.flight.session import FLIGHT_PRODUCTS, OF_FLIGHT, averaging
+from lusee_bayes.flight.session_files import is_session, read_session
 from lusee_bayes.instrument.products import labels
 from lusee_bayes.testing import assert_refused
 

@@ -18,12 +18,12 @@ from astropy.time import Time
 from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.layouts import Unread
-from lusee_bayes.instrument.flight.clock import Clock
-from lusee_bayes.instrument.flight.session import TELEMETRY, Read, Session
-from lusee_bayes.instrument.flight.session_layout import META, session_of
+from lusee_bayes.core.layouts import Layout, Unread
+from lusee_bayes.flight.clock import Clock
+from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Read, Session, session_of
 from lusee_bayes.instrument.times import scale_of, unannounced_leap_seconds
 
+LAYOUT_4 = Layout("a session of lusee.ingest, layout 4", ROWS, SAID)
 # names of layout 4 for those of layout 3
 FIELDS = {
     "Navgf": "navgf",
@@ -78,7 +78,7 @@ def session_of_4(
     InputError
         If something is missing or not as it should be.
     """
-    cube = _array(file, "spectra/data")
+    cube = _dataset(file, "spectra/data")
     if cube is None:
         raise InputError(
             f"{path} has no spectra/data: the session holds no spectra (it has "
@@ -90,13 +90,14 @@ def session_of_4(
         for key, value in _attributes(file, name).items()
     }
     arrays = {"spectra/data": cube, **_metadata(path, file, cube.shape[0] if cube.shape else 0)}
-    if (raw_s := _array(file, "spectra/raw_seconds")) is not None:
+    if (raw_s := _dataset(file, "spectra/raw_seconds")) is not None:
         arrays["spectra/raw_times"] = raw_s
-        _require_valid(path, _array(file, "spectra/raw_time_valid"))
-    clock = _clock(path, file)
+        _require_valid(path, _dataset(file, "spectra/raw_time_valid"))
+    clock = _clock_by_reference(path, file)
     if clock is not None and raw_s is not None:
-        arrays |= _telemetry(path, file, clock, np.asarray(raw_s))
-    return session_of(path, 4, "HDF5", arrays, values, clock, opener, _unused(file))
+        arrays |= _telemetry_at_rows(path, file, clock, np.asarray(raw_s))
+    found = LAYOUT_4.checked(path, arrays, values)
+    return session_of(path, 4, "HDF5", found, arrays, clock, opener, _unused(file))
 
 
 def _unused(file: h5py.File) -> dict[str, int]:
@@ -114,7 +115,7 @@ def _attributes(file: h5py.File, path: str) -> dict[str, Any]:
     return {} if item is None else dict(item.attrs)
 
 
-def _array(file: h5py.File, path: str) -> Unread | None:
+def _dataset(file: h5py.File, path: str) -> Unread | None:
     """An array, not yet read, or None."""
     item = file.get(path)
     if not isinstance(item, h5py.Dataset):
@@ -128,7 +129,7 @@ def _metadata(path: Path, file: h5py.File, n: int) -> dict[str, Unread]:
     """Fields that all rows have, in one shape."""
     found: dict[str, Unread] = {}
     for ours, theirs in FIELDS.items():
-        values = _array(file, f"{META}/fields/{theirs}/variant_000/data")
+        values = _dataset(file, f"{META}/fields/{theirs}/variant_000/data")
         if values is None:
             continue
         if tuple(values.shape)[:1] != (n,):
@@ -136,14 +137,14 @@ def _metadata(path: Path, file: h5py.File, n: int) -> dict[str, Unread]:
                 f"{path}: {META}/fields/{theirs} is there in the shape {tuple(values.shape)} for "
                 f"{n} spectra, or has several shapes; ingest the session again"
             )
-        rows = _array(file, f"{META}/fields/{theirs}/variant_000/row_indices")
+        rows = _dataset(file, f"{META}/fields/{theirs}/variant_000/row_indices")
         if rows is not None and not np.array_equal(np.asarray(rows), np.arange(n)):
             raise InputError(
                 f"{path}: row_indices of {META}/fields/{theirs} are not 0 to {n - 1}, a number for "
                 "each spectrum; ingest the session again"
             )
         found[f"{META}/{ours}"] = values
-    if (navgf := _array(file, "spectra/navgf")) is not None:
+    if (navgf := _dataset(file, "spectra/navgf")) is not None:
         told = np.asarray(found.setdefault(f"{META}/Navgf", navgf))
         if not np.array_equal(told, np.asarray(navgf)):
             raise InputError(
@@ -168,7 +169,7 @@ def _require_valid(path: Path, valid: Unread | None) -> None:
         )
 
 
-def _clock(path: Path, file: h5py.File) -> Clock | None:
+def _clock_by_reference(path: Path, file: h5py.File) -> Clock | None:
     said = _attributes(file, "clock_reference")
     if not bool(said.get("available")):
         return None
@@ -183,15 +184,15 @@ def _clock(path: Path, file: h5py.File) -> Clock | None:
 
 def _anchors(file: h5py.File) -> dict[str, float]:
     """What each clock showed at the reference."""
-    names = _array(file, "clock_reference/clock_sources")
-    raw_s = _array(file, "clock_reference/clock_reference_raw_seconds")
+    names = _dataset(file, "clock_reference/clock_sources")
+    raw_s = _dataset(file, "clock_reference/clock_reference_raw_seconds")
     if names is None or raw_s is None:
         return {}
     values = np.asarray(raw_s, dtype=np.float64).tolist()
     return dict(zip(np.asarray(names).tolist(), values, strict=True))
 
 
-def _telemetry(
+def _telemetry_at_rows(
     path: Path, file: h5py.File, clock: Clock, raw_s: Float[np.ndarray, " rows"]
 ) -> dict[str, Unread]:
     """Telemetry at the times of the spectra, where both clocks have a reference."""
@@ -199,7 +200,7 @@ def _telemetry(
     if anchor is None or "telemetry" not in file:
         return {}
     parts = ("field_names", "mission_seconds", "lusee_subsecs", "values")
-    found = {name: _array(file, f"telemetry/{name}") for name in parts}
+    found = {name: _dataset(file, f"telemetry/{name}") for name in parts}
     for name, array in found.items():
         if array is None:
             raise InputError(
@@ -211,7 +212,7 @@ def _telemetry(
     seconds, ticks, values = (np.asarray(found[name], dtype=np.float64) for name in parts[1:])
     times_s = seconds + ticks / TICKS - anchor + clock.raw_s
     return {
-        f"telemetry/{name}": at_rows(
+        f"telemetry/{name}": _interpolated_to(
             f"{path}: telemetry {name}", raw_s, times_s, values[:, names.index(name)]
         )
         for name in TELEMETRY
@@ -219,7 +220,7 @@ def _telemetry(
     }
 
 
-def at_rows(
+def _interpolated_to(
     where: str,
     raw_s: Float[np.ndarray, " rows"],
     times_s: Float[np.ndarray, " times"],

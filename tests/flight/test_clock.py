@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.flight.clock import Clock, clock_of, read_clock
+from lusee_bayes.flight.clock import Clock, clock_of, read_clock
 from lusee_bayes.testing import assert_refused
 
 RECORD = {

@@ -11,12 +11,12 @@ from astropy.time import Time
 from scipy.interpolate import CubicSpline
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.flight import reduction
-from lusee_bayes.instrument.flight.clock import read_clock
-from lusee_bayes.instrument.flight.gain_files import read_gain_table
-from lusee_bayes.instrument.flight.lines import KnownLines
-from lusee_bayes.instrument.flight.recipe import Recipe
-from lusee_bayes.instrument.flight.reduced import (
+from lusee_bayes.flight import reduction
+from lusee_bayes.flight.clock import read_clock
+from lusee_bayes.flight.flags import KnownLines
+from lusee_bayes.flight.gain_model import read_gain_table
+from lusee_bayes.flight.recipe import Recipe
+from lusee_bayes.flight.reduced import (
     BURST,
     COMB,
     NO_DATA,
@@ -24,10 +24,11 @@ from lusee_bayes.instrument.flight.reduced import (
     REASONS,
     SATURATED,
     USED,
+    read_reduced,
+    write_reduced,
 )
-from lusee_bayes.instrument.flight.reduced_file import read_reduced, write_reduced
-from lusee_bayes.instrument.flight.reduction import reduce_sessions
-from lusee_bayes.instrument.flight.sessions import read_session
+from lusee_bayes.flight.reduction import reduce_sessions
+from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.instrument.products import auto_indices, labels
 from lusee_bayes.testing import assert_refused
 

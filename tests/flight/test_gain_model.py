@@ -6,8 +6,7 @@ import xarray as xr
 from scipy.interpolate import CubicSpline
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.flight.gain_files import read_gain_table, write_gain_table
-from lusee_bayes.instrument.flight.gain_table import GainTable
+from lusee_bayes.flight.gain_model import GainModel, read_gain_table, write_gain_table
 from lusee_bayes.testing import assert_refused
 
 ANCHORS = np.array([0.1, 1.1, 5.1, 10.1, 20.1, 30.1, 50.1, 70.1])
@@ -31,7 +30,7 @@ def telemetry(n=5):
 
 def table():
     rng = np.random.default_rng(1)
-    return GainTable(
+    return GainModel(
         "made up",
         np.broadcast_to(ANCHORS, (3, 4, len(ANCHORS))).copy(),
         0.02 + 0.01 * rng.random((3, 4, len(ANCHORS))),

@@ -3,19 +3,19 @@
 import numpy as np
 import pytest
 
-from lusee_bayes.instrument.flight.band import Band
-from lusee_bayes.instrument.flight.bursts import burst_flags
-from lusee_bayes.instrument.flight.lines import (
+from lusee_bayes.flight.bands import ChannelBand
+from lusee_bayes.flight.flags import (
     COMB_LIMIT,
     NO_LINES,
     KnownLines,
+    burst_flags,
     comb_bins,
     comb_strength,
     line_flags,
     read_lines,
+    threshold,
 )
-from lusee_bayes.instrument.flight.outliers import threshold
-from lusee_bayes.instrument.flight.spectrometer import AVERAGING, channel_mhz
+from lusee_bayes.flight.session import AVERAGING, channel_mhz
 from lusee_bayes.testing import assert_refused
 
 MHZ = channel_mhz("centre")
@@ -33,7 +33,7 @@ def autos(rng, rows=ROWS, frames=FRAMES, navgf=1):
 
 
 def band_of(f=10.0, navgf=1):
-    return Band.of(f, 1.0, 2, AVERAGING[navgf], MHZ)
+    return ChannelBand.of(f, 1.0, 2, AVERAGING[navgf], MHZ)
 
 
 def flags_of(band, spectra):

@@ -22,16 +22,19 @@ from jaxtyping import Bool, Float, Float32, Int
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.threads import in_threads
-from lusee_bayes.instrument.averaging import by_the_rule
-from lusee_bayes.instrument.flight.band import Band
-from lusee_bayes.instrument.flight.bursts import burst_flags
-from lusee_bayes.instrument.flight.gain_curves import gain_curves
-from lusee_bayes.instrument.flight.gain_table import NANO2, GainTable
-from lusee_bayes.instrument.flight.lines import COMB_LIMIT, comb_bins, comb_strength, line_flags
-from lusee_bayes.instrument.flight.outliers import robust_scale, threshold
-from lusee_bayes.instrument.flight.recipe import Recipe
-from lusee_bayes.instrument.flight.reduced import (
-    AUTOS,
+from lusee_bayes.flight.bands import ChannelBand
+from lusee_bayes.flight.flags import (
+    COMB_LIMIT,
+    burst_flags,
+    comb_bins,
+    comb_strength,
+    line_flags,
+    robust_scale,
+    threshold,
+)
+from lusee_bayes.flight.gain_model import NANO2, Curves, GainModel, gain_curves
+from lusee_bayes.flight.recipe import Recipe, Timeline, timeline
+from lusee_bayes.flight.reduced import (
     BURST,
     COMB,
     CORRECTED,
@@ -42,23 +45,24 @@ from lusee_bayes.instrument.flight.reduced import (
     USED,
     Reduced,
 )
-from lusee_bayes.instrument.flight.session import Read, Session
-from lusee_bayes.instrument.flight.spectrometer import (
+from lusee_bayes.flight.session import (
+    AUTOS,
     AVERAGING,
+    FIRST_PORT,
+    IMAGINARY,
     NO_LEVEL,
     OF_FLIGHT,
     PORTS,
+    SECOND_PORT,
+    Read,
+    Session,
     channel_mhz,
 )
-from lusee_bayes.instrument.flight.timeline import Timeline, timeline
-from lusee_bayes.instrument.products import all_products
+from lusee_bayes.instrument.averaging import by_the_rule
 from lusee_bayes.instrument.times import unannounced_leap_seconds
 
 # spectra that are worked on at once, and at least how many make a piece between two bins
 SLAB, PIECE = 128, 1024
-FIRST_PORT = np.array([p.i for p in all_products()])
-SECOND_PORT = np.array([p.j for p in all_products()])
-IMAGINARY = np.array([p.part == "I" for p in all_products()])
 
 
 def reduce_sessions(
@@ -133,10 +137,20 @@ def _in_common(line: Timeline, recipe: Recipe) -> dict[str, Any]:
         "average_s": recipe.average_s,
         "component_std": recipe.table.component_std,
         "gain_std": recipe.gain_std,
-        "curves": gain_curves(line, recipe),
-        "sessions": tuple(_origin(s, recipe) for s in line.sessions),
+        "curves": _curves(line, recipe),
+        "sessions": tuple(_said_of(s, recipe) for s in line.sessions),
         "recipe": recipe.words(),
     }
+
+
+def _curves(line: Timeline, recipe: Recipe) -> Curves:
+    sessions = line.sessions
+    telemetry = {
+        name: np.concatenate([s.telemetry[name] for s in sessions])
+        for name in sessions[0].telemetry
+    }
+    levels = np.concatenate([s.level for s in sessions])
+    return gain_curves(recipe.table, recipe.gain_std, levels, telemetry)
 
 
 def _pieces(line: Timeline) -> list[slice]:
@@ -188,7 +202,7 @@ class State:
     navgf : int
     levels : tuple of str
         Of the ports.
-    bands : tuple of Band
+    bands : tuple of ChannelBand
     basis : (ports, 3, bins) array
         Mean and components of the gains, averaged over the channels of every bin; NaN where there
         are none.
@@ -199,7 +213,7 @@ class State:
     recipe: Recipe
     navgf: int
     levels: tuple[str, ...]
-    bands: tuple[Band, ...]
+    bands: tuple[ChannelBand, ...]
     basis: Float[np.ndarray, "ports 3 bins"]
     known: Bool[np.ndarray, " bins"]
 
@@ -221,7 +235,9 @@ class State:
                     axis=2
                 )
         bands = tuple(
-            Band.of(f, recipe.bandwidth_mhz, recipe.degree, averaging, middles, recipe.shared_noise)
+            ChannelBand.of(
+                f, recipe.bandwidth_mhz, recipe.degree, averaging, middles, recipe.shared_noise
+            )
             for f in recipe.frequencies_mhz
         )
         known = recipe.lines.bins(averaging, middles)
@@ -265,7 +281,7 @@ class State:
 
 
 @lru_cache(maxsize=64)
-def _spline(table: GainTable, level: str, port: int, origin: str) -> np.ndarray:
+def _spline(table: GainModel, level: str, port: int, origin: str) -> np.ndarray:
     return table.basis(level, port, channel_mhz(origin))
 
 
@@ -432,7 +448,7 @@ def _means(
         return np.moveaxis(summed / total, 0, -1)
 
 
-def _origin(session: Session, recipe: Recipe) -> Mapping[str, Any]:
+def _said_of(session: Session, recipe: Recipe) -> Mapping[str, Any]:
     clock = recipe.clock or session.clock
     return {
         "file": str(session.path),

@@ -32,7 +32,7 @@ from lusee_bayes.core.layouts import Attribute, Layout
 from lusee_bayes.core.reading import naming, read_json
 from lusee_bayes.instrument.times import scale_of, unannounced_leap_seconds, utc_of
 
-DAY_S = 86400.0
+DAY_S, MJD_ZERO = 86400.0, 2400000.5
 # two clocks that differ by less are one
 SAME_S = 1e-3
 # a clock that is off by more is none

@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.flight.channel_spectra import ChannelSpectra
-from lusee_bayes.instrument.flight.clock import Clock
-from lusee_bayes.instrument.flight.counts import Counting, bit_slices, rounded
-from lusee_bayes.instrument.flight.cubes import cache_for, guessed_chunks
-from lusee_bayes.instrument.flight.session import TELEMETRY
-from lusee_bayes.instrument.flight.session_rows import SessionRows
-from lusee_bayes.instrument.flight.session_writing import write_session
-from lusee_bayes.instrument.flight.sessions import is_session, read_session
-from lusee_bayes.instrument.flight.spectrometer import OF_FLIGHT, channel_mhz
-from lusee_bayes.instrument.flight.synthetic_gains import synthetic_gains
+from lusee_bayes.flight.clock import Clock
+from lusee_bayes.flight.gain_model import synthetic_gains
+from lusee_bayes.flight.session import OF_FLIGHT, TELEMETRY, channel_mhz
+from lusee_bayes.flight.session_files import (
+    SessionRows,
+    cache_for,
+    guessed_chunks,
+    is_session,
+    read_session,
+    write_session,
+)
+from lusee_bayes.flight.synthesis import ChannelSpectra, Counting, bit_slices, rounded
 from lusee_bayes.instrument.products import to_matrix, to_real
 
 N = 7
