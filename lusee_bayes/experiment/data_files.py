@@ -17,11 +17,10 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.experiment.flight_data import reduce_files, visibilities_of
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.flight.reduced import Reduced, read_reduced
+from lusee_bayes.flight.session_files import is_session
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.beams.gridded import SAME_FREQUENCY_MHZ
-from lusee_bayes.instrument.flight.reduced import Reduced
-from lusee_bayes.instrument.flight.reduced_file import read_reduced
-from lusee_bayes.instrument.flight.sessions import is_session
 from lusee_bayes.instrument.timestamps import Timestamp
 from lusee_bayes.instrument.visibilities import HINT, Visibilities
 from lusee_bayes.instrument.visibilities_file import read_visibilities

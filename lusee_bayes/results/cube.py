@@ -17,7 +17,7 @@ from lusee_bayes.core.progress import peak_memory_gb
 from lusee_bayes.core.representation import Described, counted, extent
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.instrument.flight.reduced import Reduced
+from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.linear.fit import RULE, ChiSquare, Fit
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.cube_fit import ChannelFits

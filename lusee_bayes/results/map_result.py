@@ -21,7 +21,7 @@ from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.terms import beam_rms_difference
-from lusee_bayes.instrument.flight.reduced import Reduced
+from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.linear.fit import LEVELS, RULE
 from lusee_bayes.linear.metrics import effective_resolution_deg
 from lusee_bayes.linear.residuals import residuals

@@ -21,8 +21,7 @@ from lusee_bayes.experiment.data_files import (
 from lusee_bayes.experiment.experiment import Experiment, build, with_truth
 from lusee_bayes.experiment.flight_data import visibilities_of
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.instrument.flight.reduced import Reduced
-from lusee_bayes.instrument.flight.reduced_file import write_reduced
+from lusee_bayes.flight.reduced import Reduced, write_reduced
 from lusee_bayes.linear.compact import CompactPosterior
 from lusee_bayes.report.figures import channel as channel_figures
 from lusee_bayes.report.figures import cube as cube_figures

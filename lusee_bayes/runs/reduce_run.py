@@ -14,8 +14,7 @@ from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.instrument.flight.reduced import Reduced
-from lusee_bayes.instrument.flight.reduced_file import write_reduced
+from lusee_bayes.flight.reduced import Reduced, write_reduced
 from lusee_bayes.runs.origins import inputs_of
 
 

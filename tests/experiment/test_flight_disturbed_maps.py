@@ -13,7 +13,7 @@ from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.leave_out import without
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.instrument.flight.reduced import BURST, SATURATED
+from lusee_bayes.flight.reduced import BURST, SATURATED
 from lusee_bayes.runs.flight_run import run_simulate_flight
 
 ROWS, STEP_S = 1000, 42.0

@@ -14,7 +14,6 @@ from lusee_bayes.experiment.flight_data import per_kelvin_of, reduce_files
 from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.calibration import Calibration
-from lusee_bayes.instrument.flight import gain_files
 from lusee_bayes.instrument.products import auto_indices, labels
 from lusee_bayes.results.unknowns import unknowns_report
 from lusee_bayes.testing import assert_refused
@@ -86,7 +85,7 @@ def naive_band(flight, name, row, navgf):
     within = (np.abs(members - 10.0) <= 0.5 + 1e-9).all(axis=1)
     if (name, row) in (("d", 4), ("d", 5)):
         within &= np.arange(2048) % 4 != 2
-    table, gains = gain_files.read_gain_table(flight / "gain"), []
+    table, gains = gain_model.read_gain_table(flight / "gain"), []
     for port in range(4):
         level = "LMH"[codes[port]]
         basis = table.basis(level, port, members[within].ravel())
@@ -151,7 +150,7 @@ def test_the_known_sky_is_within_the_error_bars(mapped):
 def test_gains_that_are_off_are_found_and_the_map_holds(flight, monkeypatch):
     """Gains of every level of every port off by 1 %: the map is within wider error bars."""
     drawn = 1.0 + 0.01 * np.random.default_rng(4).standard_normal((3, 4))
-    original = gain_files.read_gain_table
+    original = gain_model.read_gain_table
 
     def off(path, model="quadratic"):
         table = original(path, model)

@@ -7,14 +7,13 @@ import pytest
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.flight_data import reduce_files
-from lusee_bayes.experiment.flight_disturbances import Disturbances
 from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.experiment.schema import FlightSimulatedSection
-from lusee_bayes.instrument.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED
-from lusee_bayes.instrument.flight.sessions import read_session
-from lusee_bayes.instrument.flight.spectrometer import CHANNEL_MHZ
-from lusee_bayes.instrument.flight.synthetic_gains import synthetic_gains
+from lusee_bayes.flight.gain_model import synthetic_gains
+from lusee_bayes.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED
+from lusee_bayes.flight.session import CHANNEL_MHZ
+from lusee_bayes.flight.session_files import read_session
+from lusee_bayes.flight.synthesis import Disturbances
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.noise.radiometer import exact_blocks
 from lusee_bayes.runs.flight_run import run_simulate_flight
@@ -52,8 +51,7 @@ STATES = [
     ["flight.simulated.navgf=3", "flight.simulated.levels=LMHM"],
     ["flight.simulated.navgf=4", "flight.convention=conj(s_i) s_j"],
     ["flight.simulated.levels=LLLL", "flight.simulated.kind=fits", "flight.bin_origin=edge"],
-    ["flight.simulated.layout=4", "flight.simulated.session_h=1.4"],
-    ["flight.simulated.layout=4", "flight.simulated.kind=fits", "flight.simulated.navgf=2"],
+    ["flight.simulated.kind=fits", "flight.simulated.session_h=1.4"],
     ["flight.simulated.switch_h=2.2", "flight.simulated.levels=HHHH"],
     ["flight.simulated.clock=unknown", "flight.convention=conj(s_i) s_j"],
 ]
@@ -202,8 +200,8 @@ def test_a_tone_that_no_bin_holds_is_refused():
     """Navgf 3 leaves out every fourth channel, the last of each bin."""
 
     def drawn(channel):
-        section = FlightSimulatedSection(navgf=3, tones_mhz=(0.025 * channel,))
-        return Disturbances.drawn(section, np.arange(20.0), 3600.0, "centre", 1)
+        tones = (0.025 * channel,)
+        return Disturbances.drawn(np.arange(20.0), 3600.0, "centre", 1, navgf=3, tones_mhz=tones)
 
     for channel in (1000, 1001, 1002):
         assert np.flatnonzero(drawn(channel).tone_channel).tolist() == [channel]
@@ -212,18 +210,11 @@ def test_a_tone_that_no_bin_holds_is_refused():
 
 
 @pytest.mark.parametrize(
-    "change", ["navgf=5", "levels=MMMX", "levels=MMM", "layout=2", "saturated_share=0.9"]
+    "change", ["navgf=5", "levels=MMMX", "levels=MMM", "kind=netcdf", "saturated_share=0.9"]
 )
 def test_impossible_states_are_refused(change):
     with pytest.raises(InputError):
         load_scenario("fiducial", [*SMALL, "flight.simulated={}", f"flight.simulated.{change}"])
-
-
-@pytest.mark.parametrize("kind", ["hdf5", "fits"])
-def test_telemetry_of_layout_4_needs_a_clock(kind):
-    change = f"{{layout: 4, kind: {kind}, clock: unknown}}"
-    with pytest.raises(InputError, match="layout"):
-        load_scenario("fiducial", [*SMALL, f"flight.simulated={change}"])
 
 
 def test_gains_are_off_as_they_are_said_to_be(tmp_path):

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.files import COMMITTED
-from lusee_bayes.instrument.flight.sessions import read_session
+from lusee_bayes.flight.session_files import read_session
 
 SET = [
     "lmax=3",

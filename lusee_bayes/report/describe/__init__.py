@@ -38,7 +38,7 @@ def _is_compact(path: Path) -> bool:
 
 
 def _is_session(path: Path) -> bool:
-    return bool(resolve_name("lusee_bayes.instrument.flight.sessions:is_session")(path))
+    return bool(resolve_name("lusee_bayes.flight.session_files:is_session")(path))
 
 
 # other files: how each kind is recognised; what is none of them is a sky
