@@ -3,6 +3,7 @@ from datetime import datetime, timedelta
 import astropy.units as u
 import numpy as np
 import pytest
+from assertions import within
 from astropy.coordinates import ICRS, CartesianRepresentation, get_body_barycentric
 from astropy.time import Time
 from lunarsky import MCMF, MoonLocation
@@ -79,8 +80,7 @@ def test_intervals_are_cut_as_by_a_loop(seed, step_s):
     at = seconds(o, origin)
     # dates in two doubles, and sums of days in seconds: a nanosecond
     np.testing.assert_allclose(at, (start + end) / 2.0, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(at[:, None] + o.windows.bounds_s, np.stack([start, end], 1),
-                               rtol=0, atol=1e-8)  # fmt: skip
+    within(at[:, None] + o.windows.bounds_s, np.stack([start, end], 1), 1e-8)  # fmt: skip
     np.testing.assert_allclose(o.live_s, [w[2] for w in expected], rtol=0, atol=1e-8)
     np.testing.assert_array_equal(o.run, [w[3] for w in expected])
     assert [o.turntable_deg[w[3]] for w in expected] == [
@@ -149,8 +149,7 @@ def test_runs_are_a_schedule(window, step_s):
     assert (got.lon_deg, got.lat_deg) == (expected.lon_deg, expected.lat_deg)
     np.testing.assert_allclose(got.live_s, expected.live_s, rtol=0, atol=1e-8)
     if window == "mean":
-        np.testing.assert_allclose(got.windows.bounds_s, expected.windows.bounds_s,
-                                   rtol=0, atol=1e-8)  # fmt: skip
+        within(got.windows.bounds_s, expected.windows.bounds_s, 1e-8)  # fmt: skip
 
 
 def is_dark(times, lon_deg, lat_deg):
@@ -218,42 +217,25 @@ HEADER = "start,end,turntable_deg,duty_cycle,night_only\n"
         (f"{HEADER}2027-01-01,2027-01-02\n", "line 2: there are 2 entries for the 5 columns"),
         (f"{HEADER}\nsoon,2027-01-02,0,1,false\n", "line 3: start 'soon' is not a date; write it"),
         (f"{HEADER}2027-01-01,61050.8,0,1,false\n", "line 2: end '61050.8' is not a date; write"),
-        (
-            f"{HEADER}1827-01-01,2027-01-02,0,1,false\n",
-            r"outside the ephemeris \(1900-2050\): 1827",
-        ),
-        (
-            f"{HEADER}2027-01-02,2027-01-01,0,1,false\n",
-            "line 2: end 2027-01-01 does not come after start 2027-01-02; give the dates between",
-        ),
+        (f"{HEADER}1827-01-01,2027-01-02,0,1,false\n", r"outside the ephemeris \(1900-2050\):"),
+        (f"{HEADER}2027-01-02,2027-01-01,0,1,false\n", "line 2: end 2027-01-01 does not come"),
         (f"{HEADER}2027-01-01,2027-01-01,0,1,false\n", "line 2: end 2027-01-01 does not come aft"),
         (
             f"{HEADER}2027-01-01,2027-01-02,0,1,false\n2027-01-01T23:00:00,2027-01-03,0,1,false\n",
-            "line 3: the interval from 2027-01-01T23:00:00 begins 3600 s before the one that "
-            "precedes it ends, 2027-01-02; give each stretch of time once",
+            "line 3: the interval from 2027-01-01T23:00:00 begins 3600 s before",
         ),
         (
             f"{HEADER}2027-01-05,2027-01-06,0,1,false\n2027-01-01,2027-01-02,0,1,false\n",
-            "line 3: the interval from 2027-01-01 begins before the one that precedes it, from "
-            "2027-01-05; sort the intervals by their start",
+            "line 3: the interval from 2027-01-01 begins before the one that precedes it",
         ),
         (f"{HEADER}2027-01-01,2027-01-02,0,1.5,false\n", "line 2: duty_cycle is 1.5; give the fra"),
-        (
-            f"{HEADER}2027-01-01,2027-01-02,0,0,false\n",
-            "line 2: duty_cycle is 0; give the fraction",
-        ),
+        (f"{HEADER}2027-01-01,2027-01-02,0,0,false\n", "line 2: duty_cycle is 0; give the"),
         (f"{HEADER}2027-01-01,2027-01-02,0,nan,false\n", "line 2: duty_cycle is nan; give the fra"),
         (f"{HEADER}2027-01-01,2027-01-02,0,half,\n", "line 2: duty_cycle is 'half', not a number"),
-        (
-            f"{HEADER}2027-01-01,2027-01-02,north,1,\n",
-            "line 2: turntable_deg is 'north', not a num",
-        ),
+        (f"{HEADER}2027-01-01,2027-01-02,north,1,\n", "line 2: turntable_deg is 'north', not a"),
         (f"{HEADER}2027-01-01,2027-01-02,,1,\n", "line 2: turntable_deg is '', not a number"),
         (f"{HEADER}2027-01-01,2027-01-02,inf,1,\n", "line 2: turntable_deg is inf; give an angle"),
-        (
-            f"{HEADER}2027-01-01,2027-01-02,0,1,1\n",
-            "line 2: night_only is '1'; write true or false",
-        ),
+        (f"{HEADER}2027-01-01,2027-01-02,0,1,1\n", "line 2: night_only is '1'; write true or"),
     ],
 )
 def test_bad_tables_are_refused(write, text, message):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import close
 
 from lusee_bayes.core.arrays import on_device, on_host
 from lusee_bayes.core.errors import InputError
@@ -91,7 +92,7 @@ def test_equals_the_product_of_matrices(place, kind, order, missing):
     got = np.asarray(normal_matrix(coupling, noise))
     np.testing.assert_array_equal(got, got.T)
     # sums of some 500 terms, in another order
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    close(got, expected, 1e-12)
     if order:
         other = a.T @ np.linalg.solve(n, a) - np.asarray(setting(order - 1, missing).dense()).T @ (
             np.linalg.solve(n, np.asarray(setting(order - 1, missing).dense()))
@@ -106,7 +107,7 @@ def test_inside_a_compiled_function_too(kind):
     noise = noise_of(kind, coupling.layout)
     expected = np.asarray(normal_matrix(on_host(coupling), on_host(noise)))
     got = eqx.filter_jit(normal_matrix)(on_device(coupling), on_device(noise))
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    close(got, expected, 1e-12)
 
 
 def test_more_times_than_a_chunk():
