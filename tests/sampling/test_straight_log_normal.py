@@ -147,8 +147,8 @@ def test_straight_coordinates_are_one_to_one_with_the_determinant_they_say(learn
 def test_energies_are_those_of_a_gaussian_in_straight_coordinates_only():
     coordinates, found = straight_coordinates(mode()), mode()
     z = jax.random.normal(jax.random.key(0), (60, found.sky.size), dtype=jnp.float64)
-    x = np.asarray(coordinates.mean + z @ coordinates.root.T)
-    values, _ = jax.jit(jax.vmap(coordinates.to_values))(x)
+    x = np.asarray(coordinates.mean)[None] + np.asarray(z @ coordinates.root.T)
+    values, _ = jax.jit(jax.vmap(coordinates.to_values))(jnp.asarray(x))
     white = np.asarray(values[STRUCTURE])
     chi2 = np.array([float(found.information.chi2(m)) for m in found.sky.modes(white)])
     energy = 0.5 * (chi2 + (white**2).sum(1))
