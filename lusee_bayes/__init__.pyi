@@ -35,7 +35,6 @@ from .instrument.waterfalls import write_waterfall as write_waterfall
 from .linear.compact import CompactPosterior as CompactPosterior
 from .linear.compact import read_compact as read_compact
 from .linear.information import Information as Information
-from .linear.iterative_joint import solve_iteratively as solve_iteratively
 from .linear.joint import solve_directly as solve_directly
 from .linear.model import LinearGaussian as LinearGaussian
 from .linear.posterior import Posterior as Posterior

@@ -121,6 +121,7 @@ CUBE_SUMMARY = Layout(
     attributes={
         "level": LEVEL,
         "verdict": TEXT,
+        "log_evidence": NUMBER,
         "n_data": COUNT,
         "n_modes": COUNT,
         "peak_memory_gb": NUMBER,
@@ -133,8 +134,7 @@ CHANNEL_SUMMARY = Layout(
         "n_data": COUNT,
         "n_missing": COUNT,
         "instrument_p": Attribute(low=0.0, high=1.0),
-        "chi2": NUMBER,
-        "chi2_expected": Attribute(optional=True),
+        **dict.fromkeys(("chi2", "chi2_expected"), NUMBER),
         "ell_cross": Attribute("integer", optional=True),
     },
 )
