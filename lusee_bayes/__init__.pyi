@@ -32,8 +32,6 @@ from .instrument.visibilities_file import read_visibilities as read_visibilities
 from .instrument.waterfalls import read_waterfall as read_waterfall
 from .instrument.waterfalls import write_four_port as write_four_port
 from .instrument.waterfalls import write_waterfall as write_waterfall
-from .linear.compact import CompactPosterior as CompactPosterior
-from .linear.compact import read_compact as read_compact
 from .linear.information import Information as Information
 from .linear.joint import solve_directly as solve_directly
 from .linear.model import LinearGaussian as LinearGaussian

@@ -24,7 +24,6 @@ FILES = {
     "residual.fits": "mean less truth, HEALPix, K",
     "mean_alm.fits": "harmonic coefficients of the mean, as healpy.write_alm",
     "posterior.nc": "posterior over the modes; draws and covariance if asked for",
-    "posterior_compact.npz": "compact posterior, from which NumPy can draw",
     "diagnostics.nc": "residuals, groups, point-spread functions",
     "samples.nc": "draws of all chains, ArviZ DataTree",
     "reduced.nc": "the spectra behind the map, reduced to bands and bins of time, with flags",

@@ -23,7 +23,6 @@ from lusee_bayes.experiment.flight_data import visibilities_of
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.flight.reduced import Reduced
 from lusee_bayes.instrument.flight.reduced_file import write_reduced
-from lusee_bayes.linear.compact import CompactPosterior
 from lusee_bayes.report.figures import channel as channel_figures
 from lusee_bayes.report.figures import cube as cube_figures
 from lusee_bayes.report.figures import diagnostics as diagnostic_figures
@@ -37,7 +36,7 @@ from lusee_bayes.results.cube_channels import cube_result
 from lusee_bayes.results.diagnostics_file import write_diagnostics
 from lusee_bayes.results.map_files import cards, write_cube, write_map
 from lusee_bayes.results.map_result import MapResult, map_result
-from lusee_bayes.results.posterior_file import about, write_posterior
+from lusee_bayes.results.posterior_file import write_posterior
 from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.results.saved import REDUCED
 from lusee_bayes.runs.folder import (
@@ -121,7 +120,6 @@ def run_map(
         return _run_single(scenario, folder, data, truth, onto, diagnosed, replace, stages)
     output = scenario.output
     require_single_frequency("--covariance", output.covariance)
-    require_single_frequency("--compact", output.compact)
     require_single_frequency("--updatable", output.updatable)
     require_single_frequency("--onto", onto is not None)
     require_single_frequency("--diagnose", diagnosed)
@@ -215,11 +213,6 @@ def _write_coefficients(result: MapResult, folder: Path) -> None:
     write_alms(folder / "mean_alm.fits", result.channel.mean, header)
 
 
-def _write_compact(result: MapResult, folder: Path) -> None:
-    compact = CompactPosterior.of(result.inference.posterior)
-    compact.write(folder / "posterior_compact.npz", about(result.scenario))
-
-
 def _write_reduced(result: MapResult | CubeResult, folder: Path) -> None:
     write_reduced(folder / REDUCED, result.reduced, result.scenario.to_yaml())
 
@@ -260,7 +253,6 @@ MAP = RunKind(
         Output(lambda result, folder: write_posterior(result, folder / "posterior.nc")),
         Output(_write_maps),
         Output(_write_coefficients),
-        Output(_write_compact, wanted=lambda result: result.scenario.output.compact),
         Output(
             lambda result, folder: write_csv(
                 folder / "spectra.csv", rows_of(result.channel.spectra())

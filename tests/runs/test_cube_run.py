@@ -304,7 +304,7 @@ def test_a_run_with_a_channel_that_cannot_be_mapped_goes_on(
         (["--workers", "2"], "give --frequencies"),
         (["--cluster", "tcp://127.0.0.1:1"], "give --frequencies"),
         (["--workers", "0", "--frequencies", "20,25"], "expected a whole number from 1"),
-        (["--frequencies", "20,25", "--compact"], "--compact is for a single frequency"),
+        (["--frequencies", "20,25", "--covariance"], "--covariance is for a single frequency"),
         (["--frequencies", "20,25", "--onto", "x"], "--onto is for a single frequency"),
         (["--frequencies", "20,25", "--joint"], "need at least as many channels, got 2"),
         (["--set", "spectral.components=[hot]", "--frequencies", "20,25"], "spectral.components"),
