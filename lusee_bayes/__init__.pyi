@@ -58,7 +58,6 @@ from .runs.paper_run import run_paper as run_paper
 from .runs.plan_run import run_plan as run_plan
 from .runs.sample_run import run_sample as run_sample
 from .runs.simulate_run import run_simulate as run_simulate
-from .runs.skies_run import run_skies as run_skies
 from .runs.validate_run import run_validate as run_validate
 from .sampling.calibration import calibrate as calibrate
 from .sampling.calibration import calibrate_sky as calibrate_sky

@@ -166,24 +166,6 @@ COVERAGE = Layout(
         **dict.fromkeys(("rms", "rms_scatter", "largest", "allowed"), NUMBER),
     },
 )
-SKIES = Layout(
-    "the coverage of given skies",
-    attributes={
-        "passed": Attribute("boolean"),
-        **dict.fromkeys(("verdict", "thresholds"), TEXT),
-        **dict.fromkeys(("frequency_mhz", "peak_memory_gb"), NUMBER),
-    },
-)
-SKY = Layout(
-    "the coverage of a given sky",
-    attributes={
-        "passed": Attribute("boolean"),
-        **dict.fromkeys(("name", "sentence"), TEXT),
-        **dict.fromkeys(("log_evidence", "chi2_model"), NUMBER),
-        "n_data": COUNT,
-        "level": LEVEL,
-    },
-)
 SKY_ERRORS = Layout(
     "the errors of a band of latitude",
     attributes={"name": TEXT, **dict.fromkeys(("rms_error_k", "std_over_sky"), NUMBER)},
