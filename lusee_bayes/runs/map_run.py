@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from dataclasses import replace as replace_fields
 from pathlib import Path
 
@@ -41,6 +40,7 @@ from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.results.saved import REDUCED
 from lusee_bayes.runs.folder import (
     Output,
+    Run,
     RunKind,
     require_marginal,
     require_single_frequency,
@@ -49,24 +49,6 @@ from lusee_bayes.runs.folder import (
 )
 from lusee_bayes.runs.origins import inputs_of, origin_of
 from lusee_bayes.sky import write_alms
-
-
-@dataclass(frozen=True)
-class MapRun:
-    """A finished map run.
-
-    Attributes
-    ----------
-    result : MapResult or CubeResult
-        Of one frequency, or of several.
-    folder : Path
-    files : list of Path
-        What was written.
-    """
-
-    result: MapResult | CubeResult
-    folder: Path
-    files: list[Path]
 
 
 def run_map(
@@ -80,7 +62,7 @@ def run_map(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> MapRun:
+) -> Run[MapResult | CubeResult]:
     """Make a posterior map of a scenario, or of given data, and write its folder.
 
     The folder is written in one transaction. A run of several frequencies that was stopped goes on
@@ -134,7 +116,7 @@ def run_map(
         cube = cube_result(scenario, place, data=file, truth=truth, engine=engine, stages=stages)
         cube = replace_fields(cube, reduced=reduced)
         provenance = _provenance_of_channels(scenario, data, cube)
-        return MapRun(cube, place, write_run(place, cube, CUBE, origin, stages, provenance))
+        return write_run(place, cube, CUBE, origin, stages, provenance)
 
 
 def _run_single(
@@ -146,7 +128,7 @@ def _run_single(
     diagnosed: bool,
     replace: bool,
     stages: Stages,
-) -> MapRun:
+) -> Run[MapResult | CubeResult]:
     origin = origin_of(scenario, data, truth=truth or None, onto=onto)
     inputs = inputs_of(scenario, data, onto)
     with run_folder(folder, MAP, origin, replace=replace, inputs=inputs) as place:
@@ -163,7 +145,7 @@ def _run_single(
         if reduced is not None:
             result = replace_fields(result, reduced=_as_used(reduced, experiment))
         provenance = Provenance.of_experiment(experiment, data)
-        return MapRun(result, place, write_run(place, result, MAP, origin, stages, provenance))
+        return write_run(place, result, MAP, origin, stages, provenance)
 
 
 def _as_used(reduced: Reduced, experiment: Experiment) -> Reduced:

@@ -184,7 +184,7 @@ def test_samples_have_the_moments_of_weighted_draws(tmp_path):
     """Hamiltonian Monte Carlo and importance sampling, of the sky, A and the tilt."""
     scenario = small_scenario(PRIOR, lmax=4, cycles=0.1)
     sampler = Sampler(chains=2, warmup=100, draws=500, seed=1)
-    (sampled,) = lb.run_sample(scenario, tmp_path / "samples", sampler=sampler).results
+    (sampled,) = lb.run_sample(scenario, tmp_path / "samples", sampler=sampler).result
     figures = sampled.figures()
     # tails of A where the sky hardly tells it are steep: one of a thousand may fail
     assert figures["program"] == "log_normal" and figures["divergences"] <= 5
