@@ -36,7 +36,6 @@ def map_command(
     output: Output = None,
     draws: Number | None = None,
     covariance: Flag = False,
-    compact: Flag = False,
     updatable: Flag = False,
     onto: Path | None = None,
     diagnose: Flag = False,
@@ -66,8 +65,6 @@ def map_command(
         Number of posterior draws to keep in posterior.nc (output.draws).
     covariance
         Keep the posterior covariance in posterior.nc (output.covariance).
-    compact
-        Write posterior_compact.npz, from which NumPy alone makes draws (output.compact).
     updatable
         Keep in posterior.nc what --onto needs (output.updatable).
     onto
@@ -104,7 +101,6 @@ def map_command(
         flight__clock=clock,
         output__draws=draws,
         output__covariance=covariance,
-        output__compact=compact,
         output__updatable=updatable,
     )
     folder = output or default_folder(scenario)

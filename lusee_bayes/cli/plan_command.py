@@ -73,10 +73,10 @@ def plan_command(
     with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
         run = run_plan(variations, output, engine=engine, replace=force, stages=stages)
     for source in sources:
-        show(console, forecast_table([f for f in run.forecasts if f.variation.source == source]))
+        show(console, forecast_table([f for f in run.result if f.variation.source == source]))
     say(console, *(f"  {path}" for path in run.files))
     for source in sources:
-        say(console, headline(run.forecasts, source))
-        if offsets := baseline(run.forecasts, source).offsets_line():
+        say(console, headline(run.result, source))
+        if offsets := baseline(run.result, source).offsets_line():
             say(console, f"{source}: {offsets}")
     say(console, f"look at {run.folder}/figures/plan.png")

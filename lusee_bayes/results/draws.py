@@ -14,19 +14,13 @@ from lusee_bayes.linear.parameter_draws import draws_with_parameters
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.coverage import N_DRAWS
 
-# what the seed is folded with for posterior draws, for perturbations of information, and for the
-# draws that coverage is compared with
-DRAWS, PERTURBATIONS, COMPARED = 1, 7, 8
+# what the seed is folded with for posterior draws, and for those that coverage is compared with
+DRAWS, COMPARED = 1, 8
 
 
 def draw_key(scenario: Scenario) -> PRNGKeyArray:
     """The key of a scenario's posterior draws."""
     return jax.random.fold_in(jax.random.key(scenario.seed), DRAWS)
-
-
-def perturbation_key(scenario: Scenario) -> PRNGKeyArray:
-    """The key of the perturbations of a scenario's information."""
-    return jax.random.fold_in(jax.random.key(scenario.seed), PERTURBATIONS)
 
 
 def posterior_draws(

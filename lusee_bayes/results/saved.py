@@ -121,6 +121,7 @@ CUBE_SUMMARY = Layout(
     attributes={
         "level": LEVEL,
         "verdict": TEXT,
+        "log_evidence": NUMBER,
         "n_data": COUNT,
         "n_modes": COUNT,
         "peak_memory_gb": NUMBER,
@@ -133,8 +134,7 @@ CHANNEL_SUMMARY = Layout(
         "n_data": COUNT,
         "n_missing": COUNT,
         "instrument_p": Attribute(low=0.0, high=1.0),
-        "chi2": NUMBER,
-        "chi2_expected": Attribute(optional=True),
+        **dict.fromkeys(("chi2", "chi2_expected"), NUMBER),
         "ell_cross": Attribute("integer", optional=True),
     },
 )
@@ -164,24 +164,6 @@ COVERAGE = Layout(
         "n": COUNT,
         **{f"{kind}_{name}": NUMBER for kind in ("held", "scatter") for name in NAMES},
         **dict.fromkeys(("rms", "rms_scatter", "largest", "allowed"), NUMBER),
-    },
-)
-SKIES = Layout(
-    "the coverage of given skies",
-    attributes={
-        "passed": Attribute("boolean"),
-        **dict.fromkeys(("verdict", "thresholds"), TEXT),
-        **dict.fromkeys(("frequency_mhz", "peak_memory_gb"), NUMBER),
-    },
-)
-SKY = Layout(
-    "the coverage of a given sky",
-    attributes={
-        "passed": Attribute("boolean"),
-        **dict.fromkeys(("name", "sentence"), TEXT),
-        **dict.fromkeys(("log_evidence", "chi2_model"), NUMBER),
-        "n_data": COUNT,
-        "level": LEVEL,
     },
 )
 SKY_ERRORS = Layout(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
@@ -23,6 +23,7 @@ from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
 from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.runs.folder import (
     Output,
+    Run,
     RunKind,
     require_marginal,
     require_single_frequency,
@@ -30,15 +31,6 @@ from lusee_bayes.runs.folder import (
     write_run,
 )
 from lusee_bayes.runs.origins import inputs_of, origin_of
-
-
-@dataclass(frozen=True)
-class ComparePriorsRun:
-    """A finished comparison: its result, its folder and the files in it."""
-
-    result: PriorComparison
-    folder: Path
-    files: list[Path]
 
 
 def run_compare_priors(
@@ -52,7 +44,7 @@ def run_compare_priors(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> ComparePriorsRun:
+) -> Run[PriorComparison]:
     """Map one data set under several priors, and say which of them it prefers.
 
     A, N and the data are the same for all; what :func:`run_map` would find is found for each. The
@@ -112,8 +104,7 @@ def run_compare_priors(
         found = engine.each(Tasks(under, list(sections), list(sections)), stages, "priors")
         result = PriorComparison(name, scenario, tuple(found), stages.seconds)
         provenance = Provenance.of_experiment(experiment, data)
-        files = write_run(place, result, COMPARE_PRIORS, origin, stages, provenance)
-        return ComparePriorsRun(result, place, files)
+        return write_run(place, result, COMPARE_PRIORS, origin, stages, provenance)
 
 
 def _under(name: str, setup: Setup, experiment: Experiment, information: Information) -> UnderPrior:

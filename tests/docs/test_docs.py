@@ -11,12 +11,14 @@ import shlex
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 import yaml
 from matplotlib.figure import Figure
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
+from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.scenario import load_scenario, scenario_names
 
 ROOT = Path(__file__).parents[2]
@@ -80,6 +82,18 @@ def test_the_commands_of_the_readme_run(tmp_path, monkeypatch, no_figures):
     for line in lines:
         if line.startswith("lusee-bayes"):
             run_command(line)
+
+
+@pytest.mark.long
+def test_the_draws_of_the_readme_become_healpys(tmp_path, monkeypatch, no_figures):
+    blocks = [c for kind, c in FENCES.findall((ROOT / "README.md").read_text()) if kind == "python"]
+    (block,) = [b for b in blocks if "posterior.nc" in b]
+    monkeypatch.chdir(tmp_path)
+    run_command("lusee-bayes map fiducial --draws 100")
+    made = {}
+    exec(block, made)
+    assert len(made["skies"]) == 100
+    np.testing.assert_allclose(from_healpy(made["alm"]), made["skies"], rtol=1e-14)
 
 
 def test_the_citation_names_this_version():

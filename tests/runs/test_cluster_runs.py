@@ -244,15 +244,11 @@ def test_workers_of_a_killed_command_end_with_it(tmp_path):
     [
         (["plan", "fiducial", "--set", "lmax=6", "--vary", "frequency_mhz=10,20,30"], "plan.csv"),
         (
-            ["validate", "fiducial", *MAP[6:], "--skies", "embedded:2", "smooth"],
-            "coverage.csv",
-        ),
-        (
             ["compare-priors", "fiducial", *MAP[6:], "--priors", "isotropic,local_scales"],
             "priors.csv",
         ),
     ],
-    ids=["plan", "validate", "compare-priors"],
+    ids=["plan", "compare-priors"],
 )
 def test_other_commands_say_the_same(arguments, same, cluster, tmp_path):
     tables = []
