@@ -82,7 +82,7 @@ def validate_command(
         key.path=value; overrides an entry of the scenario, as often as needed.
     workers
         Processes of this machine that share out the simulated data sets, or the skies; by default
-        as many as pay.
+        one.
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share them out; by default
         DASK_SCHEDULER_ADDRESS.
@@ -94,7 +94,7 @@ def validate_command(
 
         require_simulations(simulations)
         require_draws(draws)
-    from lusee_bayes.core.workers import open_engine
+    from lusee_bayes.core.engine import open_engine
     from lusee_bayes.results.cost import demand_of, posterior_cost
 
     console = Console(quiet=quiet, soft_wrap=True)
@@ -103,8 +103,8 @@ def validate_command(
         Stages(console, verbose=verbose),
     )
     if skies is not None:
-        demand = demand_of([posterior_cost(resolved)] * max(1, len(skies)))
-        with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+        demand = demand_of([posterior_cost(resolved)])
+        with open_engine(demand, workers, cluster) as engine:
             given = {"engine": engine, "replace": force, "stages": stages}
             return _on_skies(resolved, scenario, skies, output, console, given)
     from lusee_bayes.cli.tables import checks_table
@@ -113,8 +113,8 @@ def validate_command(
     from lusee_bayes.runs.validate_run import run_validate
     from lusee_bayes.sampling.hmc import Sampler
 
-    demand = demand_of_calibration(resolved, simulations)
-    with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+    demand = demand_of_calibration(resolved)
+    with open_engine(demand, workers, cluster) as engine:
         run = run_validate(
             resolved,
             output or default_folder(scenario, "-validation"),
