@@ -29,7 +29,7 @@ import dask
 import distributed
 from distributed.scheduler import NoWorkerError
 
-from lusee_bayes.core.compilation_cache import publish, use_compilation_cache
+from lusee_bayes.core.compilation_cache import use_compilation_cache
 from lusee_bayes.core.engine import Demand, Engine, Tasks, carry_out
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.files import scratch_folder
@@ -190,10 +190,7 @@ class DaskEngine(Engine):
 def run_task(job: Path, number: int) -> Any:
     """Call the function of a job with one of its items."""
     function, items, _ = read_job(job)
-    try:
-        return carry_out(function, items[number])
-    finally:
-        publish()
+    return carry_out(function, items[number])
 
 
 def run_merge(job: Path, one: Any, other: Any) -> Any:
