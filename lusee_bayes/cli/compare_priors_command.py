@@ -67,8 +67,7 @@ def compare_priors_command(
         by default DASK_SCHEDULER_ADDRESS.
     """
     from lusee_bayes.cli.tables import priors_table
-    from lusee_bayes.core.workers import open_engine
-    from lusee_bayes.experiment.named_priors import NAMED
+    from lusee_bayes.core.engine import open_engine
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.results.cost import demand_of, posterior_cost
     from lusee_bayes.runs.compare_priors_run import run_compare_priors
@@ -79,8 +78,8 @@ def compare_priors_command(
         Stages(console, verbose=verbose),
     )
     names = None if priors is None else [n.strip() for n in priors.split(",") if n.strip()]
-    demand = demand_of([posterior_cost(resolved)] * len(names or NAMED))
-    with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+    demand = demand_of([posterior_cost(resolved)])
+    with open_engine(demand, workers, cluster) as engine:
         run = run_compare_priors(
             resolved,
             output or default_folder(scenario, "-priors"),

@@ -71,8 +71,7 @@ def validate_command(
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
     workers
-        Processes of this machine that share out the simulated data sets; by default as many as
-        pay.
+        Processes of this machine that share out the simulated data sets; by default one.
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share them out; by default
         DASK_SCHEDULER_ADDRESS.
@@ -81,7 +80,7 @@ def validate_command(
 
     require_simulations(simulations)
     require_draws(draws)
-    from lusee_bayes.core.workers import open_engine
+    from lusee_bayes.core.engine import open_engine
 
     console = Console(quiet=quiet, soft_wrap=True)
     resolved, stages = (
@@ -94,8 +93,8 @@ def validate_command(
     from lusee_bayes.runs.validate_run import run_validate
     from lusee_bayes.sampling.hmc import Sampler
 
-    demand = demand_of_calibration(resolved, simulations)
-    with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+    demand = demand_of_calibration(resolved)
+    with open_engine(demand, workers, cluster) as engine:
         run = run_validate(
             resolved,
             output or default_folder(scenario, "-validation"),

@@ -12,12 +12,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
-import yaml
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.paths import user_path
-from lusee_bayes.core.yaml_files import parse_yaml, read_yaml
+from lusee_bayes.core.yaml_files import as_yaml, parse_yaml, read_yaml
 from lusee_bayes.experiment.overrides import apply_override
 from lusee_bayes.experiment.scenario_errors import one_sentence
 from lusee_bayes.experiment.schema import (
@@ -206,7 +205,7 @@ class Scenario(Section):
 
     def to_yaml(self) -> str:
         """The resolved scenario, defaults included."""
-        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+        return as_yaml(self.model_dump(mode="json"))
 
 
 def _treatments(section: Section) -> set[str]:

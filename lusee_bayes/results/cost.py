@@ -85,15 +85,12 @@ class Cost:
 
 def demand_of(costs: Sequence[Cost]) -> Demand:
     """What independent posteriors take, one or more."""
-    memory = max(cost.memory for cost in costs) - BASE_BYTES
-    seconds = sum(cost.operations for cost in costs) / _operations_a_second()
-    return Demand(len(costs), BASE_BYTES, memory, seconds)
+    return Demand(BASE_BYTES, max(cost.memory for cost in costs) - BASE_BYTES)
 
 
 def demand_of_channels(scenario: Scenario) -> Demand:
     """What the channels of a scenario take, of several frequencies."""
-    channels = scenario.channels()
-    demand = demand_of([posterior_cost(channels[0])] * len(channels))
+    demand = demand_of([posterior_cost(scenario.channels()[0])])
     if not scenario.joint:
         return demand
     # sums over channels, of every pair of components, and another one that is added

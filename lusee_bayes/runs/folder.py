@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 
 from matplotlib.figure import Figure
 
-from lusee_bayes.core.compilation_cache import publish, use_compilation_cache
+from lusee_bayes.core.compilation_cache import use_compilation_cache
 from lusee_bayes.core.destinations import locked, require_folder
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.files import MANIFEST, recover, require_apart, transaction
@@ -152,8 +152,6 @@ def run_folder(
             except WorkersLost as error:
                 state = _state(folder, before, kind.unfinished, resume)
                 raise WorkersLost(f"{error}; {state}") from error
-            finally:
-                publish()
     finally:
         # nothing written: nothing left
         for place in ([folder / kind.unfinished] if kind.unfinished else []) + made:

@@ -13,12 +13,12 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-import yaml
 from matplotlib.figure import Figure
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
+from lusee_bayes.core.yaml_files import parse_yaml
 from lusee_bayes.experiment.scenario import load_scenario, scenario_names
 
 ROOT = Path(__file__).parents[2]
@@ -97,7 +97,7 @@ def test_the_draws_of_the_readme_become_healpys(tmp_path, monkeypatch, no_figure
 
 
 def test_the_citation_names_this_version():
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    citation = parse_yaml((ROOT / "CITATION.cff").read_text(), "the file")
     assert citation["cff-version"] == "1.2.0"
     # what the standard asks for
     assert {"authors", "message", "title"} <= set(citation)

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-import yaml
 from fits_files import write_images
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.yaml_files import as_yaml, parse_yaml
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.schema import (
     FileSkySection,
@@ -103,10 +103,10 @@ seed: 1
 
 def old_scenario(path, **changes):
     """The scenario of the old text with some sections' entries changed."""
-    tree = yaml.safe_load(OLD)
+    tree = parse_yaml(OLD, "the file")
     for section, entries in changes.items():
         tree[section] |= entries
-    path.write_text(yaml.safe_dump(tree))
+    path.write_text(as_yaml(tree))
     return load_scenario(path)
 
 
@@ -131,7 +131,7 @@ def test_the_old_fiducial_scenario_is_the_fiducial_scenario(tmp_path):
     assert found == load_scenario("fiducial", ["noise.radiometer.temperature=model"])
     assert found.prior == IsotropicPriorSection(spectrum="sky")
     # written again, it has no key of another kind
-    tree = yaml.safe_load(found.to_yaml())
+    tree = parse_yaml(found.to_yaml(), "the file")
     assert set(tree["beam"]) == set(MonopoleBeamSection.model_fields)
     assert set(tree["sky"]) == set(GalaxySection.model_fields)
     assert tree["prior"]["spectrum"] == "sky"

@@ -1,9 +1,9 @@
 """Scenarios: defaults, overrides, round trip, and errors that help."""
 
 import pytest
-import yaml
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.yaml_files import parse_yaml
 from lusee_bayes.experiment.keys import scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario, scenario_names
 from lusee_bayes.experiment.schema.section import FILES
@@ -101,7 +101,7 @@ def test_default_maps_have_two_pixels_for_each_ell():
 
 def test_yaml_of_the_package_holds_only_known_keys():
     for name in scenario_names():
-        assert yaml.safe_load(load_scenario(name).to_yaml())
+        assert parse_yaml(load_scenario(name).to_yaml(), "the file")
 
 
 def test_anchored_scenarios_name_the_same_files_in_any_folder(tmp_path, monkeypatch):

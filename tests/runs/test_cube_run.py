@@ -11,7 +11,7 @@ import xarray as xr
 from astropy.io import fits
 
 from lusee_bayes.cli.main import main
-from lusee_bayes.core import workers
+from lusee_bayes.core import engine as engine_module
 from lusee_bayes.core.engine import ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map
@@ -162,7 +162,7 @@ def made(monkeypatch):
         done.append(experiment.scenario.frequency_mhz)
         return inform(experiment, *arguments)
 
-    for module in (workers, cube_channels):
+    for module in (engine_module, cube_channels):
         monkeypatch.setattr(module, "ThisProcess", lambda *_: ThisProcess(1))
     monkeypatch.setattr(cube_channels, "inform", counting)
     return done
