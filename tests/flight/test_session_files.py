@@ -25,7 +25,7 @@ from layout_4 import (
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.flight.session import FLIGHT_PRODUCTS, OF_FLIGHT, averaging
+from lusee_bayes.flight.session import FLIGHT_PRODUCTS, OF_FLIGHT
 from lusee_bayes.flight.session_files import is_session, read_session
 from lusee_bayes.instrument.products import labels
 from lusee_bayes.testing import assert_refused
@@ -50,7 +50,6 @@ def copy(flight, tmp_path):
 def test_products_are_in_the_spectrometers_order():
     assert FLIGHT_PRODUCTS[:6] == ("00R", "11R", "22R", "33R", "01R", "01I")
     assert [FLIGHT_PRODUCTS[k] for k in OF_FLIGHT] == list(labels())
-    assert_refused(lambda: averaging("here", 5))
 
 
 def test_what_a_session_says(flight):
