@@ -385,54 +385,41 @@ def _gain_array(path: Path) -> np.ndarray:
 
 def _coefficients(path: Path, model: str) -> np.ndarray:
     columns = read_table(path, CSV, HINT)
-    found = np.zeros((len(LETTERS), PORTS, N_COMPONENTS, N_TERMS))
-    seen: set[tuple[int, ...]] = set()
+    places = {
+        f"{level}{port} PC{r + 1} {term}": (i, port, r, k)
+        for i, level in enumerate(LETTERS)
+        for port in range(PORTS)
+        for r in range(N_COMPONENTS)
+        for k, term in enumerate(_terms(port))
+    }
+    found, seen = np.zeros((len(LETTERS), PORTS, N_COMPONENTS, N_TERMS)), set()
     names = ("gain_setting", "component", "model", "term", "alpha_refit")
     for number, (setting, component, family, term, value) in enumerate(
         zip(*(columns[name] for name in names), strict=True), start=2
     ):
         if str(family).strip().lower() != model:
             continue
-        where = f"{path}: line {number}"
-        place = (*_setting(where, str(setting)), _component(where, str(component)))
-        place = (*place, _term(where, place[1], str(term)))
-        if place in seen:
-            raise InputError(f"{where} gives {setting} {component} {term} a second time")
-        seen.add(place)
-        found[place] = value
-    lacking = [
-        f"{level}{port} PC{r + 1}"
-        for i, level in enumerate(LETTERS)
-        for port in range(PORTS)
-        for r in range(N_COMPONENTS)
-        if not any(place[:3] == (i, port, r) for place in seen)
-    ]
+        name = f"{setting.strip().upper()} {component.strip().upper()} {term.strip()}"
+        if name not in places:
+            raise InputError(
+                f"{path}: line {number}: unknown coefficient '{name}'; {nearest(name, places)}"
+            )
+        if name in seen:
+            raise InputError(f"{path}: line {number} gives {name} a second time")
+        seen.add(name)
+        found[places[name]] = value
+    given = {name.rpartition(" ")[0] for name in seen}
+    lacking = dict.fromkeys(one for name in places if (one := name.rpartition(" ")[0]) not in given)
     if lacking:
         raise InputError(f"{path} has no coefficients of model {model} for {', '.join(lacking)}")
     return found
 
 
-def _setting(where: str, text: str) -> tuple[int, int]:
-    text = text.strip().upper()
-    if len(text) != 2 or text[0] not in LETTERS or text[1] not in "0123":
-        raise InputError(f"{where}: gain_setting is '{text}'; expected L0 to H3")
-    return LETTERS.index(text[0]), int(text[1])
-
-
-def _component(where: str, text: str) -> int:
-    if text.strip().upper() not in ("PC1", "PC2"):
-        raise InputError(f"{where}: component is '{text}'; expected PC1 or PC2")
-    return int(text.strip()[-1]) - 1
-
-
-def _term(where: str, port: int, text: str) -> int:
-    adc = "SPE_ADC0_T" if port < 2 else "SPE_ADC1_T"
-    fpga = "THERM_FPGA"
-    terms = ("1", fpga, adc, "SPE_1VAD8_V", "VMON_1V2D", "SPE_1VAD8_C")
-    terms = (*terms, f"{fpga}*{fpga}", f"{adc}*{adc}", f"{fpga}*{adc}")
-    if text.strip() not in terms:
-        raise InputError(f"{where}: unknown term '{text}' of port {port}; {nearest(text, terms)}")
-    return terms.index(text.strip())
+def _terms(port: int) -> tuple[str, ...]:
+    """Luseepy's names of phi."""
+    adc, fpga = f"SPE_ADC{port // 2}_T", "THERM_FPGA"
+    squares = (f"{fpga}*{fpga}", f"{adc}*{adc}", f"{fpga}*{adc}")
+    return ("1", fpga, adc, "SPE_1VAD8_V", "VMON_1V2D", "SPE_1VAD8_C", *squares)
 
 
 MEAN = {"L": 7e-4, "M": 3e-2, "H": 1.5}

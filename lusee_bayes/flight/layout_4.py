@@ -25,25 +25,8 @@ from lusee_bayes.instrument.times import scale_of, unannounced_leap_seconds
 
 LAYOUT_4 = Layout("a session of lusee.ingest, layout 4", ROWS, SAID)
 # names of layout 4 for those of layout 3
-FIELDS = {
-    "Navgf": "navgf",
-    "Navg1_shift": "navg1_shift",
-    "Navg2_shift": "navg2_shift",
-    **{
-        name: name
-        for name in (
-            "actual_bitslice",
-            "actual_gain",
-            "adc_min",
-            "adc_max",
-            "adc_invalid_count_min",
-            "adc_invalid_count_max",
-            "errors",
-            "weight",
-            "notch",
-        )
-    },
-}
+NAMES = [name.removeprefix(f"{META}/") for name in ROWS if name.startswith(META)]
+FIELDS = {name: name.lower() for name in (*NAMES, "actual_gain")}
 # groups of data that are no spectra of all channels, and what they are called
 UNUSED = {
     "tr_spectra": "time-resolved spectra",

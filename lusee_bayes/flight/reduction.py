@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from lusee_bayes.flight.flags import (
     robust_scale,
     threshold,
 )
-from lusee_bayes.flight.gain_model import NANO2, Curves, GainModel, gain_curves
+from lusee_bayes.flight.gain_model import NANO2, Curves, gain_curves
 from lusee_bayes.flight.recipe import Recipe, Timeline, timeline
 from lusee_bayes.flight.reduced import (
     BURST,
@@ -231,9 +231,8 @@ class State:
         basis = np.full((PORTS, 3, averaging.n_bins), np.nan)
         for port, level in enumerate(levels):
             if level != NO_LEVEL:
-                basis[port] = _spline(recipe.table, level, port, recipe.origin)[:, channels].mean(
-                    axis=2
-                )
+                splines = recipe.table.basis(level, port, middles)
+                basis[port] = splines[:, channels].mean(axis=2)
         bands = tuple(
             ChannelBand.of(
                 f, recipe.bandwidth_mhz, recipe.degree, averaging, middles, recipe.shared_noise
@@ -278,11 +277,6 @@ class State:
             strength = comb_strength(autos, frames, averaging, channel_mhz(self.recipe.origin))
             comb = comb | (np.abs(strength) > COMB_LIMIT)
         return self.known | (comb[:, None] & comb_bins(averaging))
-
-
-@lru_cache(maxsize=64)
-def _spline(table: GainModel, level: str, port: int, origin: str) -> np.ndarray:
-    return table.basis(level, port, channel_mhz(origin))
 
 
 def _slab(

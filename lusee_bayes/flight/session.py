@@ -86,15 +86,6 @@ AVERAGING = {
 }
 
 
-def averaging(where: str, navgf: int) -> Averaging:
-    """Return which channels the bins hold. InputError, beginning with ``where``, for no Navgf."""
-    if navgf not in AVERAGING:
-        raise InputError(
-            f"{where}: Navgf is {navgf}; the flight software has {', '.join(map(str, AVERAGING))}"
-        )
-    return AVERAGING[navgf]
-
-
 def channel_mhz(origin: BinOrigin) -> Float[np.ndarray, " channels"]:
     """Return the middle of every channel in MHz.
 

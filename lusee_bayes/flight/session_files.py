@@ -346,61 +346,35 @@ def _write_session_fits(
 def _fits_header(rows: SessionRows) -> fits.HDUList:
     """All that comes before the spectra."""
     primary = fits.PrimaryHDU()
-    primary.header["LAYOUTV"] = 3
-    primary.header["ORIGIN"] = "lusee_bayes"
+    primary.header.update({"LAYOUTV": 3, "ORIGIN": "lusee_bayes"})
     invariants = fits.ImageHDU(name="SESSION_INV")
     invariants.header["SW_VERS"] = rows.software
     raw_s, mjd, scale, source = rows.clock_words()
     constants = fits.ImageHDU(name="CONSTANTS")
-    constants.header.update(
-        {
-            "LUN_LAT": rows.lat_deg,
-            "LUN_LON": rows.lon_deg,
-            "LUN_HGT": 0.0,
-            "RAWSHFT": raw_s,
-            "MJDOFF": mjd,
-            "TIMESYS": scale.upper(),
-            "CLKSRC": source,
-        }
-    )
+    site = {"LUN_LAT": rows.lat_deg, "LUN_LON": rows.lon_deg, "LUN_HGT": 0.0}
+    clock = {"RAWSHFT": raw_s, "MJDOFF": mjd, "TIMESYS": scale.upper(), "CLKSRC": source}
+    constants.header.update(site | clock)
     return fits.HDUList([primary, invariants, constants])
 
 
 def _cube_header(n_rows: int) -> fits.Header:
     header = fits.Header()
-    header["XTENSION"] = "IMAGE"
-    header["BITPIX"] = -32
-    header["NAXIS"] = 3
-    for axis, length in enumerate((N_CHANNELS, N_PRODUCTS, n_rows), start=1):
-        header[f"NAXIS{axis}"] = length
-    header["PCOUNT"] = 0
-    header["GCOUNT"] = 1
-    header["EXTNAME"] = "SPECTRA"
-    header["NTIME"] = n_rows
-    header["NPROD"] = N_PRODUCTS
-    header["NCHAN"] = N_CHANNELS
-    header["BUNIT"] = "SDU"
-    header["BITSREST"] = True
-    header["BITSREF"] = 31
-    header["NORMVER"] = 1
+    header.update({"XTENSION": "IMAGE", "BITPIX": -32, "NAXIS": 3})
+    header.update({"NAXIS1": N_CHANNELS, "NAXIS2": N_PRODUCTS, "NAXIS3": n_rows})
+    header.update({"PCOUNT": 0, "GCOUNT": 1, "EXTNAME": "SPECTRA"})
+    header.update({"NTIME": n_rows, "NPROD": N_PRODUCTS, "NCHAN": N_CHANNELS})
+    header.update({"BUNIT": "SDU", "BITSREST": True, "BITSREF": 31, "NORMVER": 1})
     header["HIERARCH REPRESENTATION"] = "gain_model_input_sdu"
     return header
 
 
 def _fits_table(name: str, columns: Mapping[str, np.ndarray]) -> fits.BinTableHDU:
     units = {"RAW_TIME": "s", "MJD_TIME": "d"}
-    return fits.BinTableHDU.from_columns(
-        [
-            fits.Column(
-                key,
-                f"{values[0].size}{FORMATS[values.dtype.kind]}",
-                unit=units.get(key),
-                array=values,
-            )
-            for key, values in columns.items()
-        ],
-        name=name,
-    )
+    made = []
+    for key, values in columns.items():
+        form = f"{values[0].size}{FORMATS[values.dtype.kind]}"
+        made.append(fits.Column(key, form, unit=units.get(key), array=values))
+    return fits.BinTableHDU.from_columns(made, name=name)
 
 
 # as luseepy has it
@@ -430,19 +404,13 @@ def _write_session_hdf5(
 
 
 def _write_all_but_spectra(file: h5py.File, rows: SessionRows) -> None:
-    file.attrs["layout_version"] = np.int64(3)
+    file.attrs.update(layout_version=np.int64(3), cdi_directory="", n_items=np.int64(0))
     file.create_group("session_invariants").attrs["software_version"] = np.int64(rows.software)
-    file.attrs["cdi_directory"] = ""
-    file.attrs["n_items"] = np.int64(0)
     raw_s, mjd, scale, source = rows.clock_words()
     constants = file.create_group("constants").attrs
-    constants["lun_lat_deg"] = rows.lat_deg
-    constants["lun_long_deg"] = rows.lon_deg
-    constants["lun_height_m"] = 0.0
-    constants["raw_time_subtract_seconds"] = raw_s
-    constants["mjd_epoch_offset_days"] = mjd
-    constants["time_scale"] = scale
-    constants["clock_source"] = source
+    constants.update(lun_lat_deg=rows.lat_deg, lun_long_deg=rows.lon_deg, lun_height_m=0.0)
+    constants.update(raw_time_subtract_seconds=raw_s, mjd_epoch_offset_days=mjd)
+    constants.update(time_scale=scale, clock_source=source)
     if rows.clock is not None:
         constants["clock_epoch_isot"] = rows.clock.isot
     spectra = file.create_group("spectra")

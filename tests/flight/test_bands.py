@@ -68,18 +68,6 @@ def test_what_the_degree_leaves_out_is_told_by_two_more_powers():
     assert abs(off[2]) < 6e-6
 
 
-def test_noise_of_independent_channels_in_closed_form():
-    """A parabola's middle has 9/4 of the variance of a mean, times (1 + O(1/n^2))."""
-    mhz = channel_mhz("centre")
-    for navgf in (1, 4):
-        band = ChannelBand.of(25.0, 4.0, 2, AVERAGING[navgf], mhz)
-        n = band.last - band.first
-        flat = np.ones((1, n))
-        _, variance, _ = band.values(flat[:, None], flat, flat > 0)
-        channels = n * AVERAGING[navgf].members
-        assert variance[0] == pytest.approx(9.0 / 4.0 / channels, rel=10.0 / n**2 + 1e-3)
-
-
 def test_noise_of_steep_spectra_and_shared_channels_by_drawing_it():
     shared = shared_noise(1, "hann")
     band = ChannelBand.of(10.0, 1.0, 1, AVERAGING[2], channel_mhz("centre"), shared)

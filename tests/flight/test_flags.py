@@ -89,25 +89,16 @@ def test_a_comb_far_below_the_noise_of_a_channel_is_found(navgf):
     assert not found[1::2].any()
 
 
-def test_a_notch_is_a_comb_below():
-    spectra = autos(np.random.default_rng(5), rows=4)
-    spectra[:, :, comb_bins(AVERAGING[1])] *= 1.0 - 5.0 / np.sqrt(FRAMES)
-    strength = comb_strength(spectra, np.full(4, FRAMES), AVERAGING[1], MHZ)
-    assert (strength < -COMB_LIMIT).all()
-
-
-def test_a_strong_line_is_no_comb():
-    spectra = autos(np.random.default_rng(6), rows=4)
-    spectra[:, :, [835, 836]] *= 1e3
-    strength = comb_strength(spectra, np.full(4, FRAMES), AVERAGING[1], MHZ)
-    assert (np.abs(strength) < COMB_LIMIT).all()
-
-
-def test_where_every_bin_has_a_channel_of_the_comb_nothing_is_told():
-    assert comb_bins(AVERAGING[3]).all()
-    assert comb_bins(AVERAGING[4]).all()
-    spectra = autos(np.random.default_rng(7), rows=2, navgf=4)
-    assert not comb_strength(spectra, np.ones(2), AVERAGING[4], MHZ).any()
+def test_a_notch_is_a_comb_below_and_a_strong_line_is_none():
+    spectra, frames = autos(np.random.default_rng(5), rows=4), np.full(4, FRAMES)
+    spectra[:2, :, comb_bins(AVERAGING[1])] *= 1.0 - 5.0 / np.sqrt(FRAMES)
+    spectra[2:, :, [835, 836]] *= 1e3
+    strength = comb_strength(spectra, frames, AVERAGING[1], MHZ)
+    assert (strength[:2] < -COMB_LIMIT).all() and (np.abs(strength[2:]) < COMB_LIMIT).all()
+    # where every bin has a channel of the comb nothing is told
+    assert comb_bins(AVERAGING[3]).all() and comb_bins(AVERAGING[4]).all()
+    spectra = autos(np.random.default_rng(7), rows=4, navgf=4)
+    assert not comb_strength(spectra, frames, AVERAGING[4], MHZ).any()
 
 
 def test_known_lines_take_the_channels_about_them(tmp_path):

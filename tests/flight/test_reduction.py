@@ -1,14 +1,12 @@
 """Reduced spectra against the sums written out, one spectrum after the other."""
 
-import csv
 import json
 from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
 from astropy.time import Time
-from scipy.interpolate import CubicSpline
+from naive_flight import FLIGHT_ORDER, naive_band
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.flight import reduction
@@ -33,13 +31,6 @@ from lusee_bayes.instrument.products import auto_indices, labels
 from lusee_bayes.testing import assert_refused
 
 F = (10.0, 25.0)
-
-
-@pytest.fixture(scope="module")
-def flight(test_data):
-    if not (test_data / "flight").is_dir():
-        pytest.skip("no flight sessions")
-    return test_data / "flight"
 
 
 @pytest.fixture(scope="module")
@@ -70,65 +61,11 @@ def reduced(flight, table):
     return reduce_sessions(sessions(flight), recipe(table))
 
 
-def naive_gain(folder, level, port, seen, mhz):
-    """luseepy's recipe, of its files, for one spectrum."""
-    adc = seen["SPE_ADC0_T" if port < 2 else "SPE_ADC1_T"]
-    values = {
-        "1": 1.0,
-        **seen,
-        "THERM_FPGA*THERM_FPGA": seen["THERM_FPGA"] ** 2,
-        "SPE_ADC0_T*SPE_ADC0_T": adc**2,
-        "SPE_ADC1_T*SPE_ADC1_T": adc**2,
-        "THERM_FPGA*SPE_ADC0_T": seen["THERM_FPGA"] * adc,
-        "THERM_FPGA*SPE_ADC1_T": seen["THERM_FPGA"] * adc,
-    }
-    name, q = f"{level}{port}", {"PC1": 0.0, "PC2": 0.0}
-    with (folder / "alpha_refit.csv").open() as file:
-        for row in csv.DictReader(file):
-            if row["gain_setting"] == name and row["model"] == "quadratic":
-                q[row["component"]] += float(row["alpha_refit"]) * values[row["term"]]
-    mean, vectors, anchors = (
-        np.load(folder / f"{name}_{part}.npy") for part in ("mean", "eigvecs", "freqs")
-    )
-    return CubicSpline(anchors, mean + q["PC1"] * vectors[:, 0] + q["PC2"] * vectors[:, 1])(mhz)
-
-
-def naive_values(flight, name, row, f):
-    """A parabola through the channels of a band, by numpy, product by product."""
-    with h5py.File(flight / f"session_{name}.h5") as file:
-        counts = file["spectra/data"][row].astype(float)
-        codes = file["spectra/metadata/actual_gain"][row]
-        navgf = int(file["spectra/metadata/Navgf"][row])
-        group = file["spectra_interpolated_telemetry"]
-        seen = {key: float(group[key][row]) for key in group if not key.endswith("time")}
-    stride = {1: 1, 4: 4}[navgf]
-    found = {}
-    bins = np.arange(2048 // stride)
-    members = 0.025 * (stride * bins[:, None] + np.arange(stride))
-    within = np.flatnonzero((np.abs(members - f) <= 0.5 + 1e-9).all(axis=1))
-    gains = [
-        naive_gain(flight / "gain", "LMH"[codes[p]], p, seen, members[within]).mean(axis=1)
-        for p in range(4)
-    ]
-    order = ["00", "11", "22", "33"] + [
-        f"{i}{j}{part}" for i in range(4) for j in range(i + 1, 4) for part in "RI"
-    ]
-    # mean powers of each bin's channels
-    x = members[within] - f
-    powers = np.stack([(x**k).mean(axis=1) for k in range(3)], axis=1)
-    for number, product in enumerate(order):
-        i, j = int(product[0]), int(product[1])
-        y = counts[number, within] * 1e-18 / np.sqrt(gains[i] * gains[j])
-        label = product if len(product) == 3 else f"{product}R"
-        found[label] = np.linalg.lstsq(powers, y, rcond=None)[0][0]
-    return np.array([found[label] for label in labels()])
-
-
 @pytest.mark.parametrize(("name", "row"), [("a", 3), ("b", 30), ("c", 15)])
 def test_values_are_those_of_sums_written_out(flight, reduced, name, row):
     at = {"a": 0, "b": 40, "c": 80}[name] + row
     for band, f in enumerate(F):
-        expected = naive_values(flight, name, row, f)
+        expected, _ = naive_band(flight, name, row, f)
         scale = np.sqrt(np.abs(expected[auto_indices()]).max())
         np.testing.assert_allclose(
             reduced.values[band, :, at], expected, rtol=1e-9, atol=1e-12 * scale**2
@@ -170,14 +107,10 @@ def test_flags_are_those_of_what_was_injected(reduced, truth):
         comb = np.isin(name, [f"{s}{r}" for s, r in truth["comb"] if s == "d"])
         np.testing.assert_array_equal(reduced.lines[band] > 0.2, comb | saturated)
     gone = truth["missing"]
-    position = {label: k for k, label in enumerate(labels())}
-    flight_order = ["00R", "11R", "22R", "33R"] + [
-        f"{i}{j}{part}" for i in range(4) for j in range(i + 1, 4) for part in "RI"
-    ]
     expected = np.zeros(reduced.values.shape[1:], dtype=bool)
     for session, row, product in gone:
         at = int(np.flatnonzero(name == f"{session}{row}")[0])
-        expected[position[flight_order[int(product)]], at] = True
+        expected[labels().index(FLIGHT_ORDER[int(product)]), at] = True
     expected[:, saturated] = True
     np.testing.assert_array_equal(np.isnan(reduced.values[0]), expected)
 
@@ -255,24 +188,6 @@ def test_gain_errors_are_those_of_the_levels(flight, table):
     np.testing.assert_allclose(slope[2], 0.02)
 
 
-def test_components_change_the_gain_as_the_table_says(flight, table):
-    """One standard deviation of a component, put into the gains, changes values by its slope."""
-    from dataclasses import replace
-
-    std = np.full((3, 4, 2), 1e-4)
-    known = replace(table, component_std=std)
-    found = reduce_sessions(sessions(flight, "a"), recipe(known))
-    calibration = found.at(10.0, np.ones(4) * 1e-22).calibration
-    assert calibration.gain_names[:2] == ("M0 PC1", "M0 PC2")
-    moved = table.coefficient.copy()
-    moved[1, 0, 0, 0] += 1e-4  # M0, PC1, the constant
-    other = reduce_sessions(sessions(flight, "a"), recipe(replace(table, coefficient=moved)))
-    # values are counts / gain: a gain above the table's makes them too large by as much
-    ratio = found.values[0, 0] / other.values[0, 0] - 1.0
-    # to first order; of a band's mean gain for the middle's
-    np.testing.assert_allclose(calibration.gain_slope[0], ratio, rtol=0.02)
-
-
 def test_shares_of_flags_are_those_of_the_values_that_there_were(reduced):
     """Of 20 spectra 2 hold no data, 3 are bursts, 2 saturated; half of the rest does not fit."""
     reason = np.full(reduced.reason.shape, NO_DATA, dtype=np.uint8)
@@ -339,10 +254,4 @@ def test_what_contradicts_itself_is_refused(flight, table):
     with pytest.raises(InputError, match="last for"):
         reduce_sessions([a], recipe(table, timestamp="middle", average_s=60.0))
     with pytest.raises(InputError, match="lacks"):
-        reduce_sessions([without_telemetry(a)], recipe(table))
-
-
-def without_telemetry(session):
-    from dataclasses import replace
-
-    return replace(session, telemetry={})
+        reduce_sessions([replace(a, telemetry={})], recipe(table))

@@ -80,23 +80,17 @@ def test_fits_and_a_gain_table_of_ones_own(tmp_path):
         with session.spectra() as read:
             counts.append(read(0, 5))
     np.testing.assert_array_equal(*counts)
-
-
-def test_files_of_an_earlier_simulation_do_not_stay(tmp_path):
-    assert simulate(tmp_path / "a", "flight.simulated={session_h: 1, clock: unknown}") == 0
-    assert simulate(tmp_path / "a", "flight.simulated={kind: fits}", force=True) == 0
-    assert files_of(tmp_path / "a") == [
-        "gains.nc", "manifest.json", "scenario.yaml", "session_000.fits", "truth.npz"
-    ]  # fmt: skip
+    # files of an earlier simulation do not stay
+    assert simulate(second, "flight.simulated={session_h: 1, clock: unknown}", force=True) == 0
+    names = files_of(second)
+    assert "session_000.fits" not in names and {"clock.json", "gains.nc"} <= set(names)
 
 
 @pytest.mark.parametrize(
     "changes, text",
     [
-        (["flight={}"], "these beams know no volts"),
         (["flight.simulated={navgf: 5}"], "navgf"),
         (["flight.simulated={burst_every_h: 1e-9}"], "burst_every_h"),
-        (["observation.step_s=1e-6", "observation.runs=[{cycles: 1e-11}]"], "a frame of"),
         (["flight.gain_table=nowhere.nc"], "nowhere.nc"),
     ],
 )
@@ -170,13 +164,6 @@ def test_sessions_without_a_number_are_refused(simulated, tmp_path, capsys):
         file["spectra/data"][...] = np.nan
     assert main(["reduce", "-q", str(simulated / "scenario.yaml"), str(empty), "-o", str(out)]) == 2
     assert "NaN" in capsys.readouterr().err and not out.exists()
-
-
-def test_the_site_of_sessions_may_be_the_scenarios(simulated, tmp_path, capsys):
-    command = ["map", str(simulated / "scenario.yaml"), "--set", "observation.lat_deg=-20"]
-    command += ["--data", str(simulated / "session_000.h5"), "-q", "-o", str(tmp_path / "map")]
-    assert main(command) == 2
-    assert "flight.site=scenario" in capsys.readouterr().err
 
 
 def test_info_of_several_files_names_the_bad_one_and_shows_the_others(simulated, tmp_path, capsys):
