@@ -89,7 +89,7 @@ def validate_command(
     )
     from lusee_bayes.cli.tables import checks_table
     from lusee_bayes.report.pages import REPORT
-    from lusee_bayes.results.validation_result import demand_of_calibration
+    from lusee_bayes.results.cost import demand_of_calibration
     from lusee_bayes.runs.validate_run import run_validate
     from lusee_bayes.sampling.hmc import Sampler
 

@@ -23,6 +23,7 @@ from lusee_bayes.experiment.comparison import ARRAYS, MOST_MEMORY
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.results.positive_components import lmax_of_fields
+from lusee_bayes.sampling.calibration import BATCH, N_DRAWS
 
 # measured at lmax 12 to 80 and up to 3e5 data (docs/commands.md): what is there before anything is
 # computed, and what each datum takes from reading to the report
@@ -247,3 +248,8 @@ def _smaller(scenario: Scenario) -> Iterator[tuple[str, float | str, Scenario]]:
         step_s = float(ceil(section.step_s)) * 2.0**times
         fewer = section.model_copy(update={"step_s": step_s})
         yield "observation.step_s", step_s, scenario.model_copy(update={"observation": fewer})
+
+
+def demand_of_calibration(scenario: Scenario) -> Demand:
+    """What simulation-based calibration takes, in batches that use all processors."""
+    return replace(demand_of([posterior_cost(scenario, BATCH * N_DRAWS)]), side_by_side=1)

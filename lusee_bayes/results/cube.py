@@ -11,6 +11,7 @@ import xarray as xr
 from jaxtyping import Float
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.harmonics import mode_numbers, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import peak_memory_gb
@@ -19,12 +20,13 @@ from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.linear.fit import RULE, ChiSquare, Fit
+from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.cube_fit import ChannelFits
 from lusee_bayes.results.cube_unknowns import CubeUnknowns
-from lusee_bayes.results.joint_components import Components
 from lusee_bayes.results.prior_words import joint_prior_sentence
 from lusee_bayes.sky.landmarks import LANDMARKS
+from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 
 @dataclass(frozen=True, repr=False)
@@ -299,3 +301,44 @@ class CubeResult(Described):
         """Cubes by name, in K: mean, std and, where the truth is known, truth and residual."""
         parts = [channel.maps() for channel in self.channels]
         return {name: np.stack([part[name] for part in parts]) for name in parts[0]}
+
+
+@dataclass(frozen=True)
+class Components:
+    """The joint posterior of the component maps: in K, of positive skies fields without unit.
+
+    Attributes
+    ----------
+    prior : SpectralPrior
+    mean : (components, modes) array
+    spread : (pairs, modes, modes) array
+        Their covariance (:func:`.paired`).
+    draws : (n, components, modes) array
+    chi2 : float
+        Of all data under the model, prior included: chi^2 of N_data if it holds.
+    log_evidence, information_bits : float
+    refinement : float
+        Distance left, in standard deviations.
+    mode : PositiveMode or None
+        Of positive skies.
+    """
+
+    prior: SpectralPrior
+    mean: Array
+    spread: Array
+    draws: Array
+    chi2: float
+    log_evidence: float
+    information_bits: float
+    refinement: float
+    mode: PositiveMode | None = None
+
+    @property
+    def solver(self) -> str:
+        """How the mean was found."""
+        return "direct" if self.mode is None else "Gauss-Newton rounds"
+
+    @property
+    def iterations(self) -> int:
+        """Rounds of positive skies."""
+        return 0 if self.mode is None else self.mode.rounds

@@ -20,10 +20,10 @@ from lusee_bayes.results.channel import ChannelResult, channel_of_information
 from lusee_bayes.results.channel_files import ChannelFiles, identity_of
 from lusee_bayes.results.channel_information import ChannelInformation
 from lusee_bayes.results.coverage import N_DRAWS
-from lusee_bayes.results.cube import CubeResult
+from lusee_bayes.results.cube import Components, CubeResult
 from lusee_bayes.results.draws import deviations, draw_key, posterior_draws
 from lusee_bayes.results.joint_channels import names_of
-from lusee_bayes.results.joint_components import Components, solve_components
+from lusee_bayes.results.joint_components import solve_components
 from lusee_bayes.results.smooth_receivers import ChannelAlone, tie_receivers, write_tied_sky
 
 

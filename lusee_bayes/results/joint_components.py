@@ -2,65 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import numpy as np
 
-from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.engine import Engine
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.joint import component_posterior
 from lusee_bayes.linear.joint_skies import paired
-from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.channel_files import ChannelFiles
+from lusee_bayes.results.cube import Components
 from lusee_bayes.results.draws import draw_key
 from lusee_bayes.results.joint_channels import ChannelsInFiles
 from lusee_bayes.results.positive_components import positive_mode
 from lusee_bayes.sky.spectral_prior import SpectralPrior
-
-
-@dataclass(frozen=True)
-class Components:
-    """The joint posterior of the component maps: in K, of positive skies fields without unit.
-
-    Attributes
-    ----------
-    prior : SpectralPrior
-    mean : (components, modes) array
-    spread : (pairs, modes, modes) array
-        Their covariance (:func:`.paired`).
-    draws : (n, components, modes) array
-    chi2 : float
-        Of all data under the model, prior included: chi^2 of N_data if it holds.
-    log_evidence, information_bits : float
-    refinement : float
-        Distance left, in standard deviations.
-    mode : PositiveMode or None
-        Of positive skies.
-    """
-
-    prior: SpectralPrior
-    mean: Array
-    spread: Array
-    draws: Array
-    chi2: float
-    log_evidence: float
-    information_bits: float
-    refinement: float
-    mode: PositiveMode | None = None
-
-    @property
-    def solver(self) -> str:
-        """How the mean was found."""
-        return "direct" if self.mode is None else "Gauss-Newton rounds"
-
-    @property
-    def iterations(self) -> int:
-        """Rounds of positive skies."""
-        return 0 if self.mode is None else self.mode.rounds
 
 
 def solve_components(

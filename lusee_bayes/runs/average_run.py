@@ -16,7 +16,7 @@ from lusee_bayes.experiment.setup import require_fitting, set_up
 from lusee_bayes.instrument.averaging import averaged, product_live_s
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.results.cost import require_resources
-from lusee_bayes.results.forecast import expected_posterior
+from lusee_bayes.runs.forecasting import expected_posterior
 from lusee_bayes.runs.origins import inputs_of
 
 

@@ -18,9 +18,10 @@ from lusee_bayes.report.figures import samples as sample_figures
 from lusee_bayes.results.cost import require_resources
 from lusee_bayes.results.map_files import write_cube, write_map
 from lusee_bayes.results.provenance import Provenance
-from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult, sample_result
+from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult
 from lusee_bayes.runs.folder import Output, Run, RunKind, run_folder, write_run
 from lusee_bayes.runs.origins import inputs_of, origin_of
+from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling.datatree import write_datatree
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.programs import Program, load_program

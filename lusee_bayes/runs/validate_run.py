@@ -13,11 +13,12 @@ from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.report.figures import samples as sample_figures
 from lusee_bayes.results.cost import require_resources
 from lusee_bayes.results.provenance import Provenance
-from lusee_bayes.results.sample_result import CHAINS, sample_result
+from lusee_bayes.results.sample_result import CHAINS
 from lusee_bayes.results.validation_result import ValidationResult
 from lusee_bayes.runs.folder import Output, Run, RunKind, run_folder, write_run
 from lusee_bayes.runs.origins import inputs_of
 from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_origin
+from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling.calibration import calibrate_sky
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.least import require_draws, require_simulations

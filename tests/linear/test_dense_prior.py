@@ -41,7 +41,7 @@ from lusee_bayes.linear.resolution import resolution_rows
 from lusee_bayes.linear.updating import updated
 from lusee_bayes.noise import beam_error_noise
 from lusee_bayes.noise.covariance import DenseCovariance, DiagonalCovariance
-from lusee_bayes.results.forecast import informed_modes
+from lusee_bayes.runs.forecasting import informed_modes
 from lusee_bayes.sampling.distributions import Marginal, SkyPrior
 from lusee_bayes.sampling.whitening import Whitening
 from lusee_bayes.sky.priors import DensePrior, HarmonicPrior

@@ -12,7 +12,8 @@ import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.pieces import program_pieces
-from lusee_bayes.results.sample_result import SampleResult, coordinates
+from lusee_bayes.results.sample_result import SampleResult
+from lusee_bayes.runs.sampling import coordinates
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.promotion import numpyro_promotion

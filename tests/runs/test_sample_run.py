@@ -35,10 +35,10 @@ from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.results import sample_result as results
 from lusee_bayes.results.map_channel import channel_of_posterior
-from lusee_bayes.results.sample_result import sample_result
 from lusee_bayes.runs import sample_run, validate_run
 from lusee_bayes.runs.folder import run_folder, write_run
 from lusee_bayes.runs.sample_run import SAMPLE
+from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling import checkpoints
 from lusee_bayes.sampling.datatree import read_datatree
 from lusee_bayes.sampling.hmc import CHUNK, Sampler
