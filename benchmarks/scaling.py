@@ -155,7 +155,7 @@ def tasks_of_joint_run(lmax: int) -> dict:
     scenario = scenario.model_copy(update={"joint": True})
     channel = scenario.channels()[1]
     start = time.perf_counter()
-    known = inform(lb.build(channel), jax.random.key(0))[0]
+    known = inform(lb.build(channel))[0]
     inform_s = time.perf_counter() - start
     frequencies = np.array(scenario.frequencies_mhz)
     reference = np.stack([np.asarray(known.reference)] * 4)

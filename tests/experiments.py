@@ -7,6 +7,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
+from numpyro.infer.util import log_density
+
 from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.pieces import program_pieces
@@ -14,6 +17,7 @@ from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.simulate import simulate
 from lusee_bayes.experiment.terms import Around
 from lusee_bayes.sampling.programs import Program
+from lusee_bayes.sampling.promotion import numpyro_promotion
 from lusee_bayes.testing import small_scenario
 
 # nothing of these enters a setup (test_experiment.py checks it), only the data and N; the mean of
@@ -46,3 +50,13 @@ def program_arguments(program: Program, experiment: Experiment) -> dict[str, Any
     model = full_model(experiment.setup, Around(experiment.data))
     arguments = program.arguments(model, program_pieces(experiment))
     return arguments | {"data": experiment.data.data}
+
+
+def density(
+    program: Program, arguments: dict[str, Any], values: dict[str, Any]
+) -> tuple[float, dict[str, Any]]:
+    """ln p of everything at these values of the sites, and the trace."""
+    values = {name: jnp.asarray(value) for name, value in values.items()}
+    with numpyro_promotion():
+        got, trace = log_density(program.model, (), arguments, values)
+    return float(got), trace

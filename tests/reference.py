@@ -30,6 +30,20 @@ def real_harmonics(theta, phi, lmax):
     return np.stack(columns, axis=-1)
 
 
+def vectors(theta, phi):
+    """Unit vectors, components last."""
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+
+
+def steep_sky(lmax, seed=0, monopole=1e4):
+    """Modes of a sky as steep as the Galaxy's: C_ell ~ (1 + ell)^-2.5 around a monopole, in K."""
+    ell = np.repeat(np.arange(lmax + 1), 2 * np.arange(lmax + 1) + 1)
+    a = np.random.default_rng(seed).standard_normal(len(ell))
+    a *= 0.5 * monopole * (1.0 + ell) ** -1.25
+    a[0] = monopole * np.sqrt(4 * np.pi)
+    return a
+
+
 def hemisphere(n_theta, n_phi):
     """theta, phi and solid angle of directions that cover the hemisphere above the horizon."""
     x, w = np.polynomial.legendre.leggauss(n_theta)

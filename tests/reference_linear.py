@@ -27,6 +27,12 @@ class Answer(NamedTuple):
         return np.sqrt(np.diag(self.covariance))
 
 
+def matrices(model):
+    """A, S and N of a linear Gaussian model, as arrays."""
+    parts = model.coupling.dense(), model.prior.covariance(), model.noise.dense()
+    return tuple(np.asarray(part) for part in parts)
+
+
 def posterior(a, s, n, d, offset=0.0) -> Answer:
     a, s, n, d = (np.asarray(x, dtype=np.float64) for x in (a, s, n, d))
     k = a @ s @ a.T + n

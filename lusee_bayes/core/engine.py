@@ -10,14 +10,18 @@ for products of matrices.
 from __future__ import annotations
 
 import gc
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
-from threading import Event, Lock
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.memory import memory_limit
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.threads import threads
 
@@ -27,6 +31,8 @@ R = TypeVar("R")
 # tasks of one process at a time: one on each of two processors takes less than two after another
 # on both, and more than two wait for each other, and take memory
 SIDE_BY_SIDE = 2
+# the variable by which Dask's own programs are told of a cluster
+SCHEDULER = "DASK_SCHEDULER_ADDRESS"
 
 
 @dataclass(frozen=True)
@@ -57,21 +63,16 @@ class Demand:
 
     Attributes
     ----------
-    n_tasks : int
     base_bytes : float
         Memory of a process before it does anything.
     task_bytes : float
         What every task adds that is carried out at a time.
-    seconds : float
-        Of all tasks in one process of this machine.
     side_by_side : int
         How many a process carries out at a time; one where a task uses all processors.
     """
 
-    n_tasks: int
     base_bytes: float
     task_bytes: float
-    seconds: float
     side_by_side: int = SIDE_BY_SIDE
 
     def process_bytes(self, side_by_side: int | None = None) -> float:
@@ -103,7 +104,7 @@ class Engine(ABC):
         Raises
         ------
         Exception
-            The first that a task raises; no further ones are begun.
+            The first that a task raises; those that wait are not begun.
         WorkersLost
             If a task cannot be carried out because its workers fail.
         """
@@ -153,65 +154,52 @@ class ThisProcess(Engine):
     side_by_side: int = SIDE_BY_SIDE
 
     def each(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> list[R]:
-        found: list[Any] = [None] * len(tasks.items)
-
-        def keep(number: int, value: R) -> None:
-            found[number] = value
-
-        self._run(tasks, keep, stages, stage)
-        return found
+        found = dict(self._results(tasks, stages, stage))
+        return [found[number] for number in range(len(tasks.items))]
 
     def reduced(
         self, tasks: Tasks[T, R], merge: Callable[[R, R], R], stages: Stages, stage: str
     ) -> R:
         tree = _Tree(len(tasks.items), merge)
-        self._run(tasks, tree.add, stages, stage)
-        return tree.result()
+        for number, value in self._results(tasks, stages, stage):
+            tree.add(number, value)
+        return tree.total
 
     def work_in(self, folder: Path) -> None:
         pass
 
-    def _run(
-        self, tasks: Tasks[T, R], keep: Callable[[int, R], None], stages: Stages, stage: str
-    ) -> None:
-        """Call ``keep`` with the number of every item and what the function gives for it."""
+    def _results(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> Iterator[tuple[int, R]]:
+        """Numbers of the items and what the function gives for them, as they finish."""
         n_threads = max(1, min(self.side_by_side, len(tasks.items)))
-        stopped, counting, finished = Event(), Lock(), 0
-        waiting = iter(range(len(tasks.items)))
-        with stages.progress(stage, len(tasks.items)) as done:
+        with stages.progress(stage, len(tasks.items)) as done, threads(n_threads) as pool:
+            numbers = {
+                pool.submit(carry_out, tasks.function, item): number
+                for number, item in enumerate(tasks.items)
+            }
+            try:
+                for finished, future in enumerate(as_completed(numbers), start=1):
+                    number = numbers.pop(future)
+                    yield number, future.result()
+                    done(finished, tasks.names[number])
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)
 
-            def work() -> None:
-                nonlocal finished
-                while not stopped.is_set():
-                    with counting:
-                        number = next(waiting, None)
-                    if number is None:
-                        return
-                    keep(number, tasks.function(tasks.items[number]))
-                    # what a task was made of may refer to itself, and is large
-                    gc.collect()
-                    with counting:
-                        finished += 1
-                        done(finished, tasks.names[number])
 
-            with threads(n_threads) as pool:
-                running = [pool.submit(work) for _ in range(n_threads)]
-                try:
-                    for one in as_completed(running):
-                        one.result()
-                finally:
-                    stopped.set()
+def carry_out(function: Callable[[T], R], item: T) -> R:
+    """Call a function, and free at once what it leaves: it may refer to itself, and is large."""
+    try:
+        return function(item)
+    finally:
+        gc.collect()
 
 
 class _Tree(Generic[R]):
     """Merges results as they come; which with which depends on their numbers alone."""
 
+    total: R
+
     def __init__(self, n: int, merge: Callable[[R, R], R]):
-        self._widths = [n]
-        while self._widths[-1] > 1:
-            self._widths.append((self._widths[-1] + 1) // 2)
-        self._merge = merge
-        self._lock = Lock()
+        self._n, self._merge = n, merge
         self._waiting: dict[tuple[int, int], R] = {}
 
     def add(self, number: int, value: R) -> None:
@@ -224,18 +212,64 @@ class _Tree(Generic[R]):
         value
             What the function gave.
         """
-        for level, width in enumerate(self._widths[:-1]):
+        width, level = self._n, 0
+        while width > 1:
             neighbour = number ^ 1
             if neighbour < width:
-                with self._lock:
-                    if (level, neighbour) not in self._waiting:
-                        self._waiting[level, number] = value
-                        return
-                    other = self._waiting.pop((level, neighbour))
+                if (level, neighbour) not in self._waiting:
+                    self._waiting[level, number] = value
+                    return
+                other = self._waiting.pop((level, neighbour))
                 value = self._merge(*((value, other) if number < neighbour else (other, value)))
-            number //= 2
-        self._waiting[len(self._widths) - 1, 0] = value
+            number, width, level = number // 2, (width + 1) // 2, level + 1
+        self.total = value
 
-    def result(self) -> R:
-        """All of them, when the last one has come."""
-        return self._waiting.pop((len(self._widths) - 1, 0))
+
+@contextmanager
+def open_engine(
+    demand: Demand, workers: int | None = None, cluster: str | None = None
+) -> Iterator[Engine]:
+    """Start what is to carry out the tasks of a run, and end it after the block.
+
+    Parameters
+    ----------
+    demand : Demand
+        What the tasks take.
+    workers : int, optional
+        Processes of this machine; one, as by default, is this process, without any server.
+    cluster : str, optional
+        Address of the scheduler of a Dask cluster, as tcp://host:8786; by default that of the
+        environment variable ``DASK_SCHEDULER_ADDRESS``, if it is set.
+
+    Yields
+    ------
+    Engine
+
+    Raises
+    ------
+    InputError
+        If Dask is not installed, the workers do not fit into the memory, no scheduler answers, or
+        as :class:`.DaskEngine`.
+    """
+    if workers is not None and cluster is not None:
+        raise InputError("--workers starts workers of its own, --cluster uses others; give one")
+    if workers is None:
+        cluster, workers = cluster or os.environ.get(SCHEDULER), 1
+    if not cluster and workers == 1:
+        fits = demand.process_bytes() <= memory_limit()
+        gc.freeze()  # modules stay: they need not be searched
+        yield ThisProcess(demand.side_by_side if fits else 1)
+        return
+    if find_spec("distributed") is None:
+        raise InputError(
+            "--workers and --cluster need Dask; install it with pip install '.[cluster]' in the "
+            "clone of lusee_bayes"
+        )
+    # an optional library, which takes a second
+    from lusee_bayes.core.dask_engine import connected, own_workers
+
+    # before JAX starts: workers on the same GPU as this process need some of its memory
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    with ExitStack() as stack:
+        place = cluster or stack.enter_context(own_workers(workers, demand))
+        yield stack.enter_context(connected(place, demand))

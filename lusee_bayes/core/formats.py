@@ -12,7 +12,6 @@ from lusee_bayes.core.reading import reading, require_file
 VISIBILITIES = "lusee_bayes visibilities 1"
 POSTERIOR = "lusee_bayes posterior 1"
 POSTERIOR_CUBE = "lusee_bayes posterior cube 1"
-COMPACT_POSTERIOR = "lusee_bayes compact posterior 1"
 SAMPLES = "lusee_bayes samples 1"
 BEAMS = "lusee_bayes beams 1"
 GAINS = "lusee_bayes gains 1"

@@ -31,6 +31,7 @@ healpy = LazyModule("healpy")
 coordinates = LazyModule("astropy.coordinates")
 numpyro = LazyModule("numpyro")
 interpolate = LazyModule("scipy.interpolate")
+pandas = LazyModule("pandas")
 special = LazyModule("scipy.special")
 # an optional extra
 pyuvdata = LazyModule("pyuvdata")

@@ -211,22 +211,13 @@ class LinearGaussian(Described, eqx.Module):
         enough = self.n_data >= self.prior.size
         return self.prior.invertible and enough and has_structure(self.coupling, self.noise)
 
-    def inform(
-        self,
-        data: Float[Array, " data"],
-        key: PRNGKeyArray | None = None,
-        n_perturbations: int = 0,
-    ) -> tuple[Information, Posterior]:
+    def inform(self, data: Float[Array, " data"]) -> tuple[Information, Posterior]:
         """Compute the information of data, and the posterior; see :meth:`Information.of`.
 
         Parameters
         ----------
         data : (data,) array
             d, in K.
-        key : PRNGKeyArray, optional
-            For the perturbations.
-        n_perturbations : int
-            Number of draws of A^T N^-1 n.
 
         Returns
         -------
@@ -240,9 +231,7 @@ class LinearGaussian(Described, eqx.Module):
         InputError
             As :meth:`Information.of`.
         """
-        return Information.of(
-            self.coupling, self.prior, self.noise, self.offset, data, key, n_perturbations
-        )
+        return Information.of(self.coupling, self.prior, self.noise, self.offset, data)
 
     def log_prob(self, data: Float[Array, " data"]) -> Float[Array, ""]:
         """Compute the evidence ln p(d), with the sky integrated out. Differentiable.

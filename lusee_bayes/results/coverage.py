@@ -170,33 +170,6 @@ class Counts:
         )
 
 
-def p_of_shares(*counts: Counts) -> float:
-    """Probability of a share or rms pull as far from what is expected as the furthest one is.
-
-    Each is taken in units of its scatter. p is the share of draws whose furthest is as far, so
-    that it knows how many there are to choose from and how they depend on one another.
-    """
-    values = np.concatenate([one.values[:, :-1] for one in counts])
-    mean, scatter = values[..., 1:].mean(2), values[..., 1:].std(2)
-    off = values - mean[..., None]
-    # shares of the truth are told from the levels, which are also the mean over draws if the
-    # draws have these standard deviations
-    off[:, :-1, 0] = values[:, :-1, 0] - LEVELS
-    # a part that is known exactly tells nothing
-    known = scatter > 0
-    return _share((np.abs(off[known]) / scatter[known][:, None]).max(0))
-
-
-def p_of_largest(counts: Counts) -> float:
-    """Probability of a largest pull as large, in the last part."""
-    return _share(counts.values[-1, -1])
-
-
-def _share(values: Float[np.ndarray, " skies"]) -> float:
-    """Share of skies whose value is at least the truth's, the truth itself counted among them."""
-    return float((values >= values[0]).sum()) / len(values)
-
-
 def _statistics(
     pulls: Float[np.ndarray, "n skies"], parts: Iterable[Bool[np.ndarray, " n"]]
 ) -> Float[np.ndarray, "parts statistics skies"]:

@@ -85,14 +85,10 @@ class CubeResult(Described):
         """chi^2 of every channel, and the tests of all of them together."""
         chi2, degrees = self.stacked("instrument_chi2"), self.stacked("instrument_chi2_expected")
         components, n_data = self.components, float(self.stacked("n_data").sum())
-        bound = components is not None and bool(np.isnan(components.chi2))
-        if components is None:
-            total = float(self.stacked("chi2_model").sum())
-        else:
-            total = float(self.stacked("chi2").sum()) if bound else components.chi2
-        rest = ChiSquare(total - float(chi2.sum()), n_data - float(degrees.sum()))
         joint = components is not None
-        return ChannelFits(self.frequencies_mhz, chi2, degrees, rest, bound, joint)
+        total = components.chi2 if joint else float(self.stacked("chi2_model").sum())
+        rest = ChiSquare(total - float(chi2.sum()), n_data - float(degrees.sum()))
+        return ChannelFits(self.frequencies_mhz, chi2, degrees, rest, joint)
 
     @cached_property
     def fit(self) -> Fit:
@@ -119,8 +115,7 @@ class CubeResult(Described):
         crosses = [c.ell_cross for c in self.channels if c.ell_cross is not None]
         if crosses:
             parts.append(f"SNR < 1 first at ell {min(crosses)} to {max(crosses)}")
-        if self.log_evidence is not None:
-            parts.append(f"ln evidence {self.log_evidence:.1f}")
+        parts.append(f"ln evidence {self.log_evidence:.1f}")
         components = self.components
         if components is not None and components.iterations:
             parts.append(
@@ -150,13 +145,12 @@ class CubeResult(Described):
         return [f"Not mapped, {f:g} MHz: {reason}" for f, reason in self.unmapped.items()]
 
     @property
-    def log_evidence(self) -> float | None:
-        """ln p of all data; None where it is not known."""
+    def log_evidence(self) -> float:
+        """ln p of all data."""
         if self.components is None:
             alone = float(np.sum([channel.log_evidence for channel in self.channels]))
             return alone + self.tie_log_evidence
-        found = self.components.log_evidence
-        return None if np.isnan(found) else found
+        return self.components.log_evidence
 
     def landmarks(self) -> dict[str, dict[str, np.ndarray]]:
         """Brightness, its standard deviation and, if known, the truth of some directions."""
@@ -242,18 +236,15 @@ class CubeResult(Described):
         components = self.components
         if components is None:
             return None
-        numbers = {
-            "chi2": components.chi2,
-            "log_evidence": components.log_evidence,
-            "information_bits": components.information_bits,
-            "refinement_sigma": components.refinement,
-        }
         return {
             "prior": self.prior_words(),
             "components": list(components.prior.names),
             "solver": components.solver,
             "iterations": components.iterations,
-            **{name: v for name, v in numbers.items() if not np.isnan(v)},
+            "chi2": components.chi2,
+            "log_evidence": components.log_evidence,
+            "information_bits": components.information_bits,
+            "refinement_sigma": components.refinement,
         }
 
     def spectra(self) -> list[dict[str, float]]:

@@ -208,11 +208,6 @@ def map_result(
     """
     stages = stages or Stages()
     scenario, data = experiment.scenario, experiment.data
-    if onto is not None and experiment.positive is not None:
-        raise InputError(
-            "a log-normal map cannot be updated: its posterior is not Gaussian; map all data "
-            "together, or use prior.model=modulated"
-        )
     earlier = None if onto is None else read_updatable(onto, scenario)
     digests = (data.digest(),)
     with stages("posterior"), explained(experiment):

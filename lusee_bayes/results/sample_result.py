@@ -23,7 +23,7 @@ from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.pieces import program_pieces
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.simulate import true_values
-from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.results.convergence import warnings_of
 from lusee_bayes.sampling.chains import Chains
 from lusee_bayes.sampling.checkpoints import Checkpoints
@@ -34,6 +34,7 @@ from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.program_checks import require_sampleable
 from lusee_bayes.sampling.program_sites import predicts
 from lusee_bayes.sampling.programs import Program
+from lusee_bayes.sampling.straight_log_normal import coordinates_of
 from lusee_bayes.sampling.uncertainty import (
     INTERVAL,
     pixel_interval_of_draws,
@@ -201,7 +202,7 @@ def sample_result(
     n_modes = inference.posterior.mean.shape[0]
     latent = require_sampleable(program, arguments, data.data, n_modes)
     with stages("coordinates"):
-        whitening = coordinates(program, arguments, experiment, inference.posterior, latent)
+        whitening = coordinates(program, arguments, data, inference, latent)
     checkpoints = Checkpoints(folder / CHAINS, identity, resume=resume)
     times = []
     with stages.progress("sampling", sampler.warmup + sampler.draws) as update:
@@ -244,21 +245,20 @@ def sample_result(
 def coordinates(
     program: Program,
     arguments: dict,
-    experiment: Experiment,
-    posterior: Posterior,
+    data: Visibilities,
+    inference: Inference,
     latent: list[str],
 ) -> Whitening | None:
     """White coordinates for a program: those of the analytic posterior where it samples the sky
     alone, and data are Gaussian about it; the straight ones of a log-normal sky; else those about
     its mode. None if no mode is found: warmup then learns scales."""
     if latent == [SKY] and not predicts(program.model, arguments, TimesStudentT):
-        return Whitening.of(posterior)
-    if experiment.positive is not None:
-        straight = experiment.positive.posterior.coordinates
-        if set(straight.names) == set(latent):
-            return straight
-    start = {SKY: posterior.mean} if SKY in latent else {}
-    arguments = {**arguments, "data": experiment.data.data}
+        return Whitening.of(inference.posterior)
+    positive = arguments.get("log_normal")
+    if positive is not None and set(latent) == set(positive.sites):
+        return coordinates_of(positive, inference.model.inform(data.data)[0])
+    start = {SKY: inference.posterior.mean} if SKY in latent else {}
+    arguments = {**arguments, "data": data.data}
     starts = 1 if SKY in latent else STARTS
     chart = _chart(arguments, latent)
     found = laplace_approximation(program.model, arguments, start, SCALES, starts, chart)

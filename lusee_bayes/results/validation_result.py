@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import ceil
 
 import numpy as np
 
@@ -141,8 +140,6 @@ def allowed(check: Check) -> str:
     return f"{check.lower:.4g} to {check.upper:.4g}"
 
 
-def demand_of_calibration(scenario: Scenario, n_simulations: int) -> Demand:
+def demand_of_calibration(scenario: Scenario) -> Demand:
     """What simulation-based calibration takes, in batches that use all processors."""
-    demand = demand_of([posterior_cost(scenario, BATCH * N_DRAWS)])
-    n_batches = ceil(n_simulations / BATCH)
-    return replace(demand, n_tasks=n_batches, side_by_side=1)
+    return replace(demand_of([posterior_cost(scenario, BATCH * N_DRAWS)]), side_by_side=1)

@@ -21,8 +21,8 @@ from lusee_bayes.runs.origins import inputs_of
 
 
 @dataclass(frozen=True)
-class AverageRun:
-    """Data and their averages.
+class Averages:
+    """Data, their averages, and what these cost.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ def run_average(
     information: bool = True,
     replace: bool = False,
     stages: Stages | None = None,
-) -> AverageRun:
+) -> Averages:
     """Average data, write them whole or not at all, and work out what is lost.
 
     Parameters
@@ -134,7 +134,7 @@ def run_average(
             before = _bits(scenario, fine)
         with stages("and of the averages"):
             bits = (before, _bits(scenario, coarse))
-    return AverageRun(fine, coarse, bits)
+    return Averages(fine, coarse, bits)
 
 
 def _bits(scenario: Scenario, data: Visibilities) -> float:

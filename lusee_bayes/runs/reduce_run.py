@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,24 +15,6 @@ from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.flight.reduced import Reduced, write_reduced
 from lusee_bayes.runs.origins import inputs_of
-
-
-@dataclass(frozen=True)
-class ReduceRun:
-    """Reduced spectra, and the file that they are in.
-
-    Attributes
-    ----------
-    reduced : Reduced
-    path : Path
-    """
-
-    reduced: Reduced
-    path: Path
-
-    def lines(self) -> list[str]:
-        """Return what there is to say about it."""
-        return reduced_lines(self.reduced)
 
 
 def reduced_lines(reduced: Reduced) -> list[str]:
@@ -54,7 +35,7 @@ def run_reduce(
     *,
     replace: bool = False,
     stages: Stages | None = None,
-) -> ReduceRun:
+) -> Reduced:
     """Reduce sessions to the scenario's frequencies, and write them whole or not at all.
 
     Parameters
@@ -86,4 +67,4 @@ def run_reduce(
         )
     with stages("file"):
         write_reduced(path, reduced, scenario.to_yaml())
-    return ReduceRun(reduced, path)
+    return reduced

@@ -27,7 +27,6 @@ from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.instrument.beams import read_beam, sampled_beams, write_sampled_beams
 from lusee_bayes.instrument.visibilities_file import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
-from lusee_bayes.linear.compact import read_compact
 from lusee_bayes.report.describe import describe
 from lusee_bayes.results.updatable import read_updatable
 from lusee_bayes.runs import folder as folder_module
@@ -78,7 +77,6 @@ READERS = {
     "updatable.nc": (describe, read_onto),
     "cube.nc": (describe,),
     "diagnostics.nc": (describe,),
-    "compact.npz": (describe, read_compact),
     "map.fits": (describe, read_sky),
     "cube.fits": (describe, read_sky),
     "alm.fits": (describe, read_sky),
@@ -114,14 +112,12 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
     write_sampled_beams(folder / "sampled_fields.fits", sampled)
     products = sampled_beams([20.0, 30.0], products=np.ones((2, 4, 48)))
     write_sampled_beams(folder / "sampled_products.nc", products)
-    updatable = ["output={updatable: true, compact: true}"]
     with pytest.MonkeyPatch.context() as patch:
         # neither figures nor a page, which take longer than the map
         patch.setattr(map_run, "MAP", replace(map_run.MAP, figures={}))
         patch.setattr(folder_module, "PAGES", {})
-        run = lb.run_map(small_scenario(*updatable, lmax=2), folder / "run")
+        run = lb.run_map(small_scenario("output.updatable=true", lmax=2), folder / "run")
     shutil.copy(run.folder / "posterior.nc", folder / "updatable.nc")
-    shutil.copy(run.folder / "posterior_compact.npz", folder / "compact.npz")
     for name in ("posterior.nc", "diagnostics.nc"):
         shutil.copy(small_map.folder / name, folder / name)
     shutil.copy(small_map.folder / "mean.fits", folder / "map.fits")

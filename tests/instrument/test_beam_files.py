@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from assertions import close
 from astropy.io import fits
 from astropy.time import Time
 from fits_files import write_images
@@ -16,19 +17,14 @@ from reference import hemisphere, real_harmonics
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import from_healpy
-from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.pieces import program_pieces
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.experiment.simulate import true_signal, true_values
 from lusee_bayes.experiment.terms import beam_directions, beam_rms_difference, true_beams
 from lusee_bayes.instrument.beams import HemisphereGrid, ScalarBeam, read_beam
 from lusee_bayes.instrument.beams.scalar_file import FIELDS
-from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import labels, to_matrix
-from lusee_bayes.instrument.waterfalls import read_waterfall
 from lusee_bayes.testing import small_scenario
 
 LMAX, PORTS = 47, 4
@@ -47,12 +43,12 @@ def luseepy(test_data):
         sky = dict(file)
     start = Time("2025-02-01 00:00:00", scale="utc")
     times = start + 7200.0 * np.arange(len(data)) * u.s
-    observation = Observation(182.258, -23.814, times, np.zeros(len(data), int), (0.0,), 7200.0)
+    observation = lb.Observation(182.258, -23.814, times, np.zeros(len(data), int), (0.0,), 7200.0)
     return (
         read_beam(folder / "synthetic_monopole_beam.fits"),
         {f: data[:, :, k].T for k, f in enumerate(frequencies)},
         {f: from_healpy(alm) for f, alm in zip(sky["freq"], sky["alm"], strict=True)},
-        Pointing.of(observation, LMAX, order=6),
+        lb.Pointing.of(observation, LMAX, order=6),
     )
 
 
@@ -79,7 +75,7 @@ def test_the_waterfall_of_luseepys_default_engine(luseepy, test_data):
     with fits.open(test_data / "luseepy" / "waterfall_fixed_axis_engine.fits") as hdus:
         expected = hdus["data"].data[:, :, list(hdus["freq"].data).index(25.0)].T
     beam, _, sky, _ = luseepy
-    observation = read_waterfall(test_data / "luseepy" / "waterfall_fixed_axis_engine.fits")
+    observation = lb.read_waterfall(test_data / "luseepy" / "waterfall_fixed_axis_engine.fits")
     observation = replace(observation.observation, fixed_axis=True)
     beams = beam.beams(25.0, LMAX, grid=beam.luseepy_grid)
     seen = lb.CouplingMatrix.observe(beams, observation) @ jnp.asarray(sky[25.0])
@@ -285,7 +281,7 @@ def test_kelvin_in_kelvin_out(tmp_path):
             power = a[0] * b[0].conj() + a[1] * b[1].conj()
             expected[i, j] = (w / 2) @ power.mean(1) * 0.5 * (100.0 / 30.0)
     got = np.asarray(to_matrix(jnp.asarray(got)[:, None])[..., 0])
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    close(got, expected, 1e-6)
 
 
 def break_shape(images):
@@ -309,10 +305,7 @@ def break_gain(images):
     ("options", "message"),
     [
         ({"without": ("EPhi_imag",)}, "has no EPhi_imag"),
-        (
-            {"change": break_shape},
-            r"EPhi_imag has shape \(5, 45, 61\), expected 5 \(freq\) x 46",
-        ),
+        ({"change": break_shape}, r"EPhi_imag has shape \(5, 45, 61\), expected 5 \(freq\) x 46"),
         ({"change": break_order}, "freq does not grow: 40 follows 50"),
         ({"change": break_numbers}, "EPhi_real"),
         ({"change": break_gain}, r"gain_conv has shape \(4,\), expected 5 \(freq\)"),
@@ -322,26 +315,28 @@ def break_gain(images):
     ],
 )
 def test_files_that_cannot_be_used(tmp_path, options, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(lb.InputError, match=message):
         read_beam(write(tmp_path / "beam.fits", **options))
 
 
 def test_missing_and_truncated_files(tmp_path):
-    with pytest.raises(InputError, match=r"no beam file at .*check beam\.file"):
+    with pytest.raises(lb.InputError, match=r"no beam file at .*check beam\.file"):
         read_beam(tmp_path / "none.fits")
     path = write(tmp_path / "beam.fits")
     path.write_bytes(path.read_bytes()[:200_000])
-    with pytest.raises(InputError, match="cut short"):
+    with pytest.raises(lb.InputError, match="cut short"):
         read_beam(path)
     path.write_text("no FITS at all")
-    with pytest.raises(InputError, match="cannot be read as a scalar beam .*: it is no FITS file$"):
+    with pytest.raises(
+        lb.InputError, match="cannot be read as a scalar beam .*: it is no FITS file$"
+    ):
         read_beam(path)
 
 
 def test_no_extrapolation(tmp_path):
     beam = read_beam(write(tmp_path / "beam.fits"))
     for frequency in (9.9, 50.1):
-        with pytest.raises(InputError, match=f"from 10 to 50 MHz, not at {frequency}"):
+        with pytest.raises(lb.InputError, match=f"from 10 to 50 MHz, not at {frequency}"):
             beam.fields(frequency)
 
 
@@ -389,18 +384,18 @@ def test_a_second_file_as_the_true_beams(tmp_path):
     ],
 )
 def test_what_a_file_does_not_have(overrides, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(lb.InputError, match=message):
         lb.load_scenario("fiducial", ["beam.file=some.fits", *overrides])
 
 
 def test_two_beam_errors_at_once():
-    with pytest.raises(InputError, match="give either shift_mhz, file or parameters"):
+    with pytest.raises(lb.InputError, match="give either shift_mhz, file or parameters"):
         lb.load_scenario("fiducial", ["noise.beam={shift_mhz: 1, file: some.fits}"])
 
 
 def test_the_program_of_the_instrument_needs_the_embedded_antennas(tmp_path):
-    experiment = build(small_scenario(f"beam.file={write(tmp_path / 'beam.fits')}"))
-    with pytest.raises(InputError, match="leave out beam.file"):
+    experiment = lb.build(small_scenario(f"beam.file={write(tmp_path / 'beam.fits')}"))
+    with pytest.raises(lb.InputError, match="leave out beam.file"):
         program_pieces(experiment)["instrument"]()
 
 

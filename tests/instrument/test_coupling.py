@@ -1,40 +1,39 @@
+"""A against integrals over the sky, rows and rotations; and A of antennas that vary."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference import arm_response, hemisphere, visibilities
+from assertions import close
+from numpyro import handlers
+from reference import arm_response, hemisphere, steep_sky, vectors, visibilities
+from scipy.stats import norm, truncnorm
 
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import mode_numbers, n_modes
+import lusee_bayes as lb
+from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.rotations import Rotation, turn_about_z
-from lusee_bayes.instrument.beams import Monopoles, ProductBeams, monopole_beams
+from lusee_bayes.instrument.beam_operator import BeamOperator
 from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, as_coupling
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, Run
-from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import auto_indices, labels, to_matrix
+from lusee_bayes.systematics import BeamError, InstrumentParameters
 from lusee_bayes.testing import check_coupling
 
 LMAX = 8
 SITE = {"lon_deg": 182.258, "lat_deg": -23.814}
 
 
-def steep_sky(lmax, seed=0, monopole=1e4):
-    """A sky as steep as the Galaxy's: C_ell ~ (1 + ell)^-2.5 around a monopole, in K."""
-    ell, _ = mode_numbers(lmax)
-    a = np.random.default_rng(seed).standard_normal(n_modes(lmax))
-    a *= 0.5 * monopole * (1.0 + ell) ** -1.25
-    a[0] = monopole * np.sqrt(4 * np.pi)
-    return jnp.asarray(a)
-
-
 def random_beams(seed, lmax=LMAX, n_products=16):
     modes = np.random.default_rng(seed).standard_normal((n_products, n_modes(lmax)))
-    return ProductBeams(jnp.asarray(modes), 25.0)
+    return lb.ProductBeams(jnp.asarray(modes), 25.0)
 
 
 def two_runs():
-    return Observation.from_runs([Run(0.3), Run(0.2, 30.0)], step_s=30000.0)
+    return lb.Observation.from_runs([lb.Run(0.3), lb.Run(0.2, 30.0)], step_s=30000.0)
 
 
 @pytest.fixture(scope="module")
@@ -47,33 +46,23 @@ def coupling():
 )
 def test_visibilities_agree_with_an_integral_over_the_sky_in_lunartopo(lmax, turntable):
     frequency = 25.0
-    o = Observation.from_runs([Run(1.0, turntable)])
+    o = lb.Observation.from_runs([lb.Run(1.0, turntable)])
     sky = steep_sky(lmax)
-    got = CouplingMatrix.observe(monopole_beams(frequency, lmax), o) @ sky
+    got = CouplingMatrix.observe(lb.monopole_beams(frequency, lmax), o) @ sky
     got = np.asarray(got).reshape(16, -1)
     grid = theta, phi, solid_angle = hemisphere(32, 64)
     # the antennas one direction at a time, reflection included
-    s, p = Monopoles().regolith.reflection(np.cos(theta), frequency)
-    tilt, voltages = np.radians(75.0), []
-    for azimuth in np.radians([90.0, 0.0, 270.0, 180.0]):  # North, East, South, West
-        arm = np.array(
-            [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)]
-        )
-        voltages.append(
-            [
-                arm_response(
-                    theta[k],
-                    phi[k],
-                    frequency_mhz=frequency,
-                    length=3.0,
-                    arm=arm,
-                    height=2.0,
-                    reflection=(complex(s[k]), complex(p[k])),
-                    steps=121,
-                )
-                for k in range(len(theta))
-            ]
-        )
+    s, p = lb.Monopoles().regolith.reflection(np.cos(theta), frequency)
+    ground = [(complex(x), complex(y)) for x, y in zip(s, p, strict=True)]
+    antenna = {"frequency_mhz": frequency, "length": 3.0, "height": 2.0, "steps": 121}
+    arms = vectors(np.full(4, np.radians(75.0)), np.radians([90.0, 0.0, 270.0, 180.0]))
+    voltages = [
+        [
+            arm_response(t, f, arm=arm, reflection=r, **antenna)
+            for t, f, r in zip(theta, phi, ground, strict=True)
+        ]
+        for arm in arms  # North, East, South, West
+    ]
     e = np.array(voltages)  # (antenna, direction, component)
     power = np.einsum("idc,jdc->ijd", e, e.conj()) / 2
     power /= np.mean([np.sum(power[i, i].real * solid_angle) for i in range(4)])
@@ -85,14 +74,14 @@ def test_visibilities_agree_with_an_integral_over_the_sky_in_lunartopo(lmax, tur
             response, grid, np.asarray(sky), o.times[k], **SITE, turntable_deg=turntable
         )
         # Simpson with 120 steps along the arm, (k h)^4 / 180 = 1e-10, and the neglected tilts
-        np.testing.assert_allclose(got[:, k], expected, rtol=0, atol=5e-9 * np.abs(expected).max())
+        close(got[:, k], expected, 5e-9)
 
 
 def flagged_coupling():
     """Two runs of random beams with three samples in ten missing."""
     o = two_runs()
     layout = DataLayout.from_flags(np.random.default_rng(6).random((16, o.n_times)) < 0.3)
-    return CouplingMatrix.build(random_beams(5), Pointing.of(o, LMAX), layout)
+    return CouplingMatrix.build(random_beams(5), lb.Pointing.of(o, LMAX), layout)
 
 
 def by_rows(coupling):
@@ -130,22 +119,12 @@ def test_arrays_are_wrapped_and_couplings_left_alone(coupling):
 
 
 def test_bad_matrices_are_refused():
-    with pytest.raises(InputError, match=r"the coupling matrix holds NaN .*\(1, 2\)"):
+    with pytest.raises(lb.InputError, match=r"the coupling matrix holds NaN .*\(1, 2\)"):
         DenseCoupling(jnp.eye(3).at[1, 2].set(jnp.nan))
-    with pytest.raises(InputError, match="the coupling matrix must be a float64 array"):
+    with pytest.raises(lb.InputError, match="the coupling matrix must be a float64 array"):
         DenseCoupling(jnp.eye(3, dtype=jnp.float32))
-    with pytest.raises(InputError, match="the direction has shape"):
+    with pytest.raises(lb.InputError, match="the direction has shape"):
         DenseCoupling(jnp.eye(3)).plus(jnp.ones(()), DenseCoupling(jnp.ones((3, 2))))
-
-
-@pytest.mark.long
-def test_rows_are_those_of_the_matrix(coupling):
-    dense = np.asarray(coupling.dense())
-    assert dense.shape == coupling.shape == (16 * two_runs().n_times, n_modes(LMAX))
-    rng = np.random.default_rng(4)
-    product, time = rng.integers(0, 16, 40), rng.integers(0, two_runs().n_times, 40)
-    rows = coupling.rows(product, time)
-    np.testing.assert_allclose(rows, dense[product * two_runs().n_times + time], rtol=0, atol=1e-12)
 
 
 def test_dense_rows_are_each_times_own_rotation(coupling):
@@ -160,15 +139,15 @@ def test_dense_rows_are_each_times_own_rotation(coupling):
         turned = turn_about_z(beams, np.radians(o.turntable_deg[o.run[k]]))
         expected = np.asarray(turned @ seen)
         # the neglected third order of the tilts: (1e-3)^3 of low modes
-        np.testing.assert_allclose(
-            dense[:, k] @ np.asarray(a), expected, rtol=0, atol=1e-8 * np.abs(expected).max()
-        )
+        close(dense[:, k] @ np.asarray(a), expected, 1e-8)
 
 
 def test_flagged_samples_are_left_out(coupling):
     o = two_runs()
     flags = np.random.default_rng(8).random((16, o.n_times)) < 0.3
-    some = CouplingMatrix.build(random_beams(1), Pointing.of(o, LMAX), DataLayout.from_flags(flags))
+    some = CouplingMatrix.build(
+        random_beams(1), lb.Pointing.of(o, LMAX), DataLayout.from_flags(flags)
+    )
     keep = ~flags.ravel()
     assert some.shape == (keep.sum(), n_modes(LMAX))
     np.testing.assert_array_equal(some.dense(), np.asarray(coupling.dense())[keep])
@@ -185,9 +164,9 @@ def test_flagged_samples_are_left_out(coupling):
 @pytest.mark.essential
 def test_a_quarter_turn_of_the_turntable_permutes_the_products():
     lmax = 12
-    beams, sky = monopole_beams(25.0, lmax), steep_sky(lmax)
+    beams, sky = lb.monopole_beams(25.0, lmax), steep_sky(lmax)
     straight, turned = (
-        CouplingMatrix.observe(beams, Observation.from_runs([Run(0.1, angle)])) @ sky
+        CouplingMatrix.observe(beams, lb.Observation.from_runs([lb.Run(0.1, angle)])) @ sky
         for angle in (0.0, 90.0)
     )
     v, w = (np.asarray(to_matrix(x.reshape(16, -1))) for x in (straight, turned))
@@ -204,14 +183,7 @@ def test_a_second_run_is_an_observation_of_its_own(coupling):
     both = np.asarray(coupling @ a).reshape(16, -1)
     for run in (0, 1):
         keep = o.run == run
-        alone = Observation(
-            o.lon_deg,
-            o.lat_deg,
-            o.times[keep],
-            np.zeros(keep.sum(), dtype=int),
-            (o.turntable_deg[run],),
-            o.step_s,
-        )
+        alone = o.select(keep)
         # each has its own mean pole, so only the neglected third order of the series differs
         got = np.asarray(CouplingMatrix.observe(random_beams(1), alone) @ a).reshape(16, -1)
         np.testing.assert_allclose(got, both[:, keep], rtol=0, atol=2e-6 * np.abs(both).max())
@@ -219,8 +191,8 @@ def test_a_second_run_is_an_observation_of_its_own(coupling):
 
 def test_a_smaller_lmax_is_a_slice(coupling):
     low = 5
-    beams = ProductBeams(random_beams(1).modes[:, : n_modes(low)], 25.0)
-    pointing = Pointing.of(two_runs(), low, order=coupling.pointing.order)
+    beams = lb.ProductBeams(random_beams(1).modes[:, : n_modes(low)], 25.0)
+    pointing = lb.Pointing.of(two_runs(), low, order=coupling.pointing.order)
     small = CouplingMatrix.build(beams, pointing)
     full = np.asarray(coupling.dense())
     np.testing.assert_allclose(small.dense(), full[:, : n_modes(low)], rtol=0, atol=1e-12)
@@ -234,8 +206,8 @@ def test_linearity(coupling):
 
 
 def test_a_uniform_sky_of_one_kelvin_gives_autos_of_one_kelvin():
-    o = Observation.from_runs([Run(0.1, 20.0)])
-    c = CouplingMatrix.observe(monopole_beams(10.0, LMAX), o)
+    o = lb.Observation.from_runs([lb.Run(0.1, 20.0)])
+    c = CouplingMatrix.observe(lb.monopole_beams(10.0, LMAX), o)
     sky = jnp.zeros(n_modes(LMAX)).at[0].set(np.sqrt(4 * np.pi))
     v = np.asarray(c @ sky).reshape(16, -1)
     np.testing.assert_allclose(v[auto_indices()].mean(axis=0), 1.0, rtol=1e-13)
@@ -247,11 +219,11 @@ def test_a_uniform_sky_of_one_kelvin_gives_autos_of_one_kelvin():
 @pytest.mark.parametrize(("cycles", "lmax"), [pytest.param(1, 47, marks=pytest.mark.long), (3, 12)])
 def test_the_moons_axis_is_not_fixed(cycles, lmax, monkeypatch):
     """Orders of the tilt expansion in units of the fiducial radiometer noise (DESIGN 5)."""
-    o = Observation.from_runs([Run(1.0)] * cycles, step_s=20000.0)
-    beams, sky = monopole_beams(25.0, lmax), steep_sky(lmax)
+    o = lb.Observation.from_runs([lb.Run(1.0)] * cycles, step_s=20000.0)
+    beams, sky = lb.monopole_beams(25.0, lmax), steep_sky(lmax)
 
     def visibilities_at(order=None):
-        pointing = Pointing.of(o, lmax, order)
+        pointing = lb.Pointing.of(o, lmax, order)
         return np.asarray(CouplingMatrix.build(beams, pointing) @ sky)
 
     monkeypatch.setattr("lusee_bayes.instrument.window_average.TOLERANCE", 1e-14)
@@ -276,11 +248,12 @@ def test_the_moons_axis_is_not_fixed(cycles, lmax, monkeypatch):
 
 def test_differentiable_in_the_beams():
     o = two_runs()
-    pointing, sky = Pointing.of(o, LMAX), steep_sky(LMAX, monopole=1.0)
+    pointing = lb.Pointing.of(o, LMAX)
+    sky = jnp.asarray(steep_sky(LMAX, monopole=1.0))
     weights = jnp.asarray(np.random.default_rng(9).standard_normal(16 * o.n_times))
 
     def f(modes):
-        return weights @ (CouplingMatrix.build(ProductBeams(modes, 25.0), pointing) @ sky)
+        return weights @ (CouplingMatrix.build(lb.ProductBeams(modes, 25.0), pointing) @ sky)
 
     modes, direction = random_beams(1).modes, random_beams(2).modes
     slope = jnp.sum(jax.jit(jax.grad(f))(modes) * direction)
@@ -289,16 +262,20 @@ def test_differentiable_in_the_beams():
 
 
 def test_bad_input_is_refused(coupling):
-    pointing = Pointing.of(two_runs(), LMAX)
-    with pytest.raises(InputError, match=r"the beam coefficients has shape \(16, 36\), expected"):
+    pointing = lb.Pointing.of(two_runs(), LMAX)
+    with pytest.raises(
+        lb.InputError, match=r"the beam coefficients has shape \(16, 36\), expected"
+    ):
         CouplingMatrix.build(random_beams(0, lmax=5), pointing)
-    with pytest.raises(InputError, match="the data layout has 4 products x 7 times"):
+    with pytest.raises(lb.InputError, match="the data layout has 4 products x 7 times"):
         CouplingMatrix.build(random_beams(0), pointing, DataLayout(4, 7))
-    with pytest.raises(InputError, match=r"the sky has shape \(80,\), expected \(81,\)"):
+    with pytest.raises(lb.InputError, match=r"the sky has shape \(80,\), expected \(81,\)"):
         coupling @ jnp.zeros(80)
-    with pytest.raises(InputError, match=r"the data has shape \(3,\)"):
+    with pytest.raises(lb.InputError, match=r"the data has shape \(3,\)"):
         coupling.transpose_mv(jnp.zeros(3))
-    with pytest.raises(InputError, match="the sky must be a float64 array, got an array of float"):
+    with pytest.raises(
+        lb.InputError, match="the sky must be a float64 array, got an array of float"
+    ):
         coupling @ jnp.zeros(81, dtype=jnp.float32)
 
 
@@ -307,5 +284,168 @@ def test_bad_input_is_refused(coupling):
     [(16, 0, r"product numbers must lie in 0..15"), (0, -1, r"time numbers must lie in 0\.\.")],
 )
 def test_rows_that_do_not_exist_are_refused(coupling, product, time, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(lb.InputError, match=message):
         coupling.rows(np.array([product]), np.array([time]))
+
+
+# --- A of many beams, antennas placed by name, beam errors ----------------------------------------
+
+
+FREQUENCY = 25.0
+STDS = {"surface_permittivity": 0.3, "zenith_angle_deg": 2.0, "turntable_offset_deg": 1.0}
+
+
+@pytest.fixture(scope="module")
+def pointing():
+    """Two runs at two turntable angles: 18 samples."""
+    observation = lb.Observation.from_runs([lb.Run(0.3, 0.0), lb.Run(0.4, 40.0)], step_s=86400.0)
+    return lb.Pointing.of(observation, LMAX)
+
+
+@pytest.fixture(scope="module")
+def layout(pointing):
+    flags = np.zeros((16, pointing.n_times), bool)
+    flags[3, 2:5] = flags[:, 7] = True
+    return DataLayout.from_flags(flags)
+
+
+@pytest.fixture(scope="module")
+def instrument(pointing, layout):
+    return lb.Instrument(lb.Monopoles(), pointing, layout, FREQUENCY, LMAX).prepared()
+
+
+def test_turned_blocks_are_the_coupling_matrix(pointing, layout):
+    """For beams of every order, with flags and two runs; sums of 17 numbers in another order."""
+    beams = lb.ProductBeams(jax.random.normal(jax.random.key(0), (16, 81)), FREQUENCY)
+    expected = np.asarray(lb.CouplingMatrix.build(beams, pointing, layout).dense())
+    got = BeamOperator.of(pointing, layout).coupling(beams)
+    assert got.shape == (layout.size, 81)
+    close(got, expected, 1e-13)
+
+
+def test_a_of_placed_antennas_is_that_of_antennas_built_so(instrument, pointing, layout):
+    values = {
+        "length_m": 3.1,
+        "height_m": 1.7,
+        "zenith_angle_deg": 73.0,
+        "turntable_offset_deg": 5.0,
+        "surface_permittivity": 3.5,
+        "deep_permittivity": 6.5,
+        "loss_tangent": 0.02,
+    }
+    antennas = lb.Monopoles(
+        lb.Regolith(3.5, 6.5, 0.02),
+        length_m=3.1,
+        height_m=1.7,
+        zenith_angle_deg=73.0,
+        azimuths_deg=np.array([90.0, 0.0, -90.0, 180.0]) + 5.0,
+    )
+    beams = lb.monopole_beams(FREQUENCY, LMAX, antennas)
+    expected = np.asarray(lb.CouplingMatrix.build(beams, pointing, layout).dense())
+    placed = {name: jnp.asarray(value) for name, value in values.items()}
+    for got in (instrument.dense(placed), instrument.coupling(placed).dense()):
+        close(got, expected, 1e-13)
+    # and every one of them matters
+    for name, value in values.items():
+        others = placed | {name: instrument.value(name)}
+        away = np.abs(np.asarray(instrument.dense(others)) - expected).max()
+        assert away > 1e-4 * np.abs(expected).max(), (name, value)
+
+
+def test_a_that_was_not_prepared(instrument):
+    with pytest.raises(lb.InputError, match="prepare the instrument first"):
+        replace(instrument, operator=None).dense({})
+
+
+@pytest.fixture(scope="module")
+def base(instrument):
+    coupling = instrument.coupling()
+    prior = lb.HarmonicPrior(1e6 / (1.0 + jnp.arange(LMAX + 1.0)) ** 2)
+    noise = lb.DiagonalCovariance(jnp.full(coupling.shape[0], 4.0))
+    return lb.LinearGaussian(coupling, prior, noise)
+
+
+def test_sites_of_the_antennas_parameters(instrument, base):
+    """Priors cut off at the ends of the domain; A is that of the values."""
+    systematic = InstrumentParameters.centred(instrument, STDS)
+    values = {"surface_permittivity": 3.2, "zenith_angle_deg": 76.0, "turntable_offset_deg": -0.4}
+    arrays = {name: jnp.asarray(value) for name, value in values.items()}
+    with (
+        jax.numpy_dtype_promotion("standard"),
+        handlers.trace() as trace,
+        handlers.seed(rng_seed=0),
+        handlers.substitute(data=arrays),
+    ):
+        model = systematic.sampled(base)
+        got = {name: float(site["fn"].log_prob(site["value"])) for name, site in trace.items()}
+    np.testing.assert_array_equal(model.coupling.dense(), instrument.dense(arrays))
+    expected = {
+        "surface_permittivity": truncnorm.logpdf(3.2, (1 - 3.7) / 0.3, np.inf, 3.7, 0.3),
+        "zenith_angle_deg": truncnorm.logpdf(76.0, -75 / 2, 105 / 2, 75.0, 2.0),
+        "turntable_offset_deg": norm.logpdf(-0.4, 0.0, 1.0),
+    }
+    assert got == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.long
+def test_marginalised_parameters_are_derivatives_of_a(instrument, base):
+    """Central differences: h^2 f''' = 1e-8 of the slope, and rounding / h = 1e-11."""
+    got = InstrumentParameters.centred(instrument, STDS).marginalised(base)
+    expected = np.asarray(base.noise.dense())
+    for name, std in STDS.items():
+        at = instrument.value(name)
+        up, down = (
+            np.asarray(instrument.dense({name: jnp.asarray(at + h)})) for h in (1e-4, -1e-4)
+        )
+        direction = std * (up - down) / 2e-4
+        expected = expected + (direction * np.asarray(base.prior.variance())) @ direction.T
+    np.testing.assert_allclose(got.noise.dense(), expected, rtol=0, atol=1e-6 * expected.max())
+
+
+def test_the_amplitude_of_a_beam_error(instrument, base):
+    other = lb.monopole_beams(29.0, LMAX)
+    own = instrument.beams()
+    direction = lb.ProductBeams(other.modes - own.modes, FREQUENCY)
+    error = BeamError(instrument.coupling_of(direction))
+    sky = base.prior.sample(jax.random.key(3))
+    for amplitude in (0.0, 0.7, 1.0):
+        value = {"beam_amplitude": jnp.asarray(amplitude)}
+        with handlers.trace() as trace, handlers.seed(rng_seed=0), handlers.substitute(data=value):
+            model = error.sampled(base)
+        mixed = lb.ProductBeams((1 - amplitude) * own.modes + amplitude * other.modes, FREQUENCY)
+        expected = instrument.coupling_of(mixed)
+        # linear in the beams, as a product and as a matrix
+        scale = np.abs(np.asarray(expected @ sky)).max()
+        np.testing.assert_allclose(model.coupling @ sky, expected @ sky, rtol=0, atol=1e-12 * scale)
+        dense = np.asarray(expected.dense())
+        close(model.coupling.dense(), dense, 1e-13)
+        fn = trace["beam_amplitude"]["fn"]
+        assert float(fn.log_prob(amplitude)) == pytest.approx(norm.logpdf(amplitude))
+    term = np.asarray(error.marginalised(base).noise.dense() - base.noise.dense())
+    root = np.asarray(instrument.coupling_of(direction).dense()) * np.sqrt(
+        np.asarray(base.prior.variance())
+    )
+    np.testing.assert_allclose(term, root @ root.T, rtol=0, atol=1e-12 * np.abs(term).max())
+
+
+def test_a_direction_has_no_gains_and_the_same_samples(instrument, base, pointing):
+    error = instrument.coupling_of(instrument.beams())
+    with pytest.raises(lb.InputError, match="no response of its own"):
+        base.coupling.plus(jnp.ones(()), error.with_response(jnp.ones(error.shape[0])))
+    complete = lb.CouplingMatrix.build(instrument.beams(), pointing)
+    with pytest.raises(lb.InputError, match="hold different samples"):
+        base.coupling.plus(jnp.ones(()), complete)
+
+
+def test_a_response_multiplies_the_rows(base):
+    factors = 1.0 + 0.1 * jax.random.normal(jax.random.key(1), (base.n_data,))
+    twice = base.coupling.with_response(factors).with_response(2.0 * jnp.ones(base.n_data))
+    sky = base.prior.sample(jax.random.key(2))
+    expected = 2.0 * np.asarray(factors) * np.asarray(base.coupling @ sky)
+    np.testing.assert_allclose(twice @ sky, expected, rtol=1e-13)
+    rows = 2.0 * np.asarray(factors)[:, None] * np.asarray(base.coupling.dense())
+    # an entry is a sum of terms of the size of the largest
+    np.testing.assert_allclose(twice.dense(), rows, rtol=1e-13, atol=1e-15 * np.abs(rows).max())
+    np.testing.assert_allclose(
+        twice.transpose_mv(jnp.asarray(expected)), rows.T @ expected, rtol=1e-9
+    )

@@ -1,9 +1,14 @@
-import jax
+"""The embedded antennas and the ground below them, against sums along the arms and closed forms."""
+
+from __future__ import annotations
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference import SPEED_OF_LIGHT, arm_response
+from assertions import close, within
+from reference import SPEED_OF_LIGHT, arm_response, layered_reflection, vectors
 
+import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.rotations import turn_about_z
 from lusee_bayes.instrument.beams import (
@@ -11,7 +16,6 @@ from lusee_bayes.instrument.beams import (
     Monopoles,
     Regolith,
     monopole_beams,
-    product_beams,
     stokes_beam,
 )
 from lusee_bayes.instrument.beams.monopoles import PORT_AZIMUTHS_DEG
@@ -22,12 +26,9 @@ NO_GROUND = Regolith(1.0, 1.0, 0.0)
 CONDUCTOR = Regolith(4.0, 4.0, 1e16)
 
 
-def arms(zenith_angle_deg, azimuths_deg=PORT_AZIMUTHS_DEG):
-    tilt = np.radians(zenith_angle_deg)
-    return [
-        np.array([np.sin(tilt) * np.cos(a), np.sin(tilt) * np.sin(a), np.cos(tilt)])
-        for a in np.radians(azimuths_deg)
-    ]
+def arms(zenith_angle_deg):
+    tilt = np.full(4, np.radians(zenith_angle_deg))
+    return vectors(tilt, np.radians(PORT_AZIMUTHS_DEG))
 
 
 @pytest.mark.parametrize(
@@ -83,9 +84,7 @@ def test_a_vertical_arm_over_a_conductor_has_its_image():
     array_factor = 2 * np.cos(k * height * np.cos(GRID.theta))
     expected = np.abs(np.sin(GRID.theta) * array_factor) * k * 1e-8 / 2
     # the arm itself is k L = 6e-5 radians long
-    np.testing.assert_allclose(
-        np.abs(e_theta), np.tile(expected[:, None], (1, 8)), rtol=0, atol=1e-4 * expected.max()
-    )
+    within(np.abs(e_theta), np.tile(expected[:, None], (1, 8)), 1e-4 * expected.max())
 
 
 def test_ports_point_north_east_south_west():
@@ -109,25 +108,10 @@ def test_a_quarter_turn_moves_each_port_to_the_next():
     turned = np.asarray(to_matrix(turn_about_z(beams, np.pi / 2)))
     here = np.asarray(to_matrix(beams))
     previous = (np.arange(4) - 1) % 4
-    np.testing.assert_allclose(
-        turned, here[previous][:, previous], rtol=0, atol=1e-13 * here.real.max()
-    )
+    within(turned, here[previous][:, previous], 1e-13 * here.real.max())
     # a uniform sky sees no difference between the ports, and one between the autos and the crosses
     assert np.ptp(here[range(4), range(4), 0].real) < 1e-15
     assert np.abs(here[0, 1] - here[0, 0]).max() > 0.01
-
-
-def test_opposite_arms_answer_alike_after_half_a_turn():
-    fields = Monopoles().fields(25.0, GRID)
-    for name in ("e_theta", "e_phi"):
-        e = np.asarray(getattr(fields, name))
-        for one, other in ((0, 2), (1, 3)):
-            np.testing.assert_allclose(
-                np.roll(e[one], GRID.n_phi // 2, axis=1),
-                e[other],
-                rtol=0,
-                atol=1e-14 * np.abs(e).max(),
-            )
 
 
 def test_the_cross_of_opposite_arms_has_the_parities_of_the_cross():
@@ -148,31 +132,6 @@ def test_the_cross_of_opposite_arms_has_the_parities_of_the_cross():
 
 
 @pytest.mark.long
-def test_gradients_agree_with_finite_differences():
-    names = ["surface_permittivity", "loss_tangent", "zenith_angle_deg", "length_m", "height_m"]
-    weights = jnp.asarray(np.random.default_rng(0).standard_normal((16, 25)))
-    grid = HemisphereGrid.gauss_legendre(12, 24)
-
-    @jax.jit
-    def f(x):
-        ground = Regolith(surface_permittivity=x[0], loss_tangent=x[1])
-        m = Monopoles(ground, zenith_angle_deg=x[2], length_m=x[3], height_m=x[4])
-        return jnp.sum(weights * product_beams(m.fields(25.0, grid), 25.0, 4).modes)
-
-    x = np.array([3.7, 0.01, 75.0, 3.0, 2.0])
-    slopes = np.asarray(jax.jit(jax.grad(f))(jnp.asarray(x)))
-    for k, name in enumerate(names):
-        step = 1e-3 * x * (np.arange(5) == k)
-        five_point = sum(
-            c * float(f(jnp.asarray(x + n * step)))
-            for c, n in ((1 / 12, -2), (-8 / 12, -1), (8 / 12, 1), (-1 / 12, 2))
-        )
-        # error of five points: (1e-3)^4 of a few; rounding: 1e-15 / 1e-3 of f, which is order one
-        assert slopes[k] * x[k] == pytest.approx(five_point / 1e-3, rel=1e-7, abs=1e-10), name
-        assert abs(slopes[k] * x[k]) > 1e-4, name
-
-
-@pytest.mark.long
 @pytest.mark.parametrize(("frequency", "lmax"), [(50.0, 16), (25.0, 47)])
 def test_coefficients_do_not_change_when_the_nodes_double(frequency, lmax):
     grid = HemisphereGrid.for_lmax(lmax)
@@ -184,18 +143,7 @@ def test_coefficients_do_not_change_when_the_nodes_double(frequency, lmax):
     )
     # from 25 MHz to 50 the echoes of layers 14 m apart vary twice as fast over the 64 nodes
     tolerance = 1e-12 if frequency < 50.0 else 1e-11
-    np.testing.assert_allclose(coarse, fine, rtol=0, atol=tolerance * np.abs(fine).max())
-
-
-@pytest.mark.long
-def test_monopole_beams_are_the_product_beams_of_the_fields():
-    m = Monopoles(height_m=1.0)
-    fields = m.fields(25.0, HemisphereGrid.for_lmax(8))
-    for stokes in ("I", "V"):
-        got = monopole_beams(25.0, 8, m, stokes=stokes)
-        expected = product_beams(fields, 25.0, 8, stokes=stokes)
-        np.testing.assert_allclose(got.modes, expected.modes, rtol=0, atol=1e-13)
-        assert got.frequency_mhz == 25.0
+    close(coarse, fine, tolerance)
 
 
 def test_bad_parameters_are_refused():
@@ -205,3 +153,88 @@ def test_bad_parameters_are_refused():
         Monopoles(height_m=-1.0)
     with pytest.raises(InputError, match=r"frequency_mhz must be positive, got 0.0"):
         Monopoles().fields(0.0, GRID)
+
+
+# --- reflection by the ground ---------------------------------------------------------------------
+
+
+COSINES = np.cos(np.radians([0.0, 20.0, 45.0, 70.0, 85.0, 89.9]))
+
+
+def uniform(permittivity, loss_tangent):
+    return lb.Regolith(permittivity, permittivity, loss_tangent)
+
+
+def test_permittivity_rises_linearly_over_the_layers():
+    eps = np.asarray(lb.Regolith(3.7, 6.1, 0.01).permittivities())
+    np.testing.assert_allclose(eps.real, 3.7 + 2.4 * np.arange(8) / 7, rtol=1e-15)
+    np.testing.assert_allclose(eps.imag, -0.01 * eps.real, rtol=1e-15)
+
+
+# the square root loses half the digits of a cosine near zero; 1 - |r| of a conductor is
+# 2 / (|n| cos theta) at worst, |n| = 2e8
+@pytest.mark.parametrize(
+    ("eps", "loss", "atol"),
+    [(5.0, 0.3, 1e-14), (4.0, 0.0, 1e-14), (1.0, 0.0, 1e-11), (4.0, 1e16, 2e-7)],
+    ids=["lossy", "lossless", "none", "conductor"],
+)
+def test_uniform_ground_obeys_fresnel(eps, loss, atol):
+    cosines = np.append(COSINES[:-1], 1.0) if loss > 1.0 else np.append(COSINES, 1.0)
+    complex_eps = eps * (1 - 1j * loss)
+    # the principal root decays: its imaginary part is negative
+    n_cos_t = np.sqrt(complex_eps - (1 - cosines**2))
+    s, p = uniform(eps, loss).reflection(cosines, 10.0)
+    within(s, (cosines - n_cos_t) / (cosines + n_cos_t), atol)
+    within(p, (complex_eps * cosines - n_cos_t) / (complex_eps * cosines + n_cos_t), atol)
+    if loss > 1.0:
+        within(s, -1.0, 1e-7)
+        within(p, 1.0, 2e-7)
+
+
+def test_no_vertical_reflection_at_brewsters_angle():
+    eps = 3.0
+    brewster = np.cos(np.arctan(np.sqrt(eps)))
+    s, p = uniform(eps, 0.0).reflection(np.array([brewster]), 30.0)
+    assert abs(p[0]) < 1e-15
+    assert s[0].real == pytest.approx((1 - eps) / (1 + eps), abs=1e-14)
+
+
+def test_grazing_incidence_reflects_everything_with_reversed_sign():
+    s, p = lb.Regolith().reflection(np.array([1e-9]), 25.0)
+    # 2 eps cos theta / n: 4e-9
+    np.testing.assert_allclose(s, -1.0, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(p, -1.0, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_more_comes_back_than_arrives(seed):
+    rng = np.random.default_rng(seed)
+    ground = lb.Regolith(rng.uniform(1, 10), rng.uniform(1, 10), 10 ** rng.uniform(-4, 1))
+    for frequency in (1.0, 7.0, 50.0):
+        s, p = ground.reflection(rng.uniform(0, 1, 50), frequency)
+        assert np.abs(s).max() <= 1.0
+        assert np.abs(p).max() <= 1.0
+
+
+@pytest.mark.parametrize("frequency", [1.0, 5.0, 25.0])
+@pytest.mark.parametrize("ground", [(3.7, 6.1, 0.01), (8.0, 2.0, 0.02), (1.5, 9.0, 0.0)])
+def test_layers_agree_with_characteristic_matrices(ground, frequency):
+    regolith = lb.Regolith(*ground)
+    s, p = regolith.reflection(COSINES, frequency)
+    eps = np.asarray(regolith.permittivities())
+    for k, cosine in enumerate(COSINES):
+        expected = layered_reflection(eps, 100.0 / 7, cosine, frequency)
+        # seven layers; the matrices' entries grow with the loss to e^3, so 1e-13 is rounding
+        np.testing.assert_allclose([s[k], p[k]], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("bad", [(0.0, 6.1), (3.7, -1.0), (np.nan, 6.1)])
+def test_permittivities_are_positive(bad):
+    with pytest.raises(lb.InputError, match="permittivity must be positive"):
+        lb.Regolith(*bad)
+    assert lb.Regolith(jnp.asarray(2.0)).surface_permittivity == 2.0
+
+
+def test_a_ground_that_amplifies_is_refused():
+    with pytest.raises(lb.InputError, match="loss_tangent must not be negative, got -0.01"):
+        lb.Regolith(loss_tangent=-0.01)

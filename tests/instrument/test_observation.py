@@ -1,33 +1,39 @@
+"""Times, orientations and bodies in the sky, against lunarsky, astropy and ERFA."""
+
+from __future__ import annotations
+
 import astropy.units as u
+import erfa
 import numpy as np
 import pytest
+from assertions import within
 from astropy.coordinates import (
     GCRS,
     ICRS,
     CartesianRepresentation,
     Galactic,
+    SkyCoord,
     get_body_barycentric,
     get_sun,
 )
 from astropy.time import Time
 from lunarsky import MCMF, LunarTopo, MoonLocation
-from reference import galactic_directions
+from reference import galactic_directions, vectors
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
+from lusee_bayes.instrument.ephemeris import BODIES, MOON_RADIUS_KM, body_direction
 from lusee_bayes.instrument.moon import CYCLE_DAYS
-from lusee_bayes.instrument.observation import Observation, Run
+from lusee_bayes.instrument.times import unannounced_leap_seconds
 
 # the leap seconds of years far ahead are unknown; astropy says so whenever it converts them
 
 
 def test_the_fiducial_cycle_and_three_of_them():
-    one = Observation.from_runs()
+    one = lb.Observation.from_runs()
     assert one.n_times == 327
     assert one.times[0].isot == "2027-01-15T00:00:00.000"
-    np.testing.assert_allclose(
-        one.hours, 2.0 * np.arange(327), rtol=0, atol=1e-6
-    )  # a double JD: 20 ns
-    three = Observation.from_runs([Run(1.0, angle) for angle in (0.0, 30.0, 60.0)])
+    within(one.hours, 2.0 * np.arange(327), 1e-6)  # a double JD: 20 ns
+    three = lb.Observation.from_runs([lb.Run(1.0, angle) for angle in (0.0, 30.0, 60.0)])
     assert (three.n_times, three.n_runs) == (981, 3)
     np.testing.assert_array_equal(np.bincount(three.run), [327, 327, 327])
     starts = three.hours[np.searchsorted(three.run, [0, 1, 2])]
@@ -35,8 +41,8 @@ def test_the_fiducial_cycle_and_three_of_them():
 
 
 def test_runs_of_any_length_follow_one_another():
-    runs = [Run(0.25, 10.0), Run(0.5, -20.0)]
-    o = Observation.from_runs(runs, start="2026-06-01", step_s=3600.0)
+    runs = [lb.Run(0.25, 10.0), lb.Run(0.5, -20.0)]
+    o = lb.Observation.from_runs(runs, start="2026-06-01", step_s=3600.0)
     np.testing.assert_array_equal(np.bincount(o.run), [163, 327])  # floor(cycles 655.72)
     assert o.turntable_deg == (10.0, -20.0)
     assert o.hours[163] == pytest.approx(0.25 * CYCLE_DAYS * 24, abs=1e-6)
@@ -45,34 +51,26 @@ def test_runs_of_any_length_follow_one_another():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_directions_agree_with_lunartopo(seed):
     rng = np.random.default_rng(seed)
-    o = Observation.from_runs(
-        [Run(0.6), Run(0.5)],
+    o = lb.Observation.from_runs(
+        [lb.Run(0.6), lb.Run(0.5)],
         start=["2027-01-15T00:00:00", "1999-03-04T05:06:07"][seed],
         lon_deg=rng.uniform(-180, 360),
         lat_deg=rng.uniform(-90, 90),
     )
     to_topo = o.topocentric_from_mcmf() @ o.mcmf_from_galactic()
     theta, phi = np.arccos(rng.uniform(-1, 1, 40)), rng.uniform(0, 2 * np.pi, 40)
-    topo = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    topo = vectors(theta, phi).T
     for k in rng.integers(0, o.n_times, 5):
         colatitude, longitude = galactic_directions(theta, phi, o.times[k], o.lon_deg, o.lat_deg)
-        there = np.stack(
-            [
-                np.sin(colatitude) * np.cos(longitude),
-                np.sin(colatitude) * np.sin(longitude),
-                np.cos(colatitude),
-            ]
-        )
+        there = vectors(colatitude, longitude).T
         # lunarsky goes through the same kernel; what is left is rounding of three rotations
         np.testing.assert_allclose(to_topo[k] @ there, topo, rtol=0, atol=1e-10)
 
 
 def test_the_rotations_are_rotations_and_the_moon_turns():
-    o = Observation.from_runs([Run(1.0)])
+    o = lb.Observation.from_runs([lb.Run(1.0)])
     r = o.mcmf_from_galactic()
-    np.testing.assert_allclose(
-        r @ r.swapaxes(1, 2), np.tile(np.eye(3), (327, 1, 1)), rtol=0, atol=1e-13
-    )
+    within(r @ r.swapaxes(1, 2), np.tile(np.eye(3), (327, 1, 1)), 1e-13)
     np.testing.assert_allclose(np.linalg.det(r), 1.0, rtol=0, atol=1e-13)
     # after one sidereal month the Moon is back where it was, to 0.1 degrees (its rotation is
     # uniform to that: physical libration); the last of 327 samples is 1.86 steps before that
@@ -84,20 +82,16 @@ def test_the_rotations_are_rotations_and_the_moon_turns():
 
 
 def test_zenith():
-    o = Observation.from_runs([Run(0.3)])
+    o = lb.Observation.from_runs([lb.Run(0.3)])
     for k in (0, 50):
         zero = np.zeros(1)
         colatitude, longitude = galactic_directions(zero, zero, o.times[k], o.lon_deg, o.lat_deg)
-        expected = [
-            np.sin(colatitude[0]) * np.cos(longitude[0]),
-            np.sin(colatitude[0]) * np.sin(longitude[0]),
-            np.cos(colatitude[0]),
-        ]
+        expected = vectors(colatitude, longitude)[0]
         np.testing.assert_allclose(o.zenith_galactic()[k], expected, rtol=0, atol=1e-10)
 
 
 def test_sun_altitude_agrees_with_lunarsky_and_with_the_sun_seen_from_the_earth():
-    o = Observation.from_runs([Run(1.0)], step_s=40000.0)
+    o = lb.Observation.from_runs([lb.Run(1.0)], step_s=40000.0)
     got = o.sun_altitude_deg()
     site = MoonLocation.from_selenodetic(lon=o.lon_deg, lat=o.lat_deg)
     sun, moon = (get_body_barycentric(b, o.times, ephemeris="builtin") for b in ("sun", "moon"))
@@ -116,8 +110,8 @@ def test_sun_altitude_agrees_with_lunarsky_and_with_the_sun_seen_from_the_earth(
 
 
 def test_night_only_keeps_the_samples_with_the_sun_down():
-    everything = Observation.from_runs([Run(1.0), Run(1.0)])
-    mixed = Observation.from_runs([Run(1.0), Run(1.0, night_only=True)])
+    everything = lb.Observation.from_runs([lb.Run(1.0), lb.Run(1.0)])
+    mixed = lb.Observation.from_runs([lb.Run(1.0), lb.Run(1.0, night_only=True)])
     site = MoonLocation.from_selenodetic(lon=everything.lon_deg, lat=everything.lat_deg)
     sun, moon = (
         get_body_barycentric(b, everything.times, ephemeris="builtin") for b in ("sun", "moon")
@@ -136,7 +130,7 @@ def test_night_only_keeps_the_samples_with_the_sun_down():
 
 
 def test_select():
-    o = Observation.from_runs([Run(0.1), Run(0.1, 30.0)])
+    o = lb.Observation.from_runs([lb.Run(0.1), lb.Run(0.1, 30.0)])
     keep = np.arange(o.n_times) % 3 == 0
     some = o.select(keep)
     np.testing.assert_array_equal(some.times.jd, o.times.jd[keep])
@@ -153,13 +147,13 @@ def test_select():
     ],
 )
 def test_times_outside_the_ephemeris_are_refused(start, at):
-    with pytest.raises(InputError, match=rf"outside the ephemeris \(1900-2050\): {at}"):
-        Observation.from_runs([Run(1.0)], start=start)
+    with pytest.raises(lb.InputError, match=rf"outside the ephemeris \(1900-2050\): {at}"):
+        lb.Observation.from_runs([lb.Run(1.0)], start=start)
 
 
 @pytest.mark.parametrize("start", ["1900-01-02T00:00:00", "2049-11-20T00:00:00"])
 def test_times_inside_the_ephemeris_work(start):
-    r = Observation.from_runs([Run(0.1)], start=start).mcmf_from_galactic()
+    r = lb.Observation.from_runs([lb.Run(0.1)], start=start).mcmf_from_galactic()
     np.testing.assert_allclose(np.linalg.det(r), 1.0, rtol=0, atol=1e-12)
 
 
@@ -169,20 +163,20 @@ def test_times_inside_the_ephemeris_work(start):
         ({"start": "next tuesday"}, "'next tuesday' is not a date; write it as 2027-01-15"),
         ({"step_s": 0.0}, "step_s must be positive, got 0.0"),
         ({"lat_deg": 95.0}, r"lat_deg must lie in -90..90, got 95.0"),
-        ({"runs": [Run(), Run(1e-3)]}, "run 1 of 0.001 cycles holds no sample of 7200.0 s"),
+        ({"runs": [lb.Run(), lb.Run(1e-3)]}, "run 1 of 0.001 cycles holds no sample of 7200.0 s"),
         ({"runs": []}, "at least one run"),
-        ({"runs": [Run(turntable_deg=float("nan"))]}, "turntable_deg holds NaN"),
-        ({"runs": [Run(-1.0)]}, "length in cycles of run 0 must be positive, got -1.0"),
+        ({"runs": [lb.Run(turntable_deg=float("nan"))]}, "turntable_deg holds NaN"),
+        ({"runs": [lb.Run(-1.0)]}, "length in cycles of run 0 must be positive, got -1.0"),
         # the Sun is up for two weeks from 1 February 2027 at this site
         (
-            {"runs": [Run(0.1, night_only=True)], "start": "2027-02-05T00:00:00"},
-            "run 0 holds no lunar night",
+            {"runs": [lb.Run(0.1, night_only=True)], "start": "2027-02-05T00:00:00"},
+            "holds no lunar night",
         ),
     ],
 )
 def test_bad_input_is_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        Observation.from_runs(**options)
+    with pytest.raises(lb.InputError, match=message):
+        lb.Observation.from_runs(**options)
 
 
 @pytest.mark.parametrize(
@@ -196,5 +190,157 @@ def test_bad_input_is_refused(options, message):
 )
 def test_inconsistent_samples_are_refused(run, turntable, message):
     times = Time("2027-01-15") + np.arange(3.0) * u.hour
-    with pytest.raises(InputError, match=message):
-        Observation(0.0, 0.0, times, np.array(run), turntable, 3600.0)
+    with pytest.raises(lb.InputError, match=message):
+        lb.Observation(0.0, 0.0, times, np.array(run), turntable, 3600.0)
+
+
+# --- Sun, Earth and planets -----------------------------------------------------------------------
+
+
+AU_KM = 149597870.7
+LIGHT = 299792.458
+ARCSECOND = np.pi / 648000
+
+
+def angle(a, b):
+    """Angle between unit vectors along the last axis, in radians."""
+    return 2.0 * np.arcsin(np.linalg.norm(a - b, axis=-1) / 2.0)
+
+
+def dates(*isot, lon_deg=182.258, lat_deg=-23.814):
+    run = np.zeros(len(isot), dtype=int)
+    return lb.Observation(lon_deg, lat_deg, Time(list(isot)), run, (0.0,), 60.0)
+
+
+def by_erfa_and_lunartopo(planet, time, lon_deg, lat_deg):
+    """East, North, up of a planet of plan94, the Sun (0) or the Earth (3), at one time.
+
+    ERFA's series, light time by bisection, lunarsky's MCMF -> LunarTopo with a finite distance.
+    """
+    with unannounced_leap_seconds():
+        tdb = time.tdb
+
+    def place(seconds_ago, planet):
+        jd2 = tdb.jd2 - seconds_ago / 86400.0
+        heliocentric, barycentric = (x["p"] for x in erfa.epv00(tdb.jd1, jd2))
+        if planet == 3:
+            return barycentric * AU_KM
+        sun = barycentric - heliocentric
+        if planet == 0:
+            return sun * AU_KM
+        return (sun + erfa.plan94(tdb.jd1, jd2, planet)["p"]) * AU_KM
+
+    moon = place(0.0, 3) + erfa.moon98(tdb.jd1, tdb.jd2)["p"] * AU_KM
+    site = MoonLocation.from_selenodetic(lon=lon_deg * u.deg, lat=lat_deg * u.deg, height=0.0 * u.m)
+    radius = np.sqrt(site.x**2 + site.y**2 + site.z**2)
+    site = MoonLocation.from_selenodetic(
+        lon=lon_deg * u.deg, lat=lat_deg * u.deg, height=MOON_RADIUS_KM * u.km - radius
+    )
+    here = LunarTopo(obstime=time, location=site)
+
+    def seen(seconds_ago):
+        away = place(seconds_ago, planet) - moon
+        distance = np.linalg.norm(away)
+        with unannounced_leap_seconds():
+            unit = ICRS(CartesianRepresentation(away / distance)).transform_to(MCMF(obstime=time))
+            centred = MCMF(
+                CartesianRepresentation(unit.cartesian.xyz.value * distance * u.km), obstime=time
+            )
+            return centred.transform_to(here).cartesian.xyz.to_value(u.km).ravel()
+
+    early, late = 0.0, 40000.0
+    while late - early > 1e-4:
+        middle = (early + late) / 2.0
+        if np.linalg.norm(seen(middle)) > LIGHT * middle:
+            early = middle
+        else:
+            late = middle
+    north, east, up = seen(late)  # azimuth counts from North towards East
+    distance = np.linalg.norm([east, north, up])
+    return np.array([east, north, up]) / distance, distance / AU_KM
+
+
+@pytest.mark.parametrize(
+    ("body", "planet"), [("Sun", 0), ("Venus", 2), ("Earth", 3), ("Jupiter", 5), ("saturn", 6)]
+)
+def test_directions_agree_with_erfa_and_lunartopo(body, planet):
+    site = {"lon_deg": 23.4, "lat_deg": -61.0}
+    observation = dates("2026-06-02T21:00:00", "2027-01-15T03:00:00", **site)
+    to_topo = observation.topocentric_from_mcmf() @ observation.mcmf_from_galactic()
+    got = np.einsum("tij,tj->ti", to_topo, body_direction(body, observation))
+    for k in range(2):
+        expected, _ = by_erfa_and_lunartopo(planet, observation.times[k], **site)
+        # the same series by another way: rounding of rotations, and 1e-4 s of light time
+        assert angle(got[k], expected) < 1e-3 * ARCSECOND
+
+
+def test_the_sun_is_where_the_observation_says():
+    observation = lb.Observation.from_runs([lb.Run(1.0)], step_s=40000.0)
+    up = np.sum(observation.zenith_galactic() * body_direction("Sun", observation), axis=1)
+    # 1737 km at 1 au are 2.4 arcseconds, the barycentric Sun moves 0.01 km/s x 499 s = 0.01
+    within(np.degrees(np.arcsin(up)), observation.sun_altitude_deg(), 2.5 / 3600)
+
+
+def test_jupiter_is_where_the_almanac_had_it():
+    # opposition of 10 January 2026, in Gemini near Pollux: RA 7h 23m, Dec 22
+    observation = dates("2026-01-10T00:00:00")
+    gal = body_direction("Jupiter", observation)
+    there = SkyCoord(Galactic(CartesianRepresentation(gal[0]))).icrs
+    assert there.ra.deg == pytest.approx(110.8, abs=1.0)
+    assert there.dec.deg == pytest.approx(22.0, abs=0.5)
+    assert angle(gal, -body_direction("Sun", observation))[0] < np.radians(1.5)
+
+
+def test_two_landers_see_the_earth_against_different_stars():
+    # both on the great circle at right angles to the Earth's direction near 0 E, 0 N: the poles
+    north = dates("2027-01-15T00:00:00", lat_deg=90.0, lon_deg=0.0)
+    south = dates("2027-01-15T00:00:00", lat_deg=-90.0, lon_deg=0.0)
+    site = {"lon_deg": 0.0, "lat_deg": 0.0}
+    _, distance = by_erfa_and_lunartopo(3, north.times[0], **site)
+    centre_km = distance * AU_KM
+    assert 350000 < centre_km < 407000
+    a, b = body_direction("Earth", north), body_direction("Earth", south)
+    parallax = angle(a, b)[0]
+    # 2 x 1737.4 / distance = 0.52 degrees; the libration, 7 degrees, shortens the base by < 1 %
+    assert parallax == pytest.approx(2 * 1737.4 / centre_km, rel=1e-2)
+    # the northern lander sees the Earth displaced towards the south
+    assert np.sum((a - b) * north.zenith_galactic()) < -0.99 * parallax
+    # and the Sun hardly at all
+    sun = angle(body_direction("Sun", north), body_direction("Sun", south))[0]
+    assert 4.0 * ARCSECOND < sun < 5.0 * ARCSECOND
+
+
+def test_light_time():
+    # it moves a planet by its own motion: Jupiter, 13 km/s over 35 to 50 minutes, 5-9"
+    later = dates("2027-01-15T00:00:00")
+    with unannounced_leap_seconds():
+        tdb = later.times.tdb
+        heliocentric, barycentric = (x["p"] for x in erfa.epv00(tdb.jd1, tdb.jd2))
+        moon = barycentric + erfa.moon98(tdb.jd1, tdb.jd2)["p"]
+        at_once = barycentric - heliocentric + erfa.plan94(tdb.jd1, tdb.jd2, 5)["p"] - moon
+    galactic = (
+        ICRS(CartesianRepresentation(at_once[0])).transform_to(Galactic()).cartesian.xyz.value
+    )
+    moved = angle(galactic / np.linalg.norm(galactic), body_direction("Jupiter", later)[0])
+    assert 5.0 * ARCSECOND < moved < 10.0 * ARCSECOND
+
+
+def test_every_body_is_known_in_any_case():
+    observation = dates("2027-01-15T00:00:00")
+    for body in BODIES:
+        vector = body_direction(body.upper(), observation)
+        np.testing.assert_allclose(np.linalg.norm(vector, axis=1), 1.0, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("Jupitre", "unknown body 'Jupitre' in the sky of the Moon; did you mean 'Jupiter'?"),
+        ("satrun", "did you mean 'Saturn'"),
+        ("xyz", "known: Earth, Jupiter, Mars"),
+        ("moon", "unknown body 'moon'"),
+    ],
+)
+def test_unknown_bodies_are_refused(body, message):
+    with pytest.raises(lb.InputError, match=message):
+        body_direction(body, dates("2027-01-15T00:00:00"))

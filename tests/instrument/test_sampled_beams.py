@@ -9,10 +9,10 @@ import healpy
 import numpy as np
 import pytest
 import xarray as xr
+from assertions import close, refused
 from astropy.io import fits
 
 import lusee_bayes as lb
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams import (
     HemisphereGrid,
     Monopoles,
@@ -189,8 +189,8 @@ def test_files_come_back(tmp_path, kind, suffix):
     # the grid's angles go through degrees and back: one rounding
     for f in (20.0, 24.0):
         ours, own = (np.asarray(b.beams(f, LMAX).modes) for b in (again, made))
-        np.testing.assert_allclose(ours, own, rtol=0, atol=1e-13 * np.abs(own).max())
-    with pytest.raises(InputError, match="from 20 to 30 MHz, not at 31"):
+        close(ours, own, 1e-13)
+    with pytest.raises(lb.InputError, match="from 20 to 30 MHz, not at 31"):
         again.beams(31.0, LMAX)
     text = describe(path)
     assert "4 antennas" in text
@@ -205,7 +205,7 @@ def test_a_scenario_takes_the_file(tmp_path):
     assert (scenario.beam.n_ports, scenario.beam.label) == (4, "mine.nc")
     ours, own = (lb.build(s).setup.signal for s in (scenario, small_scenario()))
     assert np.abs(ours - own).max() < SPLINES * np.abs(own).max()
-    with pytest.raises(InputError, match="rotations_deg is an entry of model luseepy"):
+    with pytest.raises(lb.InputError, match="rotations_deg is an entry of model luseepy"):
         small_scenario(f"beam={{model: sampled, file: {path}, rotations_deg: [0, 10]}}")
 
 
@@ -221,7 +221,7 @@ def test_product_beams_of_a_file_may_be_in_any_order(tmp_path):
     np.testing.assert_array_equal(read_beam(path).products, made.products)
     shuffled.attrs["products"] = "00R, 01R"
     shuffled.to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(InputError, match=r"mine\.nc: products is 00R, 01R, expected the names"):
+    with pytest.raises(lb.InputError, match=r"mine\.nc: products is 00R, 01R, expected the names"):
         read_beam(path)
 
 
@@ -266,54 +266,56 @@ def nan_at_the_zenith():
     ],
 )
 def test_arrays_that_are_no_beams_are_refused(given, words):
-    with pytest.raises(InputError) as caught:
+    with refused(words):
         sampled_beams(FREQUENCY, **given())
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_what_cannot_be_computed_is_refused():
     zero = sampled_beams(FREQUENCY, products=np.zeros((16, 12 * 4**2)))
-    with pytest.raises(InputError, match="autos integrate to 0 sr"):
+    with pytest.raises(lb.InputError, match="autos integrate to 0 sr"):
         zero.beams(FREQUENCY, 2)
-    with pytest.raises(InputError, match="beams of products, not the E fields"):
+    with pytest.raises(lb.InputError, match="beams of products, not the E fields"):
         zero.fields(FREQUENCY, HemisphereGrid.for_lmax(2))
-    with pytest.raises(InputError, match="must be positive and grow"):
+    with pytest.raises(lb.InputError, match="must be positive and grow"):
         sampled_beams([20.0, 10.0], products=np.zeros((2, 16, 48)))
 
 
-@pytest.mark.parametrize("change", ["no e_phi", "cut", "no absolute", "text", "Hz"])
+DAMAGE = {
+    "no e_phi": (lambda f: f.drop_vars("e_phi_imag"), lambda h: h.pop("E_PHI_IMAG")),
+    "no absolute": (
+        lambda f: f.drop_attrs(deep=False).assign_attrs(
+            {name: value for name, value in f.attrs.items() if name != "absolute"}
+        ),
+        lambda h: h[0].header.remove("ABSOLUTE"),
+    ),
+    "text": (
+        lambda f: f.assign_attrs(absolute="yes"),
+        lambda h: h[0].header.update(ABSOLUTE="yes"),
+    ),
+    "Hz": (
+        lambda f: f.assign(frequency_mhz=1e6 * f["frequency_mhz"]),
+        lambda h: h["FREQUENCY_MHZ"].data.__imul__(1e6),
+    ),
+}
+
+
+@pytest.mark.parametrize("change", [*DAMAGE, "cut"])
 @pytest.mark.parametrize("suffix", ["nc", "fits"])
 def test_damaged_files_are_refused(tmp_path, change, suffix):
     path = tmp_path / f"mine.{suffix}"
-    write_sampled_beams(path, sampled_beams(FREQUENCY, **embedded("grid")))
+    lb.write_sampled_beams(path, lb.sampled_beams(FREQUENCY, **embedded("grid")))
     if change == "cut":
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     elif suffix == "fits":
         with fits.open(path, memmap=False) as hdus:
-            if change == "no e_phi":
-                del hdus["E_PHI_IMAG"]
-            elif change == "no absolute":
-                del hdus[0].header["ABSOLUTE"]
-            elif change == "Hz":
-                hdus["FREQUENCY_MHZ"].data *= 1e6
-            else:
-                hdus[0].header["ABSOLUTE"] = "yes"
+            DAMAGE[change][1](hdus)
             hdus.writeto(path, overwrite=True)
     else:
         with xr.open_dataset(path, engine="h5netcdf") as file:
-            found = file.load()
-        if change == "no e_phi":
-            found = found.drop_vars("e_phi_imag")
-        elif change == "no absolute":
-            del found.attrs["absolute"]
-        elif change == "Hz":
-            found["frequency_mhz"] = 1e6 * found["frequency_mhz"]
-        else:
-            found.attrs["absolute"] = "yes"
+            found = DAMAGE[change][0](file.load())
         found.to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(InputError, match=str(path)):
-        read_beam(path)
+    with pytest.raises(lb.InputError, match=str(path)):
+        lb.read_beam(path)
 
 
 # --- pyuvdata -------------------------------------------------------------------------------------
@@ -362,7 +364,7 @@ def test_a_uvbeam_is_its_fields(tmp_path, coordinates):
     conjugate = lb.from_uvbeam(beam, conjugate=True).beams(20.0, LMAX).modes
     np.testing.assert_allclose(conjugate[2], -found.beams(20.0, LMAX).modes[2], atol=1e-15)
     beam.efield_to_power()
-    with pytest.raises(InputError, match="give one of type efield"):
+    with pytest.raises(lb.InputError, match="give one of type efield"):
         lb.from_uvbeam(beam)
 
 
@@ -372,5 +374,5 @@ def test_without_pyuvdata_its_files_are_refused_with_what_to_install(tmp_path, m
     hdu.header["NORMSTD"], hdu.header["FEEDLIST"] = "physical", "[x, y]"
     hdu.writeto(path)
     monkeypatch.setattr("lusee_bayes.instrument.beams.uvbeam.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install '\.\[uvdata\]'"):
+    with pytest.raises(lb.InputError, match=r"pip install '\.\[uvdata\]'"):
         read_beam(path)

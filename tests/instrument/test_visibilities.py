@@ -1,29 +1,42 @@
-"""The data set on disk: everything comes back, and bad files are refused."""
+"""Data sets: on disk, from arrays of any order and sign, with gaps, product by product."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta, timezone
 
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
+from assertions import close, refused
+from astropy.time import Time
 
+import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, Run
-from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.instrument.visibilities_file import read_visibilities
+from lusee_bayes.instrument.products import (
+    Product,
+    all_products,
+    auto_indices,
+    labels,
+    to_matrix,
+    to_real,
+)
 
 
 @pytest.fixture
 def data():
-    observation = Observation.from_runs([Run(0.05), Run(0.03, turntable_deg=30.0)])
+    observation = lb.Observation.from_runs([lb.Run(0.05), lb.Run(0.03, turntable_deg=30.0)])
     rng = np.random.default_rng(0)
     flags = rng.random((16, observation.n_times)) < 0.1
     layout = DataLayout.from_flags(flags)
     values = jnp.asarray(rng.standard_normal(layout.size))
-    return Visibilities(values, layout, observation, 25.0, jnp.asarray(rng.standard_normal(9)))
+    return lb.Visibilities(values, layout, observation, 25.0, jnp.asarray(rng.standard_normal(9)))
 
 
 def test_round_trip_is_exact(data, tmp_path):
-    again = read_visibilities(data.write(tmp_path / "data.nc"))
+    again = lb.read_visibilities(data.write(tmp_path / "data.nc"))
     np.testing.assert_array_equal(again.data, data.data)
     np.testing.assert_array_equal(again.layout.index, data.layout.index)
     np.testing.assert_array_equal(again.truth, data.truth)
@@ -92,15 +105,15 @@ def nan(dataset):
 def test_bad_files_are_refused(data, tmp_path, change, message):
     path = tmp_path / "bad.nc"
     altered(change)(data, path)
-    with pytest.raises(InputError, match=message):
-        read_visibilities(path)
+    with pytest.raises(lb.InputError, match=message):
+        lb.read_visibilities(path)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mK", 1e-3), ("kK", 1e3), ("", 1.0)])
 def test_temperatures_in_other_units_are_converted(data, tmp_path, unit, factor):
     path = tmp_path / "other.nc"
     altered(lambda d: d["visibility"].attrs.update(units=unit))(data, path)
-    np.testing.assert_allclose(read_visibilities(path).data, factor * data.data, rtol=1e-15)
+    np.testing.assert_allclose(lb.read_visibilities(path).data, factor * data.data, rtol=1e-15)
 
 
 # TAI - UTC is 37 s since 2017, TT - TAI 32.184 s, TDB - TT less than 2 ms
@@ -110,21 +123,276 @@ def test_temperatures_in_other_units_are_converted(data, tmp_path, unit, factor)
 def test_times_in_other_scales_are_brought_to_utc(data, tmp_path, scale, s):
     path = tmp_path / "other.nc"
     altered(lambda d: [d[k].attrs.update(scale=scale) for k in ("jd1", "jd2")] and d)(data, path)
-    moved = (data.observation.times - read_visibilities(path).observation.times).sec
+    moved = (data.observation.times - lb.read_visibilities(path).observation.times).sec
     np.testing.assert_allclose(moved, s, rtol=0, atol=2e-3)
 
 
 def test_other_files_are_refused(tmp_path):
-    with pytest.raises(InputError, match="no data at .*lusee-bayes simulate"):
-        read_visibilities(tmp_path / "none.nc")
+    with pytest.raises(lb.InputError, match="no data at .*lusee-bayes simulate"):
+        lb.read_visibilities(tmp_path / "none.nc")
     (tmp_path / "text.nc").write_text("hello")
-    with pytest.raises(InputError, match="not a file of visibilities"):
-        read_visibilities(tmp_path / "text.nc")
+    with pytest.raises(lb.InputError, match="not a file of visibilities"):
+        lb.read_visibilities(tmp_path / "text.nc")
 
 
 def test_lengths_must_fit(data):
-    with pytest.raises(InputError, match="the data has shape"):
-        Visibilities(data.data[:-1], data.layout, data.observation, 25.0)
-    with pytest.raises(InputError, match="times, the observation"):
+    with pytest.raises(lb.InputError, match="the data has shape"):
+        lb.Visibilities(data.data[:-1], data.layout, data.observation, 25.0)
+    with pytest.raises(lb.InputError, match="times, the observation"):
         short = data.observation.select(data.observation.run == 0)
-        Visibilities(data.data, data.layout, short, 25.0)
+        lb.Visibilities(data.data, data.layout, short, 25.0)
+
+
+# --- data of one's own ----------------------------------------------------------------------------
+
+
+N = 5
+START = datetime(2027, 1, 15)
+TIMES = [START + timedelta(hours=2 * k) for k in range(N)]
+RNG = np.random.default_rng(3)
+VOLTAGES = RNG.normal(size=(N, 4, 50)) + 1j * RNG.normal(size=(N, 4, 50))
+# <s_i conj(s_j)>, by its definition
+MATRIX = 1e3 * np.einsum("tis,tjs->tij", VOLTAGES, VOLTAGES.conj()) / 50
+PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]
+
+
+def expected() -> np.ndarray:
+    rows = []
+    for i, j in PAIRS:
+        rows.append(MATRIX[:, i, j].real)
+        if i != j:
+            rows.append(MATRIX[:, i, j].imag)
+    return np.array(rows)
+
+
+def columns(pairs) -> np.ndarray:
+    return np.stack([MATRIX[:, i, j] for i, j in pairs], axis=1)
+
+
+def make(data=None, times=TIMES, frequency_mhz=25.0, **options) -> lb.Visibilities:
+    data = columns(PAIRS) if data is None else data
+    return lb.Visibilities.from_arrays(data, times, frequency_mhz, **options)
+
+
+def test_complex_correlations_in_the_packages_order():
+    made = make()
+    np.testing.assert_array_equal(made.grid(), expected())
+    assert made.observation.step_s == pytest.approx(7200.0, rel=1e-12)
+    assert (made.observation.lon_deg, made.observation.lat_deg) == (182.258, -23.814)
+
+
+def test_any_order_of_products_and_of_their_ports():
+    pairs = [PAIRS[k] if k % 3 else PAIRS[k][::-1] for k in RNG.permutation(len(PAIRS))]
+    made = make(columns(pairs), products=[f"{i}{j}" for i, j in pairs])
+    np.testing.assert_array_equal(made.grid(), expected())
+    # the other convention: every array is the conjugate, and said so once
+    made = make(
+        columns(pairs).conj(),
+        products=[f"{i}-{j}" for i, j in pairs],
+        convention="conj(s_i) s_j",
+    )
+    np.testing.assert_array_equal(made.grid(), expected())
+
+
+def test_real_products_in_any_order():
+    names = [p.upper() for p in lb.Visibilities.labels.fget(make())]
+    order = RNG.permutation(len(names))
+    data = expected()[order].T
+    made = make(data, products=[names[k] for k in order])
+    np.testing.assert_array_equal(made.grid(), expected())
+    made = make(expected().T)
+    np.testing.assert_array_equal(made.grid(), expected())
+    # 10I is the imaginary part of the conjugate
+    made = make(np.stack([MATRIX[:, 0, 0].real, MATRIX[:, 1, 0].imag], 1), products=["00", "10I"])
+    np.testing.assert_array_equal(made.grid()[2], MATRIX[:, 0, 1].imag)
+
+
+def test_flags_nan_and_products_without_a_column_are_absent():
+    data, flags = columns(PAIRS), np.zeros((N, len(PAIRS)), dtype=bool)
+    data[1, 2] = complex(np.nan, 1.0)  # 02
+    flags[3, 0] = True  # 00
+    data[3, 0] = np.inf  # not looked at
+    absent = np.zeros((16, N), dtype=bool)
+    absent[3:5, 1] = absent[0, 3] = True
+    made = make(data, flags=flags)
+    np.testing.assert_array_equal(made.grid(), np.where(absent, np.nan, expected()))
+    masked = np.ma.array(columns(PAIRS), mask=flags)
+    np.testing.assert_array_equal(np.isnan(make(masked).grid()[0]), flags[:, 0])
+    whole_times = np.arange(N) == 2
+    np.testing.assert_array_equal(np.isnan(make(flags=whole_times).grid()).all(0), whole_times)
+    autos = make(columns([(3, 3), (0, 0)]), products=["33", "00"])
+    assert autos.layout.size == 2 * N
+    np.testing.assert_array_equal(autos.grid()[[0, 15]], expected()[[0, 15]])
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        [t.isoformat() for t in TIMES],
+        [t.isoformat() + "Z" for t in TIMES],
+        [t.replace(tzinfo=UTC).astimezone(timezone(timedelta(hours=-7))) for t in TIMES],
+        np.array(TIMES, dtype="datetime64[s]"),
+        pd.DatetimeIndex(TIMES),
+        pd.DatetimeIndex(TIMES, tz="UTC").tz_convert("Asia/Tokyo"),
+        Time([t.isoformat() for t in TIMES], scale="utc").tdb,
+    ],
+    ids=["iso", "iso-z", "zone", "datetime64", "pandas", "pandas-zone", "tdb"],
+)
+def test_times_of_any_kind(times):
+    observation = make(times=times).observation
+    # the day is kept apart, so that rounding is that of a day in double precision
+    assert abs((observation.times - Time(TIMES, scale="utc")).sec).max() < 1e-9
+
+
+def test_angles_are_runs_and_sites_are_places(tmp_path):
+    made = make(turntable_deg=[0.0, 0.0, 30.0, 30.0, 0.0], site=(10.0, 5.0), step_s=600.0)
+    observation = made.observation
+    np.testing.assert_array_equal(observation.run, [0, 0, 1, 1, 2])
+    assert observation.turntable_deg == (0.0, 30.0, 0.0)
+    assert (observation.lon_deg, observation.lat_deg, observation.step_s) == (10.0, 5.0, 600.0)
+    again = lb.read_visibilities(made.write(tmp_path / "mine.nc"))
+    assert again.digest() == made.digest()
+    assert again.observation.turntable_deg == (0.0, 30.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"products": ["00", "01"]}, "shape"),
+        ({"data": columns(PAIRS).T}, "transpose"),
+        ({"data": "text"}, "not an array of numbers"),
+        ({"data": [1.0, 2.0]}, "expected (times, products)"),
+        ({"products": ["0a"] * 10}, "unknown product '0a'"),
+        ({"products": ["04"] * 10}, "port 4"),
+        ({"products": ["01R"] * 10}, "the data are complex"),
+        ({"data": expected().T, "products": ["01"] * 16}, "name the part"),
+        ({"data": expected().T, "products": ["00I"] * 16}, "an auto is real"),
+        ({"products": ["00"] * 10}, "more than once"),
+        ({"data": columns([(0, 1), (1, 0)]), "products": ["01", "10"]}, "01R is given more than"),
+        ({"products": "00"}, "give a list"),
+        ({"products": [f"{3 - i}{3 - j}" for i, j in PAIRS[1:]] + ["33"]}, "check the names"),
+        ({"convention": "s_i conj(s_i)"}, "did you mean 's_i conj(s_j)'"),
+        ({"data": np.full((N, 10), np.inf + 0j)}, "infinity"),
+        ({"flags": np.zeros(3, dtype=bool)}, "flags have shape"),
+        ({"flags": np.full(N, 0.5)}, "other values than true and false"),
+        ({"flags": np.ones(N, dtype=bool)}, "nothing to map"),
+        ({"times": TIMES[:3]}, "3 times for data of 5 times"),
+        ({"times": TIMES[::-1]}, "times must grow"),
+        ({"times": ["yesterday"] * N}, "is not a date"),
+        ({"times": np.arange(N)}, "give datetimes"),
+        ({"times": [t.replace(year=2060) for t in TIMES]}, "ephemeris"),
+        ({"site": "Lusee-Nihgt"}, "did you mean 'LuSEE-Night'"),
+        ({"site": 3.0}, "longitude and latitude"),
+        ({"site": (0.0, 95.0)}, "lat_deg"),
+        ({"turntable_deg": [0.0, 1.0]}, "one for each of 5 times"),
+        ({"frequency_mhz": -1.0}, "frequency_mhz must be positive"),
+        ({"frequency_mhz": 25e6}, "is this Hz"),
+        ({"data": columns(PAIRS)[:1], "times": TIMES[:1]}, "give step_s"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_sentence(options, words):
+    with refused(words):
+        make(**options)
+
+
+# --- layouts --------------------------------------------------------------------------------------
+
+
+FLAGS = np.zeros((3, 5), dtype=bool)
+FLAGS[0, 1] = FLAGS[2, 4] = True
+FLAGS[:, 3] = True
+
+
+def test_a_complete_layout_runs_over_time_fastest():
+    layout = DataLayout(3, 5)
+    assert layout.size == 15
+    grid = np.arange(15.0).reshape(3, 5)
+    d = layout.gather(jnp.asarray(grid))
+    for k, value in enumerate(np.asarray(d)):
+        assert grid[layout.product[k], layout.time[k]] == value
+    np.testing.assert_array_equal(layout.product, np.repeat([0, 1, 2], 5))
+    np.testing.assert_array_equal(layout.time, np.tile(np.arange(5), 3))
+    assert np.asarray(layout.present).all()
+
+
+def test_flagged_samples_are_not_in_the_data():
+    layout = DataLayout.from_flags(FLAGS)
+    # the positions by a loop in the order of d
+    expected = [(p, t) for p in range(3) for t in range(5) if not FLAGS[p, t]]
+    assert list(zip(layout.product, layout.time, strict=True)) == expected
+    assert layout.size == len(expected) == 10
+    np.testing.assert_array_equal(layout.present, ~FLAGS)
+    grid = np.random.default_rng(0).standard_normal((3, 5))
+    np.testing.assert_array_equal(layout.gather(jnp.asarray(grid)), [grid[e] for e in expected])
+
+
+def test_no_flag_is_the_complete_layout():
+    assert DataLayout.from_flags(np.zeros((3, 5), dtype=bool)).index is None
+
+
+@pytest.mark.parametrize("rest", [(), (2,)])
+@pytest.mark.parametrize("flags", [None, FLAGS])
+def test_scatter_is_the_transpose_of_gather(flags, rest):
+    layout = DataLayout(3, 5) if flags is None else DataLayout.from_flags(flags)
+    rng = np.random.default_rng(1)
+    grid = rng.standard_normal((3, 5, *rest))
+    data = rng.standard_normal((layout.size, *rest))
+    left = np.sum(np.asarray(layout.gather(jnp.asarray(grid))) * data)
+    back = np.asarray(layout.scatter(jnp.asarray(data)))
+    # sums of fifteen products of order one
+    np.testing.assert_allclose(np.sum(grid * back), left, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(layout.gather(jnp.asarray(back)), data)
+    if flags is not None:
+        assert not back[flags].any()
+
+
+def test_nothing_left_is_an_error():
+    with pytest.raises(InputError, match="all 15 samples are flagged"):
+        DataLayout.from_flags(np.ones((3, 5), dtype=bool))
+
+
+# --- products -------------------------------------------------------------------------------------
+
+
+# the order luseepy writes its waterfalls in
+LUSEEPY = ["00R", "01R", "01I", "02R", "02I", "03R", "03I", "11R"]
+LUSEEPY += ["12R", "12I", "13R", "13I", "22R", "23R", "23I", "33R"]
+
+
+def hermitian(rng, n, *rest):
+    """<s conj(s)> of a few random voltages, antennas on the first two axes."""
+    s = rng.standard_normal((n, 5, *rest)) + 1j * rng.standard_normal((n, 5, *rest))
+    return np.einsum("ik...,jk...->ij...", s, s.conj())
+
+
+def test_labels_are_those_of_luseepy():
+    assert list(labels()) == LUSEEPY
+    assert all_products()[4] == Product(0, 2, "I")
+    assert [LUSEEPY[k] for k in auto_indices()] == ["00R", "11R", "22R", "33R"]
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_every_real_number_of_a_hermitian_matrix_appears_once(n):
+    assert len(set(labels(n))) == len(labels(n)) == n * n
+    assert all(p.i <= p.j and (p.part == "R" or p.i < p.j) for p in all_products(n))
+
+
+def test_each_product_is_the_entry_its_label_names():
+    v = hermitian(np.random.default_rng(1), 4)
+    got = to_real(jnp.asarray(v))
+    for label, value in zip(LUSEEPY, got, strict=True):
+        entry = v[int(label[0]), int(label[1])]
+        assert value == (entry.real if label[2] == "R" else entry.imag)
+
+
+@pytest.mark.parametrize("rest", [(), (3,), (3, 2)])
+@pytest.mark.parametrize("n", [1, 2, 4])
+def test_matrix_and_products_are_inverse(n, rest):
+    v = hermitian(np.random.default_rng(2), n, *rest)
+    products = to_real(jnp.asarray(v))
+    assert products.shape == (n * n, *rest)
+    back = np.asarray(to_matrix(products))
+    # a copy of numbers: exact, except that autos lose an imaginary rounding error
+    close(back, v, 1e-14)
+    np.testing.assert_array_equal(back, back.conj().swapaxes(0, 1))
+    np.testing.assert_array_equal(to_real(jnp.asarray(back)), products)

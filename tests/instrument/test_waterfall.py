@@ -10,7 +10,6 @@ import astropy.units as u
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import yaml
 from astropy.io import fits
 from astropy.time import Time, TimeDelta
 from fits_files import write_images
@@ -18,6 +17,7 @@ from fits_files import write_images
 from lusee_bayes.cli.main import main
 from lusee_bayes.cli.options import parse_frequencies
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.yaml_files import parse_yaml
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import load_scenario
@@ -145,14 +145,8 @@ def test_temperatures_in_other_units_are_converted(tmp_path, unit, factor):
         ({"data": np.full((12, 16, 2), np.inf)}, "infinity"),
         ({"frequencies": (10e6, 20e6)}, "is this Hz"),
         ({"header": HEADER | {"BUNIT": "V^2/Hz"}}, "unit 'V.2/Hz'"),
-        (
-            {"header": HEADER | {"DELTAT_SEC": -7200.0}},
-            "DELTAT_SEC is -7200.0, expected",
-        ),
-        (
-            {"header": HEADER | {"LUN_LAT_DEG": 123.0}},
-            "LUN_LAT_DEG is 123.0, expected a",
-        ),
+        ({"header": HEADER | {"DELTAT_SEC": -7200.0}}, "DELTAT_SEC is -7200.0, expected"),
+        ({"header": HEADER | {"LUN_LAT_DEG": 123.0}}, "LUN_LAT_DEG is 123.0, expected a"),
     ],
 )
 def test_files_that_cannot_be_used(tmp_path, options, message):
@@ -304,7 +298,7 @@ def test_simulate_writes_it_and_map_reads_it(tmp_path):
         np.testing.assert_array_equal(data[:, :, k].T, expected)
     with fits.open(path) as hdus:
         kept = hdus["scenario"].data.tobytes().decode()
-    assert yaml.safe_load(kept)["observation"]["runs"][0]["cycles"] == 0.1
+    assert parse_yaml(kept, "the file")["observation"]["runs"][0]["cycles"] == 0.1
     assert main(["map", "fiducial", "--data", str(path), "-o", str(tmp_path / "map"), *given]) == 0
     assert (tmp_path / "map" / "posterior.nc").is_file()
 
@@ -403,10 +397,7 @@ twice = np.array([[2461000.0, 0.5], [2461000.0, 0.5], [2461000.0, 0.6]])
         ({"products": ["13I", "13X"]}, "no product '13X'"),
         ({"products": ["13I", "13I"]}, "the same product twice"),
         ({"products": ["13I", "31R"]}, "no product '31R'"),
-        (
-            {"products": ["13I", "00R", "11R"]},
-            r"data has shape \(5, 2, 2\), expected 5 \(time\) x 3",
-        ),
+        ({"products": ["13I", "00R", "11R"]}, r"data has shape \(5, 2, 2\), expected 5 \(time\)"),
         ({"header": {"BUNIT": "K"}}, r"BUNIT is 'K'; known: V\^2/Hz"),
         ({"header": {"TMOON_K": None}}, "has no TMOON_K"),
         ({"header": {"TIMESYS": "LOCAL"}}, "TIMESYS is 'LOCAL'"),

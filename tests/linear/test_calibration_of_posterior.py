@@ -15,13 +15,11 @@ import pytest
 from reference_linear import assert_draws_follow
 from scipy.stats import chi2, kstest
 
-from lusee_bayes.instrument.beams import monopole_beams
-from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.observation import Observation, Run
+import lusee_bayes as lb
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.linear.model import FORMS, LinearGaussian
-from lusee_bayes.noise import radiometer_noise
-from lusee_bayes.noise.covariance import Covariance, DenseCovariance, TimeBlockCovariance
-from lusee_bayes.sky.priors import HarmonicPrior
+from lusee_bayes.results.map_result import map_result
 
 LMAX, N_MODES, N_DRAWS, SEED = 8, 81, 4000, 20270115
 SPECTRUM = 1e8 * (1.0 + np.arange(LMAX + 1.0)) ** -2.5  # K^2; the monopole is 20000 K below
@@ -32,26 +30,26 @@ class Setup:
     """A of a short run and the noise terms of a 20000 K sky."""
 
     def __init__(self, beams, cycles: float):
-        observation = Observation.from_runs([Run(cycles)])
-        self.coupling = CouplingMatrix.observe(beams, observation)
+        observation = lb.Observation.from_runs([lb.Run(cycles)])
+        self.coupling = lb.CouplingMatrix.observe(beams, observation)
         layout = self.coupling.layout
         monopole = jnp.zeros(N_MODES).at[0].set(2e4 * np.sqrt(4 * np.pi))
         fiducial = self.coupling @ monopole
         grid = layout.scatter(fiducial)
-        paper, exact = (radiometer_noise(grid, layout, form=form) for form in ("paper", "exact"))
+        paper, exact = (lb.radiometer_noise(grid, layout, form=form) for form in ("paper", "exact"))
         # gains that drift together over 10 h, of the radiometer noise's own size
         hours = observation.hours[layout.time]
         kernel = np.exp(-((hours[:, None] - hours[None]) ** 2) / (2 * 10.0**2))
         signal = np.asarray(fiducial)
-        gain = DenseCovariance(jnp.asarray(1e-10 * np.outer(signal, signal) * kernel), "gain")
+        gain = lb.DenseCovariance(jnp.asarray(1e-10 * np.outer(signal, signal) * kernel), "gain")
         self.noise = {
             "paper": paper,
             "exact": exact,
-            "dense": DenseCovariance(exact.dense() + gain.dense()),
+            "dense": lb.DenseCovariance(exact.dense() + gain.dense()),
             "diagonal+dense": paper + gain,
         }
 
-    def simulate(self, noise: Covariance):
+    def simulate(self, noise: lb.Covariance):
         """(skies, data) of N_DRAWS skies from the prior and noise from N, by numpy."""
         rng = np.random.default_rng(SEED)
         skies = rng.normal(size=(N_DRAWS, N_MODES)) * PRIOR_STD
@@ -59,10 +57,10 @@ class Setup:
         added = rng.normal(size=(N_DRAWS, noise.size)) @ root.T
         return skies, skies @ np.asarray(self.coupling.dense()).T + added
 
-    def standardised(self, truth: Covariance, assumed: Covariance, form: str) -> np.ndarray:
+    def standardised(self, truth: lb.Covariance, assumed: lb.Covariance, form: str) -> np.ndarray:
         """C^-1/2 (m - mean), shape (draws, modes), of data with noise ``truth``."""
         skies, data = self.simulate(truth)
-        prior = HarmonicPrior(jnp.asarray(SPECTRUM))
+        prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM))
         solver = LinearGaussian(self.coupling, prior, assumed).factorise(form)
         means = jax.jit(jax.vmap(lambda d: solver.condition(d).mean))(jnp.asarray(data))
         covariance = np.asarray(solver.condition(jnp.asarray(data[0])).covariance())
@@ -78,7 +76,7 @@ def p_value(standardised: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def beams():
-    return monopole_beams(25.0, LMAX)
+    return lb.monopole_beams(25.0, LMAX)
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +131,7 @@ def test_notices_correlations_missing_at_one_time_of_32(long_run):
     exact = long_run.noise["exact"]
     blocks = np.array(exact.blocks)
     blocks[3] = np.diag(np.diag(blocks[3]))
-    wrong = TimeBlockCovariance(jnp.asarray(blocks), exact.layout)
+    wrong = lb.TimeBlockCovariance(jnp.asarray(blocks), exact.layout)
     assert p_value(long_run.standardised(exact, wrong, "map")) < 1e-4
 
 
@@ -150,3 +148,52 @@ def test_notices_the_papers_form_on_voltages_noise(long_run):
     assert abs((z**2).mean() - 1.0) < 0.02
     with pytest.raises(AssertionError, match="sample covariance off"):
         assert_draws_follow(z, np.zeros(N_MODES), np.eye(N_MODES))
+
+
+# --- the full size: 5232 data, 2304 modes ---------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("frequency", [5, 25, 45])
+def test_one_word_changes_the_frequency(frequency):
+    scenario = lb.load_scenario("fiducial", [f"frequency_mhz={frequency}"])
+    result = map_result(lb.build(scenario))
+    spectra, summary = result.channel.spectra(), result.summary()
+    assert spectra["rho"][1:11].min() > 0.9
+    assert summary["ell_cross"] >= 20
+    # N_data - rank + tr Lambda^-1, with the scatter of chi^2 and a sky that is no Gaussian draw
+    assert summary["chi2"] == pytest.approx(summary["chi2_expected"], abs=6 * np.sqrt(2 * 5232))
+    if frequency == 25:
+        assert spectra["rho"][1:24].min() > 0.5
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("form", ["paper", "exact"])
+def test_both_forms_agree_at_the_fiducial_condition_number(form):
+    scenario = lb.load_scenario("fiducial", [f"noise.radiometer.form={form}"])
+    experiment = lb.build(scenario)
+    model, data = full_model(experiment.setup), experiment.data
+    by_map, by_data = (model.condition(data.data, form=f) for f in ("map", "data"))
+    std = np.asarray(by_data.std())
+    # the mean is refined to 1e-9 sigma in both; variances of the map form lose eps times their
+    # inflation, about 1e-6 (Posterior.std)
+    assert np.abs((by_map.mean - by_data.mean) / std).max() < 1e-7
+    assert np.abs(np.asarray(by_map.std()) / std - 1.0).max() < 1e-5
+    assert float(by_map.log_evidence - by_data.log_evidence) == pytest.approx(0.0, abs=1e-4)
+
+
+@pytest.mark.long
+def test_skies_from_the_prior_are_calibrated_at_full_size():
+    # chi^2 per mode over 20 skies: 1 +- sqrt(2 / (20 x 2304)), the design's 0.996 +- 0.012 for few
+    scenario = lb.load_scenario("fiducial", ["noise.radiometer.form=exact"])
+    model = full_model(set_up(scenario))
+    solver = model.factorise()
+    total, n_skies = 0.0, 20
+    lower = np.tril(np.asarray(solver.lower))
+    for seed in range(n_skies):
+        sky, data = model.sample(jax.random.key(100 + seed))
+        posterior = solver.condition(data)
+        white = np.asarray(model.prior.whiten(sky - posterior.mean))
+        total += np.sum((lower.T @ white) ** 2)
+    n = n_skies * model.prior.size
+    assert abs(total / n - 1.0) < 4 * np.sqrt(2 / n)

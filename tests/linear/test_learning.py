@@ -1,4 +1,4 @@
-"""Learning a prior's parameters against brute-force maximisation, and data of known parameters."""
+"""Learning a prior's parameters against brute-force maximisation, and draws with their errors."""
 
 from __future__ import annotations
 
@@ -8,36 +8,36 @@ import jax
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
+from scipy import integrate, stats
 from scipy.optimize import minimize
 
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.linear.information import Information
+import lusee_bayes as lb
+from lusee_bayes.core.arrays import on_host
 from lusee_bayes.linear.learning import (
     ROUNDING,
+    Learned,
     _root,
     demanded_factor,
     learn,
     learn_whatever_fits,
 )
 from lusee_bayes.linear.marginal_information import marginalised
-from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.noise.covariance import DiagonalCovariance
-from lusee_bayes.sky.isotropic_family import IsotropicFamily
+from lusee_bayes.linear.parameter_draws import draws_with_parameters, information_behind
 from lusee_bayes.sky.local_scales import embedded_local_scales
-from lusee_bayes.sky.priors import HarmonicPrior
+from lusee_bayes.sky.prior_family import IsotropicFamily
 
 LMAX, N_DATA = 6, 120
 
 
-def information_of(sky: np.ndarray, noise: float = 30.0, seed: int = 2) -> Information:
+def information_of(sky: np.ndarray, noise: float = 30.0, seed: int = 2) -> lb.Information:
     """Of data of a sky through a random A."""
     rng = np.random.default_rng(seed)
     coupling = rng.standard_normal((N_DATA, len(sky))) / np.sqrt(len(sky))
     data = coupling @ sky + noise * rng.standard_normal(N_DATA)
-    model = LinearGaussian(
+    model = lb.LinearGaussian(
         coupling,
-        HarmonicPrior(np.full(LMAX + 1, 1e8)),
-        DiagonalCovariance(np.full(N_DATA, noise**2)),
+        lb.HarmonicPrior(np.full(LMAX + 1, 1e8)),
+        lb.DiagonalCovariance(np.full(N_DATA, noise**2)),
     )
     return model.inform(data)[0]
 
@@ -45,7 +45,7 @@ def information_of(sky: np.ndarray, noise: float = 30.0, seed: int = 2) -> Infor
 @dataclass(frozen=True)
 class Case:
     family: IsotropicFamily
-    information: Information
+    information: lb.Information
     truth: np.ndarray
 
 
@@ -112,21 +112,21 @@ def test_learning_gains_over_the_start_under_local_scales():
 def test_others_integrated_out(case):
     """The evidence of the first modes alone, with the others' prior in it, is that of all."""
     spectrum = np.geomspace(1e8, 1e5, LMAX + 1)
-    prior = HarmonicPrior(spectrum)
+    prior = lb.HarmonicPrior(spectrum)
     everything = case.information.posterior(prior)
     n = 16
     few = marginalised(case.information, n, np.asarray(prior.variance())[n:])
-    found = few.posterior(HarmonicPrior(spectrum[:4]))
+    found = few.posterior(lb.HarmonicPrior(spectrum[:4]))
     assert float(found.log_evidence) == pytest.approx(float(everything.log_evidence), abs=1e-6)
     np.testing.assert_allclose(found.mean, everything.mean[:n], rtol=1e-7, atol=1e-4)
     np.testing.assert_allclose(found.std(), everything.std()[:n], rtol=1e-7)
-    with pytest.raises((InputError, TypeCheckError)):
+    with pytest.raises((lb.InputError, TypeCheckError)):
         marginalised(case.information, n, np.ones(3))
 
 
 def test_nothing_settles_without_steps(case, monkeypatch):
     monkeypatch.setattr("lusee_bayes.linear.learning.MAX_STEPS", 0)
-    with pytest.raises(InputError, match="did not settle in 0 steps"):
+    with pytest.raises(lb.InputError, match="did not settle in 0 steps"):
         learn(case.family, case.information)
     # a family far from its own start is still found
     far = replace(case.family, log_monopole=case.family.log_monopole + 1.0)
@@ -154,10 +154,10 @@ def test_raised_information_is_that_of_raised_noise():
     n = (LMAX + 1) ** 2
     coupling, data = rng.standard_normal((N_DATA, n)), 100.0 * rng.standard_normal(N_DATA)
     plain, expected = (
-        LinearGaussian(
+        lb.LinearGaussian(
             coupling,
-            HarmonicPrior(np.full(LMAX + 1, 1e4)),
-            DiagonalCovariance(np.full(N_DATA, variance)),
+            lb.HarmonicPrior(np.full(LMAX + 1, 1e4)),
+            lb.DiagonalCovariance(np.full(N_DATA, variance)),
         ).inform(data)[0]
         for variance in (9.0, 63.0)
     )
@@ -197,3 +197,151 @@ def test_where_nothing_settles_the_prior_is_fixed_and_wide(case, monkeypatch):
     assert ratio[0] >= 1.0
     evidence = float(case.information.posterior(found.prior).log_evidence)
     assert found.log_evidence == pytest.approx(evidence, rel=1e-12)
+
+
+# --- draws with uncertain parameters --------------------------------------------------------------
+
+
+LOW = 3
+SIZE = (LOW + 1) ** 2
+
+
+# --- what data said, back from a posterior ----------------------------------------------------
+
+
+@pytest.mark.parametrize("n_data", [40, 6], ids=["map-space form", "data-space form"])
+@pytest.mark.parametrize("dense", [False, True], ids=["independent", "dense with a mean"])
+def test_another_prior_gives_the_posterior_that_the_data_give(n_data, dense):
+    rng = np.random.default_rng(3)
+    prior = lb.HarmonicPrior(np.geomspace(1e8, 1e6, LOW + 1))
+    if dense:
+        root = 3e3 * rng.standard_normal((SIZE, SIZE))
+        mean = 1e4 * rng.standard_normal(SIZE)
+        prior = lb.DensePrior.of_covariance(root @ root.T + 1e6 * np.eye(SIZE), mean)
+    coupling = rng.standard_normal((n_data, SIZE))
+    data = 1e4 * rng.standard_normal(n_data)
+    noise = lb.DiagonalCovariance(np.geomspace(1.0, 1e6, n_data))
+    behind = information_behind(on_host(lb.LinearGaussian(coupling, prior, noise).condition(data)))
+    other = lb.HarmonicPrior(np.full(LOW + 1, 3e7))
+    expected = lb.LinearGaussian(coupling, other, noise).condition(data)
+    found = behind.posterior(other)
+    std = np.asarray(expected.std())
+    # M is what is left of Lambda of up to 1e8 when 1 is taken off: 1e-8 of what the prior says
+    assert np.abs((np.asarray(found.mean) - np.asarray(expected.mean)) / std).max() < 1e-5
+    np.testing.assert_allclose(np.asarray(found.std()), std, rtol=1e-6)
+    assert np.isnan(float(found.log_evidence))
+
+
+# --- one parameter, the strength of the sky ---------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Member:
+    covariance: np.ndarray
+
+
+SCALE = 1e3
+
+
+class Strength(IsotropicFamily):
+    """S = exp(theta) s^2 1."""
+
+    def at(self, parameters):
+        return Member(np.exp(parameters[0]) * SCALE**2 * np.eye(SIZE))
+
+    def prior(self, covariance):
+        return lb.HarmonicPrior(np.diagonal(covariance)[np.arange(LOW + 1) ** 2])
+
+
+@pytest.fixture(scope="module")
+def one_parameter():
+    """Modes that are seen with noise from a tenth to ten times their strength; theta = 0.4 +- 1."""
+    family, width = Strength.around(2e4, LOW), 1.0
+    noise = np.geomspace(0.1, 10.0, SIZE) * SCALE
+    seen = 2.0 * SCALE * np.ones(SIZE)
+    unknown = np.asarray(0.0)
+    information = lb.Information(
+        np.diag(noise**-2.0), seen / noise**2, np.zeros(SIZE), unknown, unknown, unknown
+    )
+    prior = family.prior(family.at(np.array([0.4])).covariance)
+    learned = Learned(prior, ("theta",), np.array([0.4]), np.array([[width**2]]), 0.0, 0)
+    draws = draws_with_parameters(
+        family, learned, information.posterior(prior), jax.random.key(1), 15000
+    )
+    return noise, seen, draws
+
+
+def test_draws_are_those_of_the_integral_over_the_parameter(one_parameter):
+    """Every mode: the distribution function at some points, by quadrature over theta."""
+    noise, seen, draws = one_parameter
+    assert draws.shape == (15000, SIZE)
+
+    theta = np.linspace(-6.0, 7.0, 2001)
+    density = stats.norm.pdf(theta, 0.4, 1.0)
+    for k in (0, SIZE // 2, SIZE - 1):
+        weight = 1.0 / (1.0 + noise[k] ** 2 / (np.exp(theta) * SCALE**2))
+        for level in (0.02, 0.2, 0.5, 0.8, 0.98):
+            at = np.quantile(draws[:, k], level)
+            below = stats.norm.cdf(at, weight * seen[k], np.sqrt(weight) * noise[k])
+            expected = integrate.simpson(below * density, x=theta)
+            scatter = integrate.simpson((below - expected) ** 2 * density, x=theta)
+            # 500 theta, each for 30 draws
+            error = np.sqrt(scatter / 500 + level * (1 - level) / 15000)
+            assert abs(level - expected) < 4.0 * error
+
+
+def test_tails_are_those_of_uncertain_strength():
+    """Modes that the data do not see: exp(theta) of N(0, 1/4) makes the kurtosis 3 exp(1/4)."""
+    information = lb.Information(
+        1e-18 * np.eye(SIZE), np.zeros(SIZE), np.zeros(SIZE), *[np.asarray(0.0)] * 3
+    )
+    family = Strength.around(2e4, LOW)
+    prior = family.prior(family.at(np.zeros(1)).covariance)
+    learned = Learned(prior, ("theta",), np.zeros(1), np.array([[0.25]]), 0.0, 0)
+    posterior = information.posterior(prior)
+    draws = draws_with_parameters(family, learned, posterior, jax.random.key(2), 15000)
+    fourth = (draws**4).mean() / (draws**2).mean() ** 2
+    # 500 theta: <exp(2 theta)> is known to 6 %, <exp(theta)>^2 to 5 %, both off alike
+    assert fourth == pytest.approx(3.0 * np.exp(0.25), rel=0.15)
+    plain = np.asarray(posterior.sample(jax.random.key(3), 15000))
+    assert (plain**4).mean() / (plain**2).mean() ** 2 == pytest.approx(3.0, rel=0.05)
+    # the first ten have parameters of their own
+    sizes = draws[:10].std(1)
+    assert sizes.max() / sizes.min() > 1.5
+
+
+def test_few_draws_and_none():
+    family = IsotropicFamily.around(2e4, LOW)
+    theta = family.hyperprior.start()
+    prior = family.prior(family.at(theta).covariance)
+    information = lb.Information(
+        np.eye(SIZE) * 1e-8, np.ones(SIZE), np.zeros(SIZE), *[np.ones(())] * 3
+    )
+    learned = Learned(prior, (), theta, 0.1 * np.eye(len(theta)), 0.0, 0)
+    posterior = information.posterior(prior)
+    drawn = [
+        draws_with_parameters(family, learned, posterior, jax.random.key(1), n) for n in (0, 1, 7)
+    ]
+    assert [len(one) for one in drawn] == [0, 1, 7]
+    assert len(np.unique(drawn[2], axis=0)) == 7
+
+
+class Hopeless(Strength):
+    """No theta has an S."""
+
+    def prior(self, covariance):
+        return lb.DensePrior.of_covariance(-covariance)
+
+
+def test_parameters_without_a_covariance_are_drawn_anew_and_then_refused():
+    family = Strength.around(2e4, LOW)
+    prior = family.prior(family.at(np.zeros(1)).covariance)
+    information = lb.Information(
+        np.eye(SIZE) * 1e-8, np.ones(SIZE), np.zeros(SIZE), *[np.ones(())] * 3
+    )
+    learned = Learned(prior, (), np.zeros(1), np.eye(1), 0.0, 0)
+    posterior = information.posterior(prior)
+    with pytest.raises(
+        lb.InputError, match="no sky can be drawn with the uncertainty of the prior's"
+    ):
+        draws_with_parameters(Hopeless.around(2e4, LOW), learned, posterior, jax.random.key(1), 3)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from assertions import close
+from reference_linear import matrices
 
-from lusee_bayes.experiment.experiment import build
+import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.linear import left_out_structured
 from lusee_bayes.linear.held_out import held_out
 from lusee_bayes.linear.left_out_dense import DenseLeftOut
@@ -41,11 +42,11 @@ def test_it_is_what_matrices_say(size, kind, kept, monkeypatch):
     if kept and size is OFTEN:
         pytest.skip("smooth functions are not kept")
     monkeypatch.setattr(left_out_structured, "KEPT_BYTES", kept)
-    e = build(load_scenario("fiducial", [*size, NOISY, *KINDS[kind]]))
+    e = lb.build(lb.load_scenario("fiducial", [*size, NOISY, *KINDS[kind]]))
     model, observation = full_model(e.setup), e.data.observation
     structured = StructuredLeftOut(model, model.condition(e.data.data), e.data.data)
     dense = DenseLeftOut(model, e.data.data, e.data.layout)
-    np.testing.assert_allclose(structured.u, dense.u, rtol=0, atol=1e-9 * np.abs(dense.u).max())
+    close(structured.u, dense.u, 1e-9)
     day = observation.hours // 24
     for k in np.unique(day):
         agree(structured.stretch(day == k), dense.stretch(day == k))
@@ -58,10 +59,10 @@ def test_it_is_what_matrices_say(size, kind, kept, monkeypatch):
 
 def test_densities_of_groups_are_what_the_covariance_of_the_data_says():
     """ln p(d_s | others) = ln p(d) - ln p(others), each of K = A S A^T + N as a matrix."""
-    e = build(load_scenario("fiducial", [*FEW, NOISY]))
+    e = lb.build(lb.load_scenario("fiducial", [*FEW, NOISY]))
     model = full_model(e.setup)
-    a, n = (np.asarray(x) for x in (model.coupling.dense(), model.noise.dense()))
-    k = a @ np.diag(model.prior.variance()) @ a.T + n
+    a, s, n = matrices(model)
+    k = a @ s @ a.T + n
     less = e.data.data if model.offset is None else e.data.data - model.offset
 
     def log_density(chosen):
@@ -88,18 +89,18 @@ def test_densities_of_groups_are_what_the_covariance_of_the_data_says():
 def test_what_is_taken_out_leaves_the_model_of_the_rest(kind):
     """K = A S A^T + N of the others as a matrix: their u, and a time's chi^2 given the rest."""
     drift = ["noise.gain={sigma: 0.01, visibilities: model}"]
-    e = build(load_scenario("fiducial", [*FEW, NOISY, *KINDS.get(kind, drift)]))
+    e = lb.build(lb.load_scenario("fiducial", [*FEW, NOISY, *KINDS.get(kind, drift)]))
     model, layout = full_model(e.setup), e.data.layout
     gone = np.zeros((layout.n_products, layout.n_times), dtype=bool)
     gone[:, 4] = gone[6, 9] = gone[2] = True
     left = DenseLeftOut(model, e.data.data, layout).without(gone)
     keep = ~gone[layout.product, layout.time]
-    a, n = (np.asarray(x) for x in (model.coupling.dense(), model.noise.dense()))
-    k = (a @ np.diag(model.prior.variance()) @ a.T + n)[np.ix_(keep, keep)]
+    a, s, n = matrices(model)
+    k = (a @ s @ a.T + n)[np.ix_(keep, keep)]
     rest = e.data.data if model.offset is None else e.data.data - model.offset
     inverse = np.linalg.inv(k)
     u = inverse @ np.asarray(rest)[keep]
-    np.testing.assert_allclose(left.u[~gone], u, rtol=0, atol=1e-7 * np.abs(u).max())
+    close(left.u[~gone], u, 1e-7)
     assert not left.u[gone].any()
     here = layout.time[keep] == 9
     block = inverse[np.ix_(here, here)]

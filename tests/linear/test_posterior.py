@@ -2,17 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from reference_linear import assert_draws_follow, posterior, random_covariance
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
+from lusee_bayes.cli.main import main
+from lusee_bayes.core.harmonics import pixel_matrix, to_healpy
+from lusee_bayes.experiment.model import base_model, full_model
+from lusee_bayes.experiment.terms import Around
+from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.linear import posterior as posterior_module
+from lusee_bayes.linear.metrics import (
+    correlation,
+    effective_resolution_deg,
+    ell_cross,
+    expected_chi2,
+    highest_altitude,
+    prior_fraction_per_ell,
+    signal_to_noise,
+)
 from lusee_bayes.linear.model import FORMS, LinearGaussian
-from lusee_bayes.noise.covariance import DenseCovariance
-from lusee_bayes.sky.priors import HarmonicPrior, PixelPrior
+from lusee_bayes.linear.resolution import resolution_rows
+from lusee_bayes.linear.updating import deviation_model, updated
+from lusee_bayes.results.updatable import read_updatable
 
 SPECTRUM = np.array([4.0, 1.0, 0.5, 0.25])
 PER_MODE = np.repeat(SPECTRUM, [1, 3, 5, 7])
@@ -28,10 +46,10 @@ def conditioned(n_data, form, prior=None, blind=False):
     if blind:
         a[:, 9:] = 0.0
     n, d = random_covariance(rng, n_data), rng.normal(size=n_data)
-    prior = HarmonicPrior(jnp.asarray(SPECTRUM)) if prior is None else prior
+    prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM)) if prior is None else prior
     a = jnp.asarray(a)
-    a = prior.coupling(a) if isinstance(prior, PixelPrior) else a
-    model = LinearGaussian(a, prior, DenseCovariance(jnp.asarray(n)))
+    a = prior.coupling(a) if isinstance(prior, lb.PixelPrior) else a
+    model = LinearGaussian(a, prior, lb.DenseCovariance(jnp.asarray(n)))
     return model.condition(jnp.asarray(d), form), posterior(a, prior.covariance(), n, d)
 
 
@@ -87,7 +105,7 @@ def test_the_draw_test_notices_sqrt_two():
 
 def test_draws_in_pixels():
     """More unknowns than normals behind them: the covariance has rank 16 of 48."""
-    prior = PixelPrior(jnp.asarray(SPECTRUM), 2)
+    prior = lb.PixelPrior(jnp.asarray(SPECTRUM), 2)
     for form in FORMS:
         post, expected = conditioned(9, form, prior)
         draws = post.sample(jax.random.key(5), 20_000)
@@ -121,15 +139,6 @@ def test_information_is_the_shrinkage_of_the_covariance(n_data, form):
     assert float(post.information_bits()) == pytest.approx(bits, rel=TOL)
 
 
-def test_information_of_one_number():
-    """Variance 3 known with a noise of variance 1: 1/2 log2(1 + 3) = 1 bit."""
-    noise = DenseCovariance(jnp.array([[1.0]]))
-    model = LinearGaussian(jnp.array([[1.0]]), HarmonicPrior(jnp.array([3.0])), noise)
-    for form in FORMS:
-        post = model.condition(jnp.array([0.3]), form)
-        assert float(post.information_bits()) == pytest.approx(1.0, rel=1e-15)
-
-
 def blind_or_not(n_data, form):
     for blind in (False, True):
         yield conditioned(n_data, form, blind=blind)
@@ -148,12 +157,12 @@ def test_the_root_times_its_transpose_is_the_covariance(n_data, form):
 def test_the_root_of_a_singular_covariance():
     """Over pixels (rank 16 of 48), and with C_1 = 0: no inverse, but draws are mean + R z."""
     for form in FORMS:
-        post, expected = conditioned(9, form, PixelPrior(jnp.asarray(SPECTRUM), 2))
+        post, expected = conditioned(9, form, lb.PixelPrior(jnp.asarray(SPECTRUM), 2))
         root = np.asarray(post.root())
         assert root.shape == (48, 16)
         np.testing.assert_allclose(root @ root.T, expected.covariance, atol=TOL)
         spectrum = SPECTRUM * np.array([1.0, 0.0, 1.0, 1.0])
-        post, expected = conditioned(9, form, HarmonicPrior(jnp.asarray(spectrum)))
+        post, expected = conditioned(9, form, lb.HarmonicPrior(jnp.asarray(spectrum)))
         root = np.asarray(post.root())
         assert (root[1:4] == 0).all()
         np.testing.assert_allclose(root @ root.T, expected.covariance, atol=TOL)
@@ -173,18 +182,6 @@ def test_whitening_inverts_mean_plus_root_times_z(n_data, form):
         np.testing.assert_allclose((np.asarray(post.whiten(skies)) ** 2).sum(1), squared, rtol=1e-9)
 
 
-@cases
-def test_draws_are_white_in_their_own_coordinates_and_not_in_others(n_data, form):
-    post, _ = conditioned(n_data, form)
-    white = post.whiten(post.sample(jax.random.key(4), 20_000))
-    assert_draws_follow(white, np.zeros(16), np.eye(16))
-    other, _ = conditioned(n_data, form, blind=True)
-    with pytest.raises(AssertionError, match="off by"):
-        assert_draws_follow(
-            other.whiten(post.sample(jax.random.key(4), 20_000)), np.zeros(16), np.eye(16)
-        )
-
-
 def test_whitening_in_a_traced_program():
     """Under jit the spectrum's values are not known; the check of them must not get in the way."""
     post, _ = conditioned(9, "data")
@@ -195,10 +192,235 @@ def test_whitening_in_a_traced_program():
 
 @pytest.mark.parametrize("form", FORMS)
 def test_what_has_no_inverse_is_not_whitened(form):
-    pixels, _ = conditioned(9, form, PixelPrior(jnp.asarray(SPECTRUM), 2))
-    with pytest.raises(InputError, match="prior over pixels is singular"):
+    pixels, _ = conditioned(9, form, lb.PixelPrior(jnp.asarray(SPECTRUM), 2))
+    with pytest.raises(lb.InputError, match="prior over pixels is singular"):
         pixels.whiten(pixels.sample(jax.random.key(0), 2))
     spectrum = jnp.asarray([4.0, 0.0, 0.5, 0.25])
-    powerless, _ = conditioned(9, form, HarmonicPrior(spectrum))
-    with pytest.raises(InputError, match="zero at ell = 1 and has no density"):
+    powerless, _ = conditioned(9, form, lb.HarmonicPrior(spectrum))
+    with pytest.raises(lb.InputError, match="zero at ell = 1 and has no density"):
         powerless.whiten(powerless.sample(jax.random.key(0), 2))
+
+
+# --- fidelity -------------------------------------------------------------------------------------
+
+
+LMAX = 5
+
+
+def test_rho_and_snr_against_complex_coefficients_and_loops():
+    # the paper writes them with complex a_lm over m = -ell..ell; healpy keeps m >= 0
+    rng = np.random.default_rng(1)
+    mean, truth = rng.standard_normal((2, (LMAX + 1) ** 2))
+    a, b = to_healpy(mean), to_healpy(truth)
+    rho, snr = correlation(mean, truth), signal_to_noise(mean, truth)
+    for ell in range(LMAX + 1):
+        ab = aa = bb = dd = 0.0
+        for m in range(ell + 1):
+            index, weight = healpy.Alm.getidx(LMAX, ell, m), 1 if m == 0 else 2
+            x, y = a[index], b[index]
+            ab += weight * (x * np.conj(y)).real
+            aa, bb = aa + weight * abs(x) ** 2, bb + weight * abs(y) ** 2
+            dd += weight * abs(x - y) ** 2
+        assert rho[ell] == pytest.approx(ab / np.sqrt(aa * bb), rel=1e-12)
+        assert snr[ell] == pytest.approx(np.sqrt(aa / dd), rel=1e-12)
+
+
+def test_a_perfect_map_and_an_empty_one():
+    truth = np.random.default_rng(2).standard_normal(16)
+    np.testing.assert_allclose(correlation(truth, truth), 1.0, rtol=1e-12)
+    assert np.isnan(signal_to_noise(truth, truth)).all()  # no residual: undefined, not infinite
+    assert np.isnan(correlation(np.zeros(16), truth)).all()
+
+
+def test_ell_cross_counts_from_one():
+    assert ell_cross(np.array([0.1, 3.0, 2.0, 0.9, 2.0])) == 3
+    assert ell_cross(np.array([0.1, 3.0])) is None
+
+
+def test_effective_resolution():
+    assert effective_resolution_deg(np.array([1.0, 0.1, 0.4, 0.6, 0.2])) == 60.0
+    assert effective_resolution_deg(np.array([0.0, 0.1])) is None
+
+
+@pytest.fixture(scope="module")
+def solved():
+    rng = np.random.default_rng(5)
+    n_data = 60
+    coupling = jnp.asarray(rng.standard_normal((n_data, 16)))
+    noise = lb.DiagonalCovariance(jnp.asarray(rng.uniform(0.5, 2.0, n_data)))
+    prior = lb.HarmonicPrior(jnp.asarray([4.0, 2.0, 1.0, 0.5]))
+    model = lb.LinearGaussian(coupling, prior, noise)
+    return model, model.factorise()
+
+
+def test_residuals_and_their_expected_chi2(solved):
+    model, solver = solved
+    data = np.asarray(model.sample(jax.random.key(0))[1])
+    posterior = solver.condition(jnp.asarray(data))
+    plain = (data - np.asarray(model.coupling.dense()) @ np.asarray(posterior.mean)) / np.sqrt(
+        np.asarray(model.noise.variance)
+    )
+    got = float(model.chi2(posterior.mean, jnp.asarray(data)))
+    assert got == pytest.approx(plain @ plain, rel=1e-10)
+    # tr (1 + W W^T)^-1, the mean of |r|^2 over data from the model
+    white = np.asarray(solver.whitened)
+    trace = np.trace(np.linalg.inv(np.eye(60) + white @ white.T))
+    assert expected_chi2(posterior, 60) == pytest.approx(trace, rel=1e-10)
+
+
+def test_prior_fraction_per_ell(solved):
+    model, solver = solved
+    posterior = solver.condition(jnp.zeros(60))
+    covariance = np.diag(np.asarray(posterior.covariance()))
+    prior = np.asarray(model.prior.variance())
+    expected = [np.mean((covariance / prior)[e**2 : (e + 1) ** 2]) for e in range(4)]
+    np.testing.assert_allclose(prior_fraction_per_ell(posterior), expected, rtol=1e-10)
+
+
+def test_the_sky_that_never_rises_is_a_cap_round_the_north_pole():
+    # from latitude -23.8 the Moon's north pole stays 23.8 degrees below the horizon; the site sees
+    # all but a cap of that radius about it in one cycle (paper: "within ~24 degrees of the NCP")
+    observation = lb.Observation.from_runs([lb.Run()], step_s=3600.0)
+    nside = 32
+    highest = highest_altitude(observation, nside)
+    hidden = highest < 0
+    radius = np.radians(-observation.lat_deg)
+    expected = (1 - np.cos(radius)) / 2
+    # pixels on the rim: 2 pi sin(radius) / pixel size of them, half a pixel each at worst
+    rim = 2 * np.pi * np.sin(radius) * healpy.nside2resol(nside) / (4 * np.pi) / 2
+    assert abs(hidden.mean() - expected) < rim
+    pole = observation.mcmf_from_galactic()[:, 2].mean(axis=0)
+    distance = np.arccos(np.array(healpy.pix2vec(nside, np.flatnonzero(hidden))).T @ pole)
+    assert distance.max() < radius + 0.002  # the axis wanders by 0.0008 rad
+
+
+# --- point-spread functions -----------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("cycles", "form"), [(0.3, "map"), (0.1, "map"), (0.1, "data")])
+def test_a_row_is_what_the_map_shows_there_of_each_source(cycles, form):
+    # the best mode's signal-to-noise squared times 1e-16 is what is lost: 1e-9
+    given = ["lmax=12", f"observation.runs.0.cycles={cycles}", "noise.radiometer.factor=1e5"]
+    experiment = lb.build(lb.load_scenario("fiducial", given))
+    model = base_model(experiment.setup)
+    solver = model.factorise(form)
+    posterior = solver.condition(experiment.data.data)
+    y = pixel_matrix(4, 12)
+    pixels = [0, 60, 131]
+    rows = np.asarray(resolution_rows(posterior, y[pixels]))
+    for source in (3, 60, 100):
+        # noiseless data of a source of 1 K sr, mapped
+        mapped = solver.condition(model.coupling @ jnp.asarray(y[source])).mean
+        expected = y[pixels] @ np.asarray(mapped)
+        peak = np.abs(rows @ y.T).max()
+        np.testing.assert_allclose(rows @ y[source], expected, rtol=0, atol=1e-8 * peak)
+
+
+def test_perfect_data_resolve_everything_and_none_nothing():
+    prior = lb.HarmonicPrior(jnp.full(4, 2.0))
+    for noise, share in ((1e-9, 1.0), (1e9, 0.0)):
+        n = lb.DiagonalCovariance(jnp.full(16, noise))
+        posterior = lb.LinearGaussian(jnp.eye(16), prior, n).condition(jnp.ones(16))
+        rows = np.asarray(resolution_rows(posterior, jnp.eye(16)))
+        np.testing.assert_allclose(rows, share * np.eye(16), atol=1e-8)
+
+
+# --- new data added to a saved posterior ----------------------------------------------------------
+
+
+def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:
+    """The data of one run by themselves."""
+    keep = data.observation.run == run
+    observation = data.observation.select(keep)
+    flat = jnp.asarray(data.grid()[:, keep].ravel())
+    return replace(
+        data, data=flat, layout=DataLayout(16, observation.n_times), observation=observation
+    )
+
+
+def two_cycles(*overrides):
+    scenario = lb.load_scenario("two_cycles", list(overrides))
+    experiment = lb.build(scenario)
+    data = experiment.data
+    parts = [of_run(data, run) for run in (0, 1)]
+    models = [full_model(lb.build(scenario, part).setup, Around(part)) for part in parts]
+    return full_model(experiment.setup, Around(data)), data, models, parts
+
+
+def assert_update_equals(whole, data, models, parts, sigma):
+    first = models[0].condition(parts[0].data, form="root")
+    got = updated(first, models[1], parts[1].data)
+    expected = whole.condition(data.data, form="root")
+    std = np.asarray(expected.std())
+    assert (np.abs(np.asarray(got.mean - expected.mean)) / std).max() < sigma
+    np.testing.assert_allclose(got.std(), std, rtol=sigma)
+    assert abs(float(got.log_evidence - expected.log_evidence)) < 100 * sigma
+    # the second cycle did say something
+    assert (np.abs(np.asarray(first.mean - expected.mean)) / std).max() > 0.5
+
+
+@pytest.fixture
+def exact_tilt(monkeypatch):
+    """Tilts about the pole between two runs as exact as about each one's own."""
+    monkeypatch.setattr("lusee_bayes.instrument.pointing.LEAST_ORDER", 4)
+    monkeypatch.setattr("lusee_bayes.instrument.window_average.TOLERANCE", 1e-13)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("form", ["paper", "exact"])
+def test_a_second_run_adds_to_the_first(form, exact_tilt):
+    runs = "observation.runs=[{cycles: 0.2}, {cycles: 0.1, turntable_deg: 30}]"
+    parts = two_cycles("lmax=6", runs, f"noise.radiometer.form={form}")
+    assert_update_equals(*parts, 1e-8)
+
+
+@pytest.mark.long
+def test_a_second_cycle_at_full_size(exact_tilt):
+    """1.2e-10 of a standard deviation is what comes out."""
+    assert_update_equals(*two_cycles(), 1e-8)
+
+
+def test_what_does_not_fit_is_refused():
+    runs = "observation.runs=[{cycles: 0.2}, {cycles: 0.1, turntable_deg: 30}]"
+    _, _, models, parts = two_cycles("lmax=4", runs)
+    first = models[0].condition(parts[0].data, form="root")
+    other = replace(models[1], prior=lb.HarmonicPrior(2.0 * models[1].prior.spectrum))
+    with pytest.raises(lb.InputError, match=r"has another prior: a variance of .* K\^2 at ell = 0"):
+        deviation_model(first, other)
+    few = models[1].condition(parts[1].data, form="data")
+    with pytest.raises(lb.InputError, match="condition with form='root'"):
+        deviation_model(few, models[1])
+
+
+SMALL = ("--set", "lmax=5", "--set", "observation.runs.0.cycles=0.1")
+
+
+@pytest.mark.long
+def test_from_the_command_line(tmp_path, capsys):
+    def run(*arguments):
+        return main([str(a) for a in arguments])
+
+    second = ("--set", "observation.start=2027-02-15", "--set", "seed=2")
+    assert run("simulate", "fiducial", *SMALL, "-o", tmp_path / "a.nc", "-q") == 0
+    assert run("simulate", "fiducial", *SMALL, *second, "-o", tmp_path / "b.nc", "-q") == 0
+    mapped = ("map", "fiducial", *SMALL, "-q")
+    first, both, third = (tmp_path / name for name in ("first", "both", "third"))
+    assert run(*mapped, "--data", tmp_path / "a.nc", "--updatable", "-o", first) == 0
+    add = ("--onto", first, "--updatable", "-o", both)
+    assert run(*mapped, "--data", tmp_path / "b.nc", *add) == 0
+    scenario = lb.load_scenario("fiducial", list(SMALL[1::2]))
+    saved = read_updatable(both, scenario)
+    assert len(saved.digests) == 2
+    before = read_updatable(first, scenario).posterior
+    assert (np.asarray(saved.posterior.std()) <= np.asarray(before.std()) * (1 + 1e-12)).all()
+    assert saved.posterior.information_bits() > before.information_bits() + 10
+    capsys.readouterr()
+    for arguments, message in (
+        (("--data", tmp_path / "b.nc", "--onto", both), "would count twice"),
+        (("--onto", tmp_path / "none"), "no posterior of lusee-bayes map --updatable at"),
+        (("--onto", both, "--set", "frequency_mhz=10"), "is of frequency_mhz 25, the scenario"),
+    ):
+        assert run(*mapped, *arguments, "-o", third) == 2
+        assert message in capsys.readouterr().err
+    assert not third.exists()

@@ -1,4 +1,4 @@
-"""Data against the prediction of all others: by hand, and with something wrong on purpose."""
+"""Residuals, chi^2 and their tests: by hand, and with something wrong on purpose."""
 
 from __future__ import annotations
 
@@ -7,16 +7,21 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference_linear import matrices
+from scipy import stats
 from scipy.stats import chi2
 
-from lusee_bayes.experiment.experiment import build
+import lusee_bayes as lb
+from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.linear import residuals as residuals_module
+from lusee_bayes.linear.fit import FALSE_ALARM, LEVELS, ChiSquare, stands_out, two_sided, worst
+from lusee_bayes.linear.freedom import data_freedom
 from lusee_bayes.linear.left_out_dense import DenseLeftOut
+from lusee_bayes.linear.offset_tests import preferences
 from lusee_bayes.linear.residuals import residuals
-from lusee_bayes.linear.split import WIDER
+from lusee_bayes.linear.split import WIDER, Split, widened
 
 RUNS = "observation.runs=[{cycles: 0.03}, {cycles: 0.03, turntable_deg: 40}, {cycles: 0.02}]"
 
@@ -26,10 +31,10 @@ def simulated(*overrides, flags=None):
     # noise a thousand times larger than the telescope's: the sky's covariance, on which arithmetic
     # by hand cancels, is then only 1e4 times that of the noise
     given = ["lmax=4", "noise.radiometer.factor=1e6", RUNS, *overrides]
-    scenario = load_scenario("fiducial", given)
-    e = build(scenario)
+    scenario = lb.load_scenario("fiducial", given)
+    e = lb.build(scenario)
     if flags is not None:
-        e = build(scenario, flagged(e.data, flags))
+        e = lb.build(scenario, flagged(e.data, flags))
     model = full_model(e.setup)
     rng = np.random.default_rng(8)
     sky = np.sqrt(np.asarray(model.prior.variance())) * rng.standard_normal(model.prior.size)
@@ -218,3 +223,241 @@ def test_what_no_group_explains():
     found = judged(model, bad)
     assert found.suspects() == []
     assert "no single one is to blame" in found.fit().text
+
+
+# --- chi^2 in two parts ---------------------------------------------------------------------------
+
+
+N_MODES = 25
+# the seed is fixed: what is right fails once in 10,000 seeds
+RARE = 1e-4
+
+
+def model_of(n_data=60, prior="harmonic", seed=1):
+    """Data that know some directions to 1e-3 of the prior, and others hardly."""
+    rng = np.random.default_rng(seed)
+    left, _ = np.linalg.qr(rng.standard_normal((n_data, N_MODES if n_data > N_MODES else n_data)))
+    right, _ = np.linalg.qr(rng.standard_normal((N_MODES, left.shape[1])))
+    a = (left * np.geomspace(1e3, 1e-4, left.shape[1])) @ right.T
+    spectrum = jnp.asarray([4.0, 2.0, 1.0, 0.5, 0.3])
+    if prior == "harmonic":
+        s = lb.HarmonicPrior(spectrum)
+    else:
+        root = np.tril(0.1 * rng.standard_normal((N_MODES, N_MODES)), -1) + np.eye(N_MODES)
+        s = lb.DensePrior(jnp.asarray(root), mean=jnp.asarray(rng.standard_normal(N_MODES)))
+    noise = rng.standard_normal((n_data, n_data))
+    n = lb.DenseCovariance(jnp.asarray(noise @ noise.T / n_data + np.eye(n_data)))
+    return lb.LinearGaussian(jnp.asarray(a), s, n, jnp.asarray(rng.standard_normal(n_data)))
+
+
+def drawn(model, rng, strength=1.0):
+    """Data of a sky whose deviations from the prior mean are so many times the prior's."""
+    u = strength * rng.standard_normal(N_MODES)
+    mean = model.prior.white_mean
+    sky = model.prior.colour(jnp.asarray(u) if mean is None else u + mean)
+    root = np.linalg.cholesky(np.asarray(model.noise.dense()))
+    return model.predict(sky) + jnp.asarray(root @ rng.standard_normal(model.n_data))
+
+
+def split_of(model, data, form="map"):
+    posterior = model.condition(data, form=form)
+    chi2 = float(model.chi2(posterior.mean, data) + posterior.prior_chi2())
+    return Split.of(posterior, chi2, model.n_data), posterior, chi2
+
+
+def with_prior(model, prior):
+    return lb.LinearGaussian(model.coupling, prior, model.noise, model.offset)
+
+
+@pytest.mark.parametrize("form", ["map", "root", "data"])
+@pytest.mark.parametrize("prior", ["harmonic", "dense"])
+def test_the_posterior_under_a_wider_prior(form, prior):
+    """Against conditioning on the data again."""
+    model = model_of(60 if form != "data" else 18, prior)
+    data = drawn(model, np.random.default_rng(2))
+    posterior = on_host(model.condition(data, form=form))
+    wide, less = widened(posterior, 3.0)
+    expected = with_prior(model, model.prior.widened(3.0)).condition(data, form=form)
+    std = np.asarray(expected.std())
+    assert np.abs((wide.mean - expected.mean) / std).max() < 1e-6
+    np.testing.assert_allclose(wide.std(), std, rtol=1e-6)
+    assert float(wide.log_evidence) == pytest.approx(float(expected.log_evidence), abs=1e-6)
+    totals = [float(model.chi2(p.mean, data) + p.prior_chi2()) for p in (posterior, expected)]
+    assert less == pytest.approx(totals[0] - totals[1], abs=1e-6 * totals[0])
+
+
+@pytest.mark.parametrize("strength", [1.0, 30.0])
+def test_the_two_parts_by_matrices(strength):
+    model = model_of()
+    data = drawn(model, np.random.default_rng(3), strength)
+    found, posterior, chi2 = split_of(model, data)
+    a, s, n = matrices(model)
+    d = np.asarray(data - model.offset)
+    k = a @ s @ a.T + n
+    # how strong the sky is: |u|^2 over its mean, tr (1 - C S^-1), at least 1
+    known = N_MODES - np.trace(np.asarray(posterior.covariance()) @ np.linalg.inv(s))
+    power = max(1.0, float(posterior.prior_chi2()) / known)
+    assert (power > 100.0) == (strength > 1.0)
+    wide = WIDER**2 * power * (k - n) + n
+    assert found.instrument.chi2 == pytest.approx(d @ np.linalg.solve(wide, d), rel=1e-6)
+    expected = np.trace(np.linalg.solve(wide, n + power * (k - n)))
+    assert found.instrument.degrees == pytest.approx(expected, rel=1e-6)
+    assert found.instrument.chi2 + found.prior.chi2 == pytest.approx(chi2)
+    assert found.instrument.degrees + found.prior.degrees == pytest.approx(model.n_data)
+
+
+def p_values(model, strength, n=120, truth=None):
+    rng = np.random.default_rng(5)
+    parts = [split_of(model, drawn(truth or model, rng, strength))[0] for _ in range(n)]
+    return np.array([[one.instrument.p, one.prior.p] for one in parts])
+
+
+def test_no_sky_makes_the_instrument_look_wrong():
+    """The instrument's p is uniform whatever the sky, 100 times the prior's too; the prior's is
+    where it holds, but for the transition between known and unknown directions."""
+    model = model_of()
+    for strength in (0.0, 1.0, 100.0):
+        instrument, prior = p_values(model, strength).T
+        assert stats.kstest(instrument, "uniform").pvalue > RARE
+        if strength == 1.0:
+            for q in (0.02, 0.1, 0.3):
+                assert np.mean(prior <= q) <= q + 4.0 * np.sqrt(q / len(prior))
+        else:
+            assert np.median(prior) < 1e-2
+
+
+def test_noise_that_is_wrong_is_no_matter_of_the_prior():
+    """Data with 1.5 times the noise variance."""
+    model = model_of(n_data=200)
+    noise = lb.DenseCovariance(1.5 * model.noise.dense())
+    truth = lb.LinearGaussian(model.coupling, model.prior, noise, model.offset)
+    instrument, _ = p_values(model, 1.0, n=20, truth=truth).T
+    assert np.median(instrument) < 1e-3
+
+
+def test_data_that_are_fewer_than_the_modes_leave_little():
+    """Every sky explains them: what is left has few degrees of freedom, and no verdict."""
+    model = lb.LinearGaussian(
+        jnp.asarray(100.0 * np.random.default_rng(1).standard_normal((9, N_MODES))),
+        lb.HarmonicPrior(jnp.ones(5)),
+        lb.DiagonalCovariance(jnp.ones(9)),
+    )
+    found, _, _ = split_of(model, drawn(model, np.random.default_rng(2)), form="data")
+    assert found.instrument.degrees == pytest.approx(0.01 * 9, rel=1e-3)
+    assert 0.0 < found.instrument.p <= 1.0
+
+
+# --- probabilities --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [1, 40, 5232])
+def test_probabilities_are_uniform_if_the_model_holds(n):
+    drawn = np.random.default_rng(1).chisquare(n, 20_000)
+    p = [two_sided(float(x), n) for x in drawn]
+    # a hundred such tests in a thousand runs of the suite would fail at 1e-4; the seed is fixed
+    assert stats.kstest(p, "uniform").pvalue > 1e-4
+
+
+def test_both_sides_count():
+    for q in (1e-8, 1e-3, 0.2):
+        for value in (stats.chi2.isf(q, 100), stats.chi2.ppf(q, 100)):
+            assert two_sided(float(value), 100) == pytest.approx(2 * q, rel=1e-9)
+    assert two_sided(0.0, 100) == 0.0
+    assert 0.999 < two_sided(float(stats.chi2.median(100)), 100) <= 1.0
+
+
+def test_one_rate_for_all_tests_of_a_report():
+    below = 1.0 - 1e-9
+    assert not stands_out(FALSE_ALARM, 1) and stands_out(FALSE_ALARM * below, 1)
+    # the best of many is nothing special
+    assert not stands_out(1e-4, 10) and stands_out(1e-4, 9)
+    assert worst(["unlike the prior", "consistent"]) == "unlike the prior"
+    assert worst(list(LEVELS)) == "does not fit"
+
+
+def test_the_least_of_many_stands_out_once_in_a_thousand():
+    """Bonferroni: at most FALSE_ALARM, and for independent groups nearly that."""
+    p = np.random.default_rng(2).uniform(size=(100_000, 45)).min(axis=1)
+    found = np.mean([stands_out(float(x), 45) for x in p])
+    exact = 1.0 - (1.0 - FALSE_ALARM / 45) ** 45
+    assert found == pytest.approx(exact, abs=4 * np.sqrt(exact / len(p)))
+
+
+def test_what_was_found_is_told_with_what_was_expected():
+    part = ChiSquare(130.0, 98.0)
+    assert part.p == pytest.approx(2 * stats.chi2.sf(130.0, 98.0))
+    assert part.words() == f"p = {part.p:.2g}, chi^2 130, expected 98 +- 14"
+    assert ChiSquare(1e9, 98.0).words().startswith("p < 1e-300, chi^2 1000000000")
+
+
+# --- score tests of templates ---------------------------------------------------------------------
+
+
+N_DATA, LMAX, N = 60, 4, 5
+
+
+@pytest.mark.parametrize("low_rank", [False, True])
+def test_amplitudes_errors_and_gains(low_rank):
+    rng = np.random.default_rng(8)
+    a = rng.standard_normal((N_DATA, (LMAX + 1) ** 2))
+    noise = lb.DiagonalCovariance(rng.uniform(0.5, 2.0, N_DATA))
+    if low_rank:
+        noise = noise + lb.LowRankCovariance(rng.standard_normal((N_DATA, 2)))
+    prior = lb.HarmonicPrior(np.full(LMAX + 1, 4.0), mean=rng.standard_normal((LMAX + 1) ** 2))
+    model = lb.LinearGaussian(lb.DenseCoupling(a), prior, noise, rng.standard_normal(N_DATA))
+    data = 3.0 * rng.standard_normal(N_DATA)
+    # the last one is a sky that the prior allows, but for a small part
+    templates = rng.standard_normal((N_DATA, N))
+    templates[:, -1] = a @ rng.standard_normal(a.shape[1]) + 0.01 * templates[:, -1]
+    posterior = model.condition(data)
+    got = preferences(model, posterior, np.asarray(posterior.covariance()), data, templates)
+    k = a @ np.diag(np.asarray(prior.variance())) @ a.T + np.asarray(noise.dense())
+    mean = np.asarray(model.predict(prior.colour(prior.white_mean)))
+    inverse = np.linalg.inv(k)
+    information = np.einsum("da,de,ea->a", templates, inverse, templates)
+    pull = templates.T @ inverse @ (data - mean)
+    np.testing.assert_allclose(got.std, information**-0.5, rtol=1e-9)
+    np.testing.assert_allclose(got.amplitude, pull / information, rtol=1e-8)
+    # chi^2 of the data without the best amount of each template
+    for number in range(N):
+        left = data - mean - got.amplitude[number] * templates[:, number]
+        gain = (data - mean) @ inverse @ (data - mean) - left @ inverse @ left
+        assert got.gain[number] == pytest.approx(gain, rel=1e-7)
+
+
+def test_what_the_sky_takes_up_is_not_told():
+    """A template that the prior's wide sky explains altogether: NaN, not a rounding error."""
+    rng = np.random.default_rng(9)
+    a = rng.standard_normal((N_DATA, (LMAX + 1) ** 2))
+    prior = lb.HarmonicPrior(np.full(LMAX + 1, 1e14))
+    model = lb.LinearGaussian(lb.DenseCoupling(a), prior, lb.DiagonalCovariance(np.ones(N_DATA)))
+    data = rng.standard_normal(N_DATA)
+    posterior = model.condition(data)
+    template = a @ rng.standard_normal((a.shape[1], 1))
+    got = preferences(model, posterior, np.asarray(posterior.covariance()), data, template)
+    assert np.isnan(got.amplitude).all()
+    assert np.isnan(got.std).all()
+
+
+# --- the share of each datum that the model follows -----------------------------------------------
+
+
+@pytest.mark.parametrize("dense", [0, 10**8])
+def test_it_is_the_diagonal_of_a_product_of_matrices(monkeypatch, dense):
+    """K_s K^-1 with templates and another low-rank term, five directions at once."""
+    monkeypatch.setattr("lusee_bayes.linear.freedom.CHUNK", 5)
+    monkeypatch.setattr("lusee_bayes.linear.freedom.DENSE", dense)
+    rng = np.random.default_rng(0)
+    a, v, other = rng.normal(size=(30, 9)), rng.normal(size=(30, 2)), rng.normal(size=(30, 1))
+    spectrum, n = np.array([4.0, 1.0, 0.3]), rng.uniform(0.5, 2.0, 30)
+    noise = lb.DiagonalCovariance(n) + lb.LowRankCovariance(v) + lb.LowRankCovariance(other)
+    model = lb.LinearGaussian(lb.DenseCoupling(a), lb.HarmonicPrior(spectrum), noise)
+    signal = a @ np.diag(np.repeat(spectrum, [1, 3, 5])) @ a.T + v @ v.T
+    whole = signal + np.diag(n) + other @ other.T
+    expected = np.diag(signal @ np.linalg.inv(whole))
+    got = data_freedom(model, model.condition(np.zeros(30)), v)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10)
+    # without templates the sky's alone
+    bare = a @ np.diag(np.repeat(spectrum, [1, 3, 5])) @ a.T
+    got = data_freedom(model, model.condition(np.zeros(30)), np.zeros((30, 0)))
+    np.testing.assert_allclose(got, np.diag(bare @ np.linalg.inv(whole)), rtol=0, atol=1e-10)

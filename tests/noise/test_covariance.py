@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from reference_linear import random_covariance
 
+import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.noise.covariance import (
@@ -325,47 +326,54 @@ def test_gradients_reach_the_entries():
 # --- refusals ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
-def test_variances_must_be_positive(bad):
-    with pytest.raises(InputError, match=r"noise variance must be positive, .* first at \(1,\)"):
-        DiagonalCovariance(jnp.array([1.0, bad, 2.0]))
+LAYOUT = DataLayout(2, 3)
+BAND = jnp.zeros((3, 2, 2, 2)).at[:, 0].set(jnp.eye(2))
+BLOCKS = jnp.tile(jnp.eye(2)[None], (3, 1, 1))
+UNIT, ROOT = jnp.eye(3), jnp.ones((4, 2))
+MAKERS = {
+    "diagonal": DiagonalCovariance,
+    "dense": lambda m: DenseCovariance(m, "the gain term"),
+    "blocks": lambda b: TimeBlockCovariance(b, LAYOUT),
+    "banded": lambda b: TimeBandedCovariance(b, LAYOUT, "the gain term"),
+    "low rank": lambda u: LowRankCovariance(u, "the beams"),
+}
 
 
-@pytest.mark.parametrize("bad", [0.0, -2.0])
-def test_a_variance_cannot_be_scaled_to_nothing(bad):
-    with pytest.raises(InputError, match="must be positive"):
-        DiagonalCovariance(jnp.ones(3)).scaled(bad)
+@pytest.mark.parametrize(
+    ("kind", "entries", "message"),
+    [
+        *(
+            ("diagonal", jnp.array([1.0, bad, 2.0]), r"must be positive, .* first at \(1,\)")
+            for bad in (0.0, -1.0, np.nan, np.inf)
+        ),
+        ("diagonal", jnp.ones(3, dtype=jnp.float32), "noise variance must be a float64 array"),
+        ("dense", UNIT.astype(jnp.float32), "the gain term must be a float64 array"),
+        ("blocks", BLOCKS.astype(jnp.float32), "noise blocks must be a float64 array"),
+        ("banded", BAND.astype(jnp.float32), "the gain term must be a float64 array"),
+        ("low rank", ROOT.astype(jnp.float32), "the beams must be a float64 array"),
+        ("dense", UNIT.at[0, 2].set(jnp.nan), r"the gain term holds NaN .*\(0, 2\)"),
+        ("blocks", BLOCKS.at[1, 1, 0].set(jnp.inf), r"noise blocks holds NaN .*\(1, 1, 0\)"),
+        ("banded", BAND.at[1, 1, 0, 1].set(jnp.nan), r"holds NaN .* first at \(1, 1, 0, 1\)"),
+        ("low rank", ROOT.at[3, 1].set(jnp.inf), r"the beams holds NaN or infinity .*\(3, 1\)"),
+        ("blocks", jnp.ones((2, 3, 3)), r"shape \(2, 3, 3\), expected \(3, 2, 2\)"),
+        ("banded", BAND[:2], r"shape \(2, 2, 2, 2\), expected \(3, any, 2, 2\)"),
+        ("dense", UNIT.at[0, 1].set(0.01), r"gain term is not symmetric: .* up to 0\.01 "),
+        ("blocks", BLOCKS.at[1, 0, 1].set(0.1), "not symmetric"),
+        ("banded", BAND.at[2, 0, 0, 1].set(0.5), "within one time is not symmetric: .* 0\\.5 "),
+    ],
+)
+def test_entries_that_no_covariance_has_are_refused(kind, entries, message):
+    with pytest.raises(InputError, match=message):
+        MAKERS[kind](entries)
 
 
-def test_float32_is_refused():
-    layout = DataLayout(2, 2)
-    with pytest.raises(InputError, match="noise variance must be a float64 array, got .*float32"):
-        DiagonalCovariance(jnp.ones(3, dtype=jnp.float32))
-    with pytest.raises(InputError, match="dense covariance must be a float64 array, got .*float32"):
-        DenseCovariance(jnp.eye(3, dtype=jnp.float32))
-    with pytest.raises(InputError, match="noise blocks must be a float64 array, got .*float32"):
-        TimeBlockCovariance(jnp.ones((2, 2, 2), dtype=jnp.float32), layout)
-
-
-def test_nan_is_refused():
-    with pytest.raises(InputError, match=r"the gain term holds NaN .*\(0, 2\)"):
-        DenseCovariance(jnp.eye(3).at[0, 2].set(jnp.nan), "the gain term")
-    blocks = jnp.ones((2, 3, 3)).at[1, 2, 0].set(jnp.inf)
-    with pytest.raises(InputError, match=r"noise blocks holds NaN .*\(1, 2, 0\)"):
-        TimeBlockCovariance(blocks, DataLayout(3, 2))
-
-
-def test_blocks_must_fit_the_layout():
-    with pytest.raises(InputError, match=r"shape \(2, 3, 3\), expected \(3, 2, 2\)"):
-        TimeBlockCovariance(jnp.ones((2, 3, 3)), DataLayout(2, 3))
-
-
-def test_asymmetric_matrices_are_refused():
-    with pytest.raises(
-        InputError, match=r"the gain term is not symmetric: .* up to 0\.01 .*N \+ N"
-    ):
-        DenseCovariance(jnp.eye(3).at[0, 1].set(0.01), "the gain term")
-    DenseCovariance(jnp.eye(3).at[0, 1].set(1e-14))  # rounding passes
+def test_what_passes_and_a_factor_that_does_not():
+    DenseCovariance(UNIT.at[0, 1].set(1e-14))  # rounding
+    # blocks between times need not be symmetric
+    TimeBandedCovariance(BAND.at[1, 1, 0, 1].set(0.5), LAYOUT)
+    for bad in (0.0, -2.0):
+        with pytest.raises(InputError, match="must be positive"):
+            DiagonalCovariance(jnp.ones(3)).scaled(bad)
 
 
 def _indefinite():
@@ -397,31 +405,6 @@ def test_indefinite_bands_are_named_with_their_lowest_eigenvalue(update):
             use()
 
 
-def test_bad_bands_are_refused():
-    layout = DataLayout(2, 3)
-    good = jnp.zeros((3, 2, 2, 2)).at[:, 0].set(jnp.eye(2))
-    for bad, message in [
-        (good.at[2, 0, 0, 1].set(0.5), "the gain term within one time is not symmetric: .* 0\\.5 "),
-        (good.at[1, 1, 0, 1].set(jnp.nan), r"the gain term holds NaN .* first at \(1, 1, 0, 1\)"),
-        (good[:2], r"the gain term has shape \(2, 2, 2, 2\), expected \(3, any, 2, 2\)"),
-        (good.astype(jnp.float32), "the gain term must be a float64 array, got .*float32"),
-    ]:
-        with pytest.raises(InputError, match=message):
-            TimeBandedCovariance(bad, layout, "the gain term")
-    # blocks between times need not be symmetric
-    TimeBandedCovariance(good.at[1, 1, 0, 1].set(0.5), layout)
-
-
-def test_bad_directions_are_refused():
-    root = jnp.ones((4, 2))
-    for bad, message in [
-        (root.at[3, 1].set(jnp.inf), r"the beams holds NaN or infinity .*\(3, 1\)"),
-        (root.astype(jnp.float32), "the beams must be a float64 array, got .*float32"),
-    ]:
-        with pytest.raises(InputError, match=message):
-            LowRankCovariance(bad, "the beams")
-
-
 def test_indefinite_blocks_are_refused():
     blocks = jnp.stack([jnp.eye(6), _indefinite()])
     with pytest.raises(InputError, match=r"not positive definite: .* eigenvalue is -0\.25 "):
@@ -449,19 +432,59 @@ def test_blocks_with_other_flags_are_refused():
             a + b
 
 
-def test_asymmetric_blocks_are_refused():
-    blocks = jnp.tile(jnp.eye(3)[None], (2, 1, 1)).at[1, 0, 2].set(0.1)
-    with pytest.raises(InputError, match="not symmetric"):
-        TimeBlockCovariance(blocks, DataLayout(3, 2))
-
-
 def test_a_dense_term_can_be_built_inside_jit_from_known_numbers():
     matrix = jnp.asarray(random_covariance(np.random.default_rng(0), 3))
     got = jax.jit(lambda x: DenseCovariance(matrix).solve(x))(jnp.ones(3))
     close(got, np.linalg.solve(np.asarray(matrix), np.ones(3)))
 
 
-def test_a_dense_term_is_a_pytree_of_arrays():
-    cov = DenseCovariance(jnp.eye(3))
-    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(cov))
-    assert float(jax.jit(lambda c: c.log_det())(cov)) == 0.0
+# --- templates ------------------------------------------------------------------------------------
+
+
+GAPS = np.zeros((4, 5), dtype=bool)
+GAPS[:, 2] = GAPS[1, 0] = True
+SEEN = DataLayout.from_flags(GAPS)
+RNG = np.random.default_rng(4)
+T = RNG.normal(size=(15, 3))
+P = random_covariance(RNG, 3)
+VARIANCES = np.array([0.5, 2.0, 1e4])
+
+
+def by_hand(t, p):
+    total = np.zeros((len(t), len(t)))
+    for a in range(t.shape[1]):
+        for b in range(t.shape[1]):
+            total += p[a, b] * np.outer(t[:, a], t[:, b])
+    return total
+
+
+@pytest.mark.parametrize(("prior", "matrix"), [(VARIANCES, np.diag(VARIANCES)), (P, P)])
+def test_the_term_is_t_p_t(prior, matrix):
+    expected = by_hand(T, matrix)
+    got = lb.template_noise(jnp.asarray(T), jnp.asarray(prior), SEEN)
+    # products of a few numbers of order one
+    atol = 1e-14 * np.abs(expected).max()
+    np.testing.assert_allclose(got.dense(), expected, rtol=0, atol=atol)
+    np.testing.assert_allclose(got.diagonal(), np.diag(expected), rtol=0, atol=atol)
+    assert got.root.shape == (15, 3)
+
+
+@pytest.mark.parametrize(
+    ("templates", "prior", "message"),
+    [
+        (T[:14], VARIANCES, r"the templates has shape \(14, 3\), expected \(15, any\)"),
+        (np.ones((20, 3)), VARIANCES, r"the templates has shape \(20, 3\), expected \(15, any\)"),
+        (np.where(np.arange(15)[:, None] == 4, np.nan, T), VARIANCES, r"the templates holds NaN"),
+        (T.astype(np.float32), VARIANCES, "the templates must be a float64 array"),
+        (T, np.array([1.0, 0.0, 2.0]), r"prior variance must be positive, .* first at \(1,\)"),
+        (T, np.array([1.0, 3.0, -2.0]), r"prior variance must be positive, .* first at \(2,\)"),
+        (T, np.array([1.0, np.nan, 2.0]), r"prior variance must be positive, .* first at \(1,\)"),
+        (T, np.diag([1.0, -0.5, 2.0]), "prior is not positive definite: .* eigenvalue is -0.5 "),
+        (T, P + np.eye(3, k=1), "the templates' prior is not symmetric: .* up to 1 "),
+        (T, np.full((3, 3), np.inf), "the templates' prior holds NaN or infinity"),
+        (T, VARIANCES.astype(np.float32), "the templates' prior must be a float64 array"),
+    ],
+)
+def test_bad_input_is_refused(templates, prior, message):
+    with pytest.raises(lb.InputError, match=message):
+        lb.template_noise(jnp.asarray(templates), jnp.asarray(prior), SEEN)

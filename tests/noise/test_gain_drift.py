@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from reference_linear import assert_draws_follow, z_of
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, Run
 from lusee_bayes.noise import GainDrift, with_gains
-from lusee_bayes.noise.covariance import DiagonalCovariance, TimeBandedCovariance
 
 # a gap of 27 hours, and of 190, beyond which nothing is correlated
 HOURS = np.array([0.0, 2.0, 4.5, 31.5, 33.5, 223.5])
@@ -70,7 +68,7 @@ def gappy(n_antennas):
     return flags
 
 
-def term(drift, d, hours, flags, width=None) -> TimeBandedCovariance:
+def term(drift, d, hours, flags, width=None) -> lb.TimeBandedCovariance:
     return drift.covariance(jnp.asarray(d), hours, DataLayout.from_flags(flags), width)
 
 
@@ -182,8 +180,8 @@ def test_draws_of_the_sampler():
 
 def test_runs_with_gaps_between_them():
     """Three runs of three samples; none begins on the grid of the one before."""
-    runs = [Run(0.01), Run(0.013, 30.0), Run(0.01, 60.0)]
-    observation = Observation.from_runs(runs).select(np.arange(10) != 4)
+    runs = [lb.Run(0.01), lb.Run(0.013, 30.0), lb.Run(0.01, 60.0)]
+    observation = lb.Observation.from_runs(runs).select(np.arange(10) != 4)
     hours = 2.0 * np.array([0, 1, 2, 0, 2, 3, 0, 1, 2])
     starts = np.repeat([0.0, 0.01, 0.023], [3, 3, 3]) * 27.321661 * 24
     hours = hours + starts
@@ -210,7 +208,7 @@ def test_what_the_band_leaves_out_changes_nothing():
     beyond = [hours[t] - hours[t - gain.width - 1] for t in range(gain.width + 1, 50)]
     assert np.exp(-(min(beyond) ** 2) / (2 * 0.5**2)) < np.finfo(float).eps
     variance = np.full(d.size, 1e-3 * 2e4**2)
-    noise = DiagonalCovariance(jnp.asarray(variance)) + gain
+    noise = lb.DiagonalCovariance(jnp.asarray(variance)) + gain
     full = by_the_papers_equation(d, hours, 0.1, 0.5, flags) + np.diag(variance)
     x = d.ravel()
     tolerance = 10 * np.finfo(float).eps * np.linalg.cond(full)  # of a backward stable solve
@@ -219,7 +217,7 @@ def test_what_the_band_leaves_out_changes_nothing():
     close(factor.solve(jnp.asarray(x)), np.linalg.solve(full, x), tolerance)
     assert float(factor.log_det()) == pytest.approx(np.linalg.slogdet(full)[1], abs=200 * tolerance)
     # a band that is cut at one correlation time is not the same
-    cut = DiagonalCovariance(jnp.asarray(variance)) + term(drift, d, hours, flags, 1)
+    cut = lb.DiagonalCovariance(jnp.asarray(variance)) + term(drift, d, hours, flags, 1)
     assert np.abs(np.asarray(cut.dense()) - full).max() > 0.01 * full.max()
 
 
@@ -240,7 +238,7 @@ def test_scaling_with_sigma_and_the_signal():
 
 def test_derivatives_of_the_log_determinant():
     d, layout = visibilities(2), DataLayout.from_flags(gappy(2))
-    radiometer = DiagonalCovariance(jnp.asarray(layout.gather(jnp.asarray(d**2)) * 1e-4))
+    radiometer = lb.DiagonalCovariance(jnp.asarray(layout.gather(jnp.asarray(d**2)) * 1e-4))
     hours = HOURS / 3.0
 
     @jax.jit
@@ -262,10 +260,10 @@ def test_derivatives_of_the_log_determinant():
 
 @pytest.mark.parametrize("bad", [0.0, -0.01, np.nan, np.inf])
 def test_bad_parameters_are_refused(bad):
-    with pytest.raises(InputError, match="the gain drift's sigma must be positive, got"):
+    with pytest.raises(lb.InputError, match="the gain drift's sigma must be positive, got"):
         GainDrift(bad)
     with pytest.raises(
-        InputError, match="the gain drift's correlation time in hours must be positive, got"
+        lb.InputError, match="the gain drift's correlation time in hours must be positive, got"
     ):
         GainDrift(0.01, bad)
 
@@ -273,9 +271,11 @@ def test_bad_parameters_are_refused(bad):
 def test_bad_visibilities_are_refused():
     drift, layout = GainDrift(0.01), DataLayout(4, N_TIMES)
     d = jnp.asarray(visibilities(2))
-    with pytest.raises(InputError, match=r"the visibilities has shape \(4, 5\), expected \(4, 6\)"):
+    with pytest.raises(
+        lb.InputError, match=r"the visibilities has shape \(4, 5\), expected \(4, 6\)"
+    ):
         drift.covariance(d[:, :5], HOURS[:5], layout)
-    with pytest.raises(InputError, match=r"the visibilities holds NaN .* first at \(2, 1\)"):
+    with pytest.raises(lb.InputError, match=r"the visibilities holds NaN .* first at \(2, 1\)"):
         drift.covariance(d.at[2, 1].set(jnp.nan), HOURS, layout)
 
 
@@ -283,6 +283,7 @@ def test_the_term_alone_is_not_a_noise():
     """It is singular: the Re and Im of a product drift together."""
     gain = term(GainDrift(0.01), visibilities(2), HOURS, complete(2))
     with pytest.raises(
-        InputError, match="the gain-drift covariance is not positive definite.*add the radiometer"
+        lb.InputError,
+        match="the gain-drift covariance is not positive definite.*add the radiometer",
     ):
         gain.factor()

@@ -9,11 +9,9 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.results.finished_runs import evidence_caveat, read_runs
-from lusee_bayes.runs.map_run import run_map
-from lusee_bayes.runs.simulate_run import run_simulate
 
 pytestmark = pytest.mark.long
 SMALL = ["lmax=4", "observation.runs.0.cycles=0.1"]
@@ -24,10 +22,10 @@ def runs(tmp_path_factory):
     """Data with gain drifts, mapped with the gain term and without; and those of another seed."""
     folder = tmp_path_factory.mktemp("runs")
     data = folder / "data.nc"
-    run_simulate(load_scenario("gain_1e-2", SMALL), data)
+    lb.run_simulate(lb.load_scenario("gain_1e-2", SMALL), data)
     for name in ("gain_1e-2", "fiducial"):
-        run_map(load_scenario(name, SMALL), folder / name, data=data)
-    run_map(load_scenario("fiducial", [*SMALL, "seed=5"]), folder / "other")
+        lb.run_map(lb.load_scenario(name, SMALL), folder / name, data=data)
+    lb.run_map(lb.load_scenario("fiducial", [*SMALL, "seed=5"]), folder / "other")
     return folder
 
 

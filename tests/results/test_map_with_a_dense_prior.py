@@ -6,39 +6,37 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference_linear import random_covariance
+from reference_linear import matrices, random_covariance
 
+import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers
-from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.linear.pixel_variance import pixel_std
 from lusee_bayes.results.diagnostics import region_rows
 from lusee_bayes.results.map_result import MapResult, map_result
 from lusee_bayes.results.posterior_file import posterior_dataset
 from lusee_bayes.results.updatable import read_updatable
-from lusee_bayes.sky.priors import DensePrior
 from lusee_bayes.testing import small_scenario
 
 LMAX = 6
 
 
-def with_dense_prior(experiment: Experiment) -> Experiment:
+def with_dense_prior(experiment: lb.Experiment) -> lb.Experiment:
     width = np.sqrt(np.asarray(experiment.setup.prior.variance()))
     rng = np.random.default_rng(0)
     covariance = random_covariance(rng, len(width)) * width * width[:, None]
-    prior = DensePrior.of_covariance(covariance, 0.2 * width * rng.normal(size=len(width)))
+    prior = lb.DensePrior.of_covariance(covariance, 0.2 * width * rng.normal(size=len(width)))
     return replace(experiment, setup=replace(experiment.setup, prior=prior))
 
 
 @pytest.fixture(scope="module")
 def mapped() -> MapResult:
     scenario = small_scenario("output.updatable=true", lmax=LMAX, cycles=0.1)
-    return map_result(with_dense_prior(build(scenario)))
+    return map_result(with_dense_prior(lb.build(scenario)))
 
 
 def test_the_channel_is_that_of_matrices(mapped):
     model, data = mapped.inference.model, np.asarray(mapped.experiment.data.data)
-    s, mean = np.asarray(model.prior.covariance()), np.asarray(model.prior.mean)
-    a, n = np.asarray(model.coupling.dense()), np.asarray(model.noise.dense())
+    (a, s, n), mean = matrices(model), np.asarray(model.prior.mean)
     covariance = np.asarray(mapped.inference.posterior.covariance())
     channel = mapped.channel
     # chi^2 of residuals: N_data less what the sky takes, tr(A C A^T N^-1)
@@ -87,7 +85,7 @@ def test_new_data_are_added_to_its_file(mapped, tmp_path):
     later = small_scenario(
         "output.updatable=true", "observation.start=2027-02-20", "seed=5", lmax=LMAX
     )
-    again = map_result(with_dense_prior(build(later)), onto=tmp_path)
+    again = map_result(with_dense_prior(lb.build(later)), onto=tmp_path)
     assert (again.channel.std < mapped.channel.std * (1 + 1e-9)).all()
     more = again.channel.information_bits - mapped.channel.information_bits
     assert more > 10

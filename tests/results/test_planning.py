@@ -10,21 +10,17 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.engine import ThisProcess
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import sum_over_m
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.products import all_products
-from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.metrics import ell_cross
 from lusee_bayes.linear.model import FORMS, LinearGaussian
-from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.results import variations
 from lusee_bayes.results.forecast import (
     Variation,
@@ -36,7 +32,6 @@ from lusee_bayes.results.forecast import (
 )
 from lusee_bayes.results.forecasts import ForecastFiles, forecasts_of
 from lusee_bayes.results.variations import default_variations
-from lusee_bayes.sky.priors import HarmonicPrior
 
 # many shapes, each of which is compiled
 pytestmark = pytest.mark.long
@@ -45,7 +40,9 @@ N_SETS = 200
 
 
 def varied(*overrides, lost=()):
-    return Variation("small", "test", "test", load_scenario("fiducial", [*SMALL, *overrides]), lost)
+    return Variation(
+        "small", "test", "test", lb.load_scenario("fiducial", [*SMALL, *overrides]), lost
+    )
 
 
 def turned(*angles, factor=100):
@@ -162,7 +159,7 @@ def test_numbers_of_an_experiment_against_dense_algebra(cycles, systematic):
 def test_a_lost_antenna_is_flags():
     variation = varied()
     dead = [p.i == 2 or p.j == 2 for p in all_products()]
-    experiment = build(variation.scenario)
+    experiment = lb.build(variation.scenario)
     setup = experiment.setup
     flags = np.repeat(np.array(dead)[:, None], setup.observation.n_times, axis=1)
     found = forecast(replace(variation, lost=(2,)))
@@ -171,7 +168,7 @@ def test_a_lost_antenna_is_flags():
     # and the same model as that of data with these flags
     layout = DataLayout.from_flags(flags)
     whole = experiment.data
-    data = Visibilities(
+    data = lb.Visibilities(
         layout.gather(whole.layout.scatter(whole.data)), layout, whole.observation, 25.0
     )
     expected = full_model(set_up(variation.scenario, data))
@@ -186,10 +183,10 @@ def test_modes_do_not_depend_on_the_basis(form):
     rng = np.random.default_rng(1)
     scale = np.array([30.0, 3.0, 1.5, 1.01, 0.99, 0.5, 0.1, 0.01, 0.0])  # SNR of nine directions
     rotation = scipy.linalg.qr(rng.normal(size=(9, 9)))[0]
-    prior = HarmonicPrior(jnp.ones(3))
+    prior = lb.HarmonicPrior(jnp.ones(3))
     for basis in (np.eye(9), rotation):
         a = jnp.asarray((np.diag(scale) @ basis)[:8])
-        model = LinearGaussian(a, prior, DiagonalCovariance(jnp.ones(8)))
+        model = LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(8)))
         posterior = model.factorise(form).condition(jnp.zeros(8))
         assert informed_modes(posterior) == 4
 
@@ -197,8 +194,8 @@ def test_modes_do_not_depend_on_the_basis(form):
 def test_an_ell_that_is_not_seen_and_one_without_power():
     """Expected SNR^2 of 0 and NaN; neither is clipped."""
     a = jnp.eye(9)[:4]
-    prior = HarmonicPrior(jnp.asarray([0.0, 3.0, 2.0]))
-    model = LinearGaussian(a, prior, DiagonalCovariance(jnp.ones(4)))
+    prior = lb.HarmonicPrior(jnp.asarray([0.0, 3.0, 2.0]))
+    model = LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(4)))
     found = expected_snr_squared(model.factorise("map").condition(jnp.zeros(4)))
     assert np.isnan(found[0])
     np.testing.assert_allclose(found[1:], [3.0, 0.0], atol=1e-15)
@@ -220,7 +217,7 @@ def test_a_duty_cycle_is_worth_the_noise_it_makes():
 
 
 def test_default_variations_compare_like_with_like():
-    scenario = load_scenario("two_cycles")
+    scenario = lb.load_scenario("two_cycles")
     found = default_variations("two_cycles", scenario)
     assert found[0].scenario == scenario
     families = {v.family: [w for w in found if w.family == v.family] for v in found}
@@ -286,9 +283,9 @@ def test_what_will_be_known_of_clock_and_turntable():
 
 
 def test_ports_that_do_not_exist_and_none_left():
-    with pytest.raises(InputError, match="no port 4 to lose; ports are 0 to 3"):
+    with pytest.raises(lb.InputError, match="no port 4 to lose; ports are 0 to 3"):
         forecast(varied(lost=(4,)))
-    with pytest.raises(InputError, match="small, test: all .* samples are flagged"):
+    with pytest.raises(lb.InputError, match="small, test: all .* samples are flagged"):
         forecast(varied(lost=(0, 1, 2, 3)))
 
 
@@ -318,7 +315,7 @@ def test_the_command_writes_table_and_figure(tmp_path, capsys, monkeypatch):
         "as given", "0°", "0.05 cycles", "0.25", "0.5", "1", "port 0", "port 1", "port 2", "port 3",
     ]  # fmt: skip
     assert [row["variation"] for row in rows if row["scenario"] == "noise_x100"] == names
-    expected = forecast(Variation("", "", "", load_scenario("fiducial", tiny[1::2])))
+    expected = forecast(Variation("", "", "", lb.load_scenario("fiducial", tiny[1::2])))
     first = rows[0]
     # two decimals
     assert float(first["information_bits"]) == pytest.approx(expected.information_bits, abs=0.0051)
@@ -367,10 +364,7 @@ def test_brackets_are_values_not_markup(tmp_path, capsys):
         (["fiducial", "--vary", "lmax=]"], "--vary lmax=] is not valid YAML"),
         (["fiducial", "--vary", "lmx=3,4"], "unknown key 'lmx'; did you mean 'lmax'?"),
         (["fiducial", "--vary", "lmax=3,0"], "greater than or equal to 1"),
-        (
-            ["fiducial", "--set", "sky.file=/gone/a.fits"],
-            "fiducial, as given: no sky map at '/gone/a.fits'",
-        ),
+        (["fiducial", "--set", "sky.file=/gone/a.fits"], "fiducial, as given: no sky map at"),
         (["fiducial", "--set", "observation.start=soon"], "fiducial, as given: start 'soon'"),
         ([], "scenario"),
     ],

@@ -13,8 +13,6 @@ from reference_linear import white_posterior
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.emission import ground_per_kelvin
-from lusee_bayes.experiment.experiment import Experiment, build
-from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.simulate import simulate, true_values
@@ -22,7 +20,6 @@ from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.report.map_page import map_page
 from lusee_bayes.results.null_direction import NullDirection
 from lusee_bayes.results.unknowns import unknowns_report
-from lusee_bayes.sky.priors import HarmonicPrior
 
 RECEIVER, GROUND = "noise.receiver={power_k: 2000}", "noise.regolith={std_k: 30}"
 TABLE = "noise.gain_table={std: 0.01}"
@@ -30,13 +27,13 @@ COLUMNS = ["unknown", "unit", "value", "std", "prior", "prior_std"]
 
 
 @pytest.fixture(scope="module")
-def experiment(response_file) -> Experiment:
-    return build(four_ports(response_file, RECEIVER, GROUND, TABLE))
+def experiment(response_file) -> lb.Experiment:
+    return lb.build(four_ports(response_file, RECEIVER, GROUND, TABLE))
 
 
-def joint(experiment: Experiment):
+def joint(experiment: lb.Experiment):
     """Sky and unknowns of the model about what the data told, as one Gaussian in NumPy."""
-    found, setup = infer(experiment), experiment.setup
+    found, setup = lb.infer(experiment), experiment.setup
     table = found.systematics[-1]
     factors = np.asarray(table.errors.factors(table.centre))
     t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
@@ -88,15 +85,15 @@ def test_table_and_null_direction_are_those_of_the_joint_posterior(experiment):
 
 
 def test_only_what_the_model_has_is_listed(response_file):
-    bare = build(four_ports(response_file))
-    assert unknowns_report(bare, infer(bare)) is None
-    ground = build(four_ports(response_file, GROUND))
-    report = unknowns_report(ground, infer(ground))
+    bare = lb.build(four_ports(response_file))
+    assert unknowns_report(bare, lb.infer(bare)) is None
+    ground = lb.build(four_ports(response_file, GROUND))
+    report = unknowns_report(ground, lb.infer(ground))
     assert report.null.names == ("uniform sky", "regolith")
     assert list(report.table["unknown"]) == ["regolith_k"]
     # of measured data no truth is known
     measured = replace(ground, data=replace(ground.data, truth=None))
-    assert list(unknowns_report(measured, infer(measured)).table) == COLUMNS
+    assert list(unknowns_report(measured, lb.infer(measured)).table) == COLUMNS
 
 
 def test_the_null_direction_in_words():
@@ -117,7 +114,7 @@ def test_the_null_direction_in_words():
 
 @pytest.mark.parametrize(("common", "told"), [(None, False), (0.5, False), (0.95, True)])
 def test_the_common_gain_is_told_where_it_keeps_its_prior(experiment, common, told):
-    report = replace(unknowns_report(experiment, infer(experiment)), common=common)
+    report = replace(unknowns_report(experiment, lb.infer(experiment)), common=common)
     assert (
         any("common gain of all ports keeps its prior" in line for line in report.lines()) == told
     )
@@ -130,9 +127,9 @@ def test_unknowns_of_a_map_onto_another_are_said_to_be_of_the_new_data(response_
     first = four_ports(response_file, GROUND, "output.updatable=true")
     lb.run_map(first, tmp_path / "first")
     second = first.model_copy(update={"seed": 7})
-    alone = build(second)
+    alone = lb.build(second)
     run = lb.run_map(second, tmp_path / "both", onto=tmp_path / "first")
-    expected = unknowns_report(alone, infer(alone))
+    expected = unknowns_report(alone, lb.infer(alone))
     pd.testing.assert_frame_equal(run.result.unknowns.table, expected.table)
     note = "what the new data alone tell"
     assert any(note in line for line in run.result.lines())
@@ -184,7 +181,7 @@ def test_receivers_and_ground_that_are_not_known_cost_the_monopole_alone(respons
     first = set_up(four_ports(response_file, RECEIVER, GROUND))
     # known to a fifth, as one who maps a sky with structure knows it
     spectrum = 0.04 * np.asarray(first.prior.spectrum)
-    first = replace(first, prior=HarmonicPrior(spectrum, mean=first.sky.modes))
+    first = replace(first, prior=lb.HarmonicPrior(spectrum, mean=first.sky.modes))
     moved = []
     for seed in range(20):
         z = np.random.default_rng(seed).standard_normal(first.prior.size)
@@ -192,7 +189,7 @@ def test_receivers_and_ground_that_are_not_known_cost_the_monopole_alone(respons
         scenario = first.scenario.model_copy(update={"seed": seed})
         setup = replace(first, sky=replace(first.sky, modes=modes), scenario=scenario)
         data = simulate(setup)
-        unknown, told = (infer(Experiment(s, data)).posterior for s in (setup, known(setup)))
+        unknown, told = (lb.infer(lb.Experiment(s, data)).posterior for s in (setup, known(setup)))
         off = np.asarray(unknown.mean) - np.asarray(told.mean)
         moved.append(off / np.asarray(unknown.std()))
     moved = np.abs(moved)
@@ -202,5 +199,5 @@ def test_receivers_and_ground_that_are_not_known_cost_the_monopole_alone(respons
     wrong = known(first)
     wrong = replace(wrong, scenario=wrong.scenario.model_copy(update={"seed": 19}))
     wrong = replace(wrong, background=first.background)
-    off = np.asarray(infer(Experiment(wrong, data)).posterior.mean) - np.asarray(unknown.mean)
+    off = np.asarray(lb.infer(lb.Experiment(wrong, data)).posterior.mean) - np.asarray(unknown.mean)
     assert np.abs(off / np.asarray(unknown.std()))[1:].max() > 1.0

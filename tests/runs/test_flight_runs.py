@@ -10,10 +10,10 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
-import yaml
 from matplotlib.figure import Figure
 
 from lusee_bayes.cli.main import main
+from lusee_bayes.core.yaml_files import parse_yaml
 from lusee_bayes.flight.session_files import read_session
 
 SET = [
@@ -67,7 +67,7 @@ def test_fits_and_a_gain_table_of_ones_own(tmp_path):
     assert simulate(second, f"flight.gain_table={first / 'gains.nc'}",
                     "flight.simulated={kind: fits}") == 0  # fmt: skip
     assert "gains.nc" not in files_of(second) and "clock.json" not in files_of(second)
-    scenario = yaml.safe_load((second / "scenario.yaml").read_text())
+    scenario = parse_yaml((second / "scenario.yaml").read_text(), "the file")
     assert scenario["flight"]["gain_table"] == str(first / "gains.nc")
     assert scenario["flight"]["bin_origin"] == "centre"
     assert scenario["observation"]["timestamp"] == "middle"

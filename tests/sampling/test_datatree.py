@@ -10,16 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from reference_linear import assert_draws_follow, random_covariance, z_of
+from reference_linear import assert_draws_follow, matrices, random_covariance, z_of
 from reference_linear import posterior as naive_posterior
 
 import lusee_bayes as lb
 from lusee_bayes.core import formats
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.sampling.chains import STATISTICS, Chains
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree, write_datatree
-from lusee_bayes.sampling.programs import load_program
 
 # two antennas, so four products
 PRODUCTS, N_TIMES, N_MODES = ("00R", "01R", "01I", "11R"), 4, 9
@@ -48,8 +46,7 @@ def setting():
 @pytest.fixture(scope="module")
 def exact(setting):
     model, data = setting
-    s, n = model.prior.covariance(), model.noise.dense()
-    return naive_posterior(model.coupling.dense(), s, n, data.data)
+    return naive_posterior(*matrices(model), data.data)
 
 
 def chains_of(sites):
@@ -67,7 +64,7 @@ def drawn(setting):
     skies = np.asarray(posterior.sample(jax.random.key(3), N_CHAINS * N_DRAWS))
     chains = chains_of({"sky": skies.reshape(N_CHAINS, N_DRAWS, N_MODES)})
     tree = to_datatree(
-        chains, load_program("sky"), model, posterior, data,
+        chains, lb.load_program("sky"), model, posterior, data,
         n_predictive=N_CHAINS * N_DRAWS, attributes={"frequency_mhz": 25.0, "note": "µ = 1"},
     )  # fmt: skip
     return tree, chains
@@ -80,17 +77,10 @@ def collapsed(setting):
     levels = np.exp(np.random.default_rng(8).uniform(-2.3, 2.3, (N_CHAINS, N_DRAWS)))
     chains = chains_of({"noise_level": levels})
     tree = to_datatree(
-        chains, load_program("sky_marginal"), model, model.condition(data.data), data,
+        chains, lb.load_program("sky_marginal"), model, model.condition(data.data), data,
         n_predictive=N_CHAINS * N_DRAWS,
     )  # fmt: skip
     return tree, chains
-
-
-def a_s_n(model):
-    return (
-        np.asarray(x)
-        for x in (model.coupling.dense(), model.prior.covariance(), model.noise.dense())
-    )
 
 
 def test_every_group_is_there_with_its_dimensions(drawn, setting):
@@ -175,7 +165,7 @@ def test_constants_against_the_textbook(drawn, setting, exact):
 
 def test_prior_groups_follow_the_prior(drawn, setting):
     """Skies N(0, S), data N(0, A S A^T + N), and the data are those of the skies beside them."""
-    a, s, n = a_s_n(setting[0])
+    a, s, n = matrices(setting[0])
     skies = drawn[0]["prior"]["sky"].values[0]
     data = drawn[0]["prior_predictive"]["data"].values[0]
     assert_draws_follow(skies, np.zeros(N_MODES), s)
@@ -185,7 +175,7 @@ def test_prior_groups_follow_the_prior(drawn, setting):
 
 def test_posterior_predictive_follows_the_posterior(drawn, setting, exact):
     """N(A mean, A C A^T + N); new noise on the very sky of the same chain and draw."""
-    a, _, n = a_s_n(setting[0])
+    a, _, n = matrices(setting[0])
     replicated = drawn[0]["posterior_predictive"]["data"].values
     flat = replicated.reshape(-1, len(n))
     assert_draws_follow(flat, a @ exact.mean, a @ exact.covariance @ a.T + n)
@@ -198,7 +188,7 @@ def test_predictive_groups_are_thinned_and_know_which_draws_they_belong_to(setti
     model, data = setting
     posterior = model.condition(data.data)
     skies = np.asarray(posterior.sample(jax.random.key(1), 120)).reshape(4, 30, N_MODES)
-    program = load_program("sky")
+    program = lb.load_program("sky")
     # noise a million times smaller than the sky tells which sky the data belong to
     quiet = lb.LinearGaussian(model.coupling, model.prior, model.noise.scaled(1e-12))
     arguments = (program, quiet, posterior, data)
@@ -223,7 +213,7 @@ def test_another_seed_makes_other_predictive_draws_and_real_data_have_no_truth(s
     posterior = model.condition(data.data)
     chains = chains_of({"sky": np.asarray(posterior.sample(jax.random.key(1), 8))[None]})
     first, other = (
-        to_datatree(chains, load_program("sky"), model, posterior, d, seed=seed, n_predictive=8)
+        to_datatree(chains, lb.load_program("sky"), model, posterior, d, seed=seed, n_predictive=8)
         for seed, d in [(1, data), (2, real)]
     )
     for group, name in [
@@ -239,7 +229,7 @@ def test_another_seed_makes_other_predictive_draws_and_real_data_have_no_truth(s
 def test_a_program_without_the_sky_gets_it_drawn_given_each_of_its_draws(collapsed, setting):
     """Each in the coordinates of the posterior of its own noise level: unit normals."""
     model, data = setting
-    a, s, n = a_s_n(model)
+    a, s, n = matrices(model)
     tree, chains = collapsed
     levels = chains.sites["noise_level"]
     np.testing.assert_array_equal(tree["posterior"]["noise_level"], levels)
@@ -259,7 +249,7 @@ def test_a_program_without_the_sky_gets_it_drawn_given_each_of_its_draws(collaps
 def test_data_of_a_program_without_the_sky_are_replicated_with_its_skies(collapsed, setting):
     """(d - A m) / sqrt(level) ~ N(0, N), draw by draw; the prior predictive by its variance."""
     model, _ = setting
-    a, s, n = a_s_n(model)
+    a, s, n = matrices(model)
     tree, chains = collapsed
     noise = tree["posterior_predictive"]["data"].values - tree["posterior"]["sky"].values @ a.T
     scaled = noise / np.sqrt(chains.sites["noise_level"])[..., None]
@@ -277,7 +267,7 @@ def test_data_of_a_program_without_the_sky_are_replicated_with_its_skies(collaps
 
 
 def test_the_predictive_test_notices_noise_left_out(drawn, setting):
-    a, _, n = a_s_n(setting[0])
+    a, _, n = matrices(setting[0])
     with pytest.raises(AssertionError, match="sample covariance off"):
         silent = (
             np.zeros((2000, len(n)))
@@ -338,7 +328,7 @@ def test_files_that_are_no_samples_are_refused(setting, tmp_path):
         ("bare.nc", "its format is 'absent', expected"),
         (".", "is a folder; give a file: samples"),
     ]:
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(lb.InputError, match=message):
             read_datatree(tmp_path / name)
 
 
@@ -346,7 +336,7 @@ def test_a_tree_cut_short_is_refused(drawn, tmp_path):
     path = tmp_path / "samples.nc"
     write_datatree(drawn[0], path)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(InputError, match="cannot be read as HDF5"):
+    with pytest.raises(lb.InputError, match="cannot be read as HDF5"):
         read_datatree(path)
 
 

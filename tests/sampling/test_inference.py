@@ -16,19 +16,16 @@ import numpyro
 import pytest
 from arviz_stats.base import array_stats
 from numpyro import distributions as dist
+from reference_linear import matrices, random_covariance, z_of
 from reference_linear import posterior as naive_posterior
-from reference_linear import random_covariance, z_of
 from scipy.stats import lognorm, multivariate_normal
 
 import lusee_bayes as lb
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling import hmc as inference
 from lusee_bayes.sampling.chains import STATISTICS
 from lusee_bayes.sampling.checkpoints import Checkpoints
 from lusee_bayes.sampling.hmc import CHUNK, Sampler, draw_within, sample
 from lusee_bayes.sampling.program_sites import latent_sites
-from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.whitening import Whitening
 
 ROOT = Path(lb.__file__).resolve().parents[1]
 TESTS = Path(__file__).parent
@@ -59,23 +56,22 @@ def data(gaussian):
 @pytest.fixture(scope="module")
 def exact(gaussian, data):
     """The textbook posterior, by explicit matrices in numpy."""
-    s, n = gaussian.prior.covariance(), gaussian.noise.dense()
-    return naive_posterior(gaussian.coupling.dense(), s, n, data)
+    return naive_posterior(*matrices(gaussian), data)
 
 
 def arguments_of(gaussian, data, name="sky"):
-    return load_program(name).arguments(gaussian) | {"data": data}
+    return lb.load_program(name).arguments(gaussian) | {"data": data}
 
 
 def sky_chains(gaussian, data, sampler, whitening, **options):
-    program = load_program("sky").model
+    program = lb.load_program("sky").model
     return sample(program, arguments_of(gaussian, data), sampler, whitening, **options)
 
 
 @pytest.fixture(scope="module")
 def nuts(gaussian, data):
     """(chains, whitening): the No-U-Turn Sampler in the posterior's own coordinates."""
-    whitening = Whitening.of(gaussian.condition(data))
+    whitening = lb.Whitening.of(gaussian.condition(data))
     return sky_chains(gaussian, data, Sampler(draws=1000, seed=3), whitening), whitening
 
 
@@ -120,19 +116,13 @@ def test_the_comparison_notices_a_posterior_that_is_ten_percent_too_wide(nuts, e
         assert_follows(shifted, exact)
 
 
-def test_only_the_programs_own_sites_come_back(nuts):
-    chains, _ = nuts
-    assert set(chains.sites) == {"sky"}
-    assert set(chains.statistics) == set(STATISTICS)
-    assert all(values.shape == (4, 1000) for values in chains.statistics.values())
-
-
 def test_statistics_belong_to_the_draws_beside_them(nuts, gaussian, data):
     """lp is ln p(m, d) + ln|det R|, by scipy, draw by draw; energies hold the momenta's too."""
     chains, whitening = nuts
-    a, s, n = (np.asarray(x) for x in (
-        gaussian.coupling.dense(), gaussian.prior.covariance(), gaussian.noise.dense()
-    ))  # fmt: skip
+    assert set(chains.sites) == {"sky"} and set(chains.statistics) == set(STATISTICS)
+    # no chain is a copy of another
+    assert np.unique(chains.sites["sky"][..., 0]).size > 3000
+    a, s, n = matrices(gaussian)
     skies = chains.sites["sky"].reshape(-1, N_MODES)
     expected = multivariate_normal(cov=s).logpdf(skies)
     expected += multivariate_normal(cov=n).logpdf(np.asarray(data) - skies @ a.T)
@@ -149,12 +139,6 @@ def test_statistics_belong_to_the_draws_beside_them(nuts, gaussian, data):
     assert chains.gradients == chains.statistics["n_steps"].sum()
 
 
-def test_chains_are_not_copies_of_each_other(nuts):
-    first_modes = nuts[0].sites["sky"][..., 0]
-    for i, j in [(0, 1), (0, 2), (1, 3), (2, 3)]:
-        assert not np.isin(first_modes[i], first_modes[j]).any()
-
-
 def test_hmc_in_wrong_coordinates_follows_the_analytic_posterior(gaussian, data, exact):
     """Coordinates of another posterior: three times the noise, other data. Slower, not wrong.
 
@@ -162,7 +146,7 @@ def test_hmc_in_wrong_coordinates_follows_the_analytic_posterior(gaussian, data,
     prior's or the likelihood's part of the change of coordinates would not pass.
     """
     other = lb.LinearGaussian(gaussian.coupling, gaussian.prior, gaussian.noise.scaled(3.0))
-    wrong = Whitening.of(other.condition(-data))
+    wrong = lb.Whitening.of(other.condition(-data))
     sampler = Sampler(chains=4, warmup=150, draws=1500, algorithm="hmc", trajectory=1.2)
     chains = sky_chains(gaussian, data, sampler, wrong)
     assert_follows(chains.sites["sky"], exact)
@@ -190,7 +174,7 @@ def level_grid():
 
 def by_quadrature(gaussian, data, noise, logs):
     """Weights of each ln level, and the sky's posterior given it."""
-    a, s = np.asarray(gaussian.coupling.dense()), np.asarray(gaussian.prior.covariance())
+    a, s, _ = matrices(gaussian)
     given = [naive_posterior(a, s, np.exp(x) * noise, data) for x in logs]
     return np.array([answer.log_prob for answer in given]), given
 
@@ -199,7 +183,7 @@ def by_quadrature(gaussian, data, noise, logs):
 @pytest.mark.essential
 def test_a_sky_in_white_coordinates_beside_a_site_in_none(gaussian, data, level_grid):
     """Against quadrature over the level: p(level | d), and the sky's mean and second moments."""
-    whitening = Whitening.of(gaussian.condition(data))
+    whitening = lb.Whitening.of(gaussian.condition(data))
     arguments = {
         "coupling": gaussian.coupling,
         "prior": gaussian.prior,
@@ -233,12 +217,10 @@ def test_a_sky_in_white_coordinates_beside_a_site_in_none(gaussian, data, level_
 @pytest.mark.parametrize("algorithm", ["nuts", "hmc"])
 def test_the_marginal_program_finds_the_noise_level(gaussian, data, level_grid, algorithm):
     """No site in white coordinates; p(level | d) by quadrature over scipy's evidence."""
-    a, s, n = (np.asarray(x) for x in (
-        gaussian.coupling.dense(), gaussian.prior.covariance(), gaussian.noise.dense()
-    ))  # fmt: skip
+    a, s, n = matrices(gaussian)
     sampler = Sampler(chains=4, warmup=300, draws=1000, algorithm=algorithm)
     arguments = arguments_of(gaussian, data, "sky_marginal")
-    chains = sample(load_program("sky_marginal").model, arguments, sampler)
+    chains = sample(lb.load_program("sky_marginal").model, arguments, sampler)
     assert set(chains.sites) == {"noise_level"}
     levels = np.exp(level_grid)
     evidence = [
@@ -259,19 +241,15 @@ def test_the_marginal_program_finds_the_noise_level(gaussian, data, level_grid, 
         ({"chains": 0}, "chains must be at least 1, got 0"),
         ({"warmup": 19}, "warmup must be at least 20, got 19"),
         ({"draws": 0}, "draws must be at least 1, got 0"),
-        ({"draws": -5}, "draws must be at least 1, got -5"),
-        ({"target_accept": 0.0}, r"target_accept must lie in 0..1, got 0.0"),
         ({"target_accept": 1.0}, r"target_accept must lie in 0..1, got 1.0"),
         ({"target_accept": float("nan")}, r"target_accept must lie in 0..1, got nan"),
         ({"trajectory": 0.0}, "trajectory must be positive, got 0.0"),
-        ({"trajectory": -1.0}, "trajectory must be positive, got -1.0"),
         ({"trajectory": float("nan")}, "trajectory must be positive, got nan"),
         ({"algorithm": "nut"}, "unknown algorithm 'nut'; did you mean 'nuts'?"),
-        ({"algorithm": "gibbs"}, "unknown algorithm 'gibbs'; known: hmc, nuts"),
     ],
 )
 def test_settings_that_cannot_be_used(settings, message):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(lb.InputError) as caught:
         Sampler(**settings)
     assert str(caught.value) == message
 
@@ -290,10 +268,10 @@ def test_the_number_of_draws_is_no_part_of_a_runs_identity():
 
 @pytest.mark.parametrize("site", ["data", "skies"])
 def test_a_site_to_whiten_that_the_program_does_not_sample(gaussian, data, site):
-    whitening = Whitening.of(gaussian.condition(data), site)
+    whitening = lb.Whitening.of(gaussian.condition(data), site)
     arguments = arguments_of(gaussian, data)
-    with pytest.raises(InputError, match=f"no latent site '{site}' to whiten; it has sky"):
-        sample(load_program("sky").model, arguments, Sampler(), whitening)
+    with pytest.raises(lb.InputError, match=f"no latent site '{site}' to whiten; it has sky"):
+        sample(lb.load_program("sky").model, arguments, Sampler(), whitening)
 
 
 def test_latent_sites_are_those_sampled_and_not_observed(gaussian, data):
@@ -409,13 +387,13 @@ def in_numpyros_types():
 def test_chains_within_a_program_follow_each_data_sets_posterior(gaussian):
     """64 data sets at once. In each one's white coordinates the draws' means are independent."""
     n_sets, sampler = 64, Sampler(warmup=100, draws=30, algorithm="hmc")
-    program, pieces = load_program("sky"), load_program("sky").arguments(gaussian)
+    program, pieces = lb.load_program("sky"), lb.load_program("sky").arguments(gaussian)
     solver = gaussian.factorise()
 
     def one(key):
         data_key, key = jax.random.split(key)
         data = gaussian.sample(data_key)[1]
-        whitening = Whitening.of(solver.condition(data))
+        whitening = lb.Whitening.of(solver.condition(data))
         arguments = pieces | {"data": data}
         return data, draw_within(program.model, arguments, key, sampler, whitening, thin=2)
 
@@ -424,10 +402,10 @@ def test_chains_within_a_program_follow_each_data_sets_posterior(gaussian):
         data, sites = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(1), n_sets))
     assert set(sites) == {"sky"}
     assert sites["sky"].shape == (n_sets, 30, N_MODES)
-    s, n = gaussian.prior.covariance(), gaussian.noise.dense()
+    textbook = matrices(gaussian)
     z = np.empty(sites["sky"].shape)
     for k in range(n_sets):
-        answer = naive_posterior(gaussian.coupling.dense(), s, n, data[k])
+        answer = naive_posterior(*textbook, data[k])
         centred = np.asarray(sites["sky"][k]) - answer.mean
         z[k] = np.linalg.solve(np.linalg.cholesky(answer.covariance), centred.T).T
     i, j = np.triu_indices(N_MODES)
@@ -518,7 +496,7 @@ def test_chains_are_shared_out_among_devices_and_draw_the_same(gaussian, data, t
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     shared = np.load(tmp_path / "chains.npz")
-    whitening = Whitening.of(gaussian.condition(data))
+    whitening = lb.Whitening.of(gaussian.condition(data))
     single = sky_chains(gaussian, data, DEVICES, whitening)
     # Sums are rounded in another order: 1e-16 of numbers of order ten in a step size or a position.
     # In white coordinates the motion is that of a harmonic oscillator, which carries an error on

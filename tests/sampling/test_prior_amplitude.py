@@ -1,4 +1,4 @@
-"""The program prior_amplitude against its density on a grid, and against simulated truths.
+"""The program prior_amplitude against its density on a grid.
 
 The oracle knows the model from its docstring only: d ~ N(0, A S A^T + N), S = diag(C_ell) with
 C_ell = spectrum A ((ell + 1) / 10)^tilt, ln A ~ N(0, 0.5^2), tilt ~ N(0, 0.5^2).
@@ -8,20 +8,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
-from numpyro import handlers
-from numpyro.infer.util import log_density
+from experiments import density
 from reference_linear import posterior, random_covariance, z_of
 from scipy.stats import lognorm, norm
 
 import lusee_bayes as lb
-from lusee_bayes.sampling.calibration import N_DRAWS, Ranks, calibrate
-from lusee_bayes.sampling.hmc import Sampler, draw_within, sample
+from lusee_bayes.sampling.hmc import Sampler, sample
 from lusee_bayes.sampling.programs import collapsed_skies, load_program
 
 PROGRAM = load_program("prior_amplitude")
@@ -56,13 +53,13 @@ class Case:
         variance = spectrum_of(self.base, amplitude, tilt)[ell_of_mode(self.lmax)]
         return posterior(self.a, np.diag(variance), self.n, self.data)
 
-    def arguments(self, base_factor=1.0, noise_factor=1.0):
-        """What the program is called with; factors other than 1 make it a wrong one."""
+    def arguments(self):
+        """What the program is called with."""
         return {
             "coupling": jnp.asarray(self.a),
             "offset": jnp.zeros(len(self.a)),
-            "prior": lb.HarmonicPrior(jnp.asarray(base_factor * self.base)),
-            "noise": lb.DenseCovariance(jnp.asarray(noise_factor * self.n)),
+            "prior": lb.HarmonicPrior(jnp.asarray(self.base)),
+            "noise": lb.DenseCovariance(jnp.asarray(self.n)),
             "data": jnp.asarray(self.data),
         }
 
@@ -91,13 +88,6 @@ class Grid:
         self.sky_mean = self.weights @ means
         self.variance_of_means = self.weights @ (means - self.sky_mean) ** 2
         self.mean_variance = self.weights @ np.stack([np.diag(s.covariance) for s in skies])
-        self.mean_spectrum = self.weights @ spectrum_of(case.base, np.exp(x), t)
-
-    def draw(self, rng, shape):
-        """Independent draws of the nodes, as sites."""
-        x, t = (g.ravel() for g in np.meshgrid(self.log_amplitude, self.tilt, indexing="ij"))
-        chosen = rng.choice(len(x), shape, p=self.weights)
-        return {"amplitude": np.exp(x[chosen]), "tilt": t[chosen]}
 
     def cdf(self, which, values):
         """Marginal distribution function of ln amplitude (0) or tilt (1)."""
@@ -131,13 +121,6 @@ def assert_follow(grid: Grid, log_amplitude, tilt):
             assert abs(below.mean() - q) < limit * error, f"quantile {q} of {i} off"
 
 
-def draws_of(case: Case, seed):
-    """4 x 1500 draws by NUTS, of which about a third count."""
-    chains = sample(PROGRAM.model, case.arguments(), Sampler(draws=1500, seed=seed))
-    assert not chains.statistics["diverging"].any()
-    return chains.sites
-
-
 # --- against a grid -------------------------------------------------------------------------------
 
 
@@ -162,7 +145,10 @@ def grid(case):
 
 @pytest.fixture(scope="module")
 def sites(case):
-    return draws_of(case, 1)
+    """4 x 1500 draws by NUTS, of which about a third count."""
+    chains = sample(PROGRAM.model, case.arguments(), Sampler(draws=1500, seed=1))
+    assert not chains.statistics["diverging"].any()
+    return chains.sites
 
 
 def test_the_density_is_the_priors_times_the_evidence(case):
@@ -170,10 +156,8 @@ def test_the_density_is_the_priors_times_the_evidence(case):
     for amplitude, tilt in [(1.0, 0.0), (0.2, -1.0), (6.0, 1.3)]:
         expected = case.given(amplitude, tilt).log_prob
         expected += lognorm.logpdf(amplitude, 0.5) + norm.logpdf(tilt, 0.0, 0.5)
-        values = {"amplitude": jnp.asarray(amplitude), "tilt": jnp.asarray(tilt)}
-        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-            got, _ = log_density(PROGRAM.model, (), case.arguments(), values)
-        assert float(got) == pytest.approx(expected, rel=1e-11)
+        got, _ = density(PROGRAM, case.arguments(), {"amplitude": amplitude, "tilt": tilt})
+        assert got == pytest.approx(expected, rel=1e-11)
 
 
 @pytest.mark.long
@@ -196,22 +180,6 @@ def test_nuts_does_not_follow_the_grid_of_another_program(case, sites, wrong):
 # --- the skies drawn with it ----------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def poorly_known():
-    """Four modes seen once each, with S / N of 1 / 4 and 1 / 8, all two sigma out.
-
-    Their common brightness says that A is large, but not how large: ln A +- 0.51.
-    """
-    base, n = np.array([4.0, 2.0]), 16.0 * np.eye(4)
-    return Case(np.eye(4), base, n, 2.0 * np.sqrt(base[ell_of_mode(1)] + 16.0))
-
-
-def skies_of(case, sites, seed):
-    arguments = case.arguments()
-    data = arguments.pop("data")
-    return collapsed_skies(PROGRAM, arguments, data, sites, jax.random.key(seed))
-
-
 def assert_variances(skies, mean, variance):
     """Of every mode about the mean given, and their sum, to z_of Monte Carlo errors."""
     limit = z_of(2 * len(mean) + 1)
@@ -231,152 +199,7 @@ def assert_variances(skies, mean, variance):
 def test_skies_obey_the_law_of_total_variance(case, grid, sites):
     """Mean of the conditional variances plus variance of the conditional means, mode by mode."""
     total = grid.mean_variance + grid.variance_of_means
-    assert_variances(skies_of(case, sites, 2), grid.sky_mean, total)
-
-
-@pytest.mark.long
-def test_skies_are_wider_where_their_prior_is_uncertain(poorly_known):
-    """By the law of total variance than each of them; here, than at the mean spectrum, too.
-
-    The second is no law: conditional variances are concave in the spectrum, and with data of
-    1 sigma instead of 2 those at the mean spectrum are the larger ones, by 6 %.
-    """
-    case = poorly_known
-    grid = Grid(case, LOG_AMPLITUDES, TILTS)
-    total = grid.mean_variance + grid.variance_of_means
-    skies = skies_of(case, grid.draw(np.random.default_rng(3), (4, 2500)), 4)
+    arguments = case.arguments()
+    data = arguments.pop("data")
+    skies = collapsed_skies(PROGRAM, arguments, data, sites, jax.random.key(2))
     assert_variances(skies, grid.sky_mean, total)
-    # sums over the modes, with Monte Carlo errors of 1 %; the grid says 1.51 and 1.23
-    drawn = skies.reshape(-1, 4).var(0).sum()
-    assert drawn > 1.4 * grid.mean_variance.sum()
-    fixed = lb.LinearGaussian(
-        jnp.asarray(case.a),
-        lb.HarmonicPrior(jnp.asarray(grid.mean_spectrum)),
-        lb.DenseCovariance(jnp.asarray(case.n)),
-    ).condition(case.data)
-    assert drawn > 1.15 * float((fixed.std() ** 2).sum())
-    # skies with amplitude and tilt at their means do not pass for these
-    means = {"amplitude": np.exp(grid.mean[0]), "tilt": grid.mean[1]}
-    frozen = {name: np.full((4, 2500), value) for name, value in means.items()}
-    with pytest.raises(AssertionError, match="off"):
-        assert_variances(skies_of(case, frozen, 5), grid.sky_mean, total)
-
-
-# --- over many data sets --------------------------------------------------------------------------
-
-
-def simulate(case: Case, key):
-    """A truth from the priors, and data of it, with nothing of the package's."""
-    keys = jax.random.split(key, 4)
-    amplitude = jnp.exp(0.5 * jax.random.normal(keys[0], dtype=jnp.float64))
-    tilt = 0.5 * jax.random.normal(keys[1], dtype=jnp.float64)
-    ell = np.arange(len(case.base))
-    std = jnp.sqrt(case.base * amplitude * jnp.power((ell + 1) / 10, tilt))[ell_of_mode(case.lmax)]
-    sky = std * jax.random.normal(keys[2], std.shape, dtype=jnp.float64)
-    noise = np.linalg.cholesky(case.n) @ jax.random.normal(keys[3], (len(case.a),), dtype=float)
-    return {"amplitude": amplitude, "tilt": tilt, "sky": sky}, case.a @ sky + noise
-
-
-def draw(sampler: Sampler, thin: int, arguments: dict, shift, key, data):
-    """Amplitudes and tilts by the package's HMC, skies from what the program returns.
-
-    ``shift``: skies are given to the draw so many places later; anything but 0 is wrong.
-    """
-    chain_key, sky_key = jax.random.split(key)
-    given = {**arguments, "data": data}
-    sites = draw_within(PROGRAM.model, given, chain_key, sampler, thin=thin)
-
-    def sky(inputs):
-        values, key = inputs
-        model = handlers.substitute(handlers.seed(PROGRAM.model, 0), values)
-        return model(**given).condition(data).sample(key)
-
-    skies = jax.lax.map(sky, (sites, jax.random.split(sky_key, N_DRAWS)))
-    return {**sites, "sky": jnp.roll(skies, shift, axis=0)}
-
-
-def quantities(case: Case, unknowns, data):
-    """The unknowns, and two that link them with each other and with the data."""
-    sky, ell = unknowns["sky"], np.arange(len(case.base))
-    spectrum = case.base * unknowns["amplitude"] * jnp.power((ell + 1) / 10, unknowns["tilt"])
-    residual = np.linalg.inv(np.linalg.cholesky(case.n)) @ (data - case.a @ sky)
-    return {
-        "amplitude": unknowns["amplitude"],
-        "tilt": unknowns["tilt"],
-        "mode": sky[np.array([0, len(sky) - 1])],
-        "power": (sky**2).sum(),
-        "prior": (sky**2 / spectrum[ell_of_mode(case.lmax)]).sum(),
-        "log likelihood": -0.5 * (residual**2).sum(),
-    }
-
-
-def ranks(case: Case, sampler: Sampler, thin: int, n: int, batch: int, shift=0, **wrong) -> Ranks:
-    """Right and wrong versions differ in arrays only, so that all run one compiled program."""
-    arguments = {k: v for k, v in case.arguments(**wrong).items() if k != "data"}
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        return calibrate(
-            eqx.Partial(simulate, case),
-            eqx.Partial(draw, sampler, thin, arguments, jnp.asarray(shift)),
-            eqx.Partial(quantities, case),
-            n_simulations=n,
-            seed=1,
-            batch=batch,
-        )
-
-
-def p_values(ranks: Ranks) -> dict[str, float]:
-    return dict(zip(ranks.names, ranks.p_values(), strict=True))
-
-
-def assert_covers(ranks: Ranks):
-    """Central intervals hold the truth as often as they say."""
-    limit = z_of(len(ranks.names) * 4)
-    for name, table in ranks.coverage().items():
-        for level, covered in table.items():
-            off = abs(covered - level) / ranks.coverage_error(level)
-            assert off < limit, f"{level:.0%} interval of {name} holds {covered:.1%}"
-
-
-def of_no_data(lmax, n_data, noise) -> Case:
-    rng = np.random.default_rng(lmax)
-    a, base = rng.normal(size=(n_data, (lmax + 1) ** 2)), 4.0 / (1.0 + np.arange(lmax + 1))
-    return Case(a, base, noise * random_covariance(rng, n_data), np.zeros(n_data))
-
-
-# sampler's every second draw, data sets, data sets at once
-QUICK = (of_no_data(1, 12, 15.0), Sampler(warmup=100, draws=N_DRAWS, algorithm="hmc"), 2, 200, 100)
-
-
-@pytest.mark.long
-def test_calibrated_over_200_data_sets():
-    found = ranks(*QUICK)
-    assert found.passed, p_values(found)
-    assert_covers(found)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("wrong", "witness"),
-    [
-        pytest.param({"base_factor": 2.0}, "prior", marks=pytest.mark.long),
-        pytest.param({"noise_factor": 2.0}, "log likelihood", marks=pytest.mark.long),
-        ({"noise_factor": 0.5}, "log likelihood"),
-        pytest.param({"shift": 17}, "prior", marks=pytest.mark.long),
-    ],
-)
-def test_calibration_notices_what_is_wrong(wrong, witness):
-    """A prior of twice the power, noise off by sqrt(2), skies that belong to other amplitudes."""
-    found = ranks(*QUICK, **wrong)
-    assert not found.passed
-    assert p_values(found)[witness] < found.threshold
-
-
-@pytest.mark.long
-def test_calibrated_over_200_data_sets_of_16_modes():
-    """By NUTS, the package's own choice; every third draw is kept."""
-    settings = (of_no_data(3, 20, 15.0), Sampler(warmup=150, draws=N_DRAWS), 3, 200, 100)
-    found = ranks(*settings)
-    assert found.passed, p_values(found)
-    assert_covers(found)
-    # noise 20 % too strong
-    assert not ranks(*settings, noise_factor=1.44).passed

@@ -1,8 +1,11 @@
 """Programs: found and refused in one sentence; skies and data drawn from collapsed ones."""
 
+from __future__ import annotations
+
 import hashlib
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +15,12 @@ from numpyro import handlers
 from numpyro.infer.util import log_density
 from reference_linear import assert_draws_follow, posterior, random_covariance
 
+import lusee_bayes
 import lusee_bayes as lb
+from lusee_bayes.cli.main import main
+from lusee_bayes.experiment.pieces import program_pieces
+from lusee_bayes.sampling.program_checks import require_sampleable
 from lusee_bayes.sampling.programs import (
-    PIECES,
     collapsed_skies,
     is_collapsed,
     load_program,
@@ -146,64 +152,34 @@ def test_no_such_program(tmp_path):
         assert_one_sentence(error, str(source), "sky_marginal", "prior_amplitude")
 
 
-def test_only_python_files_are_programs(write):
-    path = write("def model(data=None):\n    pass\n", "mine.txt")
-    with pytest.raises(lb.InputError, match="give the path of a Python file"):
-        load_program(path)
-
-
 @pytest.mark.parametrize(
-    ("text", "reason"),
+    ("text", "message", "more"),
     [
-        ("def model(:\n", "line 1"),
-        ("import nowhere_to_be_found\n", "nowhere_to_be_found"),
-        ("unknown_name + 1\n", "unknown_name"),
-        ("scale = 1 / 0\n", "division by zero"),
-        ("raise RuntimeError('no device')\n", "no device"),
-        ("open('/nonexistent/table.txt')\n", "/nonexistent/table.txt"),
-        ("{}['missing key']\n", "missing key"),
-        ("assert 1 > 2, 'not so'\n", "not so"),
+        ("def model(:\n", "does not run", "line 1"),
+        ("import nowhere_to_be_found\n", "does not run", "nowhere_to_be_found"),
+        ("scale = 1 / 0\n", "does not run", "division by zero"),
+        ("raise RuntimeError('no device')\n", "does not run", "no device"),
+        ("open('/nonexistent/table.txt')\n", "does not run", "/nonexistent/table.txt"),
+        ("{}['missing key']\n", "does not run", "missing key"),
+        ("assert 1 > 2, 'not so'\n", "does not run", "not so"),
+        *(
+            (text, "has no function 'model'", "def model(")
+            for text in ("x = 1\n", "model = 3\n", "def Model(data=None):\n    pass\n")
+        ),
+        ("def model(coupling, prior):\n    pass\n", "has no argument 'data'", "mine.py"),
+        # prior predictive draws need it; better refused now than after the sampling
+        ("def model(coupling, data):\n    pass\n", "data=None", "mine.py"),
+        ("def model(coupling, nois, data=None):\n    pass\n", "asks for 'nois'", "mean 'noise'?"),
+        ("def model(xyz, data=None):\n    pass\n", "asks for 'xyz'", "noise"),
     ],
 )
-def test_a_file_that_does_not_run(write, text, reason):
+def test_files_that_are_no_programs(write, text, message, more):
     path = write(text)
-    with pytest.raises(lb.InputError, match="does not run") as error:
+    with pytest.raises(lb.InputError, match=message) as error:
         load_program(path)
-    assert_one_sentence(error, str(path), reason)
-
-
-@pytest.mark.parametrize("text", ["x = 1\n", "model = 3\n", "def Model(data=None):\n    pass\n"])
-def test_a_file_without_model(write, text):
-    path = write(text)
-    with pytest.raises(lb.InputError, match="has no function 'model'") as error:
-        load_program(path)
-    assert_one_sentence(error, str(path), "def model(")
-
-
-def test_a_model_without_data(write):
-    path = write("def model(coupling, prior):\n    pass\n")
-    with pytest.raises(lb.InputError, match="has no argument 'data'") as error:
-        load_program(path)
-    assert_one_sentence(error, str(path))
-
-
-def test_a_model_that_cannot_be_called_without_data(write):
-    """The prior predictive draws need it; better refused now than after the sampling."""
-    path = write("def model(coupling, data):\n    pass\n")
-    with pytest.raises(lb.InputError, match="data=None") as error:
-        load_program(path)
-    assert_one_sentence(error, str(path))
-
-
-def test_an_unknown_argument_and_what_may_be_meant(write):
-    path = write("def model(coupling, nois, data=None):\n    pass\n")
-    with pytest.raises(lb.InputError, match="asks for 'nois'") as error:
-        load_program(path)
-    assert_one_sentence(error, str(path), "did you mean 'noise'?")
-    path = write("def model(xyz, data=None):\n    pass\n")
-    with pytest.raises(lb.InputError, match="asks for 'xyz'") as error:
-        load_program(path)
-    assert_one_sentence(error, *PIECES)
+    assert_one_sentence(error, str(path), more)
+    with pytest.raises(lb.InputError, match="give the path of a Python file"):
+        load_program(write(text, "mine.txt"))
 
 
 # --- what they ask for ----------------------------------------------------------------------------
@@ -373,3 +349,118 @@ def test_each_sky_is_seen_in_its_own_place(gaussian, collapsed):
     )  # fmt: skip
     # noise of order one on data of order 1e6
     np.testing.assert_allclose(seen, skies @ np.asarray(gaussian.coupling.dense()).T, atol=20.0)
+
+
+# --- programs that cannot be sampled --------------------------------------------------------------
+
+
+ROOT = Path(lusee_bayes.__file__).resolve().parents[1]
+
+HEAD = """
+import jax.numpy as jnp
+import numpyro
+from numpyro import distributions as dist
+from lusee_bayes.sampling.distributions import CorrelatedNormal, SkyPrior
+
+def model(coupling, prior, noise, data=None):
+    sky = numpyro.sample("sky", SkyPrior(prior))
+    loc = coupling @ sky
+"""
+TWICE = '    numpyro.deterministic("twice", 2 * sky)\n'
+GOOD = '    numpyro.sample("data", CorrelatedNormal(loc, noise), obs=data)\n'
+
+BAD = {
+    "raises": ("    raise OSError('no disc')\n" + GOOD, r"fails when it is called \(line 10\): OS"),
+    "exits": ("    raise SystemExit(3)\n" + GOOD, "fails when it is called"),
+    "twice": ('    numpyro.sample("sky", dist.Normal(0, 1))\n' + GOOD, "sky"),
+    "discrete": ('    numpyro.sample("k", dist.Poisson(3))\n' + GOOD, "discrete site 'k'"),
+    "slash": ('    numpyro.sample("a/b", dist.Normal(0, 1))\n' + GOOD, "a site 'a/b'"),
+    "empty": ('    numpyro.sample("", dist.Normal(0, 1))\n' + GOOD, "a site ''"),
+    "dimension": ('    numpyro.sample("chain", dist.Normal(0, 1))\n' + GOOD, "'chain', a name"),
+    "derived": ('    numpyro.deterministic("x/y", loc)\n' + GOOD, "a site 'x/y'"),
+    "shape": (
+        "    data = None if data is None else data[:-1]\n"
+        '    numpyro.sample("data", dist.Normal(loc[:-1], 1), obs=data)\n',
+        "observes 'data' with shape",
+    ),
+    "column": (
+        '    numpyro.sample("data", dist.Normal(loc[:, None], 1), obs=data)\n',
+        "observes 'data' with shape|fails when",
+    ),
+    "complex": (
+        '    numpyro.factor("c", 1j * sky[0])\n' + GOOD,
+        "fails when its density is differentiated",
+    ),
+    "traced": ("    float(sky[0])\n" + GOOD, "fails when it is called"),
+    "improper": (
+        '    numpyro.sample("u", dist.ImproperUniform(dist.constraints.real, (), ()))\n' + GOOD,
+        "fails when",
+    ),
+    "only with data": (
+        '    if data is not None:\n        numpyro.sample("x", dist.Normal(0, 1))\n' + GOOD,
+        "samples 'x' only with data",
+    ),
+    "no data": (
+        '    if data is not None:\n        numpyro.sample("data", dist.Normal(loc, 1), obs=data)\n',
+        "draws no data where data=None",
+    ),
+    "unobserved": ('    numpyro.sample("data", dist.Normal(loc, 1))\n', "no observed site 'data'"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def pieces():
+    scenario = lb.load_scenario("fiducial", ["lmax=2", "observation.runs.0.cycles=0.05"])
+    experiment = lb.build(scenario)
+    model = lb.infer(experiment).model
+    return model, program_pieces(experiment), experiment.data.data
+
+
+def check(path, pieces):
+    model, more, data = pieces
+    program = lb.load_program(path)
+    arguments = program.arguments(model, more)
+    return require_sampleable(program, arguments, data, model.prior.variance().shape[0])
+
+
+def test_a_good_program_passes(tmp_path, pieces):
+    path = tmp_path / "good.py"
+    path.write_text(HEAD + '    numpyro.sample("x.y-1", dist.Normal(0, 1))\n' + TWICE + GOOD)
+    assert check(path, pieces) == ["sky", "x.y-1"]
+
+
+@pytest.mark.parametrize(
+    "name", ["sky", "sky_marginal", "prior_amplitude", "spectrum_bands", "student_t"]
+)
+def test_the_packages_programs_pass(name, pieces):
+    assert check(name, pieces)
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_programs_are_one_sentence(name, tmp_path, pieces):
+    body, message = BAD[name]
+    path = tmp_path / "bad.py"
+    path.write_text(HEAD + body)
+    with pytest.raises(lb.InputError, match=message) as caught:
+        check(path, pieces)
+    assert "\n" not in str(caught.value) and "bad.py" in str(caught.value)
+
+
+@pytest.mark.parametrize("argument", ["coupling, /, ", "*, coupling, *noise, ", "**others, "])
+def test_arguments_are_given_by_name(argument, tmp_path):
+    path = tmp_path / "bad.py"
+    path.write_text(f"def model({argument}data=None):\n    pass\n")
+    with pytest.raises(lb.InputError, match="does not run|by position, or as many as come"):
+        lb.load_program(path)
+
+
+def test_a_density_that_is_nan_names_the_program(tmp_path, capsys):
+    path = tmp_path / "bad.py"
+    lines = '    numpyro.factor("bad", jnp.log(-1.0) * sky.sum())\n'
+    path.write_text((ROOT / "models" / "sky.py").read_text() + lines + "import jax.numpy as jnp\n")
+    small = ["--set", "lmax=3", "--set", "observation.step_s=43200"]
+    short = ["--chains", "1", "--warmup", "20", "--draws", "10", "-q"]
+    out = str(tmp_path / "out")
+    assert main(["sample", "fiducial", *small, "--model", str(path), *short, "-o", out]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "bad.py" in error and "NaN" in error and "\n" not in error

@@ -12,17 +12,14 @@ import numpyro
 import pytest
 from numpyro import distributions as dist
 from numpyro import handlers
-from numpyro.infer import MCMC, NUTS, Predictive
+from numpyro.infer import Predictive
 from numpyro.infer.util import log_density
-from reference_linear import z_of
+from reference_linear import matrices, z_of
 from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
 from lusee_bayes.linear.model import FORMS
-from lusee_bayes.sampling.hmc import Sampler, sample
-from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.promotion import numpyro_promotion
-from lusee_bayes.sampling.whitening import Whitening, whitened
 
 LMAX = 2
 N_DATA = 30
@@ -30,7 +27,7 @@ NO_OFFSET = jnp.zeros(N_DATA)
 
 
 def program(name):
-    return load_program(name).model
+    return lb.load_program(name).model
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +43,7 @@ def gaussian():
 
 def test_densities_against_scipy(gaussian):
     sky, data = gaussian.sample(jax.random.key(0))
-    s, n = np.asarray(gaussian.prior.covariance()), np.asarray(gaussian.noise.dense())
-    a = np.asarray(gaussian.coupling.dense())
+    a, s, n = matrices(gaussian)
     prior = lb.SkyPrior(gaussian.prior).log_prob(sky)
     assert float(prior) == pytest.approx(multivariate_normal(cov=s).logpdf(sky), rel=1e-12)
     given = lb.CorrelatedNormal(gaussian.coupling @ sky, gaussian.noise).log_prob(data)
@@ -102,52 +98,6 @@ def test_handlers_and_predictive(gaussian):
     assert drawn["data"].shape == (7, N_DATA)
 
 
-@pytest.mark.long
-def test_nuts_finds_the_analytic_posterior(gaussian):
-    _, data = gaussian.sample(jax.random.key(5))
-    posterior = gaussian.condition(data)
-    mcmc = MCMC(
-        NUTS(program("sky")), num_warmup=500, num_samples=2000, num_chains=2,
-        chain_method="vectorized", progress_bar=False,
-    )  # fmt: skip
-    with numpyro_promotion():
-        noise = gaussian.noise.factor()
-        mcmc.run(jax.random.key(6), gaussian.coupling, NO_OFFSET, gaussian.prior, noise, data=data)
-    draws = np.asarray(mcmc.get_samples()["sky"])
-    std = np.asarray(posterior.std())
-    # NUTS makes at least a tenth of its 4000 draws count: 400 independent ones, 5 sigma
-    assert np.abs((draws.mean(0) - np.asarray(posterior.mean)) / std).max() < 5 / np.sqrt(400)
-    assert np.abs(draws.std(0) / std - 1.0).max() < 5 / np.sqrt(2 * 400)
-    assert int(mcmc.get_extra_fields()["diverging"].sum()) == 0
-
-
-@pytest.mark.long
-def test_the_marginal_program_finds_the_noise_level(gaussian):
-    """Against the density of the noise level on a grid, normalised by the trapezoidal rule."""
-    _, data = gaussian.sample(jax.random.key(7))
-    mcmc = MCMC(NUTS(program("sky_marginal")), num_warmup=300, num_samples=2000, progress_bar=False)
-    with numpyro_promotion():
-        arguments = (gaussian.coupling, NO_OFFSET, gaussian.prior, gaussian.noise)
-        mcmc.run(jax.random.key(8), *arguments, data=data)
-    draws = np.asarray(mcmc.get_samples()["noise_level"])
-    logs = np.linspace(-3.0, 3.0, 121)
-
-    def log_density(x):
-        scaled = lb.LinearGaussian(
-            gaussian.coupling, gaussian.prior, gaussian.noise.scaled(jnp.exp(x))
-        )
-        return scaled.log_prob(data) - 0.5 * x**2
-
-    values = np.array([float(log_density(jnp.asarray(x))) for x in logs])
-    weights = np.exp(values - values.max())
-    weights /= weights.sum()
-    mean = weights @ logs
-    spread = np.sqrt(weights @ (logs - mean) ** 2)
-    # at least 400 of 2000 draws count; 5 sigma
-    assert abs(np.log(draws).mean() - mean) < 5 * spread / np.sqrt(400)
-    assert abs(np.log(draws).std() / spread - 1.0) < 5 / np.sqrt(2 * 400)
-
-
 # --- white coordinates ----------------------------------------------------------------------------
 
 
@@ -177,7 +127,7 @@ def case(gaussian):
         "fixed_noise": gaussian.noise.factor(),
         "data": data,
     }
-    return arguments, Whitening.of(gaussian.condition(data))
+    return arguments, lb.Whitening.of(gaussian.condition(data))
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +145,7 @@ def test_the_log_determinant_is_that_of_the_root(gaussian, n_data, form):
         lb.DenseCovariance(gaussian.noise.matrix[:n_data, :n_data]),
     )
     posterior = few.condition(few.sample(jax.random.key(1))[1], form)
-    whitening = Whitening.of(posterior)
+    whitening = lb.Whitening.of(posterior)
     # a sum of 9 logarithms of order one, and of a root with condition below 100
     log_det = np.linalg.slogdet(np.asarray(whitening.root))[1]
     assert float(whitening.log_det) == pytest.approx(log_det, abs=1e-12)
@@ -210,13 +160,13 @@ def test_a_prior_without_density_has_no_white_coordinates():
         a = jnp.asarray(np.random.default_rng(0).standard_normal((3, prior.size)))
         model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(3)))
         with pytest.raises(lb.InputError, match="has no density"):
-            Whitening.of(model.condition(jnp.ones(3)))
+            lb.Whitening.of(model.condition(jnp.ones(3)))
 
 
 def test_the_density_of_z_is_the_programs_own_times_the_determinant(gaussian, case, z):
     """For any coordinates, and a program for which they are the wrong ones."""
     arguments, right = case
-    wrong = Whitening.of(gaussian.condition(3.0 + 2.0 * arguments["data"], "data"))
+    wrong = lb.Whitening.of(gaussian.condition(3.0 + 2.0 * arguments["data"], "data"))
     wrong = eqx.tree_at(
         lambda w: (w.root, w.log_det), wrong, (2.0 * wrong.root, wrong.log_det + 9 * np.log(2.0))
     )
@@ -225,7 +175,7 @@ def test_the_density_of_z_is_the_programs_own_times_the_determinant(gaussian, ca
             sky = whitening.mean + whitening.root @ z
             plain = joint(model, arguments, {"sky": sky, **others})
             expected = plain + np.linalg.slogdet(np.asarray(whitening.root))[1]
-            model_of_z = whitened(model, whitening)
+            model_of_z = lb.whitened(model, whitening)
             got = joint(model_of_z, arguments, {"sky_white": z, **others})
             # terms up to 1e4, summed in another order: 1e4 x 10 x eps
             assert got == pytest.approx(expected, abs=1e-11, rel=1e-13)
@@ -236,19 +186,21 @@ def test_the_density_of_z_is_the_programs_own_times_the_determinant(gaussian, ca
 def test_z_is_standard_normal_where_the_coordinates_are_the_posteriors(gaussian, case, z):
     """p(d, m) |dm/dz| = p(d) N(z; 0, 1), with the evidence by scipy."""
     arguments, whitening = case
-    a, s = np.asarray(gaussian.coupling.dense()), np.asarray(gaussian.prior.covariance())
-    covariance = a @ s @ a.T + np.asarray(gaussian.noise.dense())
+    a, s, n = matrices(gaussian)
+    covariance = a @ s @ a.T + n
     evidence = multivariate_normal(cov=covariance).logpdf(arguments["data"])
     for factor in (0.0, 1.0, -5.0):
         at = factor * np.asarray(z)
         expected = evidence + multivariate_normal(cov=np.eye(9)).logpdf(at)
-        got = joint(whitened(program("sky"), whitening), arguments, {"sky_white": jnp.asarray(at)})
+        got = joint(
+            lb.whitened(program("sky"), whitening), arguments, {"sky_white": jnp.asarray(at)}
+        )
         assert got == pytest.approx(expected, rel=1e-11)
 
 
 def test_sites_of_a_whitened_program(case, z):
     arguments, whitening = case
-    model = whitened(program("sky"), whitening)
+    model = lb.whitened(program("sky"), whitening)
     trace = handlers.trace(handlers.substitute(model, {"sky_white": z})).get_trace(**arguments)
     assert set(trace) == {"sky_white", "sky_density", "sky", "data"}
     white, sky = trace["sky_white"], trace["sky"]
@@ -266,7 +218,7 @@ def test_sites_of_a_whitened_program(case, z):
 def test_other_sites_are_left_alone(case, z):
     arguments, whitening = case
     values = {"sky_white": z, "amplitude": jnp.asarray(0.7)}
-    model = whitened(strong_sky, whitening)
+    model = lb.whitened(strong_sky, whitening)
     trace = handlers.trace(handlers.substitute(model, values)).get_trace(**arguments)
     assert isinstance(trace["amplitude"]["fn"], dist.LogNormal)
     assert float(trace["amplitude"]["value"]) == 0.7
@@ -275,23 +227,6 @@ def test_other_sites_are_left_alone(case, z):
     prior = multivariate_normal(cov=np.diag(scaled)).logpdf(trace["sky"]["value"])
     factor = float(trace["sky_density"]["fn"].log_prob(trace["sky_density"]["value"]))
     assert factor - float(whitening.log_det) == pytest.approx(prior, rel=1e-12)
-
-
-def test_conditioning_on_z_fixes_the_sky(case, z):
-    arguments, whitening = case
-    model = whitened(program("sky"), whitening)
-    free = {**arguments, "data": None}
-    conditioned = handlers.condition(model, {"sky_white": z})
-    trace = handlers.trace(handlers.seed(conditioned, 0)).get_trace(**free)
-    assert trace["sky_white"]["is_observed"]
-    np.testing.assert_allclose(
-        trace["sky"]["value"], whitening.mean + whitening.root @ z, rtol=1e-14, atol=1e-14
-    )
-    # the data are drawn by the seed: the same again, and others with another seed
-    again = handlers.trace(handlers.seed(conditioned, 0)).get_trace(**free)
-    other = handlers.trace(handlers.seed(conditioned, 1)).get_trace(**free)
-    np.testing.assert_array_equal(trace["data"]["value"], again["data"]["value"])
-    assert (trace["data"]["value"] != other["data"]["value"]).all()
 
 
 @pytest.mark.parametrize("how", ["obs", "condition"])
@@ -303,19 +238,7 @@ def test_an_observed_sky_is_not_whitened(case, z, how):
 
     model = observed if how == "obs" else handlers.condition(program("sky"), {"sky": z})
     with pytest.raises(lb.InputError, match="the site 'sky' is observed; only latent sites"):
-        handlers.substitute(whitened(model, whitening), {"sky_white": z})(**arguments)
-
-
-def test_an_improper_site_is_never_drawn_from(case):
-    """Prior draws of z do not exist; NumPyro says so, and makes nothing up."""
-    arguments, whitening = case
-    model = whitened(program("sky"), whitening)
-    free = {**arguments, "data": None}
-    with numpyro_promotion():
-        with pytest.raises(NotImplementedError):
-            handlers.seed(model, 0)(**free)
-        with pytest.raises(NotImplementedError):
-            Predictive(model, num_samples=3)(jax.random.key(0), **free)
+        handlers.substitute(lb.whitened(model, whitening), {"sky_white": z})(**arguments)
 
 
 def test_predictions_from_draws_of_z(gaussian, case):
@@ -326,7 +249,7 @@ def test_predictions_from_draws_of_z(gaussian, case):
     z = jax.random.normal(jax.random.key(3), (n, 9), dtype=jnp.float64)
     free = {**arguments, "data": None}
     with numpyro_promotion():
-        drawn = Predictive(whitened(program("sky"), whitening), {"sky_white": z})(
+        drawn = Predictive(lb.whitened(program("sky"), whitening), {"sky_white": z})(
             jax.random.key(4), **free
         )
     expected = np.asarray(whitening.mean) + np.asarray(z) @ np.asarray(whitening.root).T
@@ -337,23 +260,3 @@ def test_predictions_from_draws_of_z(gaussian, case):
     limit = z_of(2 * N_DATA)
     assert np.abs(delta.mean(0) / np.sqrt(variance / n)).max() < limit
     assert np.abs((delta**2).mean(0) / variance - 1.0).max() < limit * np.sqrt(2 / n)
-
-
-@pytest.mark.long
-def test_wrong_coordinates_slow_the_chains_down_and_leave_the_posterior_right(gaussian, case):
-    """z from other data and three times the noise: still the analytic posterior, by NUTS."""
-    arguments, _ = case
-    posterior = gaussian.condition(arguments["data"])
-    other = lb.LinearGaussian(gaussian.coupling, gaussian.prior, gaussian.noise.scaled(3.0))
-    wrong = Whitening.of(other.condition(1.0 + arguments["data"]))
-    # coordinates that differ by standard deviations, or the test would say nothing
-    assert np.abs((wrong.mean - posterior.mean) / posterior.std()).max() > 1.0
-    chains = sample(program("sky"), arguments, Sampler(chains=2, draws=1000), wrong)
-    draws = chains.sites["sky"].reshape(-1, 9)
-    white = np.asarray(posterior.whiten(draws))
-    # at least a fifth of the 2000 draws count
-    limit = z_of(2 * 9)
-    assert np.abs(white.mean(0)).max() < limit / np.sqrt(400)
-    assert np.abs((white**2).mean(0) - 1.0).max() < limit * np.sqrt(2 / 400)
-    # what those coordinates would give if their density were left out is seen by the same measure
-    assert np.abs(np.asarray(posterior.whiten(wrong.mean[None]))).max() > limit / np.sqrt(400)

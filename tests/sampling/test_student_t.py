@@ -195,8 +195,8 @@ def burst():
     white = coordinates(
         PROGRAM,
         {name: value for name, value in arguments.items() if name != "data"},
-        experiment,
-        gaussian.condition(dirty),
+        experiment.data,
+        infer(experiment),
         ["sky"],
     )
     chains = sample(

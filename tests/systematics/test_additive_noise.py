@@ -10,7 +10,6 @@ from numpyro import handlers
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.noise.covariance import Covariance, DenseCovariance, LowRankCovariance
 from lusee_bayes.systematics.base import MOST_COLLAPSED, AdditiveNoise
 
 N_PRODUCTS, N_TIMES, N_MODES = 4, 20, 9
@@ -21,8 +20,8 @@ class Pickup(AdditiveNoise):
 
     patterns: jax.Array
 
-    def covariance(self) -> Covariance:
-        return LowRankCovariance(self.patterns, "the pickup")
+    def covariance(self) -> lb.Covariance:
+        return lb.LowRankCovariance(self.patterns, "the pickup")
 
 
 class Correlated(AdditiveNoise):
@@ -30,10 +29,10 @@ class Correlated(AdditiveNoise):
 
     hours: jax.Array
 
-    def covariance(self) -> Covariance:
+    def covariance(self) -> lb.Covariance:
         lag = self.hours[:, None] - self.hours[None]
         kernel = jnp.exp(-jnp.abs(lag) / 3.0)
-        return DenseCovariance(jnp.kron(jnp.eye(self.layout.n_products), kernel), "the hum")
+        return lb.DenseCovariance(jnp.kron(jnp.eye(self.layout.n_products), kernel), "the hum")
 
 
 @pytest.fixture(scope="module")

@@ -7,21 +7,18 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import refused
 from experiments import program_arguments, small_experiment
 from numpyro import handlers
 
+import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.experiment.model import base_model, systematics
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.schema import SourceSection
 from lusee_bayes.experiment.setup import Setup, mean_flux, source_responses
 from lusee_bayes.experiment.simulate import simulate, true_values
 from lusee_bayes.experiment.terms import point_sources
 from lusee_bayes.sampling.program_sites import latent_sites
-from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sky.priors import HarmonicPrior
 from lusee_bayes.systematics import Source, SpectrumBands, normal_within
 from lusee_bayes.testing import small_scenario
 
@@ -37,15 +34,9 @@ def setup_of(*overrides: str) -> Setup:
     return replace(built(), scenario=small_scenario(CAS_A, *overrides))
 
 
-def experiment(*overrides: str) -> Experiment:
+def experiment(*overrides: str) -> lb.Experiment:
     setup = setup_of(*overrides)
-    return Experiment(setup, simulate(setup))
-
-
-def assert_one_sentence(caught):
-    text = str(caught.value)
-    assert "\n" not in text and len(text) < 300
-    assert "Traceback" not in text and "pydantic" not in text
+    return lb.Experiment(setup, simulate(setup))
 
 
 # --- in the scenario ------------------------------------------------------------------------------
@@ -56,45 +47,21 @@ def assert_one_sentence(caught):
     [
         (
             ["sources.list=[{name: Cas A}, {name: Vir A}, {name: Cas A}]"],
-            "fiducial: sources: the source 'Cas A' is there twice",
+            "source 'Cas A' is there twice",
         ),
-        pytest.param(
-            ["sky.sources=true", CAS_A],
-            "the embedded sky holds the catalogue's sources already; .* set sky.sources=false",
-        ),
+        (["sky.sources=true", CAS_A], "set sky.sources=false"),
         (["sources.list=[{name: X, ra_deg: 10}]"], "give both ra_deg and dec_deg, or none"),
         (["sources.list=[{name: X, dec_deg: 10}]"], "give both ra_deg and dec_deg, or none"),
-        (
-            ["sources.list=[{name: X, ra_deg: 10, dec_deg: 91}]"],
-            "sources.list.0.dec_deg is 91, but .*less than or equal to 90",
-        ),
-        (
-            ["sources.list=[{name: Cas A, stokes_v: 1.5}]"],
-            "sources.list.0.stokes_v is 1.5, but .*less than or equal to 1",
-        ),
-        (
-            ["sources.list=[{name: Cas A, stokes_v: -1.01}]"],
-            "stokes_v is -1.01, but .*greater than or equal to -1",
-        ),
+        (["sources.list=[{name: X, ra_deg: 10, dec_deg: 91}]"], "sources.list.0.dec_deg is 91,"),
+        (["sources.list=[{name: Cas A, stokes_v: 1.5}]"], "sources.list.0.stokes_v is 1.5, but"),
+        (["sources.list=[{name: Cas A, stokes_v: -1.01}]"], "stokes_v is -1.01, but .*greater"),
         (["sources.list=[{name: Cas A, flux_jy: 0}]"], "flux_jy is 0, but .*greater than 0"),
-        (
-            ["sources.list=[{name: Cas A, relative_std: -1}]"],
-            "relative_std is -1, but .*greater than 0",
-        ),
+        (["sources.list=[{name: Cas A, relative_std: -1}]"], "relative_std is -1, but .*greater"),
         (["sources.list=[{name: Cas A, block_h: 0}]"], "block_h is 0, but .*greater than 0"),
-        (
-            ["sources.list=[{name: Cas A, flux: 3}]"],
-            "unknown key 'sources.list.0.flux'; did you mean 'flux_jy'?",
-        ),
+        (["sources.list=[{name: Cas A, flux: 3}]"], "did you mean 'flux_jy'?"),
         (["sources.list=[{flux_jy: 3}]"], "sources.list.0.name is missing"),
-        (
-            ["sources.treatment=[marginalised, sampled]"],
-            r"sources.treatment is \['marginalised', 'sampled'\], but .*'sampled' or 'ignored'",
-        ),
-        (
-            ["noise.gain.treatment=[marginalised, sampled]"],
-            r"noise.gain.treatment is \['marginalised', 'sampled'\], but .*'sampled' or 'ignored'",
-        ),
+        (["sources.treatment=[marginalised, sampled]"], r"sources.treatment is \['marginalised',"),
+        (["noise.gain.treatment=[marginalised, sampled]"], r"noise.gain.treatment is"),
         (
             ["noise.beam={shift_mhz: 4, treatment: [marginalised, sampled]}"],
             r"noise.beam.treatment is \['marginalised', 'sampled'\], but .*'sampled' or 'ignored'",
@@ -106,28 +73,21 @@ def assert_one_sentence(caught):
         ),
         (
             ["noise.gain={log_correlation_std: 1.5, treatment: sampled}"],
-            "log_correlation_std is 1.5, but .*less than or equal to 1",
+            "log_correlation_std is 1.5",
         ),
         (["prior.band_edges=[3, 3]"], "band_edges must grow from one to the next"),
         (["prior.band_edges=[4, 2]"], "band_edges must grow from one to the next"),
         (["prior.band_edges=[0, 2]"], "band_edges.0 is 0, but .*greater than or equal to 1"),
-        (
-            ["prior.band_edges=[2, 4]", "prior.tilt_std=0.5"],
-            "give either band_edges or log_amplitude_std and tilt_std",
-        ),
-        (
-            ["prior={band_edges: [2, 4], log_amplitude_std: 0.5}"],
-            "give either band_edges or log_amplitude_std and tilt_std",
-        ),
+        (["prior.band_edges=[2, 4]", "prior.tilt_std=0.5"], "give either band_edges or"),
+        (["prior={band_edges: [2, 4], log_amplitude_std: 0.5}"], "give either band_edges or"),
         (["prior.tilt_std=0"], "prior.tilt_std is 0, but .*greater than 0"),
         (["noise.radiometer.log_factor_std=-1"], "log_factor_std is -1, but .*greater than 0"),
         (["noise.beam.parameters={length_m: 0}"], "length_m is 0, but .*greater than 0"),
     ],
 )
 def test_scenarios_that_contradict_themselves(overrides, message):
-    with pytest.raises(InputError, match=message) as caught:
-        load_scenario("fiducial", ["sky.sources=false", *overrides])
-    assert_one_sentence(caught)
+    with refused(message):
+        lb.load_scenario("fiducial", ["sky.sources=false", *overrides])
 
 
 # --- sources --------------------------------------------------------------------------------------
@@ -143,19 +103,17 @@ def test_scenarios_that_contradict_themselves(overrides, message):
 )
 def test_unknown_sources_name_the_nearest(source, message):
     scenario, setup = small_scenario(f"sources.list=[{source}]"), built()
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message):
         source_responses(scenario, setup.observation, setup.instrument.monopoles, 25.0)
-    assert_one_sentence(caught)
 
 
 def test_a_source_of_which_nothing_is_known_needs_a_flux():
     """Bodies have no flux in the catalogue; the whole experiment says so."""
     scenario = small_scenario("sources.list=[{name: Jupiter}]")
-    with pytest.raises(InputError, match="'Jupiter' is not in the catalogue.* give flux_jy") as c:
-        build(scenario)
-    assert_one_sentence(c)
+    with refused("'Jupiter' is not in the catalogue.* give flux_jy"):
+        lb.build(scenario)
     own = SourceSection(name="mine", ra_deg=1.0, dec_deg=2.0)
-    with pytest.raises(InputError, match="'mine' is not in the catalogue"):
+    with pytest.raises(lb.InputError, match="'mine' is not in the catalogue"):
         mean_flux(own, 25.0)
 
 
@@ -168,15 +126,8 @@ def test_a_source_of_which_nothing_is_known_needs_a_flux():
     ],
 )
 def test_sources_that_cannot_be(columns, std, message):
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message):
         Source(columns, 1.0, std, "X")
-    assert_one_sentence(caught)
-
-
-def test_without_sources_there_are_no_fluxes():
-    with pytest.raises(InputError, match="the scenario has no sources.list") as caught:
-        point_sources(small_experiment().setup)
-    assert_one_sentence(caught)
 
 
 # --- antennas -------------------------------------------------------------------------------------
@@ -189,47 +140,39 @@ def test_without_sources_there_are_no_fluxes():
         ("{surface_permitivity: 0.1}", "did you mean 'surface_permittivity'?"),
         ("{x: 1}", "unknown beam parameter 'x'; known: deep_permittivity, .*zenith_angle_deg"),
         # 1 lies 2.7 / 5 standard deviations below: Phi(-0.54) = 29.5 %
-        (
-            "{surface_permittivity: 5}",
-            r"prior of surface_permittivity, 3.7 \+- 5, has 29.5% .*at least 1",
-        ),
+        ("{surface_permittivity: 5}", "surface_permittivity.* 29.5% .*at least 1"),
         # Phi(-0.1) = 46 %
         ("{loss_tangent: 0.1}", r"prior of loss_tangent, 0.01 \+- 0.1, has 46.0% .*at least 0"),
         # 105 / 60 standard deviations to 180 degrees, 75 / 60 to 0: 10.6 % and 4.0 %
-        (
-            "{zenith_angle_deg: 60}",
-            r"prior of zenith_angle_deg, 75 \+- 60, has 14.6% .*at least 0",
-        ),
+        ("{zenith_angle_deg: 60}", r"prior of zenith_angle_deg, 75 \+- 60, has 14.6% .*at least 0"),
     ],
 )
 def test_antennas_that_cannot_be_sampled(parameters, message):
     setup = setup_of(f"noise.beam.parameters={parameters}", "noise.beam.treatment=sampled")
     for ask in (true_values, systematics):
-        with pytest.raises(InputError, match=message) as caught:
+        with refused(message):
             ask(setup)
-        assert_one_sentence(caught)
 
 
 def test_the_nearer_end_is_named():
-    with pytest.raises(InputError, match="at most 180"):
+    with pytest.raises(lb.InputError, match="at most 180"):
         normal_within("angle", 170.0, 20.0, 0.0, 180.0)
     # a quarter of a percent is allowed: 2.81 standard deviations
     normal_within("angle", 180.0 - 2.82, 1.0, 0.0, 180.0)
-    with pytest.raises(InputError, match="0.3% of its weight"):
+    with pytest.raises(lb.InputError, match="0.3% of its weight"):
         normal_within("angle", 180.0 - 2.80, 1.0, 0.0, 180.0)
-    with pytest.raises(InputError, match="standard deviation of angle must be positive"):
+    with pytest.raises(lb.InputError, match="standard deviation of angle must be positive"):
         normal_within("angle", 1.0, 0.0)
 
 
 def test_bands_beyond_the_highest_ell():
     e = experiment("prior.band_edges=[3, 7]")
-    program = load_program("systematics")
+    program = lb.load_program("systematics")
     arguments = {n: v for n, v in program_arguments(program, e).items() if n != "data"}
-    with pytest.raises(InputError, match="a band begins at ell = 7, above lmax = 6") as caught:
+    with refused("a band begins at ell = 7, above lmax = 6"):
         latent_sites(program.model, arguments)
-    assert_one_sentence(caught)
     # 6 is the highest ell itself
-    base = replace(base_model(e.setup), prior=HarmonicPrior(jnp.ones(7)))
+    base = replace(base_model(e.setup), prior=lb.HarmonicPrior(jnp.ones(7)))
     with handlers.seed(rng_seed=0):
         SpectrumBands((3, 6)).sampled(base)
 
@@ -249,35 +192,34 @@ def test_bands_beyond_the_highest_ell():
 )
 def test_nothing_is_counted_twice(program, overrides, section):
     """What a program samples must not be in N as well."""
-    asked = load_program(program)
+    asked = lb.load_program(program)
     e = experiment(*overrides)
     wanted = f"would count twice; set {section}.treatment=sampled"
-    with pytest.raises(InputError, match=wanted) as caught:
+    with refused(wanted):
         program_arguments(asked, e)
-    assert_one_sentence(caught)
     # either of the other treatments will do
     for treatment in ("sampled", "ignored"):
         free = experiment(*overrides, f"{section}.treatment={treatment}")
         assert program_arguments(asked, free)
 
 
-@pytest.mark.parametrize(
-    ("program", "message"),
-    [
-        ("gains", "the scenario has no noise.gain that could be sampled"),
-        ("sources", "the scenario has no sources.list"),
-    ],
-)
-def test_programs_about_what_the_scenario_does_not_have(program, message):
-    with pytest.raises(InputError, match=message) as caught:
-        program_arguments(load_program(program), small_experiment())
-    assert_one_sentence(caught)
+def test_what_the_scenario_does_not_have():
+    bare = small_experiment()
+    for ask, message in (
+        (
+            lambda: program_arguments(lb.load_program("gains"), bare),
+            "the scenario has no noise.gain",
+        ),
+        (lambda: program_arguments(lb.load_program("sources"), bare), "has no sources.list"),
+        (lambda: point_sources(bare.setup), "the scenario has no sources.list"),
+    ):
+        with refused(message):
+            ask()
 
 
 def test_pieces_of_an_experiment_need_one():
-    with pytest.raises(InputError, match="asks for 'gaussian', a piece of an experiment") as caught:
-        load_program("systematics").arguments(base_model(built()))
-    assert_one_sentence(caught)
+    with refused("asks for 'gaussian', a piece of an experiment"):
+        lb.load_program("systematics").arguments(base_model(built()))
 
 
 # --- commands -------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Sampled systematics know how well they know: ranks of known truths over many data sets.
+"""Systematics know how well they know: ranks of known truths over many data sets.
 
 Truths are drawn from a program's own priors, data from the truths (by the program without data),
 draws from the posterior by Hamiltonian Monte Carlo about the mode found for each data set.
@@ -9,18 +9,22 @@ from __future__ import annotations
 from dataclasses import replace
 
 import equinox as eqx
+import numpy as np
 import pytest
+from experiments import four_ports
 from numpyro import handlers
 from scipy import stats
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.pieces import program_pieces
+from lusee_bayes.experiment.rounds import settled
+from lusee_bayes.experiment.setup import Setup, set_up
+from lusee_bayes.experiment.simulate import simulate, true_values
+from lusee_bayes.linear.templates import template_amplitudes
+from lusee_bayes.results.unknowns import GAIN, SKY, unknowns_report
 from lusee_bayes.sampling.calibration import FALSE_ALARM, LEVELS, N_DRAWS, Ranks, calibrate
 from lusee_bayes.sampling.hmc import Sampler, draw_within
-from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.promotion import numpyro_promotion
 from lusee_bayes.systematics import SCALES
 from lusee_bayes.systematics.chart import Chart
@@ -41,7 +45,7 @@ SOURCES = (
 
 def pieces(name: str, *overrides: str):
     """(program, its arguments without the data) of a scenario."""
-    e, program = build(lb.load_scenario("fiducial", overrides)), load_program(name)
+    e, program = lb.build(lb.load_scenario("fiducial", overrides)), lb.load_program(name)
     return program, program.arguments(full_model(e.setup), program_pieces(e))
 
 
@@ -67,7 +71,7 @@ class Draws(eqx.Module):
 
     def __call__(self, key, data):
         arguments = {**self.arguments, "data": data}
-        approximation = laplace_approximation(self.program.model, arguments, starts=self.starts)
+        approximation = lb.laplace_approximation(self.program.model, arguments, starts=self.starts)
         whitening = approximation.whitening
         return draw_within(self.program.model, arguments, key, self.sampler, whitening)
 
@@ -166,7 +170,7 @@ class SampledDrifts(eqx.Module):
     def __call__(self, key, data):
         arguments = {**self.arguments, "data": data}
         start = {"sky": marginalised(arguments, data).mean}
-        approximation = laplace_approximation(
+        approximation = lb.laplace_approximation(
             self.program.model, arguments, start, SCALES, chart=self.chart
         )
         sampler = Sampler(warmup=100, draws=N_DRAWS, algorithm="hmc")
@@ -224,3 +228,68 @@ def test_strength_and_correlation_time_of_drifts():
     quantities = Sites(("gain_sigma", "gain_correlation_h"))
     draws = SampledDrifts(program, arguments, chart, 8)
     assert_calibrated(ranks_of(program, arguments, quantities, draws=draws))
+
+
+# --- receivers, ground, gain table and sky, and their null direction ------------------------------
+
+
+N = 100
+UNKNOWN = (
+    "noise.receiver={power_k: 2000}",
+    "noise.regolith={std_k: 30}",
+    "noise.gain_table={std: 0.01}",
+)
+# modes of the sky whose ranks are taken: one of every ell, and some with m != 0
+MODES = (0, 2, 3, 6, 8, 12)
+
+
+def drawn(first: Setup, seed: int) -> tuple[Setup, lb.Experiment]:
+    """The setup with a sky drawn from its prior, and data of it; N is that of the model sky."""
+    z = np.random.default_rng(seed).standard_normal(first.prior.size)
+    sky = replace(first.sky, modes=np.asarray(first.prior.colour(z)) + first.prior.mean)
+    scenario = first.scenario.model_copy(update={"seed": seed})
+    setup = replace(first, sky=sky, scenario=scenario)
+    return setup, lb.Experiment(setup, simulate(setup))
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_simulation_based_calibration(response_file):
+    first = set_up(four_ports(response_file, *UNKNOWN))
+    # known to a fifth, so that no sky is without a signal
+    spectrum = 0.04 * np.asarray(first.prior.spectrum)
+    first = replace(first, prior=lb.HarmonicPrior(spectrum, mean=first.sky.modes))
+    sky_std = np.sqrt(np.asarray(first.prior.variance()))
+    ranks, null, shares = [], [], []
+    for seed in range(N):
+        setup, experiment = drawn(first, seed)
+        found, truth = settled(setup, experiment.data), true_values(setup)
+        columns = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
+        told = template_amplitudes(found.model, found.posterior, experiment.data.data, columns)
+        sky_covariance = np.asarray(found.posterior.covariance())
+        expected = np.concatenate([s.expected for s in found.systematics])
+        mean = np.concatenate([np.asarray(found.posterior.mean), expected + told.mean])
+        covariance = np.block([[sky_covariance, told.with_sky], [told.with_sky.T, told.covariance]])
+        rng = np.random.default_rng((seed, 1))
+        draws = rng.multivariate_normal(mean, covariance, N_DRAWS, method="cholesky")
+        z = [(truth[f"receiver_{port}_k"] - 2000.0) / 200.0 for port in range(4)]
+        z += [(truth["regolith_k"] - 250.0) / 30.0, *truth["gain_table"]]
+        true = np.concatenate([setup.sky.modes, z])
+        picked = [*MODES, *range(16, 25)]
+        ranks.append((draws < true).sum(0)[picked])
+        # along the null direction, in prior standard deviations
+        report = unknowns_report(experiment, found)
+        assert report.null.names[0] == SKY
+        assert report.null.names[-1] == GAIN
+        off = true - mean
+        parts = np.concatenate([off[:1] / sky_std[0], off[16:21], [off[21:].sum() / 2.0]])
+        null.append(report.null.weights @ parts)
+        shares.append(report.null.share)
+    names = [f"mode {k}" for k in MODES] + [f"receiver {port}" for port in range(4)]
+    names += ["regolith", *(f"gain {port}" for port in range(4))]
+    table = Ranks(np.array(ranks), N_DRAWS, tuple(names))
+    assert table.passed, dict(zip(names, table.p_values(), strict=True))
+    # the direction that the data do not tell scatters as its share of the prior says
+    assert min(shares) > 0.9
+    low, high = stats.chi2(N).interval(1 - 1e-3)
+    assert low < np.sum(np.array(null) ** 2 / shares) < high

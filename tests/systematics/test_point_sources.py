@@ -13,15 +13,14 @@ from functools import lru_cache
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from experiments import program_arguments, small_experiment
-from numpyro.infer.util import log_density
+from assertions import close
+from experiments import density, program_arguments, small_experiment
 from reference_linear import exact_posterior
 from scipy.constants import Boltzmann, speed_of_light
 from scipy.stats import chi2, norm
 
+import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.model import (
     base_model,
     full_model,
@@ -31,13 +30,10 @@ from lusee_bayes.experiment.model import (
 from lusee_bayes.experiment.setup import Setup, source_responses
 from lusee_bayes.experiment.simulate import simulate, true_values
 from lusee_bayes.experiment.terms import Around, point_sources
-from lusee_bayes.instrument.source_response import altitude_deg
 from lusee_bayes.linear.fit import RULE
 from lusee_bayes.linear.templates import template_amplitudes
 from lusee_bayes.results.fluxes import flux_lines, flux_table
 from lusee_bayes.results.map_result import map_result
-from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.promotion import numpyro_promotion
 from lusee_bayes.sky import BRIGHT_SOURCES, galactic_unit_vector
 from lusee_bayes.testing import small_scenario
 
@@ -63,7 +59,7 @@ def setup_of(treatment: str = "marginalised", seed: int = 1) -> Setup:
 @lru_cache
 def experiment(treatment: str = "marginalised", seed: int = 1) -> Setup:
     setup = setup_of(treatment, seed)
-    return Experiment(setup, simulate(setup))
+    return lb.Experiment(setup, simulate(setup))
 
 
 def data(treatment: str = "marginalised", seed: int = 1):
@@ -120,14 +116,6 @@ def test_the_columns_and_the_priors():
     assert [s.site for s in sources.sources] == SITES
 
 
-def test_the_columns_of_the_blocks_sum_to_that_of_one_amplitude():
-    whole = built().responses[1].reshape(-1)
-    blocks = point_sources(built()).sources[1].columns
-    np.testing.assert_array_equal(blocks.sum(1), whole)
-    # each datum belongs to one block
-    assert ((np.asarray(blocks) != 0).sum(1) == 1).all()
-
-
 def test_the_circularly_polarised_part_enters_linearly():
     """An auto sees the power in one polarisation, so it never is negative, whatever V is."""
     e = built()
@@ -156,10 +144,8 @@ def test_marginalised_they_are_in_the_noise_and_the_offset():
     model = sources.marginalised(base)
     t, (mean, std) = columns(), priors()
     expected = np.diag(np.asarray(base.noise.diagonal())) + (t * std**2) @ t.T
-    np.testing.assert_allclose(
-        model.noise.dense(), expected, rtol=0, atol=1e-14 * np.abs(expected).max()
-    )
-    np.testing.assert_allclose(model.offset, t @ mean, rtol=0, atol=1e-13 * np.abs(t @ mean).max())
+    close(model.noise.dense(), expected, 1e-14)
+    close(model.offset, t @ mean, 1e-13)
     # an offset that is there already stays
     twice = sources.marginalised(replace(base, offset=jnp.ones(96)))
     np.testing.assert_allclose(twice.offset, 1.0 + model.offset, rtol=1e-14)
@@ -204,7 +190,7 @@ def test_fluxes_with_the_sky_integrated_out():
 
 
 def test_the_table_is_in_jansky():
-    table = flux_table(experiment(), infer(experiment()))
+    table = flux_table(experiment(), lb.infer(experiment()))
     expected, (mean, std), truth = answer(), priors(), true_values(setup_of())
     jansky = 1.0 / kelvin_steradian(1.0)
     assert list(table["source"]) == ["Cas A", "For A", "For A", "For A", "Polaris"]
@@ -224,14 +210,14 @@ def test_the_table_is_in_jansky():
     assert np.abs(off).max() < 5.0
     # data without a truth have no such column
     real = replace(experiment(), data=replace(data(), truth=None))
-    assert "true_jy" not in flux_table(real, infer(real))
+    assert "true_jy" not in flux_table(real, lb.infer(real))
 
 
 @pytest.mark.long
 def test_a_source_below_the_horizon_is_known_from_its_prior_only():
     e = experiment()
     polaris = galactic_unit_vector(270.0, 66.5)
-    assert altitude_deg(e.setup.observation, polaris).max() < -20.0
+    assert (e.setup.observation.zenith_galactic() @ polaris).max() < -0.35
     result = map_result(e)
     row = result.fluxes.iloc[4]
     assert not row["above_horizon"]
@@ -265,8 +251,7 @@ def test_ignored_sources_have_no_fluxes():
 @pytest.mark.long
 def test_the_program_given_its_fluxes():
     """d ~ N(T f, A S A^T + N_0). ln det K of 49 squeezed modes: 1e-6 each."""
-    e, program = experiment("sampled"), load_program("sources")
-    setup = e.setup
+    e, program = experiment("sampled"), lb.load_program("sources")
     setup = e.setup
     t, (mean, std) = columns(), priors()
     arguments = program_arguments(program, e)
@@ -277,11 +262,9 @@ def test_the_program_given_its_fluxes():
         expected = exact_posterior(a, s, noise, np.asarray(data().data) - t @ flux).log_prob
         expected += norm.logpdf(flux, mean, std).sum()
         values = {"flux_Cas_A": flux[0], "flux_For_A": flux[1:4], "flux_Polaris": flux[4]}
-        values = {name: jnp.asarray(value) for name, value in values.items()}
-        with numpyro_promotion():
-            got, trace = log_density(program.model, (), arguments, values)
+        got, trace = density(program, arguments, values)
         assert set(trace) == {*SITES, "data"}
-        assert float(got) == pytest.approx(expected, rel=1e-9, abs=1e-4)
+        assert got == pytest.approx(expected, rel=1e-9, abs=1e-4)
 
 
 # --- simulated data -------------------------------------------------------------------------------
@@ -346,7 +329,7 @@ def test_the_map_command_writes_the_fluxes(tmp_path, capsys):
     assert "Polaris: 2e+04 +- 1e+04 Jy, the prior's: it is never above the horizon" in printed
     with (tmp_path / "sources.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    table = flux_table(experiment(), infer(experiment()))
+    table = flux_table(experiment(), lb.infer(experiment()))
     assert list(rows[0]) == list(table.columns)
     assert [row["source"] for row in rows] == list(table["source"])
     # written in full

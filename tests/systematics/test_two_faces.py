@@ -1,28 +1,24 @@
-"""Gains marginalised to first order in N, and gains sampled exactly: where they agree, and not."""
+"""Systematics marginalised in N and sampled exactly: densities by hand, and where they agree."""
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
-from experiments import small_experiment
-from numpyro.infer.util import log_density
-from reference_linear import z_of
-from scipy.stats import norm
+from experiments import density, program_arguments, small_experiment
+from jax.flatten_util import ravel_pytree
+from reference_linear import exact_posterior, z_of
+from scipy.stats import lognorm, loguniform, norm, truncnorm, uniform
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.model import full_model, radiometer
 from lusee_bayes.experiment.pieces import program_pieces
 from lusee_bayes.experiment.terms import Around, gain_drifts
-from lusee_bayes.noise import GainDrift
-from lusee_bayes.sampling.hmc import Sampler, sample
-from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.promotion import numpyro_promotion
+from lusee_bayes.instrument.products import all_products
 
 GAINS = "noise.gain={sigma: %g, correlation_h: 10, treatment: %s, visibilities: %s}"
 # of the product (1 + g)(1 + g'), with the gains and the sky by hand
@@ -30,7 +26,7 @@ PAIRS = [(0, 0), (0, 1), (0, 1), (0, 2), (0, 2), (0, 3), (0, 3), (1, 1), (1, 2),
          (1, 3), (2, 2), (2, 3), (2, 3), (3, 3)]  # fmt: skip
 
 
-def experiment(sigma=1e-3, treatment="sampled", around="model") -> Experiment:
+def experiment(sigma=1e-3, treatment="sampled", around="model") -> lb.Experiment:
     return small_experiment(GAINS % (sigma, treatment, around))
 
 
@@ -38,7 +34,7 @@ def test_the_program_is_the_exact_product_of_gains():
     """Density of sky and white noise against scipy's, with gains worked out antenna by antenna."""
     e = experiment(0.05)
     setup, data = e.setup, e.data
-    program = load_program("gains")
+    program = lb.load_program("gains")
     arguments = {**program.arguments(full_model(setup), program_pieces(e)), "data": data.data}
     drifts = arguments["gain_drifts"]
     rng = np.random.default_rng(0)
@@ -55,15 +51,9 @@ def test_the_program_is_the_exact_product_of_gains():
     expected += norm.logpdf(sky, 0, np.sqrt(np.asarray(setup.prior.variance()))).sum()
     sigma = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     expected += norm.logpdf(np.asarray(data.data), seen, sigma).sum()
-    with numpyro_promotion():
-        got, trace = log_density(
-            program.model,
-            (),
-            arguments,
-            {"sky": jnp.asarray(sky), "gain_noise": jnp.asarray(white)},
-        )
+    got, trace = density(program, arguments, {"sky": sky, "gain_noise": white})
     # residuals of many sigma: squares of 1e5 sigma, each to 1e-10 of itself
-    assert float(got) == pytest.approx(expected, rel=1e-9)
+    assert got == pytest.approx(expected, rel=1e-9)
     np.testing.assert_allclose(trace["gains"]["value"], gains, rtol=0, atol=1e-15)
 
 
@@ -72,7 +62,7 @@ def test_white_noise_makes_drifts_of_the_right_covariance():
     drifts = gain_drifts(experiment().setup, Around())
     hours = np.asarray(drifts.hours)
     for correlation_h in (10.0, 14.0, 20.0):
-        drift = GainDrift(0.02, correlation_h)
+        drift = lb.GainDrift(0.02, correlation_h)
         # a margin for 10 hours cuts off longer ones at exp(-(60 / t)^2 2)
         unit = jnp.eye(drifts.grid.shape[0])
         root = np.asarray(drift.history(unit, hours, drifts.grid))
@@ -83,14 +73,14 @@ def test_white_noise_makes_drifts_of_the_right_covariance():
 
 
 def sampled(e, seed=3):
-    program, inference = load_program("gains"), infer(e)
+    program, inference = lb.load_program("gains"), lb.infer(e)
     posterior = inference.posterior
     pieces = program.arguments(inference.model, program_pieces(e))
     arguments = {**pieces, "data": e.data.data}
-    approximation = laplace_approximation(program.model, arguments, {"sky": posterior.mean})
+    approximation = lb.laplace_approximation(program.model, arguments, {"sky": posterior.mean})
     assert bool(approximation.converged)
-    sampler = Sampler(draws=1500, seed=seed)
-    return sample(program.model, arguments, sampler, approximation.whitening), posterior
+    sampler = lb.Sampler(draws=1500, seed=seed)
+    return lb.sample(program.model, arguments, sampler, approximation.whitening), posterior
 
 
 @pytest.mark.long
@@ -116,3 +106,189 @@ def test_small_gains_marginalised_and_sampled_give_the_same_sky():
     bare = lb.LinearGaussian(setup.coupling, setup.prior, radiometer(setup)).condition(data.data)
     assert np.abs((np.asarray(bare.mean) - np.asarray(posterior.mean)) / std).max() > 1.0
     assert (np.asarray(bare.std()) / std).min() < 0.8
+
+
+# --- coordinates for sky and gains together -------------------------------------------------------
+
+
+SCALES = {"log_sigma_std": 0.5, "log_correlation_std": 0.2}
+
+
+@lru_cache
+def pieces(*scales: str):
+    """(gaussian, drifts, chart) with these scales as sites."""
+    stds = "".join(f", {name}: {SCALES[name]}" for name in scales)
+    gain = f"noise.gain={{sigma: 0.03, correlation_h: 10, treatment: sampled{stds}}}"
+    parts = program_pieces(small_experiment(gain, lmax=2))
+    gaussian, drifts = parts["gaussian"](), parts["gain_drifts"]()
+    return gaussian, drifts, drifts.chart(gaussian)
+
+
+def values_of(chart, seed=0) -> dict:
+    """Unconstrained values of the chart's sites, and of one that it does not know."""
+    rng = np.random.default_rng(seed)
+    values = {
+        "sky": jnp.asarray(1e4 * rng.normal(size=9)),
+        "gain_noise": jnp.asarray(rng.normal(size=(4, chart.grid.shape[0]))),
+        "other": jnp.asarray(rng.normal(size=3)),
+    }
+    if chart.sigma_is_site:
+        values["gain_sigma"] = jnp.log(0.03) + jnp.asarray(0.4 * rng.normal())
+    if chart.log_correlation_reach is not None:
+        values["gain_log_correlation"] = jnp.asarray(rng.normal())
+    return values
+
+
+def gains_of(drifts, values):
+    """Gains at the samples, from the sites, by hand."""
+    sigma, correlation_h = 0.03, 10.0
+    if "gain_sigma" in values:
+        sigma = jnp.exp(values["gain_sigma"])
+    if "gain_log_correlation" in values:
+        reach = 3.0 * SCALES["log_correlation_std"]
+        u = 1.0 / (1.0 + jnp.exp(-values["gain_log_correlation"]))
+        correlation_h = 10.0 * jnp.exp(-reach + 2.0 * reach * u)
+    drift = lb.GainDrift(sigma, correlation_h)
+    return drift.history(values["gain_noise"], np.asarray(drifts.hours), drifts.grid)
+
+
+CASES = [(), ("log_sigma_std",), ("log_correlation_std",), tuple(SCALES)]
+
+
+@pytest.mark.long
+@pytest.mark.essential
+@pytest.mark.parametrize("scales", CASES)
+def test_there_and_back_with_the_determinant_of_the_derivative(scales):
+    """Rounding of the solves: the smallest covariance is the floor, 3e-10 over 4e-3 of the drifts'.
+
+    So the way back is good to 1e-16 * 1e7, and the determinant likewise.
+    """
+    _, _, chart = pieces(*scales)
+    values = values_of(chart)
+    x = chart.from_values(values)
+    back, log_det = chart.to_values(x)
+    assert set(back) == set(values)
+    for name in values:
+        size = np.abs(np.asarray(values[name])).max()
+        np.testing.assert_allclose(back[name], values[name], rtol=0, atol=1e-9 * size)
+    assert (np.asarray(x["other"]) == np.asarray(values["other"])).all()
+    flat, split = ravel_pytree(x)
+    jacobian = jax.jit(jax.jacfwd(lambda f: ravel_pytree(chart.to_values(split(f))[0])[0]))(flat)
+    expected = np.linalg.slogdet(np.asarray(jacobian))[1]
+    assert float(log_det) == pytest.approx(expected, abs=1e-6)
+    assert abs(expected) > 1e-2
+
+
+@pytest.mark.long
+@pytest.mark.essential
+@pytest.mark.parametrize("scales", CASES)
+def test_the_data_do_not_change_along_the_shared_scale(scales):
+    """Nor with strength and correlation time, by more than the noise."""
+    gaussian, drifts, chart = pieces(*scales)
+
+    def seen(x):
+        values, _ = chart.to_values(x)
+        gains = gains_of(drifts, values)
+        return np.asarray(drifts.response(gains) * gaussian.predict(values["sky"])), gains
+
+    x = chart.from_values(values_of(chart))
+    before, gains = seen(x)
+    scale, constant = chart._shared()
+    assert float((scale * jnp.ones((4, 1)) * constant).sum()) == pytest.approx(1.0, rel=1e-14)
+    moved, other = seen(x | {"gain_noise": x["gain_noise"] + 0.1 * constant})
+    noise = np.sqrt(np.asarray(chart.floor) * before.size)
+    # the gains of constant noise are constant to what lies outside the grid, exp(-36); with other
+    # scales to a fraction of the noise
+    exact = 1e-12 if not scales else noise
+    assert np.linalg.norm(moved - before) < exact * np.abs(before).max()
+    assert np.linalg.norm(np.asarray(1 + other - np.exp(0.1) * (1 + gains))) < exact
+    for name, step in [("gain_sigma", 0.2), ("gain_log_correlation", 0.5)]:
+        if name not in x:
+            continue
+        turned, other = seen(x | {name: x[name] + step})
+        # each of the gains' modes to floor / (floor + variance) of itself: half the noise at most
+        assert np.linalg.norm(np.asarray(other - gains)) < noise
+        assert np.linalg.norm(turned - before) < 2 * noise * np.abs(before).max()
+        # while the same change of the site alone changes them altogether
+        values, _ = chart.to_values(x)
+        plain = gains_of(drifts, values | {name: values[name] + step})
+        assert np.linalg.norm(np.asarray(plain - gains)) > 10 * noise
+
+
+def test_drifts_too_strong_for_the_coordinates_have_none():
+    """Where the mean gain may be -1 the scale has no logarithm: 0.1 exp(3 x 0.5) > 0.2."""
+    gaussian, drifts, chart = pieces("log_sigma_std")
+    assert chart is not None
+    strong = lb.GainDrift(0.1, 10.0)
+    kinder = lb.systematics.GainDrifts(**{**vars(drifts), "drift": strong})
+    assert kinder.chart(gaussian) is None
+
+
+# --- models/instrument.py and models/gain_scales.py -----------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_the_instruments_program():
+    """Beams of antennas built so, the evidence in decimal arithmetic, and the priors by scipy."""
+    e = small_experiment(lmax=4)
+    setup, data = e.setup, e.data
+    values = {
+        "surface_permittivity": 3.4,
+        "deep_permittivity": 6.6,
+        "loss_tangent": 0.02,
+        "zenith_angle_deg": 76.5,
+        "noise_level": 1.7,
+    }
+    antennas = lb.Monopoles(lb.Regolith(3.4, 6.6, 0.02), zenith_angle_deg=76.5)
+    a = lb.CouplingMatrix.build(lb.monopole_beams(25.0, 4, antennas), setup.pointing).dense()
+    noise = np.diag(1.7 * np.asarray(radiometer(setup).diagonal()))
+    s = np.asarray(setup.prior.variance())
+    expected = exact_posterior(np.asarray(a), s, noise, np.asarray(data.data)).log_prob
+    expected += uniform.logpdf(3.4, 2.5, 2.5) + uniform.logpdf(6.6, 5.0, 3.0)
+    expected += loguniform.logpdf(0.02, 1e-3, 1e-1) + lognorm.logpdf(1.7, 0.5)
+    expected += norm.logpdf(76.5, 75.0, 2.0)
+    program = lb.load_program("instrument")
+    got, trace = density(program, program_arguments(program, e), values)
+    assert set(trace) == {*values, "data"}
+    # chi^2 of 1e8, of which A by two routes leaves 1e-13 of 2e4 K against 0.2 K, twice
+    assert abs(expected) > 1e4
+    assert got == pytest.approx(expected, rel=1e-7)
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_the_program_of_gain_scales():
+    """N with the drifts' covariance entry by entry, the mean of the autos, and the priors."""
+    gain = "noise.gain={sigma: 0.01, correlation_h: 8, treatment: sampled}"
+    e = small_experiment(gain, lmax=4)
+    setup, data = e.setup, e.data
+    sigma, octaves = 0.013, 0.4
+    correlation_h = 8.0 * 2.0**octaves
+    hours, products = np.asarray(data.observation.hours), all_products(4)
+    around = np.asarray(gain_drifts(setup, Around(data)).visibilities)
+    lag = hours[:, None] - hours[None]
+    c = sigma**2 * np.exp(-(lag**2) / (2 * correlation_h**2))
+    n_times = len(hours)
+    noise = np.diag(np.asarray(radiometer(setup).diagonal()))
+    for x, p in enumerate(products):
+        for y, q in enumerate(products):
+            shared = [(p.i == q.i) + (p.i == q.j) + (p.j == q.i) + (p.j == q.j)]
+            both = (p.i == q.i) * (p.j == q.j) + (p.i == q.j) * (p.j == q.i)
+            rows = slice(x * n_times, (x + 1) * n_times)
+            columns = slice(y * n_times, (y + 1) * n_times)
+            signal = around[x][:, None] * around[y][None]
+            noise[rows, columns] += signal * c * (shared[0] + c * both)
+    mean = np.repeat([1.0 + sigma**2 * (p.i == p.j) for p in products], n_times)
+    a = mean[:, None] * np.asarray(setup.coupling.dense())
+    s = np.asarray(setup.prior.variance())
+    expected = exact_posterior(a, s, noise, np.asarray(data.data)).log_prob
+    expected += lognorm.logpdf(sigma, 0.5, scale=0.01)
+    expected += truncnorm.logpdf(octaves, -1 / 0.7, 1 / 0.7, 0.0, 0.7)
+    values = {"gain_sigma": sigma, "gain_octaves": octaves}
+    program = lb.load_program("gain_scales")
+    got, trace = density(program, program_arguments(program, e), values)
+    assert set(trace) == {*values, "gain_correlation_h", "data"}
+    assert float(trace["gain_correlation_h"]["value"]) == pytest.approx(correlation_h, rel=1e-14)
+    # logarithms of 49 squeezed modes, each to 1e-6
+    assert got == pytest.approx(expected, rel=1e-8, abs=1e-4)

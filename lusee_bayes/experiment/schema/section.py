@@ -50,7 +50,6 @@ FILES = (
     "mean_file",
     "schedule",
     "spectrum_file",
-    "template",
 )
 
 

@@ -1,4 +1,4 @@
-"""The prior of a positive sky, its C_ell known or not, for use in programs."""
+"""The prior of a positive sky, its C_ell known or not: what the program ``log_normal`` samples."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.representation import Described, number
 from lusee_bayes.sky.log_normal import LogNormalSky
-from lusee_bayes.sky.priors import DensePrior
 from lusee_bayes.systematics.base import SKY
 
 # the sites: white unknowns of the sky, and what C_ell of its logarithm is made of
@@ -86,29 +85,14 @@ class LogNormalPrior(Described, eqx.Module):
         )
 
     @property
-    def is_learned(self) -> bool:
+    def samples_spectrum(self) -> bool:
         """Whether A and the tilt are unknowns."""
         return self.log_amplitude_std is not None
 
-    def expected(self) -> DensePrior:
-        """Return the Gaussian prior about the template, of A and the tilt at their medians."""
-        return self.sky.linearised(np.zeros(self.sky.size))
-
-    def log_density(
-        self, log_amplitude: float | Float[Array, ""], tilt: float | Float[Array, ""]
-    ) -> float | Float[Array, ""]:
-        """Compute ln p(ln A, tilt) where they are unknowns.
-
-        Parameters
-        ----------
-        log_amplitude, tilt : float or () array
-            ln A and the tilt.
-        """
-        xp = namespace(self, log_amplitude, tilt)
-        off = (log_amplitude - xp.log(self.amplitude)) / self.log_amplitude_std
-        tilted = (tilt - self.tilt) / self.tilt_std
-        constant = xp.log(2.0 * np.pi * self.log_amplitude_std * self.tilt_std)
-        return -0.5 * (off**2 + tilted**2) - constant
+    @property
+    def sites(self) -> tuple[str, ...]:
+        """The sites that are sampled."""
+        return (AMPLITUDE, TILT, STRUCTURE) if self.samples_spectrum else (STRUCTURE,)
 
     def sampled(self) -> Float[Array, " modes"]:
         """Sample the sky inside a NumPyro program.
@@ -122,7 +106,7 @@ class LogNormalPrior(Described, eqx.Module):
             m, in K.
         """
         sky = self.sky
-        if self.is_learned:
+        if self.samples_spectrum:
             median = jnp.log(self.amplitude)
             amplitude = numpyro.sample(AMPLITUDE, dist.LogNormal(median, self.log_amplitude_std))
             tilt = numpyro.sample(TILT, dist.Normal(self.tilt, self.tilt_std))

@@ -1,37 +1,192 @@
-"""Errors of the gain table: exact factors, and the Gaussian about what the data tell of them."""
+"""Receivers, ground and gain table: templates of N about what data tell, or sites, by hand."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
-from experiments import four_ports, program_arguments
-from numpyro.infer.util import log_density
+from assertions import refused, within
+from experiments import density, four_ports, program_arguments
 from reference_linear import white_posterior, z_of
 from scipy.optimize import least_squares
 from scipy.stats import norm
 
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.experiment import Experiment, build
-from lusee_bayes.experiment.inference import infer
+import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model, radiometer, systematics
 from lusee_bayes.experiment.rounds import Inference, model_about, offset_posterior
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.simulate import simulate, true_signal, true_values
 from lusee_bayes.experiment.terms import Around, pointed
 from lusee_bayes.experiment.terms.gain_table import table_errors
 from lusee_bayes.instrument.calibration import Calibration
-from lusee_bayes.instrument.products import all_products
+from lusee_bayes.instrument.products import all_products, labels
 from lusee_bayes.linear.templates import template_amplitudes
-from lusee_bayes.sampling.hmc import Sampler, sample
-from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.promotion import numpyro_promotion
+from lusee_bayes.testing import small_scenario
+
+RECEIVER = "noise.receiver={power_k: 2000, relative_std: 0.1, treatment: %s}"
+GROUND = "noise.regolith={std_k: 30, treatment: %s}"
+AUTOS = [labels().index(f"{port}{port}R") for port in range(4)]
+
+
+@pytest.fixture(scope="module")
+def warm(response_file) -> lb.Experiment:
+    return lb.build(four_ports(response_file, RECEIVER % "marginalised", GROUND % "marginalised"))
+
+
+def columns(response_file, n_times: int) -> np.ndarray:
+    """What one standard deviation of each of the five adds to the data, made by hand."""
+    grid = np.zeros((16, n_times, 5))
+    for port, product in enumerate(AUTOS):
+        grid[product, :, port] = 200.0
+    response = lb.read_beam(response_file)
+    warmer = response.background(20.0, 280.0) - response.background(20.0, 250.0)
+    grid[:, :, 4] = warmer[:, None]
+    return grid.reshape(-1, 5)
+
+
+def joint(warm: lb.Experiment, response_file):
+    """Sky and the five together: 21 unknowns with independent priors."""
+    setup, data = warm.setup, np.asarray(warm.data.data)
+    t = columns(response_file, setup.layout.n_times)
+    a = np.concatenate([np.asarray(setup.coupling.dense()), t], axis=1)
+    prior = np.append(np.sqrt(np.asarray(setup.prior.variance())), np.ones(5))
+    constant = np.asarray(lb.read_beam(response_file).background(20.0, 250.0)).copy()
+    constant[AUTOS] += 2000.0
+    noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    rest = data - np.repeat(constant, setup.layout.n_times)
+    return white_posterior(a, prior, noise, rest)
+
+
+def test_marginalised_they_are_the_closed_form(warm, response_file):
+    """Means to 1e-5 standard deviations, covariances to 1e-5: Lambda's condition costs 1e-6."""
+    found, expected = lb.infer(warm), joint(warm, response_file)
+    std, sky = expected.std, slice(16)
+    off = (np.asarray(found.posterior.mean) - expected.mean[sky]) / std[sky]
+    assert np.abs(off).max() < 1e-5
+    scale = np.outer(std, std)
+    got = np.asarray(found.posterior.covariance())
+    within(got / scale[sky, sky], expected.covariance[sky, sky] / scale[sky, sky], 1e-5)
+    assert float(found.posterior.log_evidence) == pytest.approx(expected.log_prob, abs=1e-4)
+    t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
+    told = template_amplitudes(found.model, found.posterior, warm.data.data, t)
+    assert np.abs((told.mean - expected.mean[16:]) / std[16:]).max() < 1e-5
+    blocks = [(told.covariance, slice(16, 21), slice(16, 21)), (told.with_sky, sky, slice(16, 21))]
+    for block, rows, cols in blocks:
+        wanted = expected.covariance[rows, cols] / scale[rows, cols]
+        within(block / scale[rows, cols], wanted, 1e-5)
+    # sky and unknowns do depend on one another, and the data do tell the receivers
+    assert np.abs(expected.covariance[0, 16:] / scale[0, 16:]).max() > 0.05
+    assert (std[16:20] < 0.5).all()
+
+
+def test_the_mean_receiver_sets_the_noise_and_the_offset(warm, response_file):
+    bare = set_up(four_ports(response_file))
+    setup = warm.setup
+    added = np.asarray(setup.signal) - np.asarray(bare.signal)
+    np.testing.assert_allclose(added[AUTOS], 2000.0, rtol=1e-9)
+    np.testing.assert_allclose(np.delete(added, AUTOS, axis=0), 0.0, atol=1e-9)
+    ratio = np.asarray(radiometer(setup).diagonal()) / np.asarray(radiometer(bare).diagonal())
+    assert ratio.reshape(16, -1)[0].min() > 1.2
+    np.testing.assert_allclose(setup.offset - bare.offset, setup.layout.gather(added), atol=1e-8)
+
+
+def test_powers_in_volts_and_their_slope(response_file):
+    """P / U_aa at the receiver's input, and a power law in frequency: (20 / 5)^-2 = 1/16."""
+    per_kelvin = lb.read_beam(response_file).per_kelvin(20.0)
+    keys = "slope: -2, reference_mhz: 5"
+    volts = set_up(four_ports(response_file, f"noise.receiver={{power_v2_hz: 1e-17, {keys}}}"))
+    ground = lb.read_beam(response_file).background(20.0, 250.0)[AUTOS]
+    np.testing.assert_allclose(volts.background[AUTOS] - ground, 1e-17 / 16 / per_kelvin, rtol=1e-9)
+    kelvin = set_up(four_ports(response_file, f"noise.receiver={{power_k: 160, {keys}}}"))
+    np.testing.assert_allclose(kelvin.background[AUTOS] - ground, 10.0, rtol=1e-9)
+
+
+def test_receivers_of_antennas_that_know_no_volts():
+    setup = set_up(small_scenario("noise.receiver={power_k: 100}"))
+    assert setup.offset is not None
+    np.testing.assert_array_equal(setup.background[AUTOS], 100.0)
+
+
+@pytest.mark.parametrize("treatment", ["marginalised", "sampled", "ignored"])
+def test_simulated_data_hold_them_whatever_their_treatment(warm, response_file, treatment):
+    given = four_ports(response_file, RECEIVER % treatment, GROUND % treatment)
+    setup = replace(warm.setup, scenario=given)
+    truth = true_values(setup)
+    assert set(truth) == {*(f"receiver_{port}_k" for port in range(4)), "regolith_k"}
+    powers = np.array([truth[f"receiver_{port}_k"] for port in range(4)])
+    # drawn from their priors, each its own
+    assert (np.abs(powers - 2000.0) < 4 * 200.0).all()
+    assert len(set(powers)) == 4
+    assert 0.0 < abs(truth["regolith_k"] - 250.0) < 4 * 30.0
+    z = np.append((powers - 2000.0) / 200.0, (truth["regolith_k"] - 250.0) / 30.0)
+    added = np.asarray(setup.layout.gather(true_signal(setup, truth) - setup.signal))
+    t = columns(response_file, setup.layout.n_times)
+    np.testing.assert_allclose(added, t @ z, rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(simulate(setup).data, warm.data.data)
+    reseeded = replace(setup, scenario=given.model_copy(update={"seed": 2}))
+    assert not set(true_values(reseeded).values()) & set(truth.values())
+
+
+def test_ignored_they_are_taken_for_their_means(warm, response_file):
+    given = four_ports(response_file, RECEIVER % "ignored", GROUND % "ignored")
+    setup = replace(warm.setup, scenario=given)
+    found = full_model(setup)
+    np.testing.assert_array_equal(found.noise.diagonal(), radiometer(setup).diagonal())
+    np.testing.assert_array_equal(found.offset, setup.offset)
+    # which the data contradict: a receiver off by 200 K is hundreds of standard deviations
+    chi2 = found.chi2(found.condition(warm.data.data).mean, warm.data.data)
+    assert float(chi2) > 100 * found.n_data
+
+
+def test_ground_at_zero_kelvin_has_a_template_all_the_same(response_file):
+    cold = set_up(four_ports(response_file, "beam.moon_temperature_k=0", GROUND % "marginalised"))
+    assert cold.offset is None
+    root = columns(response_file, cold.layout.n_times)[:, 4:]
+    bare = np.diag(np.asarray(radiometer(cold).diagonal()))
+    np.testing.assert_allclose(full_model(cold).noise.dense(), bare + root @ root.T, rtol=1e-6)
+
+
+def test_receivers_sampled_have_the_density_of_the_closed_form(response_file):
+    """Priors by scipy, and the evidence of the sky alone given the five."""
+    given = four_ports(response_file, RECEIVER % "sampled", GROUND % "sampled")
+    e = lb.build(given)
+    setup, z = e.setup, np.array([0.3, -0.2, 0.1, 0.5, -1.2])
+    values = {f"receiver_{port}_k": 2000.0 + 200.0 * z[port] for port in range(4)}
+    values["regolith_k"] = 250.0 + 30.0 * z[4]
+    program = lb.load_program("systematics")
+    got, trace = density(program, program_arguments(program, e), values)
+    assert set(trace) == {*values, "data"}
+    t = columns(response_file, setup.layout.n_times)
+    rest = np.asarray(e.data.data) - np.asarray(setup.offset) - t @ z
+    prior = np.sqrt(np.asarray(setup.prior.variance()))
+    noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    a = np.asarray(setup.coupling.dense())
+    expected = white_posterior(a, prior, noise, rest).log_prob
+    expected += norm.logpdf(z).sum() - 4 * np.log(200.0) - np.log(30.0)
+    # chi^2 of 1e7, each of whose squares is right to 1e-10 of itself
+    assert got == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["noise.receiver={}"], "give either power_v2_hz or power_k"),
+        (["noise.receiver={power_k: 1, power_v2_hz: 1e-17}"], "give either power_v2_hz or power_k"),
+        (["noise.receiver={power_k: 1, relative_std: 0}"], "greater than 0"),
+        (["noise.regolith={}"], "std_k"),
+        (["noise.receiver={power_v2_hz: 1e-17}"], r"power_v2_hz needs antennas that know volts"),
+        (["noise.regolith={std_k: 30}"], r"noise\.regolith needs antennas that receive from the"),
+    ],
+)
+def test_refused_in_one_sentence(overrides, message):
+    with refused(message):
+        set_up(lb.load_scenario("fiducial", ["lmax=2", "observation.step_s=1e5", *overrides]))
+
+
+# --- errors of the gain table ---------------------------------------------------------------------
+
 
 TABLE = "noise.gain_table={std: 0.01, treatment: %s}"
 UNKNOWN = ("noise.receiver={power_k: 2000}", "noise.regolith={std_k: 30}", TABLE % "marginalised")
@@ -66,8 +221,8 @@ def per_port(z: np.ndarray, n_times: int = 23) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def experiment(response_file) -> Experiment:
-    return build(four_ports(response_file, *UNKNOWN, "seed=5"))
+def experiment(response_file) -> lb.Experiment:
+    return lb.build(four_ports(response_file, *UNKNOWN, "seed=5"))
 
 
 # --- simulated data -------------------------------------------------------------------------------
@@ -133,18 +288,11 @@ def test_about_given_values_it_is_the_closed_form(experiment):
     std = expected.std
     assert np.abs((np.asarray(found.posterior.mean) - expected.mean[:16]) / std[:16]).max() < 1e-3
     got, scale = np.asarray(found.posterior.covariance()), np.outer(std, std)
-    np.testing.assert_allclose(
-        got / scale[:16, :16], expected.covariance[:16, :16] / scale[:16, :16], rtol=0, atol=1e-5
-    )
+    within(got / scale[:16, :16], expected.covariance[:16, :16] / scale[:16, :16], 1e-5)
     t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
     told = template_amplitudes(found.model, found.posterior, data.data, t)
     assert np.abs((told.mean - expected.mean[16:]) / std[16:]).max() < 1e-3
-    np.testing.assert_allclose(
-        told.covariance / scale[16:, 16:],
-        expected.covariance[16:, 16:] / scale[16:, 16:],
-        rtol=0,
-        atol=1e-5,
-    )
+    within(told.covariance / scale[16:, 16:], expected.covariance[16:, 16:] / scale[16:, 16:], 1e-5)
 
 
 def share() -> np.ndarray:
@@ -160,7 +308,7 @@ def test_rounds_find_the_mode_and_the_first_order_does_not(experiment):
     K = F (A S A^T + T_l T_l^T) F + N_0 a matrix; the mode is where both cancel, to 1e-12.
     """
     setup, d = experiment.setup, np.asarray(experiment.data.data)
-    found = infer(experiment)
+    found = lb.infer(experiment)
     assert found.rounds > 2
     a, offset = np.asarray(setup.coupling.dense()), np.asarray(setup.offset)
     prior = np.sqrt(np.asarray(setup.prior.variance()))
@@ -228,7 +376,7 @@ def test_many_modes_do_not_pass_for_a_gain():
     deviations for each sky, 0.02 on average. About the joint mode it would be 121 x 0.005 = 0.6.
     """
     given = ["lmax=10", "prior={model: isotropic, spectrum: sky}", "noise.receiver={power_k: 2000}"]
-    first = set_up(load_scenario("fiducial", [*given, TABLE % "marginalised"]))
+    first = set_up(lb.load_scenario("fiducial", [*given, TABLE % "marginalised"]))
     found = []
     for seed in range(20):
         z = np.random.default_rng(seed).standard_normal(first.prior.size)
@@ -236,7 +384,7 @@ def test_many_modes_do_not_pass_for_a_gain():
         sky = replace(first.sky, modes=np.asarray(first.prior.colour(z)))
         setup = replace(first, sky=sky, scenario=scenario)
         data = simulate(setup)
-        it = infer(Experiment(setup, data))
+        it = lb.infer(lb.Experiment(setup, data))
         gains = it.systematics[-1]
         told = template_amplitudes(it.model, it.posterior, data.data, gains.columns)
         found.append(gains.common @ (gains.expected + told.mean))
@@ -248,8 +396,8 @@ def test_many_modes_do_not_pass_for_a_gain():
 def test_errors_that_data_name_are_found(response_file):
     setup = calibrated(set_up(four_ports(response_file, "noise.gain_table={}")))
     data = replace(simulate(setup), calibration=setup.calibration)
-    experiment = Experiment(setup, data)
-    found = infer(experiment)
+    experiment = lb.Experiment(setup, data)
+    found = lb.infer(experiment)
     (table,) = found.systematics
     assert table.names == ("gain_M0_PC1", "gain_M0_PC2", "gain_L3_PC1", "gain_M1_PC1")
     slope = slopes(23)[:4]
@@ -267,9 +415,9 @@ def test_errors_that_data_name_are_found(response_file):
 def test_clock_and_pointing_beside_it_settle_in_the_same_rounds(response_file):
     """The step of Gauss and Newton that is left, with derivatives of the exact model in all 26."""
     pointing = "noise.pointing={turntable_deg: 0.05, true_values: {turntable_deg: 0.08}}"
-    experiment = build(four_ports(response_file, *UNKNOWN, pointing, "seed=5"))
+    experiment = lb.build(four_ports(response_file, *UNKNOWN, pointing, "seed=5"))
     setup, d = experiment.setup, np.asarray(experiment.data.data)
-    found = infer(experiment)
+    found = lb.infer(experiment)
     assert [type(s).__name__ for s in found.moving] == ["PointingOffsets", "GainTable"]
     prior = np.sqrt(np.asarray(setup.prior.variance()))
     noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
@@ -318,12 +466,10 @@ def test_what_n_holds_of_the_others_is_seen_through_the_gains(response_file):
 
 def test_sampled_the_density_is_the_closed_form(response_file):
     """Factors by hand on the rows of A and on the offset."""
-    e = build(four_ports(response_file, TABLE % "sampled"))
+    e = lb.build(four_ports(response_file, TABLE % "sampled"))
     setup, z = e.setup, np.array([0.5, -1.5, 0.2, 1.1])
-    program = load_program("systematics")
-    arguments = program_arguments(program, e)
-    with numpyro_promotion():
-        got, trace = log_density(program.model, (), arguments, {"gain_table": jnp.asarray(z)})
+    program = lb.load_program("systematics")
+    got, trace = density(program, program_arguments(program, e), {"gain_table": z})
     assert set(trace) == {"gain_table", "data"}
     factors = per_port(z)
     a = factors[:, None] * np.asarray(setup.coupling.dense())
@@ -333,19 +479,17 @@ def test_sampled_the_density_is_the_closed_form(response_file):
     expected = white_posterior(a, prior, noise, rest).log_prob + norm.logpdf(z).sum()
     assert abs(expected) > 1e4
     # chi^2 of 1e7, each of whose squares is right to 1e-10 of itself
-    assert float(got) == pytest.approx(expected, rel=1e-8)
+    assert got == pytest.approx(expected, rel=1e-8)
 
 
 def test_beside_what_is_sampled_it_is_marginalised_in_its_place(response_file):
     """Receivers sampled, the gain table in N: the density is that of N about what data tell."""
-    e = build(four_ports(response_file, "noise.receiver={power_k: 2000, treatment: sampled}",
+    e = lb.build(four_ports(response_file, "noise.receiver={power_k: 2000, treatment: sampled}",
                          TABLE % "marginalised"))  # fmt: skip
-    program = load_program("systematics")
-    arguments = program_arguments(program, e)
-    values = {f"receiver_{port}_k": jnp.asarray(2000.0 + 50.0 * port) for port in range(4)}
-    with numpyro_promotion():
-        got = jax.jit(lambda x: log_density(program.model, (), arguments, x)[0])(values)
-    found = infer(e)
+    program = lb.load_program("systematics")
+    values = {f"receiver_{port}_k": 2000.0 + 50.0 * port for port in range(4)}
+    got, _ = density(program, program_arguments(program, e), values)
+    found = lb.infer(e)
     (table,) = found.moving
     factors = np.asarray(table.errors.factors(np.asarray(table.centre)))
     a = factors[:, None] * np.asarray(e.setup.coupling.dense())
@@ -360,7 +504,7 @@ def test_beside_what_is_sampled_it_is_marginalised_in_its_place(response_file):
     prior = np.append(np.sqrt(np.asarray(e.setup.prior.variance())), np.ones(4))
     expected = white_posterior(np.concatenate([a, t], axis=1), prior, noise, rest).log_prob
     expected += norm.logpdf([0.0, 0.25, 0.5, 0.75]).sum() - 4 * np.log(200.0)
-    assert float(got) == pytest.approx(expected, rel=1e-7)
+    assert got == pytest.approx(expected, rel=1e-7)
 
 
 @pytest.mark.long
@@ -371,8 +515,8 @@ def test_sampled_and_marginalised_tell_the_same(response_file):
     0.5 % of a standard deviation, a third of the Monte Carlo error of some 4000 draws.
     """
     loud = "noise.radiometer.factor=1e4"
-    e = build(four_ports(response_file, *UNKNOWN, loud, "seed=7"))
-    found = infer(e)
+    e = lb.build(four_ports(response_file, *UNKNOWN, loud, "seed=7"))
+    found = lb.infer(e)
     columns = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
     told = template_amplitudes(found.model, found.posterior, e.data.data, columns)
     centre = told.mean + np.append(np.zeros(5), found.systematics[-1].expected)
@@ -380,12 +524,12 @@ def test_sampled_and_marginalised_tell_the_same(response_file):
     for name in ("receiver", "regolith", "gain_table"):
         tree["noise"][name]["treatment"] = "sampled"
     e = replace(e, setup=replace(e.setup, scenario=type(e.scenario).model_validate(tree)))
-    program = load_program("systematics")
+    program = lb.load_program("systematics")
     arguments = program_arguments(program, e)
-    approximation = laplace_approximation(program.model, arguments)
+    approximation = lb.laplace_approximation(program.model, arguments)
     assert bool(approximation.converged)
-    sampler = Sampler(draws=1500, seed=3)
-    chains = sample(program.model, arguments, sampler, approximation.whitening)
+    sampler = lb.Sampler(draws=1500, seed=3)
+    chains = lb.sample(program.model, arguments, sampler, approximation.whitening)
     assert not chains.statistics["diverging"].any()
     powers = [(chains.sites[f"receiver_{port}_k"] - 2000.0) / 200.0 for port in range(4)]
     ground = (chains.sites["regolith_k"] - 250.0) / 30.0
@@ -402,22 +546,21 @@ def test_sampled_and_marginalised_tell_the_same(response_file):
 # --- refused --------------------------------------------------------------------------------------
 
 
-def refused(setup: Setup, message: str) -> None:
+def both_refuse(setup: Setup, message: str) -> None:
     for ask in (true_values, full_model):
-        with pytest.raises(InputError, match=message) as caught:
+        with refused(message):
             ask(setup)
-        assert "\n" not in str(caught.value)
 
 
 def test_errors_that_nobody_says_and_errors_that_both_say(response_file):
     nothing = set_up(four_ports(response_file, "noise.gain_table={}"))
-    refused(nothing, r"say nothing of a gain table; give noise\.gain_table\.std")
+    both_refuse(nothing, r"say nothing of a gain table; give noise\.gain_table\.std")
     n = nothing.layout.n_times
-    refused(
+    both_refuse(
         replace(nothing, calibration=Calibration(np.full(n, 1e10))), r"give noise\.gain_table\.std"
     )
     both = calibrated(set_up(four_ports(response_file, TABLE % "marginalised")))
-    refused(
+    both_refuse(
         both, r"say the errors of their gain table themselves; leave out noise\.gain_table\.std"
     )
 
@@ -429,7 +572,7 @@ def test_without_a_table_each_port_is_off_as_the_levels_of_flight_files_are(resp
     own = set_up(four_ports(response_file, TABLE % "marginalised", "flight={gain_std: 0.03}"))
     assert (table_errors(own).slope == 0.01).all()
     wide = set_up(four_ports(response_file, "noise.gain_table={}", "flight={gain_std: 0.3}"))
-    refused(wide, r"flight\.gain_std is 0\.3, .* give a smaller noise\.gain_table\.std")
+    both_refuse(wide, r"flight\.gain_std is 0\.3, .* give a smaller noise\.gain_table\.std")
 
 
 def test_tables_that_are_hardly_known(response_file):
@@ -437,10 +580,12 @@ def test_tables_that_are_hardly_known(response_file):
     n = setup.layout.n_times
     slope = np.stack([np.full(n, 0.08), np.full(n, 0.07)])
     wide = Calibration(np.full(n, 1e10), ("a", "b"), np.array([1, 1]), slope)
-    refused(replace(setup, calibration=wide), "of port 1 is known to 0.11 of itself, expected at")
+    both_refuse(
+        replace(setup, calibration=wide), "of port 1 is known to 0.11 of itself, expected at"
+    )
 
 
 @pytest.mark.parametrize("std", ["0", "-0.01", "0.2", "x"])
 def test_what_is_no_standard_deviation(response_file, std):
-    with pytest.raises(InputError, match=r"noise\.gain_table\.std"):
+    with pytest.raises(lb.InputError, match=r"noise\.gain_table\.std"):
         four_ports(response_file, f"noise.gain_table={{std: {std}}}")

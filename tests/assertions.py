@@ -1,0 +1,33 @@
+"""Assertions that the tests share."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from lusee_bayes.core.errors import InputError
+
+
+def close(got: object, expected: object, relative: float) -> None:
+    """Assert that arrays agree to a part of the largest expected entry."""
+    largest = np.abs(np.asarray(expected)).max()
+    np.testing.assert_allclose(got, expected, rtol=0, atol=relative * largest)
+
+
+def within(got: object, expected: object, atol: object) -> None:
+    """Assert that arrays agree to so much, whatever their size."""
+    np.testing.assert_allclose(got, expected, rtol=0, atol=atol)
+
+
+@contextmanager
+def refused(words: str) -> Iterator[None]:
+    """Assert that input is refused in one sentence that has these words, or their pattern."""
+    with pytest.raises(InputError) as caught:
+        yield
+    text = str(caught.value)
+    assert words in text or re.search(words, text), text
+    assert "\n" not in text and "Traceback" not in text and "pydantic" not in text

@@ -1,0 +1,719 @@
+"""Windows of samples: averages of data by loops, A against instants, and files and arrays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime, timedelta
+
+import astropy.units as u
+import numpy as np
+import pytest
+import xarray as xr
+from assertions import refused, within
+from astropy.coordinates import ICRS, CartesianRepresentation, Galactic
+from astropy.time import Time
+from lunarsky import LunarTopo, MoonLocation
+from reference import steep_sky
+
+import lusee_bayes as lb
+from lusee_bayes.core.rotations import Rotation
+from lusee_bayes.instrument.averaging import averaged, product_live_s
+from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.times import unannounced_leap_seconds
+from lusee_bayes.instrument.window_average import sufficient_nodes
+from lusee_bayes.instrument.windows import Windows
+from lusee_bayes.noise.radiometer import paper_variance
+from lusee_bayes.report.describe import describe
+
+# --- averages of data -----------------------------------------------------------------------------
+
+
+STEP = 600.0
+RUNS = [lb.Run(0.004), lb.Run(0.003, turntable_deg=30.0)]
+
+
+def observed(keep=None, windows="odd", runs=RUNS):
+    """15 and 11 samples; every third is made of two pieces."""
+    observation = lb.Observation.from_runs(runs, step_s=STEP, window="mean")
+    rng = np.random.default_rng(7)
+    n = observation.n_times
+    if windows == "odd":
+        sample, start, end, live = [], [], [], []
+        for k in range(n):
+            pieces = [(-300.0, -100.0), (-40.0, 300.0)] if k % 3 == 0 else [(-300.0, 300.0)]
+            share = 1.0 if k % 2 else rng.uniform(0.2, 1.0)
+            for a, b in pieces:
+                sample, start, end = [*sample, k], [*start, a], [*end, b]
+                live.append(share * (b - a))
+        made = Windows(np.array(sample), np.array(start), np.array(end), np.array(live))
+        observation = replace(observation, windows=made)
+    return observation if keep is None else observation.select(keep)
+
+
+def data_of(observation, flagged=0.0, seed=1):
+    rng = np.random.default_rng(seed)
+    layout = DataLayout.from_flags(rng.random((16, observation.n_times)) < flagged)
+    values = rng.normal(3e4, 1e3, layout.size)
+    return lb.Visibilities(values, layout, observation, 25.0, truth=rng.normal(size=9))
+
+
+def seconds_of(observation, origin):
+    return (observation.times - origin).to_value(u.s)
+
+
+def pieces_of(observation, origin):
+    """(start, end, live) of every piece of every sample, in seconds from one time."""
+    windows, seconds = observation.windows, seconds_of(observation, origin)
+    found = [[] for _ in seconds]
+    for k, a, b, live in zip(
+        windows.sample, windows.start_s, windows.end_s, windows.live_s, strict=True
+    ):
+        found[k].append((seconds[k] + a, seconds[k] + b, live))
+    return found
+
+
+def naive(data, to_s):
+    """Bins as lists of (run, values by product, pieces), by loops over the module's rule."""
+    observation, grid = data.observation, data.grid()
+    pieces = pieces_of(observation, observation.times[0])
+    bins = {}
+    for k, run in enumerate(observation.run):
+        first = list(observation.run).index(run)
+        place = (pieces[k][0][0] - pieces[first][0][0] + 1e-3) // to_s
+        bins.setdefault((run, place), []).append(k)
+    found = []
+    for (run, _), members in bins.items():
+        live = {k: sum(p[2] for p in pieces[k]) for k in members}
+        members = [k for k in members if not np.isnan(grid[:, k]).all()]
+        total = sum(live[k] for k in members)
+        products = [
+            p
+            for p in range(16)
+            if sum(live[k] for k in members if not np.isnan(grid[p, k])) >= total / 2
+        ]
+        members = [k for k in members if not any(np.isnan(grid[p, k]) for p in products)]
+        if not members or not products:
+            continue
+        weight = sum(live[k] for k in members)
+        values = {p: sum(live[k] * grid[p, k] for k in members) / weight for p in products}
+        merged = []
+        for piece in (p for k in members for p in pieces[k]):
+            start, end, lived = piece
+            share = lived / (end - start)
+            if merged and abs(merged[-1][1] - start) < 1e-6:
+                a, _, before = merged[-1]
+                if abs(before / (merged[-1][1] - a) - share) < 1e-9:
+                    merged[-1] = (a, end, before + lived)
+                    continue
+            merged.append(piece)
+        found.append((run, values, merged))
+    return found
+
+
+CASES = {
+    "whole": (observed(), 0.0),
+    "flags": (observed(), 0.15),
+    "many flags": (observed(), 0.55),
+    "gaps": (observed(np.arange(26) % 7 != 3), 0.1),
+    "one window each": (observed(windows="whole"), 0.1),
+}
+
+
+@pytest.mark.parametrize("to_s", [STEP, 3 * STEP, 5 * STEP, 1e5])
+@pytest.mark.parametrize("case", CASES)
+def test_values_windows_and_live_times_are_those_of_loops(case, to_s):
+    data = data_of(*CASES[case])
+    found, expected = averaged(data, to_s), naive(data, to_s)
+    observation = found.observation
+    assert observation.step_s == to_s and observation.n_times == len(expected)
+    origin = data.observation.times[0]
+    grid, pieces = found.grid(), pieces_of(observation, origin)
+    middles = seconds_of(observation, origin)
+    for k, (run, values, expected_pieces) in enumerate(expected):
+        assert data.observation.turntable_deg[run] == observation.turntable_deg[observation.run[k]]
+        column = np.full(16, np.nan)
+        column[list(values)] = list(values.values())
+        np.testing.assert_allclose(grid[:, k], column, rtol=1e-12)
+        # seconds over days, of Julian dates in two parts
+        np.testing.assert_allclose(pieces[k], expected_pieces, rtol=0, atol=1e-6)
+        middle = (expected_pieces[0][0] + expected_pieces[-1][1]) / 2
+        assert middles[k] == pytest.approx(middle, abs=1e-6)
+    assert found.frequency_mhz == data.frequency_mhz
+    np.testing.assert_array_equal(found.truth, data.truth)
+
+
+@pytest.mark.parametrize("to_s", [STEP, 2.5 * STEP, 7 * STEP, 1e6])
+def test_live_time_times_value_is_conserved(to_s):
+    data = data_of(observed())
+    after = averaged(data, to_s)
+
+    def integral(data):
+        return data.grid() @ data.observation.live_s
+
+    np.testing.assert_allclose(integral(after), integral(data), rtol=1e-12)
+    assert product_live_s(after) == pytest.approx(product_live_s(data), rel=1e-12)
+
+
+@pytest.mark.parametrize("to_s", [1.5 * STEP, 2.5 * STEP, 3.25 * STEP])
+def test_no_bin_is_longer_than_asked_for(to_s):
+    """Samples that do not fit: bins of whole samples, none across a run, all of them there."""
+    keep = np.ones(26, dtype=bool)
+    keep[[2, 8]] = False
+    observation = observed(keep, windows="whole")
+    # what follows the gap is off the grid by a third of a sample
+    late = np.where(np.arange(24) > 10, STEP / 3, 0.0)
+    observation = replace(observation, times=observation.times + late * u.s)
+    data = data_of(observation)
+    after = averaged(data, to_s)
+    bounds = after.observation.windows.bounds_s
+    assert (bounds[:, 1] - bounds[:, 0] <= to_s + 1e-6).all()
+    assert after.observation.n_times < data.observation.n_times or to_s < 2 * STEP
+    assert after.observation.live_s.sum() == pytest.approx(24 * STEP, rel=1e-12)
+    assert after.observation.n_runs == 2
+
+
+# --- flags --------------------------------------------------------------------------------------
+
+
+def flagged(*absent, n=4):
+    """``n`` samples of one run, of equal live times, without some (product, sample)."""
+    observation = lb.Observation.from_runs([lb.Run(0.02)], step_s=STEP, window="mean")
+    observation = observation.select(np.arange(observation.n_times) < n)
+    flags = np.zeros((16, n), dtype=bool)
+    for product, sample in absent:
+        flags[product, sample] = True
+    layout = DataLayout.from_flags(flags)
+    return lb.Visibilities(
+        np.random.default_rng(3).normal(size=layout.size), layout, observation, 25.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("absent", "kept", "lost"),
+    [
+        # product 5 in one of 4 samples, less than half; product 2 in three, so that one is lost
+        ([(5, 0), (5, 1), (5, 2), (2, 3)], [0, 1, 2], [5]),
+        # half of the samples is enough
+        ([(5, 0), (5, 1)], [2, 3], []),
+        # samples without any product do not count: the last one is all that there is
+        ([(p, k) for p in range(16) for k in range(3)], [3], []),
+    ],
+)
+def test_products_that_are_rarely_there_are_left_out(absent, kept, lost):
+    data = flagged(*absent)
+    found = averaged(data, 4 * STEP)
+    expected = data.grid()[:, kept].mean(axis=1)
+    expected[lost] = np.nan
+    np.testing.assert_allclose(found.grid()[:, 0], expected, rtol=1e-12)
+    assert found.observation.live_s == pytest.approx(len(kept) * STEP)
+    share = len(kept) * (16 - len(lost)) / (64 - len(absent))
+    assert product_live_s(found) / product_live_s(data) == pytest.approx(share)
+
+
+def test_bins_of_which_nothing_remains_are_dropped():
+    data = flagged(*((p, k) for p in range(16) for k in (0, 1)))
+    found = averaged(data, 2 * STEP)
+    assert found.observation.n_times == 1 and found.n_missing == 0
+    # no product is there for half of the time, or none with another
+    rarely = flagged(*((p, k) for p in range(16) for k in range(4) if p % 4 != k))
+    halves = flagged(*((p, k) for p in range(16) for k in range(4) if p % 2 != k % 2))
+    for data in (rarely, halves):
+        with pytest.raises(lb.InputError, match="nothing is left of the data in bins of 2400 s"):
+            averaged(data, 4 * STEP)
+
+
+def test_a_run_of_which_nothing_remains_is_gone():
+    observation = observed()
+    flags = np.zeros((16, observation.n_times), dtype=bool)
+    flags[:, observation.run == 0] = True
+    layout = DataLayout.from_flags(flags)
+    data = lb.Visibilities(np.ones(layout.size), layout, observation, 25.0)
+    found = averaged(data, 3 * STEP).observation
+    assert found.turntable_deg == (30.0,) and set(found.run) == {0}
+
+
+@pytest.mark.parametrize(
+    ("windows", "to_s", "words"),
+    [
+        ("instant", 3600.0, "the samples are instants, which have no mean over a time"),
+        ("mean", 300.0, "over 300 s, which is shorter than their samples of 600 s"),
+        ("mean", 1e9 * 86400.0, "give at most 30 days"),
+        ("mean", 0.0, "the time to average over, in seconds, must be positive"),
+        ("mean", np.nan, "the time to average over, in seconds, must be positive"),
+    ],
+)
+def test_what_cannot_be_averaged(windows, to_s, words):
+    observation = lb.Observation.from_runs([lb.Run(0.01)], step_s=STEP, window=windows)
+    with refused(words):
+        averaged(data_of(observation), to_s)
+
+
+# --- A as the mean over windows -------------------------------------------------------------------
+
+
+def partly_filled(n, step_s, seed=1):
+    """Whole windows, windows that end early, and windows with one or two gaps."""
+    rng = np.random.default_rng(seed)
+    sample, start, end, live = [], [], [], []
+    for k in range(n):
+        edges = np.sort(rng.uniform(-0.5, 0.5, 2 * (k % 4))) * step_s
+        edges = np.concatenate([[-step_s / 2], edges, [step_s / 2]])
+        if k % 4 == 1:  # one piece, without its end
+            edges = edges[:2]
+        for first, last in zip(edges[::2], edges[1::2], strict=True):
+            sample.append(k)
+            start.append(first)
+            end.append(last)
+            live.append(rng.uniform(0.3, 1.0) * (last - first))
+    return Windows(np.array(sample), np.array(start), np.array(end), np.array(live))
+
+
+def observation(step_s, filled):
+    """Eight samples across a cycle, so that the pole has wandered between them."""
+    whole = lb.Observation.from_runs([lb.Run(1.0, 20.0)], step_s=step_s, window="mean")
+    keep = np.zeros(whole.n_times, dtype=bool)
+    keep[np.linspace(0, whole.n_times - 1, 8).astype(int)] = True
+    some = whole.select(keep)
+    return replace(some, windows=partly_filled(8, step_s)) if filled else some
+
+
+def nodes_of(windows, k, n):
+    """n instants of sample k and their weights, piece by piece."""
+    x, w = np.polynomial.legendre.leggauss(n)
+    offsets, weights = [], []
+    pieces = np.flatnonzero(windows.sample == k)
+    for piece in pieces:
+        a, b = windows.start_s[piece], windows.end_s[piece]
+        offsets.append((a + b) / 2 + (b - a) / 2 * x)
+        weights.append(w / 2 * windows.live_s[piece] / windows.live_s[pieces].sum())
+    return np.concatenate(offsets), np.concatenate(weights)
+
+
+def sigma_of(v, o):
+    """Radiometer noise of one live time, 1 MHz wide."""
+    return np.sqrt(paper_variance(v) / (1e6 * o.live_s))
+
+
+@pytest.mark.parametrize("lmax", [12, pytest.param(47, marks=pytest.mark.long)])
+@pytest.mark.parametrize("filled", [False, True])
+@pytest.mark.parametrize("step_s", [10.0, 600.0, 7200.0, 43200.0])
+def test_equals_the_mean_of_200_instants(step_s, filled, lmax):
+    o, beams, sky = observation(step_s, filled), lb.monopole_beams(25.0, lmax), steep_sky(lmax)
+    got = np.asarray(lb.CouplingMatrix.observe(beams, o) @ sky).reshape(16, -1)
+    expected = np.zeros_like(got)
+    for k in range(o.n_times):
+        offsets, weights = nodes_of(o.windows, k, 200)
+        with unannounced_leap_seconds():
+            times = o.times[k] + offsets * u.s
+        run = np.zeros(len(times), dtype=int)
+        instants = replace(o, times=times, run=run, windows=None)
+        pointing = lb.Pointing.of(instants, lmax, order=4)
+        v = np.asarray(lb.CouplingMatrix.build(beams, pointing) @ sky).reshape(16, -1)
+        expected[:, k] = v @ weights
+    off = (got - expected) / sigma_of(expected, o)
+    assert np.abs(off).max() < 1e-6
+    # and instants at the same times would not do
+    instants = np.asarray(lb.CouplingMatrix.observe(beams, replace(o, windows=None)) @ sky)
+    wrong = np.abs((instants.reshape(16, -1) - expected) / sigma_of(expected, o)).max()
+    assert wrong > {10.0: 1e-8, 600.0: 1e-4, 7200.0: 0.1, 43200.0: 10.0}[step_s]
+
+
+def antenna_frame(o, time):
+    """From Galactic axes to those of the turned antennas, by lunarsky's LunarTopo."""
+    site = MoonLocation.from_selenodetic(o.lon_deg * u.deg, o.lat_deg * u.deg, 0.0 * u.m)
+    axes = Galactic(CartesianRepresentation(np.eye(3))).transform_to(ICRS())
+    with unannounced_leap_seconds():
+        there = axes.transform_to(LunarTopo(obstime=time, location=site))
+    east, north, up = np.sin(there.az), np.cos(there.az), np.sin(there.alt)
+    flat = np.cos(there.alt)
+    topocentric = np.array([(flat * east).value, (flat * north).value, up.value])
+    psi = np.radians(o.turntable_deg[0])
+    back = np.array([[np.cos(psi), np.sin(psi), 0], [-np.sin(psi), np.cos(psi), 0], [0, 0, 1]])
+    return back @ topocentric
+
+
+@pytest.mark.parametrize(
+    ("step_s", "filled", "lmax"),
+    [(7200.0, False, 20), pytest.param(43200.0, True, 47, marks=pytest.mark.long)],
+)
+def test_equals_the_mean_of_20_instants_by_lunarsky(step_s, filled, lmax):
+    o, beams, sky = observation(step_s, filled), lb.monopole_beams(25.0, lmax), steep_sky(lmax)
+    got = np.asarray(lb.CouplingMatrix.observe(beams, o) @ sky).reshape(16, -1)
+    for k in (1, 2, 7):
+        offsets, weights = nodes_of(o.windows, k, 20)
+        expected = 0.0
+        for offset, weight in zip(offsets, weights, strict=True):
+            with unannounced_leap_seconds():
+                time = o.times[k] + offset * u.s
+            turned = Rotation.from_matrix(antenna_frame(o, time), lmax)(sky)
+            expected = expected + weight * (np.asarray(beams.modes) @ turned)
+        sigma = sigma_of(np.asarray(expected)[:, None], replace(o.select(np.arange(8) == k)))
+        assert np.abs((got[:, k] - expected) / sigma[:, 0]).max() < 1e-6
+
+
+def test_a_fixed_axis_gives_a_factor_for_each_order():
+    """sin(m h) / (m h), h half of the angle of a window, where nothing wanders."""
+    o = lb.Observation.from_runs([lb.Run(0.2)], step_s=7200.0, window="mean")
+    p = lb.Pointing.of(o, 30, order=0)
+    # the Moon's own turn, from its orientations at the ends of the windows
+    with unannounced_leap_seconds():
+        edges = replace(o, times=o.times - 3600.0 * u.s, windows=None)
+    half = np.diff(np.unwrap(np.asarray(lb.Pointing.of(edges, 2).azimuth))) / 2.0
+    got = np.asarray(p.functions)[:-1] @ np.asarray(p.factors)[:, 0, :, 0]
+    m = np.arange(31)
+    # what functions of time leave out
+    np.testing.assert_allclose(got, np.sinc(m * half[:, None] / np.pi), rtol=0, atol=1e-8)
+    # one function is all but exact: the rate of the turn varies by 1e-4
+    alone = np.asarray(p.functions)[:-1, :1] * np.asarray(p.factors)[0, 0, :, 0]
+    np.testing.assert_allclose(alone, got, rtol=0, atol=1e-4 * (30 * half.max()) ** 2)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-3, 0.3, 3.0])
+def test_nodes_suffice(angle):
+    x, w = np.polynomial.legendre.leggauss(sufficient_nodes(angle))
+    assert w @ np.cos(angle * x) / 2 == pytest.approx(np.sinc(angle / np.pi), abs=2e-15 + 1e-14)
+
+
+def test_windows_that_cannot_be():
+    one = np.array([1.0])
+    with pytest.raises(
+        lb.InputError, match="sample 0 ends -1 s from its time, not after its start"
+    ):
+        Windows.whole(one, -one)
+    with pytest.raises(lb.InputError, match="sample 0 was live for 3 s of a window of 2 s"):
+        Windows.whole(-one, one, 3 * one)
+    with pytest.raises(lb.InputError, match="sample 0 has a live time of 0 s"):
+        Windows.whole(-one, one, 0 * one)
+    with pytest.raises(lb.InputError, match="sample 0 has a piece that begins at 0.5 s, before"):
+        Windows(np.array([0, 0]), np.array([0.0, 0.5]), np.array([1.0, 2.0]), np.ones(2))
+    with pytest.raises(lb.InputError, match="must count the samples 0, 1"):
+        Windows(np.array([0, 2]), np.zeros(2), np.ones(2), np.ones(2))
+    none = np.zeros(0)
+    with pytest.raises(lb.InputError, match="same length, with at least one piece"):
+        Windows(none.astype(int), none, none, none)
+    o = lb.Observation.from_runs([lb.Run(0.05)], window="mean")
+    n = np.ones(o.n_times)
+    with pytest.raises(
+        lb.InputError, match="the window of sample 0 lasts 8000 s, longer than the st"
+    ):
+        replace(o, windows=Windows.whole(-4000 * n, 4000 * n))
+    with pytest.raises(
+        lb.InputError, match=r"samples 0 and 1 \(2027-01-15T01:00:00\) overlap by 600"
+    ):
+        replace(o, windows=Windows.whole(-3600 * n, 3600 * n + 600 * (o.hours == 0)), step_s=8e3)
+    with pytest.raises(lb.InputError, match="windows of 3 samples for 16 times"):
+        replace(o, windows=Windows.whole(-n[:3], n[:3]))
+    with pytest.raises(lb.InputError, match="samples are instants; use observation.window=instant"):
+        replace(o, fixed_axis=True)
+
+
+def test_nodes_and_live_times():
+    w = partly_filled(9, 100.0)
+    sample, offset, weight = w.nodes(3)
+    np.testing.assert_allclose(np.bincount(sample, weight), 1.0, rtol=1e-14)
+    for k in range(9):
+        pieces = w.sample == k
+        assert w.live_per_sample_s[k] == pytest.approx(w.live_s[pieces].sum(), rel=1e-14)
+        np.testing.assert_array_equal(
+            w.bounds_s[k], [w.start_s[pieces].min(), w.end_s[pieces].max()]
+        )
+        # the mean of t^2 over the pieces, by hand
+        exact = (w.end_s**3 - w.start_s**3) / 3 / (w.end_s - w.start_s) * w.live_s
+        exact = exact[pieces].sum() / w.live_s[pieces].sum()
+        assert weight[sample == k] @ offset[sample == k] ** 2 == pytest.approx(exact, rel=1e-12)
+    keep = np.arange(9) % 3 == 0
+    some = w.select(keep)
+    np.testing.assert_array_equal(some.live_per_sample_s, w.live_per_sample_s[keep])
+    assert "3 windows in" in repr(some)
+
+
+# --- windows in files and in arrays ---------------------------------------------------------------
+
+
+HOUR = 3600.0
+START = datetime(2027, 1, 15)
+STARTS = [START + timedelta(seconds=HOUR * k) for k in range(4)]
+VALUES = np.arange(4.0 * 16).reshape(4, 16)
+
+
+def made(times=STARTS, **options):
+    return lb.Visibilities.from_arrays(VALUES[: len(times)], times, 25.0, **options)
+
+
+def bounds_of(observation):
+    """Start and end of every sample in seconds from START, by datetimes of astropy."""
+    seconds = (observation.times - Time(START, scale="utc")).to_value(u.s)
+    return seconds[:, None] + observation.windows.bounds_s
+
+
+@pytest.fixture
+def data():
+    """Windows in pieces of odd lengths, and flags."""
+    observation = lb.Observation.from_runs(
+        [lb.Run(0.01), lb.Run(0.01, turntable_deg=30.0)], window="mean"
+    )
+    n = observation.n_times
+    rng = np.random.default_rng(5)
+    edges = np.sort(rng.uniform(-3600.0, 3600.0, (n, 4)), axis=1)
+    start, end = edges[:, ::2].ravel(), edges[:, 1::2].ravel()
+    live = (end - start) * rng.uniform(0.3, 1.0, 2 * n)
+    windows = Windows(np.repeat(np.arange(n), 2), start, end, live)
+    observation = replace(observation, windows=windows)
+    layout = DataLayout.from_flags(rng.random((16, n)) < 0.1)
+    return lb.Visibilities(rng.normal(size=layout.size), layout, observation, 25.0)
+
+
+def test_windows_come_back_to_the_last_bit(data, tmp_path):
+    again = lb.read_visibilities(data.write(tmp_path / "data.nc"))
+    for name in ("sample", "start_s", "end_s", "live_s"):
+        there, here = (getattr(d.observation.windows, name) for d in (data, again))
+        np.testing.assert_array_equal(here, there)
+    assert again.says_window
+    assert again.digest() == data.digest()
+
+
+def test_the_digest_knows_windows(data):
+    windows = data.observation.windows
+    other = replace(windows, live_s=windows.live_s * 0.5)
+    changed = replace(data, observation=replace(data.observation, windows=other))
+    instants = replace(data, observation=replace(data.observation, windows=None))
+    assert len({d.digest() for d in (data, changed, instants)}) == 3
+
+
+def test_other_software_finds_bounds_as_the_cf_conventions_have_them(tmp_path):
+    path = made(timestamp="start").write(tmp_path / "data.nc")
+    with xr.open_dataset(path, engine="h5netcdf") as found:
+        assert found["time_bounds"].dims[0] == "time" and found["time_bounds"].shape == (4, 2)
+        expected = np.array([[s, s + timedelta(seconds=HOUR)] for s in STARTS], "datetime64[ns]")
+        middles = np.array([s + timedelta(seconds=HOUR / 2) for s in STARTS], "datetime64[ns]")
+        np.testing.assert_array_equal(found["time_bounds"], expected)
+        np.testing.assert_array_equal(found["time"], middles)
+        assert found["time"].encoding["units"] == found["time_bounds"].encoding["units"]
+        np.testing.assert_allclose(found["live_time"], HOUR, rtol=0, atol=1e-8)
+    with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as raw:
+        assert raw["time"].attrs["bounds"] == "time_bounds"
+        assert raw["time"].dtype == raw["time_bounds"].dtype
+
+
+def rewritten(data, path, change):
+    dataset = data.to_dataset()
+    change(dataset).to_netcdf(path, engine="h5netcdf")
+    return path
+
+
+def without_pieces(dataset):
+    return dataset.drop_vars([str(n) for n in dataset.variables if str(n).startswith("piece_")])
+
+
+@pytest.mark.parametrize("units", ["seconds since 2027-01-15", "days since 2027-01-01T00:00:00"])
+def test_bounds_of_other_software_are_windows(tmp_path, units):
+    """Without pieces, with stamps at the starts, and units that the bounds leave to the time."""
+
+    def foreign(dataset):
+        dataset = without_pieces(dataset).drop_vars("live_time")
+        at_start = Time(START, scale="utc") + HOUR * np.arange(4) * u.s
+        dataset["jd1"][:], dataset["jd2"][:] = at_start.jd1, at_start.jd2
+        dataset["live_time"] = ("time", 0.25 * HOUR * np.ones(4))
+        # as xarray writes them: bounds without units of their own
+        dataset["time"].encoding = {"units": units, "dtype": "float64"}
+        dataset["time_bounds"].encoding = {"dtype": "float64"}
+        return dataset
+
+    path = rewritten(made(timestamp="start"), tmp_path / "foreign.nc", foreign)
+    with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as raw:
+        assert "units" not in raw["time_bounds"].attrs
+    again = lb.read_visibilities(path)
+    expected = HOUR * np.stack([np.arange(4), np.arange(1, 5)], axis=1)
+    # days in double precision since New Year: 3e-7 s, and a Julian date in two parts
+    np.testing.assert_allclose(bounds_of(again.observation), expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(again.observation.live_s, HOUR / 4, rtol=1e-15)
+    middles = (again.observation.times - Time(START, scale="utc")).to_value(u.s)
+    np.testing.assert_allclose(middles, HOUR * (np.arange(4) + 0.5), rtol=0, atol=1e-6)
+
+
+def test_instants_and_silent_files(data, tmp_path):
+    instants = made(timestamp="instant")
+    assert instants.observation.windows is None
+    path = instants.write(tmp_path / "instants.nc")
+    again = lb.read_visibilities(path)
+    assert again.says_window and again.observation.windows is None
+    assert "times are instants" in describe(path)
+
+    def silent(dataset):
+        del dataset.attrs["window"]
+        return dataset
+
+    path = rewritten(instants, tmp_path / "silent.nc", silent)
+    again = lb.read_visibilities(path)
+    assert not again.says_window and again.observation.windows is None
+    assert "does not say what its times are" in describe(path)
+    # what does not say it does not learn it by being written
+    assert not lb.read_visibilities(again.write(tmp_path / "again.nc")).says_window
+    assert "it is not known what the times are" in repr(again)
+    assert "not known" not in repr(instants)
+    started = again.stamped("start")
+    np.testing.assert_allclose(bounds_of(started.observation)[:, 0], HOUR * np.arange(4), atol=1e-6)
+    with pytest.raises(lb.InputError, match="the data have windows"):
+        started.stamped("end")
+
+
+def test_info_says_windows_and_live_share(data, tmp_path):
+    path = made(timestamp="end", live_s=[900.0] * 4).write(tmp_path / "data.nc")
+    assert "times are middles of windows of 3600 s, live for 25.0% of them" in describe(path)
+    text = describe(data.write(tmp_path / "pieces.nc"))
+    assert f"in {2 * data.observation.n_times} pieces" in text
+
+
+def lose(*names):
+    return lambda dataset: dataset.drop_vars(names)
+
+
+def attribute(name, value):
+    return lambda dataset: dataset.assign_attrs({name: value})
+
+
+def shifted_bounds(dataset):
+    bounds = dataset["time_bounds"]
+    return dataset.assign(time_bounds=(bounds.dims, bounds.values + np.timedelta64(30, "s")))
+
+
+def changed(name, value):
+    def change(dataset):
+        values = dataset[name].values.copy()
+        values[1] = value
+        return dataset.assign({name: (dataset[name].dims, values)})
+
+    return change
+
+
+def numbers(dataset):
+    """Bounds without units, of a time that does not name them."""
+    seconds = np.stack([np.arange(4.0), np.arange(1.0, 5.0)], axis=1)
+    dataset["time"].attrs.clear()
+    return dataset.assign(time_bounds=(dataset["time_bounds"].dims, seconds))
+
+
+def bounds_alone(change):
+    return lambda dataset: change(without_pieces(dataset))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lose("piece_end_s"), "there is piece_sample, but no piece_end_s"),
+        (bounds_alone(lose("time_bounds")), "there is live_time, but no time_bounds"),
+        (bounds_alone(lose("time_bounds", "live_time")), "window = 'mean', but no time_bounds"),
+        (attribute("window", "instant"), "says that the samples are instants, and piece_sample"),
+        (attribute("window", "means"), "window is 'means'; did you mean 'mean'"),
+        (shifted_bounds, "time_bounds and the pieces of sample 0 differ by 30 s"),
+        (changed("piece_end_s", -2000.0), "sample 1 ends -2000 s from its time, not after"),
+        (changed("piece_start_s", np.nan), "piece_start_s holds NaN"),
+        (changed("piece_sample", 0), "at least one piece for each"),
+        (changed("piece_live_s", 4000.0), "sample 1 was live for 4000 s of a window of 3600 s"),
+        (bounds_alone(changed("live_time", 4000.0)), "sample 1 was live for 4000 s"),
+        (bounds_alone(changed("live_time", -1.0)), "sample 1 has a live time of -1 s"),
+        (bounds_alone(changed("time_bounds", np.datetime64("NaT"))), "time_bounds holds no time"),
+        (bounds_alone(numbers), "time_bounds holds values of type float64, expected times"),
+    ],
+)
+def test_windows_that_a_file_cannot_have(tmp_path, change, words):
+    path = rewritten(made(), tmp_path / "bad.nc", change)
+    with pytest.raises(lb.InputError) as caught:
+        lb.read_visibilities(path)
+    assert words in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+# --- arrays -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("timestamp", "shift"), [("start", 0.0), ("middle", -0.5), ("end", -1.0)])
+def test_timestamps(timestamp, shift):
+    observation = made(timestamp=timestamp).observation
+    start = HOUR * (np.arange(4) + shift)
+    # a Julian date in two parts is exact to less than a nanosecond, offsets of hours to 1e-12
+    within(bounds_of(observation), np.stack([start, start + HOUR], axis=1), 1e-8)
+    np.testing.assert_allclose(observation.windows.bounds_s.sum(axis=1), 0.0, atol=1e-12)
+    # the median of steps between Julian dates
+    np.testing.assert_allclose(observation.live_s, HOUR, rtol=0, atol=1e-8)
+
+
+def test_middles_are_the_default_and_steps_may_be_shorter_than_the_times():
+    observation = made(step_s=600.0, live_s=[60.0, 600.0, 1.0, 599.0]).observation
+    start = HOUR * np.arange(4) - 300.0
+    within(bounds_of(observation), np.stack([start, start + 600.0], axis=1), 1e-8)
+    np.testing.assert_array_equal(observation.live_s, [60.0, 600.0, 1.0, 599.0])
+
+
+def test_bounds_of_any_kind_of_times():
+    bounds = [[s, s + timedelta(seconds=1000.0 + 100.0 * k)] for k, s in enumerate(STARTS)]
+    given = (
+        bounds,
+        [[one.isoformat() for one in pair] for pair in bounds],
+        np.array(bounds, dtype="datetime64[us]"),
+        Time(bounds, scale="utc"),
+    )
+    for one in given:
+        observation = made(bounds=one, live_s=np.full(4, 500.0)).observation
+        start = HOUR * np.arange(4)
+        expected = np.stack([start, start + 1000.0 + 100.0 * np.arange(4)], axis=1)
+        np.testing.assert_allclose(bounds_of(observation), expected, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(observation.windows.bounds_s.sum(axis=1), 0.0, atol=1e-9)
+        assert observation.step_s == pytest.approx(HOUR, abs=1e-8)
+        np.testing.assert_array_equal(observation.live_s, 500.0)
+    alone = made(times=STARTS[:1], bounds=bounds[:1]).observation
+    assert alone.step_s == pytest.approx(1000.0, abs=1e-8)
+
+
+def test_rounded_times_make_no_overlaps():
+    """Julian dates in one number are exact to 4e-5 s, so that half of the steps are too short."""
+    starts = Time(START, scale="utc") + 60.0 * np.arange(400) * u.s
+    rounded = Time(starts.jd, format="jd", scale="utc")
+    data = np.zeros((400, 16))
+    edges = np.random.default_rng(1).uniform(-2e-5, 2e-5, (400, 2))
+    edges = starts[:, None] + (edges + np.array([0.0, 60.0])) * u.s
+    for options in (
+        {},
+        {"step_s": 60.0},
+        {"step_s": 60.0, "live_s": np.full(400, 60.0)},
+        {"bounds": edges},
+    ):
+        observation = lb.Visibilities.from_arrays(
+            data, rounded, 25.0, timestamp="start", **options
+        ).observation
+        found = bounds_of(observation)
+        assert (found[1:, 0] >= found[:-1, 1] - 1e-6).all()
+        np.testing.assert_allclose(found[:, 0], 60.0 * np.arange(400), rtol=0, atol=1e-4)
+        np.testing.assert_allclose(observation.live_s, 60.0, rtol=0, atol=1e-4)
+
+
+PAIRS = [[s, s + timedelta(seconds=HOUR)] for s in STARTS]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"timestamp": "begin"}, "unknown timestamp 'begin'; did you mean"),
+        ({"timestamp": "instant", "live_s": [1.0] * 4}, "instants have no live time"),
+        ({"timestamp": "instant", "bounds": PAIRS}, "instants have no bounds"),
+        ({"live_s": [1.0] * 3}, "live_s has shape (3,); give a finite number for each of 4"),
+        ({"live_s": [1.0, 2.0, np.nan, 3.0]}, "give a finite number for each of 4 times"),
+        ({"live_s": "all"}, "live_s is 'all'; give a number for each time"),
+        ({"live_s": [1.0, 2.0, 3700.0, 3.0]}, "sample 2 was live for 3700 s of a window of 3600"),
+        ({"live_s": [1.0, 0.0, 1.0, 3.0]}, "leave out samples in which nothing was integrated"),
+        ({"step_s": 4000.0}, "windows of samples 0 and 1 (2027-01-15T00:00:00) overlap by 400 s"),
+        ({"bounds": PAIRS[:3]}, "bounds have shape (3, 2), expected (4, 2)"),
+        ({"bounds": [["now", "then"]] * 4}, "bounds, taken row by row: time 0 'now' is not a date"),
+        ({"bounds": [pair[::-1] for pair in PAIRS]}, "windows need a start and then an end"),
+        ({"bounds": PAIRS[::-1]}, "the time of sample 0 (2027-01-15T00:00:00) is not within"),
+        ({"bounds": PAIRS, "step_s": 1800.0}, "lasts 3600 s, longer than the step of 1800 s"),
+        (
+            {"bounds": [[a, b + timedelta(seconds=500)] for a, b in PAIRS], "step_s": 4100.0},
+            "overlap by 500 s",
+        ),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_sentence(options, words):
+    with refused(words):
+        made(**options)
