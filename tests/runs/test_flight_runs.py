@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import shutil
-import signal
 from pathlib import Path
 
 import h5py
@@ -15,7 +13,6 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.files import COMMITTED
 from lusee_bayes.core.yaml_files import parse_yaml
 from lusee_bayes.flight.session_files import read_session
 
@@ -178,32 +175,3 @@ def test_info_of_several_files_names_the_bad_one_and_shows_the_others(simulated,
     ] * 2
     assert told.err.startswith(f"lusee-bayes: {bad} ") and told.err.count("\n") == 1
     assert main(["info", *map(str, good)]) == 0
-
-
-def test_an_interrupt_during_the_commit_says_that_the_sessions_are_there(
-    tmp_path, monkeypatch, capsys
-):
-    move = os.replace
-
-    def interrupted(*paths):
-        if str(paths[1]).endswith(COMMITTED):
-            signal.raise_signal(signal.SIGINT)
-        move(*paths)
-
-    earlier = signal.signal(signal.SIGINT, signal.default_int_handler)
-    monkeypatch.setattr(os, "replace", interrupted)
-    try:
-        assert simulate(tmp_path / "a") == 130
-    finally:
-        signal.signal(signal.SIGINT, earlier)
-    assert "complete" in capsys.readouterr().err
-    assert "session_000.h5" in files_of(tmp_path / "a")
-
-
-def test_force_does_not_remove_the_sessions_that_are_mapped(simulated, capsys):
-    before = files_of(simulated)
-    data = str(simulated / "session_000.h5")
-    options = ["--data", data, "-o", str(simulated), "--force", "-q", "--set", "lmax=3"]
-    assert main(["map", "fiducial", *options]) == 2
-    assert "is an input of this run" in capsys.readouterr().err
-    assert files_of(simulated) == before
