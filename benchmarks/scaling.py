@@ -28,7 +28,7 @@ from rich.table import Table
 from scipy.linalg.blas import dsyrk
 
 import lusee_bayes as lb
-from lusee_bayes.core.rotations import tilt_powers
+from lusee_bayes.core.harmonics import tilt_powers
 from lusee_bayes.experiment.inference import inform
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up

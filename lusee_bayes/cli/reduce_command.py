@@ -49,7 +49,7 @@ def reduce_command(
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
     """
-    from lusee_bayes.core.representation import counted
+    from lusee_bayes.core.checks import counted
     from lusee_bayes.runs.reduce_run import reduced_lines, run_reduce
 
     console = Console(quiet=quiet, soft_wrap=True)

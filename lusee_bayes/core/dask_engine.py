@@ -29,13 +29,11 @@ import dask
 import distributed
 from distributed.scheduler import NoWorkerError
 
-from lusee_bayes.core.compilation_cache import use_compilation_cache
-from lusee_bayes.core.engine import Demand, Engine, Tasks, carry_out
+from lusee_bayes.core.arrays import use_compilation_cache
+from lusee_bayes.core.engine import Demand, Engine, Tasks, carry_out, processors, threads
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.files import scratch_folder
-from lusee_bayes.core.memory import gigabytes, memory_limit
-from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.threads import processors, threads
+from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
 from lusee_bayes.core.version import __version__
 
 T = TypeVar("T")

@@ -10,9 +10,8 @@ import numpy as np
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.fits_files import image_names, is_fits
-from lusee_bayes.core.formats import format_of
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import user_path
+from lusee_bayes.core.formats import format_of, image_names, is_fits
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.experiment.flight_data import reduce_files, visibilities_of

@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.files import user_path
 from lusee_bayes.core.formats import format_of
-from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import FlightSection

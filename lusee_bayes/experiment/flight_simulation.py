@@ -14,9 +14,9 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+from lusee_bayes.core.engine import in_threads, processors
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.threads import in_threads, processors
 from lusee_bayes.experiment.flight_data import gain_table_of, per_kelvin_of
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import FlightSection, FlightSimulatedSection

@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.yaml_files import as_yaml
+from lusee_bayes.core.reading import as_yaml
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import Section
 

@@ -15,8 +15,8 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.paths import user_path
-from lusee_bayes.core.yaml_files import as_yaml, parse_yaml, read_yaml
+from lusee_bayes.core.files import user_path
+from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
 from lusee_bayes.experiment.overrides import apply_override
 from lusee_bayes.experiment.scenario_errors import one_sentence
 from lusee_bayes.experiment.schema import (

@@ -26,13 +26,11 @@ from jaxtyping import Float
 from lusee_bayes.core import formats
 from lusee_bayes.core.checks import require_positive, require_shape
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.files import replacing
-from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.core.files import replacing, user_path
+from lusee_bayes.core.formats import read_netcdf
+from lusee_bayes.core.layouts import Layout, Variable, require_mhz
 from lusee_bayes.core.lazy import interpolate
-from lusee_bayes.core.netcdf_files import read_netcdf
-from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import read_table, reading, require_file
-from lusee_bayes.core.units import require_mhz
 from lusee_bayes.flight.session import LEVELS, PORTS, TELEMETRY
 
 LETTERS = tuple(LEVELS.values())

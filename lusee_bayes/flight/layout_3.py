@@ -12,7 +12,7 @@ import numpy as np
 from astropy.io import fits
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.fits_files import IMAGE_DTYPES
+from lusee_bayes.core.formats import IMAGE_DTYPES
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Unread
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, SAME_S, Clock
 from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Read, Session, session_of

@@ -14,13 +14,12 @@ import xarray as xr
 from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.checks import Described, counted
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing
+from lusee_bayes.core.files import replacing, user_path
+from lusee_bayes.core.formats import read_netcdf
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
-from lusee_bayes.core.netcdf_files import read_netcdf
-from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import naming
-from lusee_bayes.core.representation import Described, counted
 from lusee_bayes.core.version import __version__
 from lusee_bayes.flight.gain_model import LETTERS, N_COMPONENTS, Curves
 from lusee_bayes.flight.session import AUTOS, N_PRODUCTS, NO_LEVEL, PORTS

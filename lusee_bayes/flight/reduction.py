@@ -19,9 +19,9 @@ import astropy.units as u
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.threads import in_threads
 from lusee_bayes.flight.bands import ChannelBand
 from lusee_bayes.flight.flags import (
     COMB_LIMIT,

@@ -16,10 +16,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Shaped
 
+from lusee_bayes.core.checks import Described, counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Attribute, Content, Unread, Variable
 from lusee_bayes.core.reading import reading
-from lusee_bayes.core.representation import Described, counted
 from lusee_bayes.flight.clock import Clock
 from lusee_bayes.instrument.products import all_products, auto_indices, labels
 

@@ -19,10 +19,8 @@ from astropy.io import fits
 from jaxtyping import Float, Float32, Int, Shaped
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing
-from lusee_bayes.core.fits_files import has_words, is_fits, opened
-from lusee_bayes.core.hdf5_probe import require_readable_hdf5
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import replacing, user_path
+from lusee_bayes.core.formats import has_words, is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.reading import reading, require_file
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
 from lusee_bayes.flight.layout_3 import (

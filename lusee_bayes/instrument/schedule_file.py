@@ -19,8 +19,7 @@ from astropy.time import Time
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import pandas
-from lusee_bayes.core.reading import naming, read_text, reading
-from lusee_bayes.core.yaml_files import parse_yaml
+from lusee_bayes.core.reading import naming, parse_yaml, read_text, reading
 from lusee_bayes.instrument.schedule import Interval, require_sequence
 from lusee_bayes.instrument.times import require_ephemeris, unannounced_leap_seconds
 

@@ -26,7 +26,14 @@ from lusee_bayes.core.arrays import (
     placed,
     repeated,
 )
-from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
+from lusee_bayes.core.checks import (
+    Described,
+    is_traced,
+    number,
+    require_finite,
+    require_float64,
+    require_shape,
+)
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import (
     cholesky,
@@ -34,7 +41,6 @@ from lusee_bayes.core.linalg import (
     precise_residual,
     solve_lower,
 )
-from lusee_bayes.core.representation import Described, number
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
 from lusee_bayes.linear.normal_matrix import has_structure, is_within_times, normal_matrix
 from lusee_bayes.linear.posterior import Posterior

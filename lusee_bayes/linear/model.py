@@ -15,9 +15,8 @@ import jax
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, on_processor
-from lusee_bayes.core.checks import require_finite, require_float64, require_shape
+from lusee_bayes.core.checks import Described, require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.representation import Described
 from lusee_bayes.instrument.coupling import Coupling, as_coupling
 from lusee_bayes.linear.information import Information, gradient_and_misfit
 from lusee_bayes.linear.normal_matrix import has_structure, is_within_times

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lusee_bayes.core.checks import counted
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_json
-from lusee_bayes.core.representation import counted
 from lusee_bayes.linear.fit import stands_out
 from lusee_bayes.report import head, html
 from lusee_bayes.report.cube_explorer import cube_explorer

@@ -14,8 +14,8 @@ import xarray as xr
 from jaxtyping import Float, Shaped
 
 from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import Described, extent
 from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, power_spectrum
-from lusee_bayes.core.representation import Described, extent
 from lusee_bayes.experiment.plausibility import about_information
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.metrics import (

@@ -17,8 +17,7 @@ import numpy as np
 
 from lusee_bayes.core.engine import Demand
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.memory import gigabytes, memory_limit
-from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
 from lusee_bayes.experiment.comparison import ARRAYS, MOST_MEMORY
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.harmonics import columns_to_maps, lmax_of, mode_numbers
 from lusee_bayes.core.lazy import healpy, special
-from lusee_bayes.core.threads import in_threads
 from lusee_bayes.linear.levels import LEVELS, NAMES
 
 # draws that tell the scatter: it is then known to 4 %

@@ -12,10 +12,10 @@ from jaxtyping import Float
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import Described, counted, extent
 from lusee_bayes.core.harmonics import mode_numbers, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import peak_memory_gb
-from lusee_bayes.core.representation import Described, counted, extent
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.flight.reduced import Reduced

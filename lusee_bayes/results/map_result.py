@@ -11,9 +11,9 @@ import pandas as pd
 import xarray as xr
 
 from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages, peak_memory_gb
-from lusee_bayes.core.representation import Described
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.diagnosis import Diagnosis, diagnose
 from lusee_bayes.experiment.experiment import Experiment, explained

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.tables import write_csv
+from lusee_bayes.core.reading import write_csv
 from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import Experiment, observed, with_truth
 from lusee_bayes.experiment.learned_prior import about_sky, learned_prior

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.tables import write_csv
+from lusee_bayes.core.reading import write_csv
 from lusee_bayes.report.comparison_page import comparison_page
 from lusee_bayes.report.figures import comparison as comparison_figures
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, read_runs

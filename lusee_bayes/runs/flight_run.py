@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import transaction
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import transaction, user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
 from lusee_bayes.experiment.scenario import Scenario, load_scenario

@@ -10,11 +10,17 @@ from typing import Any, Generic, TypeVar
 
 from matplotlib.figure import Figure
 
-from lusee_bayes.core.compilation_cache import use_compilation_cache
-from lusee_bayes.core.destinations import locked, require_folder
+from lusee_bayes.core.arrays import use_compilation_cache
 from lusee_bayes.core.errors import InputError, WorkersLost
-from lusee_bayes.core.files import MANIFEST, recover, require_apart, transaction
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import (
+    MANIFEST,
+    locked,
+    recover,
+    require_apart,
+    require_folder,
+    transaction,
+    user_path,
+)
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.report.figures.drawing import save
 from lusee_bayes.report.pages import PAGES, REPORT

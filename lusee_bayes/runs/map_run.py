@@ -10,7 +10,7 @@ import numpy as np
 
 from lusee_bayes.core.engine import Engine
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.tables import rows_of, write_csv
+from lusee_bayes.core.reading import rows_of, write_csv
 from lusee_bayes.experiment.data_files import (
     Data,
     are_sessions,

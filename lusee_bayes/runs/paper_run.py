@@ -11,7 +11,7 @@ from pathlib import Path
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.tables import write_csv
+from lusee_bayes.core.reading import write_csv
 from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios, read_case
 from lusee_bayes.paper.claim_table import claim_table, claims_as_markdown
 from lusee_bayes.paper.claims import Cases

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from lusee_bayes.core.engine import Engine, ThisProcess
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.reading import naming
-from lusee_bayes.core.tables import write_csv
+from lusee_bayes.core.reading import naming, write_csv
 from lusee_bayes.report.figures import plan as plan_figures
 from lusee_bayes.results.cost import posterior_cost, require_fits
 from lusee_bayes.results.forecast import Forecast, Variation, forecast_rows

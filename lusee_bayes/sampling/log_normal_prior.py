@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import require_positive
+from lusee_bayes.core.checks import Described, number, require_positive
 from lusee_bayes.core.lazy import dist, numpyro
-from lusee_bayes.core.representation import Described, number
 from lusee_bayes.sky.log_normal import LogNormalSky
 from lusee_bayes.systematics.base import SKY
 

@@ -21,10 +21,9 @@ from jaxtyping import Float
 from scipy.special import log_ndtr
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import is_traced, require_finite, require_positive
+from lusee_bayes.core.checks import Described, extent, is_traced, require_finite, require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mode_numbers, n_modes, per_mode
-from lusee_bayes.core.representation import Described, extent
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.sky.bright_sources import PointSource
 from lusee_bayes.sky.template import Template

@@ -6,12 +6,12 @@ import os
 import subprocess
 import sys
 
-from lusee_bayes.core.compilation_cache import SWITCH
+from lusee_bayes.core.arrays import SWITCH
 
 # one program, compiled anew or found; says which
 PROGRAM = """
 import jax
-from lusee_bayes.core.compilation_cache import use_compilation_cache
+from lusee_bayes.core.arrays import use_compilation_cache
 found = []
 jax.monitoring.register_event_listener(lambda name, **_: found.append(name))
 use_compilation_cache()

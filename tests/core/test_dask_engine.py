@@ -13,10 +13,9 @@ from threadpoolctl import threadpool_info
 
 from lusee_bayes.core import dask_engine
 from lusee_bayes.core.dask_engine import DaskEngine
-from lusee_bayes.core.engine import Demand, open_engine
+from lusee_bayes.core.engine import Demand, open_engine, processors
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.threads import processors
 
 distributed = pytest.importorskip("distributed")
 

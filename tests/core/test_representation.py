@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lusee_bayes as lb
-from lusee_bayes.core.representation import Described, listed
+from lusee_bayes.core.checks import Described, listed
 
 
 class Shown(Described):

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.yaml_files import as_yaml, parse_yaml, read_yaml
+from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
 
 TEXT = st.text(max_size=10)
 LEAVES = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(allow_nan=False), TEXT)

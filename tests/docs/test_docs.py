@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
-from lusee_bayes.core.yaml_files import parse_yaml
+from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.scenario import load_scenario, scenario_names
 
 ROOT = Path(__file__).parents[2]

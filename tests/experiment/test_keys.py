@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.yaml_files import parse_yaml
+from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.keys import keys_as_markdown, scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 

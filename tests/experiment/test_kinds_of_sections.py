@@ -5,7 +5,7 @@ import pytest
 from fits_files import write_images
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.yaml_files import as_yaml, parse_yaml
+from lusee_bayes.core.reading import as_yaml, parse_yaml
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.schema import (
     FileSkySection,

@@ -3,7 +3,7 @@
 import pytest
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.yaml_files import parse_yaml
+from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.keys import scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario, scenario_names
 from lusee_bayes.experiment.schema.section import FILES

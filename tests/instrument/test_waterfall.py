@@ -17,7 +17,7 @@ from fits_files import write_images
 from lusee_bayes.cli.main import main
 from lusee_bayes.cli.options import parse_frequencies
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.yaml_files import parse_yaml
+from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import load_scenario

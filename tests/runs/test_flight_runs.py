@@ -13,7 +13,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.yaml_files import parse_yaml
+from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.flight.session_files import read_session
 
 SET = [

@@ -26,8 +26,8 @@ from reference_linear import z_of
 
 import lusee_bayes
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.destinations import LOCK
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.files import LOCK
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.experiment import Experiment, build

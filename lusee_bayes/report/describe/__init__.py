@@ -7,7 +7,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.fits_files import has_words, image_names, is_fits
+from lusee_bayes.core.formats import has_words, image_names, is_fits
 from lusee_bayes.core.reading import require_file
 
 # the package's own netCDF files, by their attribute ``format``. What describes a kind is named by
