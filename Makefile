@@ -28,7 +28,6 @@ essential: $(VENV)/installed-dev
 # LLVM's optimisations, and each by itself
 LONG := $(BIN)/python -m pytest -m "long and not essential" -n 2
 COMPUTING := $(addprefix tests/, sampling/test_hmc_full_size.py sampling/test_prior_amplitude.py \
-	sampling/test_log_normal_full_size.py sampling/test_log_normal_calibration.py \
 	sampling/test_calibration.py systematics/test_calibration_of_systematics.py)
 long: $(VENV)/installed-dev
 	LUSEE_BAYES_TEST_XLA_LEVEL=3 $(LONG) --dist load $(COMPUTING); first=$$?; \

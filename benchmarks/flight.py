@@ -20,9 +20,8 @@ from lusee_bayes.core.progress import peak_memory_gb
 from lusee_bayes.experiment.flight_data import recipe_of
 from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.instrument.flight.reduction import reduce_sessions
-from lusee_bayes.instrument.flight.session_writing import write_session
-from lusee_bayes.instrument.flight.sessions import read_session
+from lusee_bayes.flight.reduction import reduce_sessions
+from lusee_bayes.flight.session_files import read_session, write_session
 from lusee_bayes.runs.flight_run import run_simulate_flight
 
 STEP_S, SPECTRA, BANDS = 42.0, 57_000, 46

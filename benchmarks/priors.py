@@ -18,8 +18,7 @@ from rich.table import Table
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.schema import ModulatedPriorSection
-from lusee_bayes.sky.modulated import relative_spectrum
+from lusee_bayes.sky.local_scales import embedded_local_scales
 
 
 def steady(work: Callable[[], object], repeats: int) -> float:
@@ -40,10 +39,8 @@ def main() -> None:
     scenario = lb.load_scenario("fiducial", options.set)
     experiment = lb.build(scenario)
     data, independent = experiment.data.data, full_model(experiment.setup)
-    section, frequency = ModulatedPriorSection(amplitude=0.04), scenario.frequency_mhz
-    modulation = section.modulation(frequency, scenario.lmax)
-    spectrum = relative_spectrum(modulation.lmax_deviations, section.amplitude, section.tilt)
-    correlated = replace(independent, prior=modulation.prior(spectrum))
+    family = embedded_local_scales(scenario.frequency_mhz, scenario.lmax)
+    correlated = replace(independent, prior=family.expected())
     posteriors = [model.condition(data) for model in (independent, correlated)]
     steps = {
         "data to posterior": [lambda m=m: m.condition(data) for m in (independent, correlated)],
@@ -58,8 +55,10 @@ def main() -> None:
         one, other = (steady(call, options.repeats) for call in work)
         table.add_row(name, f"{one:.3f}", f"{other:.3f}", f"{other / one:.2f}")
     making = {
-        "B of the template": lambda: section.modulation(frequency, scenario.lmax).matrix,
-        "S = G G^T of a C_ell": lambda: modulation.prior(spectrum).root,
+        "family about the template": lambda: (
+            embedded_local_scales(scenario.frequency_mhz, scenario.lmax).mean
+        ),
+        "S = G G^T of parameters": lambda: family.expected().root,
     }
     for name, call in making.items():
         table.add_row(name, "", f"{steady(call, options.repeats):.3f}", "")

@@ -28,7 +28,7 @@ from rich.table import Table
 from scipy.linalg.blas import dsyrk
 
 import lusee_bayes as lb
-from lusee_bayes.core.rotations import tilt_powers
+from lusee_bayes.core.harmonics import tilt_powers
 from lusee_bayes.experiment.inference import inform
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
@@ -155,7 +155,7 @@ def tasks_of_joint_run(lmax: int) -> dict:
     scenario = scenario.model_copy(update={"joint": True})
     channel = scenario.channels()[1]
     start = time.perf_counter()
-    known = inform(lb.build(channel), jax.random.key(0))[0]
+    known = inform(lb.build(channel))[0]
     inform_s = time.perf_counter() - start
     frequencies = np.array(scenario.frequencies_mhz)
     reference = np.stack([np.asarray(known.reference)] * 4)

@@ -1,6 +1,7 @@
 """Draw the documentation's figures and print its tables.
 
 Run from the repository's root: python docs/make_figures.py [ULSA folder]
+Those of given skies are benchmarks/skies.py's.
 The figure of the regolith needs the draws of
     lusee-bayes sample regolith --draws 320 --warmup 80 -o output/regolith
 """
@@ -10,7 +11,6 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import astropy.units as u
 import numpy as np
@@ -24,7 +24,6 @@ from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.simulate import true_values
 from lusee_bayes.linear.metrics import ell_cross, signal_to_noise
-from lusee_bayes.report.figures import coverage
 from lusee_bayes.report.figures.channel import maps
 from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar
 from lusee_bayes.report.figures.mollweide import mollweide
@@ -204,21 +203,6 @@ def embedded_sky(ulsa: Path | None) -> None:
             )
 
 
-def given_skies(ulsa: Path | None) -> None:
-    """Draw and print how often error bars hold skies that the prior does not draw, at 10 MHz."""
-    files = [] if ulsa is None else [ulsa / "exp10.0MHz_sky_map_with_absorption.hdf5"]
-    skies = ["embedded:1", "embedded:2", "embedded+sources:1", "smooth", "spotty", *files]
-    priors = {"": "spectrum: sky", "_local_scales": "model: local_scales"}
-    for ending, prior in priors.items():
-        overrides = ["frequency_mhz=10", "lmax=31", f"prior={{{prior}}}"]
-        scenario = lb.load_scenario("fiducial", overrides)
-        with TemporaryDirectory() as folder:
-            result = lb.run_skies(scenario, folder, skies, name="fiducial").result
-        print(result.as_markdown())
-        coverage.coverage(result).savefig(HERE / f"coverage{ending}.png", dpi=80)
-        coverage.pulls(result).savefig(HERE / f"pulls{ending}.png", dpi=70)
-
-
 def point_sources() -> None:
     """Draw maps of data with the catalogue's sources, fitted separately or left to the map."""
     listed = ", ".join(f"{{name: {source.name}}}" for source in BRIGHT_SOURCES)
@@ -345,6 +329,5 @@ if __name__ == "__main__":
     point_sources()
     ulsa = Path(sys.argv[1]) if len(sys.argv) > 1 else None
     embedded_sky(ulsa)
-    given_skies(ulsa)
     fixed_axis()
     instants()

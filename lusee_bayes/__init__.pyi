@@ -32,10 +32,7 @@ from .instrument.visibilities_file import read_visibilities as read_visibilities
 from .instrument.waterfalls import read_waterfall as read_waterfall
 from .instrument.waterfalls import write_four_port as write_four_port
 from .instrument.waterfalls import write_waterfall as write_waterfall
-from .linear.compact import CompactPosterior as CompactPosterior
-from .linear.compact import read_compact as read_compact
 from .linear.information import Information as Information
-from .linear.iterative_joint import solve_iteratively as solve_iteratively
 from .linear.joint import solve_directly as solve_directly
 from .linear.model import LinearGaussian as LinearGaussian
 from .linear.posterior import Posterior as Posterior
@@ -61,7 +58,6 @@ from .runs.paper_run import run_paper as run_paper
 from .runs.plan_run import run_plan as run_plan
 from .runs.sample_run import run_sample as run_sample
 from .runs.simulate_run import run_simulate as run_simulate
-from .runs.skies_run import run_skies as run_skies
 from .runs.validate_run import run_validate as run_validate
 from .sampling.calibration import calibrate as calibrate
 from .sampling.calibration import calibrate_sky as calibrate_sky

@@ -79,6 +79,14 @@ def test_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def flight(test_data) -> Path:
+    """Folder of sessions that luseepy has written of a known sky."""
+    if not (test_data / "flight").is_dir():
+        pytest.skip("no flight sessions")
+    return test_data / "flight"
+
+
+@pytest.fixture(scope="session")
 def tiny_experiment() -> Experiment:
     """Six times of the paper's observation: 96 data, 49 modes."""
     return make_small_experiment()

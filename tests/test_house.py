@@ -47,16 +47,6 @@ def test_what_is_not_exported_is_an_attribute_error():
         _ = lb.no_such_name
 
 
-def test_modules_are_short():
-    """One idea a file: none has more than 350 lines."""
-    long = {
-        str(path.relative_to(PACKAGE)): n
-        for path in PACKAGE.rglob("*.py")
-        if (n := len(path.read_text().splitlines())) > 350
-    }
-    assert not long
-
-
 def test_there_is_one_version():
     cited = re.search(r'^version: "(.*)"$', (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     logged = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)

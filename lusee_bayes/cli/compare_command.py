@@ -35,6 +35,6 @@ def compare_command(
     console = Console(quiet=quiet, soft_wrap=True)
     run = run_compare(folders, output, replace=force, stages=Stages(console, verbose=verbose))
     say(console, *(f"  {path}" for path in run.files))
-    show(console, comparison_table(run.runs))
-    caveat = evidence_caveat(run.runs)
+    show(console, comparison_table(run.result))
+    caveat = evidence_caveat(run.result)
     say(console, *([] if caveat is None else [caveat]), f"look at {output / 'comparison.html'}")

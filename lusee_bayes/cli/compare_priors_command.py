@@ -12,7 +12,6 @@ from lusee_bayes.cli.options import (
     DataFiles,
     Flag,
     Force,
-    Number,
     Output,
     Overrides,
     Quiet,
@@ -33,7 +32,6 @@ def compare_priors_command(
     clock: Clock = None,
     truth: Flag = False,
     priors: str | None = None,
-    draws: Number = 100,
     output: Output = None,
     set_: Overrides | None = None,
     workers: Workers = None,
@@ -55,10 +53,8 @@ def compare_priors_command(
         The given data are of the scenario's own sky: count how often error bars hold it.
     priors
         Two or more, with commas: isotropic, isotropic-sky (C_ell of the scenario's sky; simulated
-        data only), modulated, lognormal, local_scales. By default all that can be. The scenario's
+        data only), local_scales. By default all that can be. The scenario's
         own section counts for the prior of its kind.
-    draws
-        Draws of learned parameters, to check Laplace's evidence by importance sampling; 0 for none.
     output
         Folder for the results; by default output/NAME-priors.
     set_
@@ -71,8 +67,7 @@ def compare_priors_command(
         by default DASK_SCHEDULER_ADDRESS.
     """
     from lusee_bayes.cli.tables import priors_table
-    from lusee_bayes.core.workers import open_engine
-    from lusee_bayes.experiment.named_priors import NAMED
+    from lusee_bayes.core.engine import open_engine
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.results.cost import demand_of, posterior_cost
     from lusee_bayes.runs.compare_priors_run import run_compare_priors
@@ -83,15 +78,14 @@ def compare_priors_command(
         Stages(console, verbose=verbose),
     )
     names = None if priors is None else [n.strip() for n in priors.split(",") if n.strip()]
-    demand = demand_of([posterior_cost(resolved)] * len(names or NAMED))
-    with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+    demand = demand_of([posterior_cost(resolved)])
+    with open_engine(demand, workers, cluster) as engine:
         run = run_compare_priors(
             resolved,
             output or default_folder(scenario, "-priors"),
             names,
             data=data,
             truth=truth,
-            draws=draws,
             name=Path(scenario).stem,
             engine=engine,
             replace=force,

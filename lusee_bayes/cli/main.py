@@ -21,10 +21,9 @@ from cyclopts import App, CycloptsError, Parameter
 from rich.console import Console
 
 from lusee_bayes.cli.commands import COMMANDS, help_of
-from lusee_bayes.core.command_line import COMMAND, printable
 from lusee_bayes.core.errors import InputError, WorkersLost
-from lusee_bayes.core.paths import user_path
-from lusee_bayes.core.version import release
+from lusee_bayes.core.files import user_path
+from lusee_bayes.core.version import COMMAND, printable, release
 
 # the beginning of a path in the user's folder, by itself or after the name of an option
 HOME = re.compile(r"^(--[a-z-]+=)?(~.*)$", re.DOTALL)

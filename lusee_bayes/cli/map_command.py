@@ -36,7 +36,6 @@ def map_command(
     output: Output = None,
     draws: Number | None = None,
     covariance: Flag = False,
-    compact: Flag = False,
     updatable: Flag = False,
     onto: Path | None = None,
     diagnose: Flag = False,
@@ -66,8 +65,6 @@ def map_command(
         Number of posterior draws to keep in posterior.nc (output.draws).
     covariance
         Keep the posterior covariance in posterior.nc (output.covariance).
-    compact
-        Write posterior_compact.npz, from which NumPy alone makes draws (output.compact).
     updatable
         Keep in posterior.nc what --onto needs (output.updatable).
     onto
@@ -81,15 +78,14 @@ def map_command(
     joint
         One posterior for the skies of all channels, with the scenario's spectral prior.
     workers
-        Processes of this machine that share out the channels; by default as many as pay. With
-        several GPUs, each has one.
+        Processes of this machine that share out the channels; by default one.
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share out the channels; by
         default DASK_SCHEDULER_ADDRESS.
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
     """
-    from lusee_bayes.core.workers import open_engine
+    from lusee_bayes.core.engine import open_engine
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.results.cost import demand_of_channels
     from lusee_bayes.runs.map_run import run_map
@@ -104,7 +100,6 @@ def map_command(
         flight__clock=clock,
         output__draws=draws,
         output__covariance=covariance,
-        output__compact=compact,
         output__updatable=updatable,
     )
     folder = output or default_folder(scenario)
@@ -113,7 +108,7 @@ def map_command(
     given["diagnosed"] = diagnose
     if resolved.frequencies_mhz:
         demand = demand_of_channels(resolved)
-        with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+        with open_engine(demand, workers, cluster) as engine:
             run = run_map(resolved, folder, engine=engine, **given)
     elif workers is None and cluster is None:
         run = run_map(resolved, folder, **given)

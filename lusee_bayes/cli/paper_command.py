@@ -36,12 +36,12 @@ def paper_command(
         the one nearest in log frequency.
         Without them the embedded sky is used.
     workers
-        Processes of this machine that share out the cases; by default as many as pay.
+        Processes of this machine that share out the cases; by default one.
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share out the cases; by
         default DASK_SCHEDULER_ADDRESS.
     """
-    from lusee_bayes.core.workers import open_engine
+    from lusee_bayes.core.engine import open_engine
     from lusee_bayes.paper.cases import paper_scenarios
     from lusee_bayes.results.cost import demand_of, posterior_cost
     from lusee_bayes.runs.paper_run import run_paper
@@ -49,7 +49,7 @@ def paper_command(
     console, skies = Console(quiet=quiet, soft_wrap=True), sky or []
     demand = demand_of([posterior_cost(s) for s in paper_scenarios(skies=skies).values()])
     stages = Stages(console, verbose=verbose)
-    with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+    with open_engine(demand, workers, cluster) as engine:
         run = run_paper(output, skies=skies, engine=engine, replace=force, stages=stages)
     say(console, *(f"  {path}" for path in run.files if path.suffix != ".nc"))
     say(console, (run.folder / "claims.md").read_text(encoding="utf-8").splitlines()[0])

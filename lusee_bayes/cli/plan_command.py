@@ -50,14 +50,14 @@ def plan_command(
     set_
         key.path=value; overrides an entry of every scenario, as often as needed.
     workers
-        Processes of this machine that share out the variations; by default as many as pay.
+        Processes of this machine that share out the variations; by default one.
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share out the variations; by
         default DASK_SCHEDULER_ADDRESS.
     """
     from lusee_bayes.cli.plan_variations import headline, variations_of
     from lusee_bayes.cli.tables import forecast_table
-    from lusee_bayes.core.workers import open_engine
+    from lusee_bayes.core.engine import open_engine
     from lusee_bayes.results.cost import demand_of, posterior_cost
     from lusee_bayes.results.forecast import baseline
     from lusee_bayes.runs.plan_run import run_plan
@@ -70,13 +70,13 @@ def plan_command(
     variations = [v for s in sources for v in variations_of(s, vary, set_ or [], console)]
     stages = Stages(console, verbose=verbose)
     demand = demand_of([posterior_cost(v.scenario) for v in variations])
-    with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+    with open_engine(demand, workers, cluster) as engine:
         run = run_plan(variations, output, engine=engine, replace=force, stages=stages)
     for source in sources:
-        show(console, forecast_table([f for f in run.forecasts if f.variation.source == source]))
+        show(console, forecast_table([f for f in run.result if f.variation.source == source]))
     say(console, *(f"  {path}" for path in run.files))
     for source in sources:
-        say(console, headline(run.forecasts, source))
-        if offsets := baseline(run.forecasts, source).offsets_line():
+        say(console, headline(run.result, source))
+        if offsets := baseline(run.result, source).offsets_line():
             say(console, f"{source}: {offsets}")
     say(console, f"look at {run.folder}/figures/plan.png")

@@ -7,7 +7,7 @@ import json
 from rich.console import Console
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.yaml_files import parse_yaml
+from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation, baseline
 from lusee_bayes.results.variations import default_variations

@@ -49,15 +49,16 @@ def reduce_command(
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
     """
-    from lusee_bayes.core.representation import counted
-    from lusee_bayes.runs.reduce_run import run_reduce
+    from lusee_bayes.core.checks import counted
+    from lusee_bayes.runs.reduce_run import reduced_lines, run_reduce
 
     console = Console(quiet=quiet, soft_wrap=True)
-    run = run_reduce(
+    reduced = run_reduce(
         load(scenario, set_, frequencies, replaces=output if force else None, flight__clock=clock),
         files,
         output,
         replace=force,
         stages=Stages(console, verbose=verbose),
     )
-    say(console, *run.lines(), f"{counted(len(run.reduced.frequencies_mhz), 'band')} -> {output}")
+    bands = counted(len(reduced.frequencies_mhz), "band")
+    say(console, *reduced_lines(reduced), f"{bands} -> {output}")

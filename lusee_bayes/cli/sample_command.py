@@ -100,7 +100,7 @@ def sample_command(
         stages=Stages(console, verbose=verbose),
     )
     say(console, *(f"  {path}" for path in run.files))
-    for result in run.results:
+    for result in run.result:
         if resolved.frequencies_mhz:
             say(console, f"{result.experiment.scenario.frequency_mhz:g} MHz")
         say(console, *result.lines())

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from rich.markup import escape
 from rich.table import Table
 
-from lusee_bayes.linear.levels import LEVELS
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, forecast_rows
 from lusee_bayes.results.prior_comparison import PriorComparison
-from lusee_bayes.results.sky_coverage import SkiesResult
 from lusee_bayes.results.validation_result import allowed
 from lusee_bayes.sampling.validation import Check
 
@@ -51,25 +49,6 @@ def checks_table(checks: list[Check]) -> Table:
         verdict = "ok" if check.passed else "FAILED"
         meaning = escape(check.meaning)
         table.add_row(escape(check.name), f"{check.value:.4g}", allowed(check), verdict, meaning)
-    return table
-
-
-def coverage_table(result: SkiesResult) -> Table:
-    """Given skies and how often error bars hold them, by Galactic latitude."""
-    table = Table("sky", caption="three numbers: |b| < 10, 10 to 30, > 30 deg", show_lines=False)
-    table.columns[0].overflow = "fold"
-    for name in ("68% hold [%]", "rms pull", "largest", "ln evidence", "holds"):
-        table.add_column(name, justify="right", no_wrap=name != "68% hold [%]")
-    for sky in result.skies:
-        *bands, whole = sky.pixels.coverage()
-        table.add_row(
-            escape(sky.name),
-            " ".join(f"{100 * band.held[LEVELS.index(0.68)]:.0f}" for band in bands),
-            " ".join(f"{band.rms:.2f}" for band in bands),
-            f"{whole.largest:.1f}",
-            f"{sky.channel.log_evidence:.1f}",
-            "yes" if result.held(sky) else "NO",
-        )
     return table
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
 
-from cyclopts import Parameter
 from rich.console import Console
 
 from lusee_bayes.cli.options import (
@@ -26,17 +24,12 @@ from lusee_bayes.cli.options import (
     say,
     show,
 )
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-
-if TYPE_CHECKING:
-    from lusee_bayes.experiment.scenario import Scenario
 
 
 def validate_command(
     scenario: str,
     *,
-    skies: Annotated[list[str] | None, Parameter(consume_multiple=True, negative="")] = None,
     data: DataFiles = None,
     clock: Clock = None,
     output: Output = None,
@@ -52,22 +45,19 @@ def validate_command(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> int:
-    """Check the posterior of a scenario by HMC and by simulated data sets, or on given skies.
+    """Check the posterior of a scenario by HMC and by simulated data sets.
 
-    Ends with exit code 1 if a check fails; the thresholds are in validation.md or coverage.md.
+    Ends with exit code 1 if a check fails; the thresholds are in validation.md.
 
     Parameters
     ----------
     scenario
         A YAML file, or the name of a scenario of the package (fiducial, ...).
-    skies
-        Skies to map with the scenario's prior and to compare with the error bars: files, or
-        embedded, smooth and spotty with a seed, as in embedded:2. Nothing is sampled then.
     data
         Visibilities to use: a file, or sessions of the spectrometer, one or many; without them the
         scenario's own are simulated.
     output
-        Folder for the results; by default output/NAME-validation, or NAME-skies.
+        Folder for the results; by default output/NAME-validation.
     resume
         Go on with the unfinished run in the folder, or judge the finished one again.
     chains
@@ -81,40 +71,30 @@ def validate_command(
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
     workers
-        Processes of this machine that share out the simulated data sets, or the skies; by default
-        as many as pay.
+        Processes of this machine that share out the simulated data sets; by default one.
     cluster
         Address of a Dask scheduler, as tcp://host:8786, whose workers share them out; by default
         DASK_SCHEDULER_ADDRESS.
     """
-    if skies is not None and (data is not None or resume):
-        raise InputError("--skies simulates its data, all at once; leave out --data and --resume")
-    if skies is None:
-        from lusee_bayes.sampling.least import require_draws, require_simulations
+    from lusee_bayes.sampling.least import require_draws, require_simulations
 
-        require_simulations(simulations)
-        require_draws(draws)
-    from lusee_bayes.core.workers import open_engine
-    from lusee_bayes.results.cost import demand_of, posterior_cost
+    require_simulations(simulations)
+    require_draws(draws)
+    from lusee_bayes.core.engine import open_engine
 
     console = Console(quiet=quiet, soft_wrap=True)
     resolved, stages = (
         load(scenario, set_, replaces=output if force else None, flight__clock=clock),
         Stages(console, verbose=verbose),
     )
-    if skies is not None:
-        demand = demand_of([posterior_cost(resolved)] * max(1, len(skies)))
-        with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
-            given = {"engine": engine, "replace": force, "stages": stages}
-            return _on_skies(resolved, scenario, skies, output, console, given)
     from lusee_bayes.cli.tables import checks_table
     from lusee_bayes.report.pages import REPORT
-    from lusee_bayes.results.validation_result import demand_of_calibration
+    from lusee_bayes.results.cost import demand_of_calibration
     from lusee_bayes.runs.validate_run import run_validate
     from lusee_bayes.sampling.hmc import Sampler
 
-    demand = demand_of_calibration(resolved, simulations)
-    with open_engine(demand, workers, cluster, verbose=verbose, say=stages.say) as engine:
+    demand = demand_of_calibration(resolved)
+    with open_engine(demand, workers, cluster) as engine:
         run = run_validate(
             resolved,
             output or default_folder(scenario, "-validation"),
@@ -129,26 +109,5 @@ def validate_command(
         )
     say(console, *(f"  {path}" for path in run.files))
     show(console, checks_table(run.result.checks))
-    say(console, f"{run.result.headline()}; look at {run.folder / REPORT}")
-    return 0 if run.result.passed else 1
-
-
-def _on_skies(
-    resolved: Scenario,
-    scenario: str,
-    skies: list[str],
-    output: Path | None,
-    console: Console,
-    given: dict[str, Any],
-) -> int:
-    from lusee_bayes.cli.tables import coverage_table
-    from lusee_bayes.report.pages import REPORT
-    from lusee_bayes.runs.skies_run import run_skies
-
-    folder = output or default_folder(scenario, "-skies")
-    run = run_skies(resolved, folder, skies, name=Path(scenario).stem, **given)
-    say(console, *(f"  {path}" for path in run.files))
-    show(console, coverage_table(run.result))
-    say(console, run.result.thresholds())
     say(console, f"{run.result.headline()}; look at {run.folder / REPORT}")
     return 0 if run.result.passed else 1

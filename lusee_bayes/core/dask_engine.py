@@ -3,139 +3,117 @@
 Tasks are functions of files: what they share is written into the run's folder, and so is what they
 find out. So Dask carries no more than numbers of tasks, and the sums of a reduction. Whatever
 worker, scheduler or command ends, nothing is lost that was finished. A task whose worker ends is
-repeated elsewhere, by Dask, ``REPEATS`` times at most.
+repeated elsewhere, by Dask.
 """
 
 from __future__ import annotations
 
+import asyncio
+import gc
+import logging
+import os
+import pickle
 import shutil
-import time
-from collections import Counter, deque
+import signal
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import replace
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from threading import TIMEOUT_MAX
+from threading import Lock
 from typing import Any, TypeVar
-from uuid import uuid4
 
 import cloudpickle
 import dask
 import distributed
+from distributed.scheduler import NoWorkerError
 
-from lusee_bayes.core.dask_worker import (
-    HANGS,
-    Failed,
-    Job,
-    Terms,
-    host_of_worker,
-    refusal_of,
-    run_merge,
-    run_task,
-    this_process,
-    versions,
-)
-from lusee_bayes.core.engine import Demand, Engine, Tasks
+from lusee_bayes.core.arrays import use_compilation_cache
+from lusee_bayes.core.engine import Demand, Engine, Tasks, carry_out, processors, threads
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.files import scratch_folder
-from lusee_bayes.core.memory import gigabytes
-from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
+from lusee_bayes.core.version import __version__
 
 T = TypeVar("T")
 R = TypeVar("R")
 
-# of a task whose worker ends, or which lacks memory or disk
+# of a task that fails: memory or disk may have been full
 REPEATS = 3
-# seconds between looks at scheduler and workers
-POLL_S = 1.0
-# what a future says of a task that failed, and of one that the scheduler does not know
-BAD = ("error", "cancelled")
-# a task hangs that takes so many times as long as expected, and longer than that
-HANGING, LEAST_LIMIT_S = 50.0, 3600.0
-# seconds after which a result that does not come is asked for again
-FETCH_S = 300.0
-# how long no worker may be there before the run ends (DASK_LUSEE_BAYES__PATIENCE)
-PATIENCE = "lusee-bayes.patience", "10 minutes"
+ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
+# seconds in which a scheduler has to answer
+ANSWER_S = 10.0
+
+_reading = Lock()
 
 
 class DaskEngine(Engine):
     """Carries tasks out on the workers of a Dask cluster.
 
     The workers have this package and share a disk with this process: tasks write into the run's
-    folder. The processors of a host are divided among all threads of its workers.
+    folder.
 
     Parameters
     ----------
     client : distributed.Client
         Of the cluster; it stays open.
     demand : Demand, optional
-        What the tasks take. With it, workers whose memory would not suffice are refused, and tasks
-        that take far too long are taken for hanging.
+        What the tasks take; workers whose memory would not suffice are refused.
     """
 
     def __init__(self, client: distributed.Client, demand: Demand | None = None):
         self.client = client
         self._demand = demand
-        self._limit_s = TIMEOUT_MAX
-        if demand is not None:
-            expected = demand.seconds / max(demand.n_tasks, 1)
-            self._limit_s = max(LEAST_LIMIT_S, HANGING * expected)
-        self._terms: Terms | None = None
-        # workers that have ended, and why
-        self._ended: deque[dict[str, Any]] = deque()
-        self._causes: dict[str, str] = {}
+        self._folder: Path | None = None
 
     def work_in(self, folder: Path) -> None:
-        place, process = folder.resolve(), this_process()
-        self._terms = Terms(versions(), place, self._demand, process)
-        answers = self.client.run(refusal_of, self._terms, on_error="return")
-        for answer in answers.values():
-            if isinstance(answer, ModuleNotFoundError):
-                raise InputError(
-                    f"workers of {self._scheduler()} lack {answer.name}; install lusee_bayes for "
-                    "them"
-                )
-            if isinstance(answer, str):
-                raise InputError(answer)
+        self._folder = folder.resolve()
+        answers = self.client.run(
+            refusal_of, versions(), self._folder, self._demand, on_error="return"
+        )
+        for worker, answer in answers.items():
+            if answer is not None:
+                raise InputError(f"worker {worker}: {answer}")
 
     def each(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> list[R]:
         found: list[Any] = [None] * len(tasks.items)
-        with self._job(tasks) as job:
-            futures = self._submitted(job, tasks)
-            for number, value in self._results(futures, 0, tasks, stages, stage):
-                found[number] = value
+        with self._job(tasks) as job, self._explained(stages, stage) as names:
+            futures = self._submitted(job, tasks, names)
+            numbers = {future.key: number for number, future in enumerate(futures)}
+            for future in self._finished(futures, names, stages, stage):
+                found[numbers[future.key]] = future.result()
         return found
 
     def reduced(
         self, tasks: Tasks[T, R], merge: Callable[[R, R], R], stages: Stages, stage: str
     ) -> R:
-        with self._job(tasks, merge) as job:
-            futures = self._submitted(job, tasks)
-            level, height = list(futures), 0
+        with self._job(tasks, merge) as job, self._explained(stages, stage) as names:
+            futures = level = self._submitted(job, tasks, names)
+            height = 0
             while len(level) > 1:
                 height += 1
                 level = [
                     self._merged(job, level[first : first + 2], height)
                     for first in range(0, len(level), 2)
                 ]
-            if height:
-                futures.append(level[0])
-            level.clear()
+            (total,) = level
             # what the tasks give is left with the workers
-            last = len(futures) - 1
-            ((_, value),) = self._results(futures, last, tasks, stages, stage)
-        return value
+            for future in self._finished(futures, names, stages, stage):
+                if future.status != "finished":
+                    future.result()
+            return total.result()
 
-    def _submitted(self, job: Path, tasks: Tasks[T, R]) -> list[distributed.Future]:
-        terms = replace(self._told(), threads=self._threads(), limit_s=self._limit_s)
-        label = uuid4().hex
-        return [
-            self.client.submit(
-                run_task, job, number, terms, key=f"{label}-{number}", retries=REPEATS
-            )
-            for number in range(len(tasks.items))
+    def _submitted(
+        self, job: Path, tasks: Tasks[T, R], names: dict[str, str]
+    ) -> list[distributed.Future]:
+        numbers = range(len(tasks.items))
+        futures = [
+            self.client.submit(run_task, job, number, pure=False, retries=REPEATS)
+            for number in numbers
         ]
+        names |= {futures[number].key: tasks.names[number] for number in numbers}
+        return futures
 
     def _merged(
         self, job: Path, parts: list[distributed.Future], height: int
@@ -147,191 +125,218 @@ class DaskEngine(Engine):
             run_merge, job, *parts, pure=False, retries=REPEATS, priority=height
         )
 
-    def _results(
-        self,
-        futures: list[distributed.Future],
-        first: int,
-        tasks: Tasks[T, R],
-        stages: Stages,
-        stage: str,
-    ) -> Iterator[tuple[int, Any]]:
-        """Numbers and values of the futures from the ``first`` on, as they finish.
-
-        The list is emptied, so that none is held longer than needed. If one fails, the others are
-        cancelled.
-        """
-        ended: SimpleQueue[distributed.Future] = SimpleQueue()
-        numbers = {future.key: number for number, future in enumerate(futures)}
-        names = dict(zip(numbers, tasks.names, strict=False))  # a sum has none
-        waiting = dict(zip(numbers, futures, strict=True))
+    def _finished(
+        self, futures: list[distributed.Future], names: dict[str, str], stages: Stages, stage: str
+    ) -> Iterator[distributed.Future]:
+        """Futures as they finish, well or not; the list is emptied, so that results are freed."""
+        waiting, n = distributed.as_completed(futures, loop=self.client.loop), len(futures)
         futures.clear()
-        for future in waiting.values():
-            future.add_done_callback(ended.put)
-        absence, finished = _Absence(), 0
         try:
-            with self._listening(), stages.progress(stage, len(tasks.items)) as done:
-                while waiting:
-                    try:
-                        future = ended.get(timeout=POLL_S)
-                    except Empty:
-                        self._require_workers(absence)
-                    else:
-                        number = numbers[future.key]
-                        if number >= first or future.status in BAD:
-                            yield number, self._value(future, names, stage)
-                        del waiting[future.key]
-                        if future.key in names:
-                            finished += 1
-                            done(finished, names[future.key])
-                    self._tell(names, stages)
-        except BaseException:
-            # to cancel them would be to ask for sums, too, which nobody holds
-            for future in waiting.values():
-                future.release()
-            raise
+            with stages.progress(stage, n) as done:
+                for finished, future in enumerate(waiting, start=1):
+                    yield future
+                    done(finished, names[future.key])
+        finally:
+            waiting.clear()
 
-    def _value(self, future: distributed.Future, names: dict[str, str], stage: str) -> Any:
-        """What a task gave, from the worker that holds it; if that has ended, from another.
+    @contextmanager
+    def _explained(self, stages: Stages, stage: str) -> Iterator[dict[str, str]]:
+        """Say in a sentence which workers end, and whether the block fails because of that.
 
-        WorkersLost, in one sentence, if it could not be carried out.
+        Yields the names of tasks by their keys, which the block fills in.
         """
-        absence = _Absence()
-        while future.status not in BAD:
-            try:
-                value = future.result(timeout=FETCH_S)
-            except TimeoutError:
-                self._require_workers(absence)
-            except Exception:
-                # its status says why
-                if future.status not in BAD:
-                    raise
-            else:
-                if isinstance(value, Failed):
-                    raise value.error
-                return value
-        if future.status != "error":
-            raise WorkersLost(f"{self._scheduler()} is gone, or has forgotten this run")
-        error = future.exception()
-        killed = isinstance(error, distributed.KilledWorker)
-        key = str(error.task) if killed else future.key
-        name = f"{stage}, {names[key]}" if key in names else stage
-        if not killed:
+        names: dict[str, str] = {}
+
+        def note(event: tuple[float, Any]) -> None:
+            said = event[1]
+            if said.get("action") == "remove-worker" and not said.get("expected"):
+                again = ", ".join(names[key] for key in said["processing-tasks"] if key in names)
+                if again:
+                    stages.say(f"  worker {said['worker']} ended; given to others: {again}")
+
+        self.client.subscribe_topic("all", note)
+        try:
+            yield names
+        except distributed.KilledWorker as error:
             raise WorkersLost(
-                f"{name}: failed {REPEATS + 1} times, at last with {type(error).__name__}: "
-                f"{' '.join(str(error).split())[:300]}"
+                f"{stage}, {names.get(str(error.task), 'a sum')}: {error.allowed_failures + 1} "
+                "workers ended while they worked on it, one after the other, the last of them "
+                f"{error.last_worker.address} (killed, or out of memory)"
             ) from error
-        last = str(error.last_worker.address)
-        why = self._causes.get(last, "killed, or out of memory")
-        raise WorkersLost(
-            f"{name}: {error.allowed_failures + 1} workers ended while they worked on it, one "
-            f"after the other, the last of them {last} ({why})"
-        ) from error
-
-    def _require_workers(self, absence: _Absence) -> None:
-        """WorkersLost if the scheduler is gone, or all workers have been for long."""
-        if self.client.status != "running":
-            raise WorkersLost(f"{self._scheduler()} is gone")
-        patience = dask.utils.parse_timedelta(dask.config.get(*PATIENCE))
-        missing = absence.seconds(there=bool(self._workers()))
-        if missing > patience:
+        except (CancelledError, NoWorkerError) as error:
             raise WorkersLost(
-                f"{self._scheduler()} has had no workers for {missing:.0f} s; start some, with: "
-                f"dask worker {self._address()}"
-            )
-
-    def _scheduler(self) -> str:
-        return f"the Dask scheduler at {self._address()}"
-
-    def _address(self) -> str:
-        scheduler = self.client.scheduler
-        return "an unknown address" if scheduler is None else str(scheduler.address)
-
-    def _workers(self) -> dict[str, Any]:
-        return dict(self.client.scheduler_info(n_workers=-1)["workers"])
-
-    def _threads(self) -> dict[str, int]:
-        """Threads for products of matrices of every task, by host."""
-        at_once: Counter[str] = Counter()
-        found: dict[str, int] = {}
-        workers, hosts = self._workers(), self.client.run(host_of_worker, on_error="ignore")
-        for address, (host, n_processors) in hosts.items():
-            if address in workers:
-                at_once[host] += workers[address]["nthreads"]
-                found[host] = n_processors
-        return {host: max(1, n // at_once[host]) for host, n in found.items()}
-
-    def _told(self) -> Terms:
-        if self._terms is None:
-            raise RuntimeError("the engine is not told where to work: call work_in first")
-        return self._terms
+                "the Dask scheduler is gone, has no workers, or has forgotten this run"
+            ) from error
+        finally:
+            if self.client.status == "running":
+                self.client.unsubscribe_topic("all")
 
     @contextmanager
     def _job(self, tasks: Tasks[T, R], merge: Callable[[R, R], R] | None = None) -> Iterator[Path]:
         """Write what all tasks share where the workers see it."""
-        with _scratch(self._told().folder) as place:
-            path = place / "job.pickle"
-            with path.open("wb") as file:
-                cloudpickle.dump(Job(tasks.function, tasks.items, merge), file)
-            yield path
-
-    @contextmanager
-    def _listening(self) -> Iterator[None]:
-        """Take note of workers that end."""
-        topics = {"all": self._note_ended, "worker-restart-memory": self._note_memory}
-        topics[HANGS] = self._note_hanging
-        for topic, handler in topics.items():
-            self.client.subscribe_topic(topic, handler)
+        if self._folder is None:
+            raise RuntimeError("the engine is not told where to work: call work_in first")
+        place = scratch_folder(self._folder)
         try:
-            yield
+            with (place / "job.pickle").open("wb") as file:
+                cloudpickle.dump((os.getpid(), tasks.function, tasks.items, merge), file)
+            yield place / "job.pickle"
         finally:
-            for topic in topics:
-                with suppress(Exception):
-                    self.client.unsubscribe_topic(topic)
-
-    def _note_ended(self, event: tuple[float, Any]) -> None:
-        said = event[1]
-        if said.get("action") == "remove-worker" and not said.get("expected"):
-            self._ended.append(said)
-
-    def _note_memory(self, event: tuple[float, Any]) -> None:
-        said = event[1]
-        self._causes[said["worker"]] = f"it took {gigabytes(said['rss'])} of memory, too much"
-
-    def _note_hanging(self, event: tuple[float, Any]) -> None:
-        said = event[1]
-        self._causes[said["worker"]] = f"its task took longer than {said['limit_s']:.0f} s"
-
-    def _tell(self, names: dict[str, str], stages: Stages) -> None:
-        """Say which workers have ended, and what they had begun or were to begin."""
-        while self._ended:
-            said = self._ended.popleft()
-            worker = said["worker"]
-            again = [name for key, name in names.items() if key in said["processing-tasks"]]
-            why = f" ({self._causes[worker]})" if worker in self._causes else ""
-            if again:
-                stages.say(f"  worker {worker} ended{why}; given to others: {', '.join(again)}")
+            shutil.rmtree(place, ignore_errors=True)
 
 
-class _Absence:
-    """How long the workers have been away."""
+def run_task(job: Path, number: int) -> Any:
+    """Call the function of a job with one of its items."""
+    function, items, _ = read_job(job)
+    return carry_out(function, items[number])
 
-    def __init__(self):
-        self._since: float | None = None
 
-    def seconds(self, *, there: bool) -> float:
-        """Since when they have not been there; 0 if they are."""
-        if there:
-            self._since = None
-            return 0.0
-        self._since = self._since or time.monotonic()
-        return time.monotonic() - self._since
+def run_merge(job: Path, one: Any, other: Any) -> Any:
+    """Merge two results of a job."""
+    return read_job(job)[2](one, other)
+
+
+def read_job(path: Path) -> tuple[Callable[..., Any], Any, Any]:
+    """Function, items and merging of a job, read once by every worker."""
+    # both threads of a worker need it at the same time
+    with _reading:
+        return _read_job(path)
+
+
+@lru_cache(maxsize=1)
+def _read_job(path: Path) -> tuple[Callable[..., Any], Any, Any]:
+    with path.open("rb") as file:
+        command, *job = pickle.load(file)
+    if os.getpid() != command:
+        # this process works as one of a command does
+        gc.set_threshold(100_000, 20, 100)
+        use_compilation_cache()
+        # xarray would ask the scheduler for a lock for every file, over a client of its own
+        dask.config.set(scheduler="threads")
+    return tuple(job)
+
+
+def versions() -> str:
+    """Those that code is sent between processes by."""
+    return f"lusee_bayes {__version__} and Python {sys.version_info.major}.{sys.version_info.minor}"
+
+
+def refusal_of(
+    wanted: str, folder: Path, demand: Demand | None, dask_worker: distributed.Worker
+) -> str | None:
+    """Why a worker cannot do what a command asks for, in one sentence; None if it can.
+
+    Parameters
+    ----------
+    wanted : str
+        The command's :func:`versions`.
+    folder : Path
+        Of the run.
+    demand : Demand or None
+    dask_worker : distributed.Worker
+        Dask gives the worker to an argument of this name.
+    """
+    if versions() != wanted:
+        return f"it has {versions()}, the command {wanted}; install the same on both"
+    limit, n = dask_worker.memory_manager.memory_limit, dask_worker.state.nthreads
+    if demand is not None and limit and demand.process_bytes(n) > limit:
+        return (
+            f"it may take {gigabytes(limit)} of memory, and {n} task(s) at a time need about "
+            f"{gigabytes(demand.process_bytes(n))}; start it with a larger --memory-limit or fewer "
+            "--nthreads"
+        )
+    if not folder.is_dir():
+        return (
+            f"it does not see '{folder}'; command and workers have to share a disk: give a folder "
+            "on it with -o"
+        )
+    return None
 
 
 @contextmanager
-def _scratch(folder: Path) -> Iterator[Path]:
-    """A folder inside ``folder`` during the block."""
-    place = scratch_folder(folder)
+def own_workers(n: int, demand: Demand) -> Iterator[distributed.LocalCluster]:
+    """A cluster of this machine alone, whose processors and memory its workers share.
+
+    Raises
+    ------
+    InputError
+        If they do not fit into the memory.
+    """
+    side_by_side = min(demand.side_by_side, max(1, processors() // n))
+    needed = n * demand.process_bytes(side_by_side)
+    if needed > memory_limit():
+        raise InputError(
+            f"{n} workers need about {gigabytes(needed)} of memory; this machine has "
+            f"{gigabytes(memory_limit())}: use fewer"
+        )
+    settings = {
+        # Dask makes glibc return memory early (MALLOC_TRIM_THRESHOLD_), which fixes at 128 kB the
+        # size from which every array is new memory that the system clears: a third more time for a
+        # channel; this is the largest size
+        f"{ENVIRONMENT}.MALLOC_MMAP_THRESHOLD_": 32 << 20,
+        f"{ENVIRONMENT}.OPENBLAS_NUM_THREADS": max(1, processors() // (n * side_by_side)),
+        # no worker has tasks that wait for others
+        "distributed.scheduler.worker-saturation": 1.0,
+    }
+    # Ctrl-C ends the command, which ends them: they do not hear it
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        yield place
+        with dask.config.set(settings):
+            cluster = distributed.LocalCluster(
+                n_workers=n,
+                threads_per_worker=side_by_side,
+                memory_limit=memory_limit() // n,
+                host="127.0.0.1",
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,
+            )
     finally:
-        shutil.rmtree(place, ignore_errors=True)
+        signal.signal(signal.SIGINT, before)
+    with cluster:
+        yield cluster
+
+
+@contextmanager
+def connected(place: str | distributed.LocalCluster, demand: Demand) -> Iterator[DaskEngine]:
+    """The engine of a cluster, which is connected to during the block.
+
+    Parameters
+    ----------
+    place : str or distributed.LocalCluster
+        The cluster, or the address of its scheduler.
+    demand : Demand
+
+    Raises
+    ------
+    InputError
+        If no scheduler answers.
+    """
+    if isinstance(place, str):
+        _require_answer(place)
+    # what Dask would write into the terminal is said in one sentence
+    for name in [name for name in logging.root.manager.loggerDict if "distributed" in name]:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    with distributed.Client(place, timeout=ANSWER_S, set_as_default=False) as client:
+        yield DaskEngine(client, demand)
+
+
+def _require_answer(address: str) -> None:
+    """Ask a scheduler who it is; a Client waits for ever where connections meet silence."""
+
+    async def ask() -> None:
+        arguments = distributed.Security().get_connection_args("client")
+        async with distributed.rpc(address, timeout=ANSWER_S, connection_args=arguments) as server:
+            await asyncio.wait_for(server.identity(), ANSWER_S)
+
+    try:
+        # in a thread: this one may have a loop that runs, as in a notebook
+        with threads(1) as pool:
+            pool.submit(asyncio.run, ask()).result()
+    except (OSError, ValueError, TypeError, MemoryError) as error:
+        # TypeError: TLS without certificates; MemoryError: Dask reads the length of a message from
+        # whatever a web server answers
+        why = " ".join(str(error).split())[:200] or f"silent for {ANSWER_S:g} s"
+        raise InputError(
+            f"no Dask scheduler answers at '{address}' ({why}); start one with: dask scheduler, "
+            "and give its address as tcp://host:8786 (8787 is its dashboard's)"
+        ) from error

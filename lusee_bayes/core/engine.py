@@ -5,28 +5,92 @@ and here and there a sum over all of them. An engine carries them out: in thread
 or on the workers of Dask (:mod:`.dask_engine`). What a sum adds to what does not depend on it, so
 that the numbers are the same to the last bit wherever they are made, by the same number of threads
 for products of matrices.
+
+Smaller pieces of work run in as many threads as there are processors (:func:`in_threads`). NumPy
+and LAPACK (:mod:`.linalg`) let other threads go on while they compute. A thread with one processor
+of its own does more than two that share both for every product of matrices.
 """
 
 from __future__ import annotations
 
 import gc
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from concurrent.futures import as_completed
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
-from threading import Event, Lock
+from threading import RLock
 from typing import Any, Generic, TypeVar
 
-from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.threads import threads
+from threadpoolctl import threadpool_limits
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.progress import Stages, memory_limit
+
+# each has its own memory to work in
+MOST = 8
 
 T = TypeVar("T")
 R = TypeVar("R")
 
+
+def processors() -> int:
+    """How many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def in_threads(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
+    """Call a function with every item; what it gives, in their order.
+
+    Parameters
+    ----------
+    function : callable
+        Safe to be called by several threads.
+    items : sequence
+        Its arguments.
+
+    Returns
+    -------
+    list
+    """
+    n_threads = min(len(items), processors(), MOST)
+    if n_threads < 2:
+        return [function(item) for item in items]
+    with threads(n_threads) as pool:
+        return list(pool.map(function, items))
+
+
+@contextmanager
+def threads(n: int) -> Iterator[ThreadPoolExecutor]:
+    """Start so many threads, each with its share of the processors for products of matrices."""
+    share = max(1, processors() // n)
+    with threadpool_limits(share, "blas"), ThreadPoolExecutor(n) as pool:
+        yield pool
+
+
+class once(cached_property):
+    """A cached property that one thread computes while others wait for it."""
+
+    def __init__(self, function: Callable[[Any], Any]):
+        super().__init__(function)
+        self._computing = RLock()
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        with self._computing:
+            return super().__get__(instance, owner)
+
+
 # tasks of one process at a time: one on each of two processors takes less than two after another
 # on both, and more than two wait for each other, and take memory
 SIDE_BY_SIDE = 2
+# the variable by which Dask's own programs are told of a cluster
+SCHEDULER = "DASK_SCHEDULER_ADDRESS"
 
 
 @dataclass(frozen=True)
@@ -57,21 +121,16 @@ class Demand:
 
     Attributes
     ----------
-    n_tasks : int
     base_bytes : float
         Memory of a process before it does anything.
     task_bytes : float
         What every task adds that is carried out at a time.
-    seconds : float
-        Of all tasks in one process of this machine.
     side_by_side : int
         How many a process carries out at a time; one where a task uses all processors.
     """
 
-    n_tasks: int
     base_bytes: float
     task_bytes: float
-    seconds: float
     side_by_side: int = SIDE_BY_SIDE
 
     def process_bytes(self, side_by_side: int | None = None) -> float:
@@ -103,7 +162,7 @@ class Engine(ABC):
         Raises
         ------
         Exception
-            The first that a task raises; no further ones are begun.
+            The first that a task raises; those that wait are not begun.
         WorkersLost
             If a task cannot be carried out because its workers fail.
         """
@@ -153,65 +212,52 @@ class ThisProcess(Engine):
     side_by_side: int = SIDE_BY_SIDE
 
     def each(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> list[R]:
-        found: list[Any] = [None] * len(tasks.items)
-
-        def keep(number: int, value: R) -> None:
-            found[number] = value
-
-        self._run(tasks, keep, stages, stage)
-        return found
+        found = dict(self._results(tasks, stages, stage))
+        return [found[number] for number in range(len(tasks.items))]
 
     def reduced(
         self, tasks: Tasks[T, R], merge: Callable[[R, R], R], stages: Stages, stage: str
     ) -> R:
         tree = _Tree(len(tasks.items), merge)
-        self._run(tasks, tree.add, stages, stage)
-        return tree.result()
+        for number, value in self._results(tasks, stages, stage):
+            tree.add(number, value)
+        return tree.total
 
     def work_in(self, folder: Path) -> None:
         pass
 
-    def _run(
-        self, tasks: Tasks[T, R], keep: Callable[[int, R], None], stages: Stages, stage: str
-    ) -> None:
-        """Call ``keep`` with the number of every item and what the function gives for it."""
+    def _results(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> Iterator[tuple[int, R]]:
+        """Numbers of the items and what the function gives for them, as they finish."""
         n_threads = max(1, min(self.side_by_side, len(tasks.items)))
-        stopped, counting, finished = Event(), Lock(), 0
-        waiting = iter(range(len(tasks.items)))
-        with stages.progress(stage, len(tasks.items)) as done:
+        with stages.progress(stage, len(tasks.items)) as done, threads(n_threads) as pool:
+            numbers = {
+                pool.submit(carry_out, tasks.function, item): number
+                for number, item in enumerate(tasks.items)
+            }
+            try:
+                for finished, future in enumerate(as_completed(numbers), start=1):
+                    number = numbers.pop(future)
+                    yield number, future.result()
+                    done(finished, tasks.names[number])
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)
 
-            def work() -> None:
-                nonlocal finished
-                while not stopped.is_set():
-                    with counting:
-                        number = next(waiting, None)
-                    if number is None:
-                        return
-                    keep(number, tasks.function(tasks.items[number]))
-                    # what a task was made of may refer to itself, and is large
-                    gc.collect()
-                    with counting:
-                        finished += 1
-                        done(finished, tasks.names[number])
 
-            with threads(n_threads) as pool:
-                running = [pool.submit(work) for _ in range(n_threads)]
-                try:
-                    for one in as_completed(running):
-                        one.result()
-                finally:
-                    stopped.set()
+def carry_out(function: Callable[[T], R], item: T) -> R:
+    """Call a function, and free at once what it leaves: it may refer to itself, and is large."""
+    try:
+        return function(item)
+    finally:
+        gc.collect()
 
 
 class _Tree(Generic[R]):
     """Merges results as they come; which with which depends on their numbers alone."""
 
+    total: R
+
     def __init__(self, n: int, merge: Callable[[R, R], R]):
-        self._widths = [n]
-        while self._widths[-1] > 1:
-            self._widths.append((self._widths[-1] + 1) // 2)
-        self._merge = merge
-        self._lock = Lock()
+        self._n, self._merge = n, merge
         self._waiting: dict[tuple[int, int], R] = {}
 
     def add(self, number: int, value: R) -> None:
@@ -224,18 +270,64 @@ class _Tree(Generic[R]):
         value
             What the function gave.
         """
-        for level, width in enumerate(self._widths[:-1]):
+        width, level = self._n, 0
+        while width > 1:
             neighbour = number ^ 1
             if neighbour < width:
-                with self._lock:
-                    if (level, neighbour) not in self._waiting:
-                        self._waiting[level, number] = value
-                        return
-                    other = self._waiting.pop((level, neighbour))
+                if (level, neighbour) not in self._waiting:
+                    self._waiting[level, number] = value
+                    return
+                other = self._waiting.pop((level, neighbour))
                 value = self._merge(*((value, other) if number < neighbour else (other, value)))
-            number //= 2
-        self._waiting[len(self._widths) - 1, 0] = value
+            number, width, level = number // 2, (width + 1) // 2, level + 1
+        self.total = value
 
-    def result(self) -> R:
-        """All of them, when the last one has come."""
-        return self._waiting.pop((len(self._widths) - 1, 0))
+
+@contextmanager
+def open_engine(
+    demand: Demand, workers: int | None = None, cluster: str | None = None
+) -> Iterator[Engine]:
+    """Start what is to carry out the tasks of a run, and end it after the block.
+
+    Parameters
+    ----------
+    demand : Demand
+        What the tasks take.
+    workers : int, optional
+        Processes of this machine; one, as by default, is this process, without any server.
+    cluster : str, optional
+        Address of the scheduler of a Dask cluster, as tcp://host:8786; by default that of the
+        environment variable ``DASK_SCHEDULER_ADDRESS``, if it is set.
+
+    Yields
+    ------
+    Engine
+
+    Raises
+    ------
+    InputError
+        If Dask is not installed, the workers do not fit into the memory, no scheduler answers, or
+        as :class:`.DaskEngine`.
+    """
+    if workers is not None and cluster is not None:
+        raise InputError("--workers starts workers of its own, --cluster uses others; give one")
+    if workers is None:
+        cluster, workers = cluster or os.environ.get(SCHEDULER), 1
+    if not cluster and workers == 1:
+        fits = demand.process_bytes() <= memory_limit()
+        gc.freeze()  # modules stay: they need not be searched
+        yield ThisProcess(demand.side_by_side if fits else 1)
+        return
+    if find_spec("distributed") is None:
+        raise InputError(
+            "--workers and --cluster need Dask; install it with pip install '.[cluster]' in the "
+            "clone of lusee_bayes"
+        )
+    # an optional library, which takes a second
+    from lusee_bayes.core.dask_engine import connected, own_workers
+
+    # before JAX starts: workers on the same GPU as this process need some of its memory
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    with ExitStack() as stack:
+        place = cluster or stack.enter_context(own_workers(workers, demand))
+        yield stack.enter_context(connected(place, demand))

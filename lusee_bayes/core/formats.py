@@ -1,18 +1,112 @@
-"""Names of the package's own file formats: every file says which one it is, in ``format``."""
+"""HDF5, netCDF and FITS files, read by their declared layouts.
+
+Every file of the package says which of its formats it has, in ``format``. On damaged metadata
+HDF5's library may run for ever, or end the process, and nothing in Python can interrupt it: so a
+file is tried first in a process of its own, with a time limit.
+"""
 
 from __future__ import annotations
 
+import faulthandler
+import os
+import signal
+import sys
+import time
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
 import h5py
+import numpy as np
 
-from lusee_bayes.core.hdf5_probe import require_readable_hdf5
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.layouts import Content, Layout
+from lusee_bayes.core.lazy import astropy_exceptions, fits
+from lusee_bayes.core.lazy import xarray as xr
 from lusee_bayes.core.reading import reading, require_file
+
+# a file is read whole up to this size; of a larger one, all metadata and the first value of each
+# array
+WHOLE_BYTES = 200_000_000
+# a whole file of that size takes less than a tenth of it
+LIMIT_S = 20.0
+
+
+def require_readable_hdf5(path: Path) -> None:
+    """Check that HDF5's library comes to an end with a file. What it raises is left to the reader.
+
+    Raises
+    ------
+    InputError
+        If it does not within ``LIMIT_S``, or if it ends the process.
+    """
+    status = path.stat()
+    _probe(str(path), status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=64)
+def _probe(path: str, mtime_ns: int, size: int) -> None:
+    # a process of macOS may not go on behind a fork
+    if sys.platform != "linux":
+        return
+    with warnings.catch_warnings():
+        # of threads that are not copied: the child needs none of them
+        warnings.simplefilter("ignore")
+        child = os.fork()
+    if child == 0:
+        _read_all(path, size)
+    limit, status = time.monotonic() + LIMIT_S, 0
+    pause = 1e-3
+    while True:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            break
+        if time.monotonic() > limit:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            raise InputError(
+                f"{path} is damaged: HDF5's library does not come to an end with it within "
+                f"{LIMIT_S:g} s"
+            )
+        time.sleep(pause)
+        pause = min(2 * pause, 0.05)
+    if os.WIFSIGNALED(status):
+        raise InputError(f"{path} is damaged: HDF5's library fails on it")
+
+
+def _read_all(path: str, size: int) -> None:
+    """In the child: read, and leave without a word."""
+    try:
+        # whatever it prints is of no use
+        faulthandler.disable()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+        with h5py.File(path) as file:
+            _read(file, size)
+            file.visititems(lambda _, item: _read(item, size))
+    finally:
+        os._exit(0)
+
+
+def _read(item: h5py.Group | h5py.Dataset, size: int) -> None:
+    for name in item.attrs:
+        try:
+            item.attrs[name]
+        except (OSError, KeyError, RuntimeError, ValueError, TypeError):
+            continue  # the reader says it
+    if isinstance(item, h5py.Dataset) and item.size:
+        whole = size <= WHOLE_BYTES and item.size * item.dtype.itemsize <= 5 * WHOLE_BYTES
+        try:
+            item[()] if whole or not item.shape else item[(0,) * len(item.shape)]
+        except (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError):
+            return
+
 
 VISIBILITIES = "lusee_bayes visibilities 1"
 POSTERIOR = "lusee_bayes posterior 1"
 POSTERIOR_CUBE = "lusee_bayes posterior cube 1"
-COMPACT_POSTERIOR = "lusee_bayes compact posterior 1"
 SAMPLES = "lusee_bayes samples 1"
 BEAMS = "lusee_bayes beams 1"
 GAINS = "lusee_bayes gains 1"
@@ -41,3 +135,221 @@ def format_of(path: str | Path) -> str | None:
             kind = file.attrs.get("format")
     kind = kind.decode(errors="replace") if isinstance(kind, bytes) else kind
     return kind if isinstance(kind, str) else None
+
+
+# what the CF conventions call times, and what bounds may leave to the variable that they bound
+CF_TIME = ("units", "calendar")
+
+
+def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") -> Content:
+    """Read one of the package's own files.
+
+    Dimensions are told by their names: an array whose dimensions are in another order is turned.
+    Attributes of a variable are those of the file by the name ``variable.attribute``.
+
+    Parameters
+    ----------
+    path : str or Path
+    format_ : str
+        Its ``format``, one of :mod:`.formats`.
+    layout : Layout
+    hint : str
+        What to do if there is no such file.
+
+    Returns
+    -------
+    Content
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or of another kind, or not as declared.
+    """
+    with _opened_netcdf(path, format_, layout, hint) as dataset:
+        return _checked_netcdf(path, dataset, layout)
+
+
+def read_dataset(path: str | Path, format_: str, layout: Layout, hint: str = "") -> xr.Dataset:
+    """As :func:`read_netcdf`, with the file as a whole: what is not declared, too."""
+    with _opened_netcdf(path, format_, layout, hint) as dataset:
+        _checked_netcdf(path, dataset, layout)
+        return dataset.load()
+
+
+def says(path: Path, attributes: Mapping[str, str]) -> bool:
+    """Tell whether a netCDF file of unfinished work is whole, and says so of itself.
+
+    What is damaged is made anew, as what is not there.
+    """
+    if not path.is_file():
+        return False
+    try:
+        with reading(path, "unfinished work"), xr.open_dataset(path, engine="h5netcdf") as file:
+            return all(file.attrs.get(name) == value for name, value in attributes.items())
+    except InputError:
+        return False
+
+
+@contextmanager
+def _opened_netcdf(
+    path: str | Path, format_: str, layout: Layout, hint: str
+) -> Iterator[xr.Dataset]:
+    path = require_file(path, layout.what, hint)
+    found = format_of(path)
+    if found != format_:
+        raise InputError(
+            f"{path} is not a file of {layout.what}: its format is '{found or 'absent'}', expected "
+            f"'{format_}'" + (f"; {hint}" if hint else "")
+        )
+    with (
+        reading(path, layout.what),
+        xr.open_dataset(path, engine="h5netcdf", decode_times=False) as dataset,
+    ):
+        yield dataset
+
+
+def _decoded(dataset: xr.Dataset, name: str, variable: xr.Variable) -> xr.Variable:
+    """Times by the CF conventions: bounds have the units of what they bound, if none of their own.
+
+    Without units they stay numbers.
+    """
+    bounding = (v.attrs for v in dataset.variables.values() if v.attrs.get("bounds") == name)
+    units = {key: v for attrs in bounding for key, v in attrs.items() if key in CF_TIME}
+    known = variable.copy(deep=False)
+    known.attrs = units | dict(variable.attrs)
+    return xr.conventions.decode_cf_variable(name, known)
+
+
+def _checked_netcdf(path: str | Path, dataset: xr.Dataset, layout: Layout) -> Content:
+    arrays = {str(name): variable for name, variable in dataset.variables.items()}
+    for name, declared in layout.variables.items():
+        if name not in arrays:
+            continue
+        array = dataset[name]
+        dims = [str(d) for d in declared.dims]
+        if array.dims != tuple(dims) and sorted(map(str, array.dims)) == sorted(dims):
+            array = array.transpose(*dims)
+        variable = array.variable
+        arrays[name] = _decoded(dataset, name, variable) if declared.kind == "time" else variable
+    said = {f"{name}.{key}": v for name, one in arrays.items() for key, v in one.attrs.items()}
+    return layout.checked(path, arrays, said | dataset.attrs)
+
+
+# kinds of numbers that images hold, by BITPIX
+IMAGE_DTYPES = {8: "u1", 16: "i2", 32: "i4", 64: "i8", -32: "f4", -64: "f8"}
+
+# words that say how a file is built
+STRUCTURE = ("SIMPLE", "BITPIX", "NAXIS", "EXTEND", "COMMENT", "HISTORY")
+
+
+def is_fits(path: str | Path) -> bool:
+    """Return whether a file begins like FITS."""
+    with Path(path).open("rb") as file:
+        return file.read(6) == b"SIMPLE"
+
+
+def image_names(path: str | Path) -> list[str]:
+    """Return the names of all images and tables of a FITS file, in lower case.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is cut short.
+    """
+    with opened(path) as hdus:
+        return [hdu.name.lower() for hdu in hdus]
+
+
+def has_words(path: str | Path, words: Iterable[str]) -> bool:
+    """Return whether a file is FITS and its primary header has all of these words.
+
+    Raises
+    ------
+    InputError
+        If it is FITS and cannot be read.
+    """
+    if not is_fits(path):
+        return False
+    with opened(path) as hdus:
+        return all(word in hdus[0].header for word in words)
+
+
+def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
+    """Read images, columns of tables and words of the primary header.
+
+    Variables are images by their names, or columns as ``table.column``; upper and lower case are
+    the same. Attributes are words of the primary header. Units are BUNIT and TUNITn.
+
+    Parameters
+    ----------
+    path : str or Path
+    layout : Layout
+    hint : str
+        What to do if there is no such file.
+
+    Returns
+    -------
+    Content
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, or not as declared.
+    """
+    with opened(path, layout.what, hint) as hdus:
+        arrays: dict[str, Any] = {}
+        words = hdus[0].header
+        said = {key: words[key] for key in words if key and not key.startswith(STRUCTURE)}
+        declared = {name.lower(): name for name in layout.variables}
+
+        def put(name: str, array: Any, unit: str | None) -> None:
+            name = declared.get(name.lower(), name.lower())
+            arrays[name] = array
+            if unit is not None:
+                said[f"{name}.units"] = unit
+
+        for hdu in hdus:
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
+                for number, column in enumerate(hdu.columns):
+                    put(f"{hdu.name}.{column.name}", hdu.data.field(number), column.unit)
+            elif hdu.header.get("NAXIS", 0):
+                put(hdu.name, _Image(hdu), hdu.header.get("BUNIT"))
+        return layout.checked(path, arrays, said)
+
+
+class _Image:
+    """An image that is read when it is asked for."""
+
+    def __init__(self, hdu: fits.PrimaryHDU | fits.ImageHDU):
+        self._hdu = hdu
+        self.shape = tuple(hdu.shape)
+        self.dtype = np.dtype(IMAGE_DTYPES[hdu.header["BITPIX"]])
+
+    @cached_property
+    def _values(self) -> np.ndarray:
+        return np.asarray(self._hdu.data)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return self._values.astype(self.dtype if dtype is None else dtype)
+
+
+@contextmanager
+def opened(path: str | Path, what: str = "FITS", hint: str = "") -> Iterator[fits.HDUList]:
+    """Open a FITS file for the duration of a ``with`` block.
+
+    Raises
+    ------
+    InputError
+        If the file, or what the block reads of it, is cut short or damaged.
+    """
+    with reading(path, what, hint) as place, place.open("rb") as file:
+        # astropy only warns of a file that is cut short
+        warnings.simplefilter("error", astropy_exceptions.AstropyWarning)
+        try:
+            hdus = fits.open(file, memmap=False)
+        except OSError as error:
+            if "SIMPLE" not in str(error):
+                raise
+            raise InputError(f"{path} cannot be read as {what}: it is no FITS file") from error
+        with hdus:
+            yield hdus

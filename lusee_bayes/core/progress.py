@@ -1,7 +1,8 @@
-"""Progress of a run: the stage that is running, and how long each one took."""
+"""Progress of a run: the stage that is running, how long each one took, and how much memory."""
 
 from __future__ import annotations
 
+import os
 import resource
 import sys
 import threading
@@ -9,6 +10,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
@@ -21,6 +24,13 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+# limits of the process's control group, of either version
+CGROUP_LIMITS = (
+    Path("/sys/fs/cgroup/memory.max"),
+    Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
+)
+# addresses that libraries and threads reserve without using the memory, below which XLA aborts
+RESERVED = 1_500_000_000
 # seconds and share of a stage between lines of its progress in a file
 LINE_S, LINE_SHARE = 10.0, 0.05
 
@@ -121,3 +131,22 @@ def peak_memory_gb() -> float:
     """Return the largest resident size of this process so far, in GB (10^9 bytes)."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e9 if sys.platform == "darwin" else peak * 1024 / 1e9
+
+
+@lru_cache(maxsize=1)
+def memory_limit() -> int:
+    """Bytes of this machine's memory, or of the share of it that the process is limited to."""
+    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    addresses, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if addresses != resource.RLIM_INFINITY:
+        limits.append(max(0, addresses - RESERVED))
+    for path in CGROUP_LIMITS:
+        text = path.read_text(encoding="utf-8").strip() if path.is_file() else ""
+        if text.isdigit():
+            limits.append(int(text))
+    return min(limits)
+
+
+def gigabytes(n: float | int) -> str:
+    """Format a number of bytes: 1.2 GB."""
+    return f"{n / 1e9:.2g} GB" if n < 1e11 else f"{n / 1e9:,.0f} GB"

@@ -1,4 +1,7 @@
-"""The door for every file: what cannot be read is said in one sentence, with the file's name."""
+"""The door for every file: what cannot be read is said in one sentence, with the file's name.
+
+JSON, CSV, NumPy's .npz and YAML are read here. YAML is that of version 1.2, but dates stay text.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,19 @@ import json
 import os
 import stat
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ruamel.yaml import YAML, YAMLError
+from ruamel.yaml.constructor import SafeConstructor
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.files import user_path
 from lusee_bayes.core.layouts import Content, Layout
-from lusee_bayes.core.paths import user_path
 
 # a text file that is larger is none that a person or this package has written
 LARGEST_TEXT = 50_000_000
@@ -235,3 +241,74 @@ class _Member:
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self._arrays[self._name], dtype=dtype)
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
+    """Write rows with the keys of the first one as header."""
+    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def rows_of(columns: Mapping[str, np.ndarray]) -> list[dict[str, object]]:
+    """Rows of a table that is given by columns, as plain Python values."""
+    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in rows]
+
+
+class _Constructor(SafeConstructor):
+    """The safe one, without dates."""
+
+
+_Constructor.add_constructor("tag:yaml.org,2002:timestamp", lambda _, node: node.value)
+
+
+def _yaml() -> YAML:
+    plain = YAML(typ="safe", pure=True)
+    plain.Constructor = _Constructor
+    plain.default_flow_style = False
+    plain.allow_unicode = False  # line breaks of Unicode would not come back
+    plain.sort_base_mapping_type_on_output = False
+    return plain
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """Parse YAML.
+
+    Parameters
+    ----------
+    text : str
+    where : str
+        What it is, for messages.
+
+    Returns
+    -------
+    object
+        Lists, mappings, numbers, text, booleans and None.
+
+    Raises
+    ------
+    InputError
+        If it is not valid.
+    """
+    try:
+        return _yaml().load(text)
+    except (YAMLError, ValueError, RecursionError) as error:
+        problem, mark = getattr(error, "problem", None), getattr(error, "problem_mark", None)
+        words = " ".join(str(problem or error).split())
+        place = "" if mark is None else f" (line {mark.line + 1})"
+        raise InputError(f"{where} is not valid YAML: {words}{place}") from error
+
+
+def read_yaml(path: str | Path, what: str, hint: str = "") -> Any:
+    """Read a YAML file. InputError if it cannot be read, or as :func:`parse_yaml`."""
+    return parse_yaml(read_text(path, what, hint), str(path))
+
+
+def as_yaml(tree: Any, *, flow: bool = False) -> str:
+    """Write lists, mappings and plain values as YAML, in a line if ``flow``."""
+    written, plain = StringIO(), _yaml()
+    plain.default_flow_style = flow
+    plain.dump(tree, written)
+    return written.getvalue()

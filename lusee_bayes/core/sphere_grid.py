@@ -14,10 +14,16 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array, as_complex, namespace
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import SQRT2, azimuth_functions, lmax_of, mode_numbers, n_modes
+from lusee_bayes.core.harmonics import (
+    SQRT2,
+    azimuth_functions,
+    lmax_of,
+    mode_numbers,
+    n_modes,
+    order_products,
+)
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.linalg import mirrored
-from lusee_bayes.core.order_products import order_products
 
 
 class SphereGrid(eqx.Module):

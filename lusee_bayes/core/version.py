@@ -1,6 +1,9 @@
-"""Versions of the package and of the libraries that its numbers depend on."""
+"""What made a result: versions of the package and its libraries, and the command line, if any."""
+
+from __future__ import annotations
 
 import subprocess
+from contextvars import ContextVar
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -42,3 +45,11 @@ def versions(*, with_commit: bool = True) -> dict[str, str]:
     own = {"commit": commit()} if with_commit and commit() else {}
     found = {name: metadata.version(name) for name in libraries}
     return {"lusee_bayes": __version__, **own, **found}
+
+
+COMMAND: ContextVar[str] = ContextVar("COMMAND", default="")
+
+
+def printable(text: str) -> str:
+    """Text in which the bytes of file names that are not UTF-8 are shown by their escapes."""
+    return text.encode(errors="backslashreplace").decode()

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.lazy import special
-from lusee_bayes.core.memory import memory_limit
-from lusee_bayes.core.threads import in_threads
+from lusee_bayes.core.progress import memory_limit
 from lusee_bayes.experiment.rounds import model_about, settled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import Around

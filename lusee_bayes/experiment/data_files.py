@@ -10,18 +10,16 @@ import numpy as np
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.fits_files import image_names, is_fits
-from lusee_bayes.core.formats import format_of
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import user_path
+from lusee_bayes.core.formats import format_of, image_names, is_fits
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.experiment.flight_data import reduce_files, visibilities_of
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.flight.reduced import Reduced, read_reduced
+from lusee_bayes.flight.session_files import is_session
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.beams.gridded import SAME_FREQUENCY_MHZ
-from lusee_bayes.instrument.flight.reduced import Reduced
-from lusee_bayes.instrument.flight.reduced_file import read_reduced
-from lusee_bayes.instrument.flight.sessions import is_session
 from lusee_bayes.instrument.timestamps import Timestamp
 from lusee_bayes.instrument.visibilities import HINT, Visibilities
 from lusee_bayes.instrument.visibilities_file import read_visibilities

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.representation import Described
 from lusee_bayes.experiment.learned_prior import with_learned_prior
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import radiometer
@@ -21,7 +21,6 @@ from lusee_bayes.experiment.simulate import simulate
 from lusee_bayes.experiment.terms import Around
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.learning import Learned
-from lusee_bayes.sampling.log_normal.learned import LearnedLogNormal
 from lusee_bayes.sky import SkySource
 
 
@@ -63,11 +62,6 @@ class Experiment(Described):
     def scenario(self) -> Scenario:
         """What the experiment was built of."""
         return self.setup.scenario
-
-    @property
-    def positive(self) -> LearnedLogNormal | None:
-        """The posterior over positive skies of a log-normal prior; None for any other."""
-        return self.learned if isinstance(self.learned, LearnedLogNormal) else None
 
 
 def build(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,21 +10,20 @@ from jaxtyping import Float
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.files import user_path
 from lusee_bayes.core.formats import format_of
-from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import FlightSection
+from lusee_bayes.flight.bands import shared_noise
+from lusee_bayes.flight.clock import read_clock
+from lusee_bayes.flight.flags import NO_LINES, read_lines
+from lusee_bayes.flight.gain_model import GainModel, read_gain_table
+from lusee_bayes.flight.recipe import Recipe
+from lusee_bayes.flight.reduced import Reduced
+from lusee_bayes.flight.reduction import reduce_sessions
+from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.instrument.correlations import CONVENTIONS
-from lusee_bayes.instrument.flight.clock import read_clock
-from lusee_bayes.instrument.flight.filter_bank import shared_noise
-from lusee_bayes.instrument.flight.gain_files import read_gain_table
-from lusee_bayes.instrument.flight.gain_table import GainTable
-from lusee_bayes.instrument.flight.lines import NO_LINES, read_lines
-from lusee_bayes.instrument.flight.recipe import Recipe
-from lusee_bayes.instrument.flight.reduced import Reduced
-from lusee_bayes.instrument.flight.reduction import reduce_sessions
-from lusee_bayes.instrument.flight.sessions import read_session
 from lusee_bayes.instrument.visibilities import Visibilities
 
 
@@ -70,7 +68,7 @@ def recipe_of(scenario: Scenario) -> Recipe:
     InputError
         If it does not say what the files leave open: gains, bin origin, what the times are.
     """
-    section = _section(scenario)
+    section = _flight_section(scenario)
     if section.gain_table is None:
         raise InputError(
             "the sessions hold counts, and the scenario names no gain table; use --set "
@@ -146,7 +144,7 @@ def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
     return np.ascontiguousarray(circuit.per_kelvin.diagonal().real)
 
 
-def gain_table_of(section: FlightSection) -> GainTable:
+def gain_table_of(section: FlightSection) -> GainModel:
     """The gain table that a scenario names, with what it says of its errors.
 
     Raises
@@ -155,29 +153,10 @@ def gain_table_of(section: FlightSection) -> GainTable:
         If the table cannot be read, or says itself what the scenario says of its components.
     """
     table = read_gain_table(section.gain_table, section.gain_model)
-    return with_component_std(table, section)
+    return table.with_component_std(section.component_std)
 
 
-def with_component_std(table: GainTable, section: FlightSection) -> GainTable:
-    """The same with the scenario's errors of the components, if it names any.
-
-    Raises
-    ------
-    InputError
-        If the table has some itself.
-    """
-    if section.component_std is None:
-        return table
-    if table.component_std is not None:
-        raise InputError(
-            f"{table.path} says by how much its components may be off, and so does "
-            "flight.component_std; leave that out"
-        )
-    std = np.broadcast_to(section.component_std, table.component.shape[:3]).copy()
-    return replace(table, component_std=std)
-
-
-def _section(scenario: Scenario) -> FlightSection:
+def _flight_section(scenario: Scenario) -> FlightSection:
     if scenario.flight is None:
         raise InputError(
             "the data are sessions of the spectrometer, and the scenario does not say how they "

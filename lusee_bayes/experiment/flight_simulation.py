@@ -1,36 +1,30 @@
 """Sessions of the spectrometer, simulated: counts, gains, telemetry and clock of a scenario's sky.
 
-The inverse of :mod:`.instrument.flight`: visibilities become spectra of all channels, with the
+The inverse of :mod:`lusee_bayes.flight`: visibilities become spectra of all channels, with the
 radiometer noise of each and with what disturbs them, and those become counts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+from lusee_bayes.core.engine import in_threads, processors
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.threads import in_threads, processors
-from lusee_bayes.experiment.flight_data import gain_table_of, with_component_std
-from lusee_bayes.experiment.flight_disturbances import SATURATED, Disturbances
-from lusee_bayes.experiment.flight_visibilities import spectra_observation, true_visibilities
+from lusee_bayes.experiment.flight_data import gain_table_of, per_kelvin_of
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import FlightSection, FlightSimulatedSection
-from lusee_bayes.instrument.correlations import CONVENTIONS
-from lusee_bayes.instrument.flight.channel_spectra import ChannelSpectra
-from lusee_bayes.instrument.flight.clock import DAY_S, Clock
-from lusee_bayes.instrument.flight.counts import Counting, bit_slices, rounded
-from lusee_bayes.instrument.flight.gain_errors import draw_gains
-from lusee_bayes.instrument.flight.gain_table import GainTable
-from lusee_bayes.instrument.flight.session_layout import MJD_ZERO
-from lusee_bayes.instrument.flight.session_rows import SessionRows
-from lusee_bayes.instrument.flight.spectrometer import (
+from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.simulate import true_signal, true_values
+from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
+from lusee_bayes.flight.gain_model import GainModel, draw_gains, synthetic_gains
+from lusee_bayes.flight.session import (
     ADC_HIGH,
     ADC_LOW,
     FRAME_S,
@@ -38,11 +32,25 @@ from lusee_bayes.instrument.flight.spectrometer import (
     BinOrigin,
     channel_mhz,
 )
-from lusee_bayes.instrument.flight.synthetic_gains import synthetic_gains
+from lusee_bayes.flight.session_files import SessionRows
+from lusee_bayes.flight.synthesis import (
+    SATURATED_FACTOR,
+    ChannelSpectra,
+    Counting,
+    Disturbances,
+    bit_slices,
+    rounded,
+)
+from lusee_bayes.instrument.correlations import CONVENTIONS
+from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import to_matrix, to_real
+from lusee_bayes.instrument.products import all_products, to_matrix, to_real
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.instrument.windows import Windows
 from lusee_bayes.noise.sample_covariances import sample_covariances
 
+# spectra whose A is in memory at once
+PIECE = 2048
 # spectra that a thread works on at once
 BLOCK = 16
 # the clock was started so long before the observation, and showed so much
@@ -77,9 +85,9 @@ class FlightSimulation:
     visibilities : (nodes, products, rows) array
         Without noise, in V^2/Hz.
     disturbances : Disturbances
-    table : GainTable
+    table : GainModel
         By which the counts are to be divided.
-    gains : GainTable
+    gains : GainModel
         By which they are multiplied: the table's, or drawn about it.
     gain_errors : dict
         What was drawn, in standard deviations, by names as M0 and M0 PC1.
@@ -96,8 +104,8 @@ class FlightSimulation:
     frequencies_mhz: Float[np.ndarray, " nodes"]
     visibilities: Float[np.ndarray, "nodes products rows"]
     disturbances: Disturbances
-    table: GainTable
-    gains: GainTable
+    table: GainModel
+    gains: GainModel
     gain_errors: dict[str, float]
     origin: BinOrigin
     navg_shift: int
@@ -192,7 +200,7 @@ class FlightSimulation:
         levels = "".join(self.disturbances.level[rows.start])
         counts = self._counting(levels)(to_real(t), self._telemetry(rows))
         saturated = self.disturbances.saturated[rows]
-        counts[saturated] *= SATURATED
+        counts[saturated] *= SATURATED_FACTOR
         bitslice = np.broadcast_to(self._slices[levels], counts.shape[:2])
         found = rounded(counts, bitslice)
         found[self.disturbances.absent[rows]] = np.nan
@@ -251,12 +259,14 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
             "longer observation.step_s (42 s in flight)"
         )
     shift = int(np.floor(np.log2(step_s / FRAME_S * (1.0 + 1e-12))))
-    table, gains, errors = _gains(scenario, flight)
+    table, gains, errors = _drawn_gains(scenario, flight)
     observation = spectra_observation(scenario, FRAME_S * 2.0**shift)
     origin = flight.bin_origin or "centre"
     nodes = np.array(scenario.frequencies_mhz or (scenario.frequency_mhz,))
     hours = observation.hours
-    made = Disturbances.drawn(section, hours - hours[0], step_s, origin, scenario.seed)
+    made = Disturbances.drawn(
+        hours - hours[0], step_s, origin, scenario.seed, **section.disturbances()
+    )
     visibilities = true_visibilities(scenario, observation, stages)
     mjd = float(np.floor(observation.times[0].mjd)) - CLOCK_DAYS
     clock = Clock("the simulation", MJD_ZERO, mjd, "utc", CLOCK_S)
@@ -276,12 +286,109 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
     )
 
 
-def _gains(
+def spectra_observation(scenario: Scenario, window_s: float) -> Observation:
+    """Return the scenario's observation, with windows as long as a spectrum.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    window_s : float
+        Length of each, in seconds, about the middle of the sample.
+
+    Raises
+    ------
+    InputError
+        If the axis of the Moon is fixed, no sample lasts for so long, or the turntable turns:
+        sessions do not say its angle.
+    """
+    if scenario.observation.fixed_axis:
+        raise InputError(
+            "spectra are means over the time of their integration, and observation.fixed_axis is "
+            "for instants; leave it out"
+        )
+    # whatever the samples of other data would be
+    planned = scenario.observation.model_copy(update={"window": "mean"}).observation()
+    bounds, live = planned.windows.bounds_s, planned.windows.live_per_sample_s
+    whole = live > (bounds[:, 1] - bounds[:, 0]) * (1.0 - 1e-9)
+    half = window_s / 2.0
+    long = whole & (bounds[:, 0] <= -half + 1e-6) & (bounds[:, 1] >= half - 1e-6)
+    if not long.any():
+        raise InputError(
+            f"no sample of the observation is live for the {window_s:.6g} s of a spectrum; check "
+            "observation.schedule and observation.step_s"
+        )
+    observation = planned.select(long)
+    if len(set(observation.turntable_deg)) > 1:
+        raise InputError(
+            "the turntable turns within the observation, and sessions do not say its angle; "
+            "simulate the stretch of each angle on its own (observation.runs)"
+        )
+    edges = np.full(observation.n_times, half)
+    return replace(observation, windows=Windows.whole(-edges, edges))
+
+
+def true_visibilities(
+    scenario: Scenario, observation: Observation, stages: Stages
+) -> Float[np.ndarray, "frequencies products times"]:
+    """Return visibilities of the scenario's sky with the true instrument, in V^2/Hz.
+
+    Errors of the gain table are none of the instrument's: they are in the counts.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of one frequency, or several.
+    observation : Observation
+    stages : Stages
+        Told how far it is.
+
+    Raises
+    ------
+    InputError
+        If the beams know no volts.
+    """
+    known = scenario.noise.model_copy(update={"gain_table": None})
+    scenario = scenario.model_copy(update={"noise": known})
+    channels = scenario.channels() or (scenario,)
+    scales = [_volts_per_kelvin(channel) for channel in channels]
+    # what changes with time has to be drawn for all of it
+    noise = scenario.noise
+    whole = noise.gain is not None or noise.pointing is not None or bool(scenario.sources.list)
+    n = observation.n_times
+    piece = n if whole else PIECE
+    found = np.empty((len(channels), len(all_products()), n))
+    with stages.progress("visibilities", n * len(channels)) as done:
+        for start in range(0, n, piece):
+            here = np.zeros(n, dtype=bool)
+            here[start : start + piece] = True
+            part = observation.select(here)
+            for number, (channel, scale) in enumerate(zip(channels, scales, strict=True)):
+                found[number, :, here] = (scale[:, None] * _true_kelvin(channel, part)).T
+                done(start * len(channels) + (number + 1) * part.n_times)
+    return found
+
+
+def _volts_per_kelvin(scenario: Scenario) -> Float[np.ndarray, " products"]:
+    """V^2/Hz for 1 K in each product."""
+    per_kelvin = per_kelvin_of(scenario)
+    return np.sqrt([per_kelvin[p.i] * per_kelvin[p.j] for p in all_products()])
+
+
+def _true_kelvin(
+    scenario: Scenario, observation: Observation
+) -> Float[np.ndarray, "products times"]:
+    layout = DataLayout.from_flags(np.zeros((len(all_products()), observation.n_times), dtype=bool))
+    nothing = Visibilities(np.zeros(layout.size), layout, observation, scenario.frequency_mhz)
+    setup = set_up(scenario, nothing)
+    return np.asarray(true_signal(setup, true_values(setup)))
+
+
+def _drawn_gains(
     scenario: Scenario, flight: FlightSection
-) -> tuple[GainTable, GainTable, dict[str, float]]:
+) -> tuple[GainModel, GainModel, dict[str, float]]:
     """The table, the gains of which it is the mean, and by how much they are off."""
     if flight.gain_table is None:
-        table = with_component_std(synthetic_gains(), flight)
+        table = synthetic_gains().with_component_std(flight.component_std)
     else:
         table = gain_table_of(flight)
     section = scenario.noise.gain_table

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from jaxtyping import PRNGKeyArray
-
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference, model_about, rebuilds, settled
 from lusee_bayes.experiment.terms import Around
@@ -27,18 +25,12 @@ def infer(experiment: Experiment) -> Inference:
     return settled(experiment.setup, experiment.data, experiment.around)
 
 
-def inform(
-    experiment: Experiment, key: PRNGKeyArray, n_perturbations: int = 0
-) -> tuple[Information, Inference]:
+def inform(experiment: Experiment) -> tuple[Information, Inference]:
     """What the data say of the sky as a quadratic form, and the posterior that it gives.
 
     Parameters
     ----------
     experiment : Experiment
-    key : PRNG key
-        For the perturbations.
-    n_perturbations : int
-        See :meth:`LinearGaussian.inform`.
 
     Raises
     ------
@@ -50,5 +42,5 @@ def inform(
     else:
         around = Around(experiment.data)
         found = Inference(*model_about(experiment.setup, around), None, 1, around)
-    information, posterior = found.model.inform(experiment.data.data, key, n_perturbations)
+    information, posterior = found.model.inform(experiment.data.data)
     return information, replace(found, posterior=posterior)

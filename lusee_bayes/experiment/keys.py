@@ -11,12 +11,12 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-import yaml
 from docstring_parser import DocstringStyle, parse
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.reading import as_yaml
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import Section
 
@@ -210,7 +210,7 @@ def _as_yaml(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, Section):
-        return yaml.safe_dump(value.model_dump(), default_flow_style=True, sort_keys=False).strip()
+        return as_yaml(value.model_dump(), flow=True).strip()
     if isinstance(value, tuple):
         return f"[{', '.join(_as_yaml(item) for item in value)}]"
     return "{}" if value == {} else str(value)

@@ -7,19 +7,15 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.rounds import first_order, rebuilds, rebuilds_gains, settled
+from lusee_bayes.experiment.rounds import rebuilds, settled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import Around
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.linear.importance import LogMean, sampled_evidence
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.learning import Learned, learn_whatever_fits
 from lusee_bayes.linear.marginal_information import marginalised
-from lusee_bayes.sampling.log_normal.learned import LearnedLogNormal, learn_log_normal
-from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
 from lusee_bayes.sky.prior_family import PriorFamily
 
 # the map and its prior are found together when the map moves by less than this, rms; a step of
@@ -51,11 +47,6 @@ def with_learned_prior(
         How it was learned.
     Around or None
         What N was built around in the last round; None where that is the data alone.
-
-    Raises
-    ------
-    InputError
-        As :func:`.learn_log_normal`.
     """
     if setup.family is None:
         return setup, None, None
@@ -86,43 +77,23 @@ def about_sky(setup: Setup, data: Visibilities) -> Information:
 
 def learned_prior(
     setup: Setup,
-    family: PriorFamily | LogNormalPrior,
+    family: PriorFamily,
     information: Information,
     start: Float[np.ndarray, " parameters"] | None = None,
 ) -> Learned:
     """Learn the prior of a family, up to a lower ell first where there are many.
 
-    That of a log-normal sky is Gaussian about its mode (:mod:`.learned`).
-
     Parameters
     ----------
     setup : Setup
         Of the scenario that the family is of.
-    family : PriorFamily or LogNormalPrior
+    family : PriorFamily
     information : Information
         What the data say of the sky (:func:`about_sky`).
     start : (parameters,) array, optional
         Where to begin.
-
-    Raises
-    ------
-    InputError
-        As :func:`.learn_log_normal`; for a log-normal sky if N is to be built
-        around the posterior's own prediction.
     """
     scenario, seed = setup.scenario, setup.scenario.seed
-    if isinstance(family, LogNormalPrior):
-        if rebuilds_gains(setup):
-            raise InputError(
-                "a log-normal sky is found under one N, and noise.gain.visibilities=posterior "
-                "builds several; use noise.gain.visibilities=measured"
-            )
-        for term in first_order(setup):
-            raise InputError(
-                f"a log-normal sky is found under one N, and {term.key} about what the data tell "
-                f"builds several; {term.fixed}"
-            )
-        return learn_log_normal(family, information, seed)
     if start is not None or scenario.lmax <= COARSE_LMAX:
         return learn_whatever_fits(family, information, start, seed)
     coarse = scenario.prior.family(scenario.frequency_mhz, COARSE_LMAX)
@@ -131,33 +102,3 @@ def learned_prior(
     first = learn_whatever_fits(coarse, marginalised(information, n, variance), seed=seed)
     start = family.start_from(coarse, first.parameters) if first.settled else None
     return learn_whatever_fits(family, information, start=start, seed=seed)
-
-
-def evidence_by_sampling(
-    family: PriorFamily | LogNormalPrior,
-    information: Information,
-    learned: Learned,
-    n: int,
-    seed: int,
-) -> LogMean:
-    """Estimate ln p(d) with a family's parameters integrated out by importance sampling.
-
-    Parameters
-    ----------
-    family : PriorFamily or LogNormalPrior
-    information : Information
-        What the data say of the sky.
-    learned : Learned
-        Of this family.
-    n : int
-        Number of draws.
-    seed : int
-
-    Raises
-    ------
-    InputError
-        For fewer than two draws.
-    """
-    if isinstance(learned, LearnedLogNormal):
-        return learned.sampled_evidence(n, seed)
-    return sampled_evidence(family, information, learned, n, seed)

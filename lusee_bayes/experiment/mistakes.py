@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import mode_numbers
-from lusee_bayes.core.rotations import turn_about_z
+from lusee_bayes.core.harmonics import mode_numbers, turn_about_z
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.instrument.beams import ProductBeams
 from lusee_bayes.instrument.observation import Observation

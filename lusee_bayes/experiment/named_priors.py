@@ -9,8 +9,6 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.schema import (
     IsotropicPriorSection,
     LocalScalesPriorSection,
-    LogNormalPriorSection,
-    ModulatedPriorSection,
     PriorSection,
 )
 
@@ -19,8 +17,6 @@ OF_TRUE_SKY = "isotropic-sky"
 NAMED: dict[str, PriorSection] = {
     "isotropic": IsotropicPriorSection(),
     OF_TRUE_SKY: IsotropicPriorSection(spectrum="sky"),
-    "modulated": ModulatedPriorSection(),
-    "lognormal": LogNormalPriorSection(),
     "local_scales": LocalScalesPriorSection(),
 }
 
@@ -37,7 +33,7 @@ def named_priors(
     ----------
     names : sequence of str or None
         Two or more of ``isotropic`` (C_ell learned), ``isotropic-sky`` (that of the scenario's
-        sky), ``modulated``, ``lognormal`` and ``local_scales``; None for all that can be.
+        sky) and ``local_scales``; None for all that can be.
     scenario : Scenario
     known_sky : bool
         Whether the data are of the scenario's sky.

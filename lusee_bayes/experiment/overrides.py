@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.yaml_files import parse_yaml
+from lusee_bayes.core.reading import parse_yaml
 
 
 def apply_override(tree: dict[str, Any], override: str) -> None:

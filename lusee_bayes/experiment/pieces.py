@@ -14,7 +14,6 @@ from lusee_bayes.experiment.rounds import rebuilds, settled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.terms import TERMS, Around, gain_drifts, point_sources
 from lusee_bayes.instrument.instrument import Instrument
-from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
@@ -22,7 +21,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
 
     A piece raises InputError, once made, for a systematic that the scenario marginalises as well.
     """
-    setup, data = experiment.setup, experiment.data
+    setup, data, log_normal = experiment.setup, experiment.data, experiment.scenario.log_normal
 
     def free(key: str, made: Callable[[], Any]) -> Callable[[], Any]:
         def make():
@@ -51,19 +50,9 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
         "gain_drifts": free("noise.gain", lambda: gain_drifts(setup, around())),
         "instrument": free("noise.beam", lambda: embedded_instrument(setup)),
         "sources": free("sources", lambda: point_sources(setup)),
-        "log_normal": lambda: log_normal_prior(setup),
+        "log_normal": lambda: on_device(log_normal.prior(setup.sky.frequency_mhz, setup.sky.lmax)),
         "layout": lambda: data.layout,
     }
-
-
-def log_normal_prior(setup: Setup) -> LogNormalPrior:
-    """The prior over positive skies. InputError where the scenario has another."""
-    if not isinstance(setup.family, LogNormalPrior):
-        raise InputError(
-            "the program asks for a log-normal prior, and the scenario has prior.model="
-            f"{setup.scenario.prior.model}; set prior.model=lognormal"
-        )
-    return on_device(setup.family)
 
 
 def embedded_instrument(setup: Setup) -> Instrument:

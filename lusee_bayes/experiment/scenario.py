@@ -12,12 +12,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
-import yaml
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.paths import user_path
-from lusee_bayes.core.yaml_files import parse_yaml, read_yaml
+from lusee_bayes.core.files import user_path
+from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
 from lusee_bayes.experiment.overrides import apply_override
 from lusee_bayes.experiment.scenario_errors import one_sentence
 from lusee_bayes.experiment.schema import (
@@ -27,7 +26,7 @@ from lusee_bayes.experiment.schema import (
     GalaxySection,
     IsotropicPriorSection,
     LocalScalesPriorSection,
-    LogNormalPriorSection,
+    LogNormalSection,
     MonopoleBeamSection,
     NoiseSection,
     ObservationSection,
@@ -73,6 +72,8 @@ class Scenario(Section):
         Point sources apart from the map.
     spectral : SpectralSection
         Prior of joint channels.
+    log_normal : LogNormalSection
+        Prior of the program ``log_normal``.
     flight : FlightSection
         How sessions of the spectrometer become visibilities.
     output : OutputSection
@@ -93,6 +94,7 @@ class Scenario(Section):
     noise: NoiseSection = NoiseSection()
     sources: SourcesSection = SourcesSection()
     spectral: SpectralSection = SpectralSection()
+    log_normal: LogNormalSection = LogNormalSection()
     flight: FlightSection | None = None
     output: OutputSection = OutputSection()
     seed: Seed = 1
@@ -160,11 +162,6 @@ class Scenario(Section):
                 "noise.receiver.smooth_octaves ties the receivers of channels that have a "
                 "posterior each; with joint, leave it out"
             )
-        if isinstance(self.prior, LogNormalPriorSection):
-            raise ValueError(
-                "noise.receiver.smooth_octaves ties channels whose skies are Gaussian, not those "
-                "of prior.model=lognormal; leave it out, or take another prior"
-            )
         return self
 
     @property
@@ -208,7 +205,7 @@ class Scenario(Section):
 
     def to_yaml(self) -> str:
         """The resolved scenario, defaults included."""
-        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+        return as_yaml(self.model_dump(mode="json"))
 
 
 def _treatments(section: Section) -> set[str]:

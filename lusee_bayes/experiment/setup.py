@@ -25,7 +25,6 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.source_response import source_response
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
 from lusee_bayes.sky import BRIGHT_SOURCES, Sky, galactic_unit_vector, kelvin_steradian
 from lusee_bayes.sky.prior_family import PriorFamily
 from lusee_bayes.sky.priors import Prior
@@ -63,9 +62,8 @@ class Setup:
         Visibilities of sky, background and sources through the modelled beams, in K.
     receiver : Receiver or None
         The receivers that the data say; None for others.
-    family : PriorFamily, LogNormalPrior or None
-        Of which data choose the prior, or about whose mode it is Gaussian; None for a prior that
-        is given.
+    family : PriorFamily or None
+        Of which data choose the prior; None for a prior that is given.
     calibration : Calibration or None
         Of data that are averages of a spectrometer's spectra; None for others.
     measured : bool
@@ -84,7 +82,7 @@ class Setup:
     background: Float[Array, " products"]
     signal: Float[Array, "products times"]
     receiver: Receiver | None = None
-    family: PriorFamily | LogNormalPrior | None = None
+    family: PriorFamily | None = None
     calibration: Calibration | None = None
     measured: bool = False
 
@@ -211,9 +209,7 @@ def set_up(
     )
 
 
-def prior_and_family(
-    scenario: Scenario, sky: Sky
-) -> tuple[Prior, PriorFamily | LogNormalPrior | None]:
+def prior_and_family(scenario: Scenario, sky: Sky) -> tuple[Prior, PriorFamily | None]:
     """The scenario's prior, or what is expected of it before there are data, and its family."""
     family = scenario.prior.family(scenario.frequency_mhz, scenario.lmax)
     return (scenario.prior.prior(sky) if family is None else family.expected()), family

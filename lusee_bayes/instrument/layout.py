@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import is_traced
+from lusee_bayes.core.checks import Described, is_traced
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.representation import Described
 
 
 class DataLayout(Described, eqx.Module):

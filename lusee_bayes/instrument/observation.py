@@ -17,9 +17,8 @@ import numpy as np
 from astropy.time import Time
 from jaxtyping import Bool, Float, Int
 
-from lusee_bayes.core.checks import require_finite, require_positive
+from lusee_bayes.core.checks import Described, listed, require_finite, require_positive
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.representation import Described, listed
 from lusee_bayes.instrument.moon import (
     about_fixed_axis,
     lean,

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.rotations import Rotation
+from lusee_bayes.core.harmonics import Rotation
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.window_average import sufficient_nodes, windowed
 

@@ -9,24 +9,23 @@ entry. In one mode alone, ``science``, the spectrometer takes data (``config/mod
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterator, Sequence
 from functools import lru_cache
+from io import StringIO
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import yaml
 from astropy.time import Time
 
-from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.reading import naming, read_text, reading
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.lazy import pandas
+from lusee_bayes.core.reading import naming, parse_yaml, read_text, reading
 from lusee_bayes.instrument.schedule import Interval, require_sequence
 from lusee_bayes.instrument.times import require_ephemeris, unannounced_leap_seconds
 
 WHAT = "a schedule, a table in CSV or OpSim's in YAML"
-REQUIRED = ("start", "end", "turntable_deg")
-OPTIONAL = ("duty_cycle", "night_only")
+REQUIRED = {"start", "end", "turntable_deg"}
+OPTIONAL = {"duty_cycle", "night_only"}
 # of OpSim, in which data are taken
 OBSERVING = "science"
 
@@ -50,7 +49,7 @@ def read_schedule(path: str | Path) -> tuple[Interval, ...]:
     Raises
     ------
     InputError
-        With file and line, for a missing column, a bad value, intervals that overlap or are not in
+        With file and row, for a missing column, a bad value, intervals that overlap or are not in
         order, and a schedule without any.
     """
     return _parsed(str(path), read_text(path, WHAT))
@@ -60,129 +59,83 @@ def read_schedule(path: str | Path) -> tuple[Interval, ...]:
 def _parsed(path: str, text: str) -> tuple[Interval, ...]:
     """Channels of several frequencies and estimates of their cost read the same file again."""
     is_yaml = Path(path).suffix in (".yaml", ".yml")
-    intervals = tuple(_of_commands(path, text) if is_yaml else _of_table(path, text))
-    if not intervals:
-        raise InputError(f"{path} holds no interval below its header; give at least one")
-    require_sequence(intervals)
+    intervals = _of_commands(path, text) if is_yaml else _of_table(path, text)
+    with naming(path):
+        require_sequence(intervals)
     return intervals
 
 
-def _of_table(path: str, text: str) -> Iterator[Interval]:
-    lines = [line.partition("#")[0] for line in text.splitlines()]
+def _of_table(path: str, text: str) -> tuple[Interval, ...]:
     with reading(path, WHAT):
-        rows = [
-            (f"{path}, line {number}", [cell.strip() for cell in next(csv.reader([line]))])
-            for number, line in enumerate(lines, start=1)
-            if line.strip()
-        ]
-    if not rows:
-        raise InputError(f"{path} is empty; give a table with the header {','.join(REQUIRED)}")
-    place, header = rows[0]
-    _check_header(place, header)
-    for place, row in rows[1:]:
-        if len(row) != len(header):
-            raise InputError(
-                f"{place}: there are {len(row)} entries for the {len(header)} columns "
-                f"{','.join(header)}; give each column one"
-            )
-        cells = dict(zip(header, row, strict=True))
-        yield Interval(
-            cells["start"],
-            cells["end"],
-            _number(place, cells, "turntable_deg"),
-            _number(place, cells, "duty_cycle") if cells.get("duty_cycle") else 1.0,
-            _truth(place, cells.get("night_only") or "false"),
-            place,
-        )
-
-
-def _check_header(place: str, header: Sequence[str]) -> None:
-    known = (*REQUIRED, *OPTIONAL)
-    for name in REQUIRED:
-        if name not in header:
-            raise InputError(
-                f"{place}: there is no column '{name}' in the header {','.join(header)}; a "
-                f"schedule has {', '.join(REQUIRED)}, and may have {' and '.join(OPTIONAL)}"
-            )
-    for name in header:
-        if name not in known:
-            raise InputError(
-                f"{place}: a schedule has no column '{name}'; {nearest(name, sorted(known))}"
-            )
-        if header.count(name) > 1:
-            raise InputError(f"{place}: the column '{name}' comes twice; leave out one of them")
-
-
-def _number(place: str, cells: dict[str, str], name: str) -> float:
-    try:
-        return float(cells[name])
-    except ValueError as error:
+        table = pandas.read_csv(StringIO(text), dtype=str, comment="#", skipinitialspace=True)
+        if not isinstance(table.index, pandas.RangeIndex):
+            raise ValueError("rows have more entries than the header")
+    table = table.fillna("")
+    if not REQUIRED <= set(table.columns) <= REQUIRED | OPTIONAL:
         raise InputError(
-            f"{place}: {name} is '{cells[name]}', not a number; write it as 0.5 or -30"
-        ) from error
+            f"{path} has the columns {', '.join(table.columns)}; a schedule has "
+            f"{', '.join(sorted(REQUIRED))}, and may have {' and '.join(sorted(OPTIONAL))}"
+        )
+    return tuple(
+        _interval(f"{path}, row {number}", row)
+        for number, row in enumerate(table.to_dict("records"), start=1)
+    )
 
 
-def _truth(place: str, text: str) -> bool:
-    if text.lower() not in ("true", "false"):
-        raise InputError(f"{place}: night_only is '{text}'; write true or false")
-    return text.lower() == "true"
+def _interval(place: str, row: dict[str, str]) -> Interval:
+    numbers = {}
+    for name, default in (("turntable_deg", ""), ("duty_cycle", "1")):
+        try:
+            numbers[name] = float(row.get(name) or default)
+        except ValueError as error:
+            raise InputError(f"{place}: {name} is '{row[name]}', not a number") from error
+    night_only = (row.get("night_only", "").strip() or "false").lower()
+    if night_only not in ("true", "false"):
+        raise InputError(f"{place}: night_only is '{night_only}'; write true or false")
+    return Interval(
+        row["start"], row["end"], **numbers, night_only=night_only == "true", where=place
+    )
 
 
-def _of_commands(path: str, text: str) -> Iterator[Interval]:
+def _of_commands(path: str, text: str) -> tuple[Interval, ...]:
     """Every stretch in the mode science."""
-    with reading(path, WHAT):
-        # numbers stay text: OpSim's keys are numbers, and lines are needed for messages
-        root = yaml.compose(text, Loader=yaml.BaseLoader)
-    if not isinstance(root, yaml.MappingNode):
+    root = parse_yaml(text, path)
+    if not isinstance(root, dict):
         raise InputError(
             f"{path} is no command table of OpSim: expected numbered entries with start and mode; "
             "a table of intervals is a CSV file, whose name ends otherwise"
         )
-    entries = [
-        _command(f"{path}, line {key.start_mark.line + 1}", node) for key, node in root.value
-    ]
+    entries = [_command(f"{path}, entry {name}", entry) for name, entry in root.items()]
     for (_, before, _), (place, after, _) in pairwise(entries):
         if not after > before:
             raise InputError(
                 f"{place}: start {after} does not come after that of the entry before, {before}; "
                 "sort the entries by their start"
             )
-    if OBSERVING not in {mode for _, _, mode in entries}:
-        raise InputError(
-            f"{path} holds no entry in the mode {OBSERVING}, the one in which data are taken; its "
-            f"modes are {', '.join(sorted({mode for _, _, mode in entries}))}"
-        )
-    if entries[-1][2] == OBSERVING:
+    if entries and entries[-1][2] == OBSERVING:
         raise InputError(
             f"{entries[-1][0]}: the last entry is in the mode {OBSERVING}, and nothing says when "
             "it ends; add an entry of another mode"
         )
-    for (place, start, mode), (_, end, _) in pairwise(entries):
-        if mode == OBSERVING:
-            yield Interval(_date(start), _date(end), where=place)
+    return tuple(
+        Interval(_date(start), _date(end), where=place)
+        for (place, start, mode), (_, end, _) in pairwise(entries)
+        if mode == OBSERVING
+    )
 
 
-def _command(place: str, node: yaml.Node) -> tuple[str, float, str]:
+def _command(place: str, entry: object) -> tuple[str, float, str]:
     """Where an entry is, its start as MJD and its mode."""
-    found = {}
-    if isinstance(node, yaml.MappingNode):
-        found = {key.value: value.value for key, value in node.value}
-    for name in ("start", "mode"):
-        if not isinstance(found.get(name), str):
-            raise InputError(
-                f"{place}: the entry has no {name}; a command table of OpSim has a start (MJD, "
-                "UTC) and a mode in each"
-            )
     try:
-        start = float(found["start"])
-    except ValueError as error:
+        start, mode = float(entry["start"]), str(entry["mode"])  # type: ignore[index]
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{place}: start is '{found['start']}', not a number; give a modified Julian date, as "
-            "61050.8"
+            f"{place}: a command table of OpSim has a start (a modified Julian date, UTC, as "
+            "61050.8) and a mode in each entry"
         ) from error
     with naming(place):
         require_ephemeris(np.array([start + 2400000.5]))
-    return place, start, found["mode"]
+    return place, start, mode
 
 
 def _date(mjd: float) -> str:

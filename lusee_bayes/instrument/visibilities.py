@@ -13,13 +13,19 @@ from jaxtyping import Float
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import require_finite, require_float64, require_positive, require_shape
+from lusee_bayes.core.checks import (
+    Described,
+    extent,
+    listed,
+    require_finite,
+    require_float64,
+    require_positive,
+    require_shape,
+)
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing
+from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.harmonics import lmax_of, n_modes
-from lusee_bayes.core.paths import user_path
-from lusee_bayes.core.representation import Described, extent, listed
-from lusee_bayes.core.units import require_mhz
+from lusee_bayes.core.layouts import require_mhz
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument import window_variables
 from lusee_bayes.instrument.beams.receiver import MeasuredReceiver

@@ -9,8 +9,8 @@ import numpy as np
 from lusee_bayes.core import formats
 from lusee_bayes.core.checks import require_finite
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.formats import read_netcdf
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
-from lusee_bayes.core.netcdf_files import read_netcdf
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.instrument.beams.receiver import MeasuredReceiver
 from lusee_bayes.instrument.layout import DataLayout

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from threadpoolctl import threadpool_limits
 
-from lusee_bayes.core.rotations import tilt_powers
+from lusee_bayes.core.harmonics import tilt_powers
 
 # of what is left out of any sample, relative to its visibility if what a beam sees of the sky falls
 # with ell to this power: less than 1e-6 of the radiometer noise in the fiducial case

@@ -15,9 +15,8 @@ import numpy as np
 from astropy.time import Time
 from jaxtyping import Bool, Float, Int
 
-from lusee_bayes.core.checks import require_finite
+from lusee_bayes.core.checks import Described, require_finite
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.representation import Described
 from lusee_bayes.instrument.times import unannounced_leap_seconds
 
 # times of a Julian date in two parts are exact to less than a nanosecond, others to a few of them

@@ -56,9 +56,9 @@ class ChiSquare:
         """p, and chi^2 with what is expected of it."""
         return f"p {probability(self.p)}, {self.found()}"
 
-    def found(self, most: str = "") -> str:
-        """chi^2 with what is expected of it; ``most``: words before that."""
-        expected = f"{most}{self.degrees:.0f} +- {np.sqrt(2.0 * self.degrees):.0f}"
+    def found(self) -> str:
+        """chi^2 with what is expected of it."""
+        expected = f"{self.degrees:.0f} +- {np.sqrt(2.0 * self.degrees):.0f}"
         return f"chi^2 {self.chi2:.0f}, expected {expected}"
 
 

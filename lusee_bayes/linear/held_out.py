@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Int
 
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.core.threads import in_threads
+from lusee_bayes.core.engine import in_threads
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.left_out import Missed
 from lusee_bayes.linear.model import LinearGaussian

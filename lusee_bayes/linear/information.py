@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float
 
 from lusee_bayes.core.arrays import (
     Array,
@@ -26,7 +26,14 @@ from lusee_bayes.core.arrays import (
     placed,
     repeated,
 )
-from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
+from lusee_bayes.core.checks import (
+    Described,
+    is_traced,
+    number,
+    require_finite,
+    require_float64,
+    require_shape,
+)
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import (
     cholesky,
@@ -34,7 +41,6 @@ from lusee_bayes.core.linalg import (
     precise_residual,
     solve_lower,
 )
-from lusee_bayes.core.representation import Described, number
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
 from lusee_bayes.linear.normal_matrix import has_structure, is_within_times, normal_matrix
 from lusee_bayes.linear.posterior import Posterior
@@ -60,8 +66,6 @@ class Information(Described, eqx.Module):
         ln|N|, with N in K^2.
     n_data : () array
         Number of data, as a float.
-    perturbations : (n, modes) array or None
-        Draws of A^T N^-1 n with n ~ N(0, N), in 1/K. Solving for them gives posterior draws.
     """
 
     matrix: Float[Array, "modes modes"]
@@ -70,7 +74,6 @@ class Information(Described, eqx.Module):
     misfit: Float[Array, ""]
     log_det: Float[Array, ""]
     n_data: Float[Array, ""]
-    perturbations: Float[Array, "n modes"] | None = None
 
     @classmethod
     def of(
@@ -80,8 +83,6 @@ class Information(Described, eqx.Module):
         noise: Covariance,
         offset: Float[Array, " data"] | None,
         data: Float[Array, " data"],
-        key: PRNGKeyArray | None = None,
-        n_perturbations: int = 0,
     ) -> tuple[Information, Posterior]:
         """Compute the information of data, and the posterior under a prior.
 
@@ -99,10 +100,6 @@ class Information(Described, eqx.Module):
             Mean of the data without a sky, in K; None for zero.
         data : (data,) array
             d, in K.
-        key : PRNGKeyArray, optional
-            For the perturbations.
-        n_perturbations : int
-            Number of draws of A^T N^-1 n.
 
         Returns
         -------
@@ -115,7 +112,7 @@ class Information(Described, eqx.Module):
         ------
         InputError
             If ``data`` is not float64, not finite or of another length, N is not positive definite,
-            the prior is over pixels, ``key`` is missing, or the mean does not converge.
+            the prior is over pixels, or the mean does not converge.
         """
         require_float64("the data", data)
         require_shape("the data", data, (noise.size,))
@@ -139,15 +136,7 @@ class Information(Described, eqx.Module):
         lower = _precision_root(matrix, prior)
         mean = prior.colour(_condition(first, prior, lower, 1)[0])
         vector, misfit = gradient_and_misfit(coupling, factor, centred, mean)
-        perturbations = None
-        if n_perturbations:
-            if key is None:
-                raise InputError("give a key for the perturbations")
-            drawn = noise.sample(key, n_perturbations)
-            perturbations = xp.stack(
-                [gradient_and_misfit(coupling, factor, n, zero)[0] for n in drawn]
-            )
-        information = cls(matrix, vector, mean, misfit, first.log_det, n_data, perturbations)
+        information = cls(matrix, vector, mean, misfit, first.log_det, n_data)
         return information, information._posterior(prior, lower)
 
     def description(self) -> tuple[str, ...]:
@@ -187,7 +176,7 @@ class Information(Described, eqx.Module):
         return replace(self, vector=self.vector - pulled, reference=sky, misfit=misfit)
 
     def raised(self, factor: float) -> Information:
-        """The information of the same data under N times a factor; perturbations are dropped.
+        """The information of the same data under N times a factor.
 
         Parameters
         ----------
@@ -203,7 +192,6 @@ class Information(Described, eqx.Module):
             vector=self.vector / factor,
             misfit=xp.asarray(self.misfit / factor),
             log_det=xp.asarray(self.log_det + self.n_data * np.log(factor)),
-            perturbations=None,
         )
 
     def chi2(self, sky: Float[Array, " modes"]) -> Float[Array, ""]:

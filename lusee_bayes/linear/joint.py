@@ -17,10 +17,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float
 
 from lusee_bayes.core.arrays import (
     Array,
@@ -40,9 +38,7 @@ from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 @compiled
 def common_part(
-    information: Information,
-    residual_root: Float[Array, " modes"] | None,
-    key: PRNGKeyArray | None = None,
+    information: Information, residual_root: Float[Array, " modes"] | None
 ) -> Information:
     """Integrate a channel's residual out of its information about the sky.
 
@@ -52,27 +48,20 @@ def common_part(
         About the channel's whole sky.
     residual_root : (modes,) array or None
         R^1/2, the prior standard deviations of the residual, in K; None if there is no residual.
-    key : PRNGKeyArray, optional
-        For the perturbations, which are to be draws of N(0, M'). With z ~ N(0, 1) and the draws e
-        of N(0, M), R^-1/2 (1 + P)^-1 (P z + R^1/2 e) is one. Without a key they are dropped.
 
     Returns
     -------
     Information
         About the common part of the channel's sky.
     """
-    e = None if key is None else information.perturbations
     if residual_root is None:
-        return replace(information, perturbations=e)
+        return information
     xp = namespace(information, residual_root)
     lower = residual_lower(information, residual_root)
     inverse = inverse_from_cholesky(lower)
     gradient = residual_root * information.vector
     solved = inverse @ gradient
     log_det = 2.0 * xp.log(xp.diagonal(lower)).sum()
-    if e is not None:
-        z = jax.random.normal(key, e.shape, dtype=jnp.float64)
-        e = (z + (residual_root[None] * e - z) @ inverse) / residual_root[None]
     diagonal = np.diag_indices(residual_root.shape[0])
     matrix = placed(-inverse, diagonal, 1.0 - inverse[diagonal])
     return Information(
@@ -82,7 +71,6 @@ def common_part(
         xp.asarray(information.misfit - gradient @ solved),
         xp.asarray(information.log_det + log_det),
         information.n_data,
-        e,
     )
 
 

@@ -56,21 +56,17 @@ class ChannelSky(eqx.Module):
     mean : (modes,) array
         In K.
     covariance : (modes, modes) array or None
-        In K^2; None if the component maps are known by draws only.
+        In K^2; None if that of the component maps was not given.
     draws : (n, modes) array
         In K.
     chi2 : () array
         Of the channel's data, at the mean.
-    chi2_expected : () array
-        Its expectation if the model holds: N_data less the trace of M times the covariance. NaN
-        without a covariance.
     """
 
     mean: Float[Array, " modes"]
     covariance: Float[Array, "modes modes"] | None
     draws: Float[Array, "n modes"]
     chi2: Float[Array, ""]
-    chi2_expected: Float[Array, ""]
 
 
 def channel_sky(
@@ -95,7 +91,7 @@ def channel_sky(
     maps : (components, modes) array
         Mean of the component maps, in K.
     covariances : (pairs, modes, modes) array or None
-        Their covariance as packed by :func:`paired`, in K^2; None if it is not known.
+        Their covariance as packed by :func:`paired`, in K^2; None if that of the sky is not wanted.
     draws : (n, components, modes) array
         Draws of the component maps, in K.
     key : PRNGKeyArray
@@ -152,7 +148,4 @@ def _channel_sky(
             white = scaled(covariance, 1.0 / residual_root, overwrite=True)
             white = symmetric_product(inverse @ white, inverse) + inverse
             covariance = scaled(white, residual_root, overwrite=True)
-    expected = xp.asarray(xp.nan)
-    if covariance is not None:
-        expected = information.n_data - xp.vdot(information.matrix, covariance)
-    return ChannelSky(mean, covariance, skies, information.chi2(mean), xp.asarray(expected))
+    return ChannelSky(mean, covariance, skies, information.chi2(mean))

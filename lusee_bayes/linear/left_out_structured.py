@@ -34,9 +34,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.engine import once
 from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.core.linalg import solve_lower
-from lusee_bayes.core.threads import once
 from lusee_bayes.instrument.coupling import CouplingMatrix, turned_about_pole
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.linear.left_out import LeftOut, Missed, log_det_of

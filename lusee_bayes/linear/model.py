@@ -15,9 +15,8 @@ import jax
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, on_processor
-from lusee_bayes.core.checks import require_finite, require_float64, require_shape
+from lusee_bayes.core.checks import Described, require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.representation import Described
 from lusee_bayes.instrument.coupling import Coupling, as_coupling
 from lusee_bayes.linear.information import Information, gradient_and_misfit
 from lusee_bayes.linear.normal_matrix import has_structure, is_within_times
@@ -211,22 +210,13 @@ class LinearGaussian(Described, eqx.Module):
         enough = self.n_data >= self.prior.size
         return self.prior.invertible and enough and has_structure(self.coupling, self.noise)
 
-    def inform(
-        self,
-        data: Float[Array, " data"],
-        key: PRNGKeyArray | None = None,
-        n_perturbations: int = 0,
-    ) -> tuple[Information, Posterior]:
+    def inform(self, data: Float[Array, " data"]) -> tuple[Information, Posterior]:
         """Compute the information of data, and the posterior; see :meth:`Information.of`.
 
         Parameters
         ----------
         data : (data,) array
             d, in K.
-        key : PRNGKeyArray, optional
-            For the perturbations.
-        n_perturbations : int
-            Number of draws of A^T N^-1 n.
 
         Returns
         -------
@@ -240,9 +230,7 @@ class LinearGaussian(Described, eqx.Module):
         InputError
             As :meth:`Information.of`.
         """
-        return Information.of(
-            self.coupling, self.prior, self.noise, self.offset, data, key, n_perturbations
-        )
+        return Information.of(self.coupling, self.prior, self.noise, self.offset, data)
 
     def log_prob(self, data: Float[Array, " data"]) -> Float[Array, ""]:
         """Compute the evidence ln p(d), with the sky integrated out. Differentiable.

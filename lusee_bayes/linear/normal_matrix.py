@@ -23,8 +23,8 @@ from jaxtyping import Float, Int
 from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import is_traced, require_shape
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import Rotation
 from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, mirrored, solve_lower
-from lusee_bayes.core.rotations import Rotation
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_about_pole
 from lusee_bayes.linear.one_angle import of_one_angle, places
 from lusee_bayes.linear.time_sums import CHUNK

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.threads import in_threads
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.learning import Learned
 from lusee_bayes.linear.posterior import Posterior

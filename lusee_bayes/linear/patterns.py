@@ -66,10 +66,10 @@ class Patterns(eqx.Module):
         return self.patterns.sum(0)
 
     def without(self) -> Information:
-        """Integrate the patterns out: what the data say of d; perturbations are dropped."""
+        """Integrate the patterns out: what the data say of d."""
         whole = self.information
         if not len(self.patterns):
-            return replace(whole, perturbations=None)
+            return whole
         across = solve_lower(self.lower, self.patterns @ whole.matrix, transpose=False)
         pull = solve_lower(self.lower, (self.patterns @ whole.vector)[:, None], transpose=False)
         return replace(
@@ -79,7 +79,6 @@ class Patterns(eqx.Module):
             reference=whole.reference - self.expected,
             misfit=np.asarray(whole.misfit - (pull**2).sum()),
             log_det=np.asarray(whole.log_det + 2.0 * np.log(np.diagonal(self.lower)).sum()),
-            perturbations=None,
         )
 
     def whole_sky(self, diffuse: Float[np.ndarray, " modes"]) -> Float[np.ndarray, " modes"]:

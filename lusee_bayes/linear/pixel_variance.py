@@ -1,6 +1,6 @@
 """Variances of all pixels of a map, from the covariance of its harmonic coefficients.
 
-diag(Y C Y^T) ring by ring; see :mod:`lusee_bayes.core.order_products`.
+diag(Y C Y^T) ring by ring; see :mod:`lusee_bayes.core.harmonics`.
 """
 
 from __future__ import annotations
@@ -11,9 +11,14 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.harmonics import azimuth_functions, lmax_of, polar_functions
+from lusee_bayes.core.harmonics import (
+    azimuth_functions,
+    lmax_of,
+    modes_by_order,
+    order_products,
+    polar_functions,
+)
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.order_products import modes_by_order, order_products
 from lusee_bayes.sky.priors import Prior
 
 

@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, compiled, namespace
-from lusee_bayes.core.checks import is_traced
+from lusee_bayes.core.checks import Described, is_traced, number
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower
-from lusee_bayes.core.representation import Described, number
 from lusee_bayes.sky.priors import Prior
 
 # directions whose standard deviations are computed at once

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.core.threads import in_threads
+from lusee_bayes.core.engine import in_threads
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.fit import ChiSquare, Fit, Level, probability, stands_out, two_sided
 from lusee_bayes.linear.left_out import LeftOut, Missed

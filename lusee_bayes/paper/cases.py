@@ -13,7 +13,7 @@ import xarray as xr
 from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.netcdf_files import says
+from lusee_bayes.core.formats import says
 from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.version import __version__, versions
 from lusee_bayes.experiment.experiment import build

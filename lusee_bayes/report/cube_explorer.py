@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.fits_files import opened
+from lusee_bayes.core.formats import opened
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.report.explorer import CONTROLS, sky_furniture, with_scripts

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lusee_bayes.core.checks import counted
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_json
-from lusee_bayes.core.representation import counted
 from lusee_bayes.linear.fit import stands_out
 from lusee_bayes.report import head, html
 from lusee_bayes.report.cube_explorer import cube_explorer
@@ -112,8 +112,7 @@ def cube_page(folder: Path, name: str) -> str:
 
 
 def _how(joint: dict | None, summary: dict) -> str:
-    evidence = summary.get("log_evidence")
-    known = "" if evidence is None else f" ln evidence {evidence:.1f}."
+    known = f" ln evidence {summary['log_evidence']:.1f}."
     if joint is None:
         tied = ", given what the others tell of its receivers" * summary.get("tied", False)
         return f"Every channel has a posterior of its own{tied}.{known}"
@@ -204,7 +203,7 @@ def _table(channels: list[dict]) -> str:
             c["n_missing"],
             f"{c['instrument_p']:.2g}",
             f"{c['chi2']:.0f}",
-            f"{c['chi2_expected']:.0f}" if "chi2_expected" in c else "unknown",
+            f"{c['chi2_expected']:.0f}",
             "" if c.get("ell_cross") is None else c["ell_cross"],
         )
         for c in channels

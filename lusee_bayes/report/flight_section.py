@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from lusee_bayes.core.representation import counted
-from lusee_bayes.instrument.flight.reduced import REASONS, Reduced
-from lusee_bayes.instrument.flight.reduced_file import read_reduced
+from lusee_bayes.core.checks import counted
+from lusee_bayes.flight.reduced import REASONS, Reduced, read_reduced
 from lusee_bayes.report import html
 from lusee_bayes.results.saved import REDUCED
 

@@ -9,7 +9,7 @@ from importlib import resources
 from pathlib import Path
 from urllib.parse import quote
 
-from lusee_bayes.core.command_line import printable
+from lusee_bayes.core.version import printable
 
 TEMPLATE = """<!DOCTYPE html>
 <html lang="en">

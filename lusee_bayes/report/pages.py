@@ -14,7 +14,6 @@ from lusee_bayes.report.cube_page import cube_page
 from lusee_bayes.report.map_page import map_page
 from lusee_bayes.report.priors_page import priors_page
 from lusee_bayes.report.sample_page import sample_page
-from lusee_bayes.report.skies_page import skies_page
 
 REPORT = "report.html"
 # by the kind of run: the page as text, of a folder and the run's name
@@ -23,7 +22,6 @@ PAGES: dict[str, Callable[[Path, str], str]] = {
     "cube": cube_page,
     "sample": sample_page,
     "validate": sample_page,
-    "validate --skies": skies_page,
     "compare-priors": priors_page,
 }
 

@@ -9,8 +9,8 @@ from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_json
 from lusee_bayes.report import head, html
 from lusee_bayes.report.run_details import details
-from lusee_bayes.results.prior_table import prior_table
-from lusee_bayes.results.saved import COVERAGE, HELD_OUT, PRIOR, PRIORS, SAMPLED, SKY_ERRORS, SNR
+from lusee_bayes.results.prior_comparison import prior_table
+from lusee_bayes.results.saved import COVERAGE, HELD_OUT, PRIOR, PRIORS, SKY_ERRORS, SNR
 
 FIGURE = (
     "Differences of ln evidence and of the density of data left out, coverage by latitude and "
@@ -78,11 +78,6 @@ def _priors(path: Path, found: dict) -> list[dict]:
     lengths = set()
     for one in priors:
         held = entries(path, one, "held_out", HELD_OUT)
-        sampled = one.get("sampled")
-        if sampled is not None:
-            if not isinstance(sampled, dict):
-                raise InputError(f"{path}: sampled is no object; make the results anew")
-            SAMPLED.checked(path, {}, sampled)
         known = one.get("coverage") is not None
         parts = entries(path, one, "coverage", COVERAGE) if known else []
         errors = entries(path, one, "errors", SKY_ERRORS) if known else []

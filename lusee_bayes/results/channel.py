@@ -14,8 +14,8 @@ import xarray as xr
 from jaxtyping import Float, Shaped
 
 from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import Described, extent
 from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, power_spectrum
-from lusee_bayes.core.representation import Described, extent
 from lusee_bayes.experiment.plausibility import about_information
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.metrics import (
@@ -69,7 +69,7 @@ class ChannelResult(Described):
         NaN for a channel of a joint posterior, where only those of all channels are known. Where
         receivers tie channels, ln p of the channel's own data alone.
     chi2, chi2_expected : float
-        Of the residuals about the mean, and its mean if the model holds (NaN if not known).
+        Of the residuals about the mean, and its mean if the model holds.
     chi2_model : float
         Of the data under the model, sky included: a chi^2 distribution of ``n_data`` degrees of
         freedom. NaN for a channel of a joint posterior, which has no model of its own.
@@ -228,18 +228,17 @@ def channel_of_information(
     observed: Observed,
     information: Information,
     mean: Float[Array, " modes"],
-    covariance: Float[Array, "modes modes"] | None,
+    covariance: Float[Array, "modes modes"],
     draws: Float[Array, "n modes"],
     *,
     compared: Float[np.ndarray, "more modes"] | None = None,
-    known_widths: tuple[np.ndarray, np.ndarray] | None = None,
     independent: Float[Array, " modes"] | None = None,
     log_evidence: float = np.nan,
     information_bits: float = np.nan,
     chi2_model: float = np.nan,
     refinement: float = np.nan,
 ) -> ChannelResult:
-    """The channel of a mean and a covariance; where that is not known, of draws.
+    """The channel of a mean and a covariance.
 
     Parameters
     ----------
@@ -248,27 +247,17 @@ def channel_of_information(
         What the channel's own data say.
     mean : (modes,) array
         In K.
-    covariance : (modes, modes) array or None
-        In K^2; None if only the draws tell.
+    covariance : (modes, modes) array
+        In K^2.
     draws : (n, modes) array
         In K.
     compared : (more, modes) array, optional
         Draws less mean for :class:`.Counts`, where the truth is known, in K.
-    known_widths : (modes,) and (pixels,) array, optional
-        Standard deviations other than the covariance's, in K.
     independent, log_evidence, information_bits, chi2_model, refinement
         See :class:`ChannelResult`.
     """
-    expected = np.nan
-    if covariance is None:
-        spread = np.asarray(draws) - np.asarray(mean)
-        covariance = spread.T @ spread / len(spread)
-    else:
-        expected = float(information.n_data - np.vdot(information.matrix, covariance))
     std, unknowns = np.sqrt(np.diagonal(np.asarray(covariance))), observed.unknowns
     width, found = pixel_std(covariance, round(np.sqrt(observed.highest_altitude.size / 12))), ()
-    if known_widths is not None:
-        std, width = known_widths
     if compared is not None and observed.truth is not None:
         found = Counts.of_pixels(width, observed.truth - np.asarray(mean), compared).coverage()
     return ChannelResult(
@@ -285,7 +274,7 @@ def channel_of_information(
         log_evidence=log_evidence,
         information_bits=information_bits,
         chi2=float(information.chi2(mean)),
-        chi2_expected=expected,
+        chi2_expected=float(information.n_data - np.vdot(information.matrix, covariance)),
         chi2_model=chi2_model,
         refinement=refinement,
         n_data=int(information.n_data),

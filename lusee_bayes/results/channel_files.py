@@ -14,7 +14,7 @@ from pathlib import Path
 import xarray as xr
 
 from lusee_bayes.core.files import replacing
-from lusee_bayes.core.netcdf_files import says
+from lusee_bayes.core.formats import says
 from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.data_files import Data, digest_of
 from lusee_bayes.experiment.scenario import Scenario

@@ -63,9 +63,6 @@ class ChannelInformation:
         }
         if observed.truth is not None:
             variables["truth"] = ("mode", observed.truth)
-        if information.perturbations is not None:
-            perturbations = np.asarray(information.perturbations)
-            variables["perturbations"] = (("draw", "mode"), perturbations)
         numbers = {name: float(getattr(information, name)) for name in OF_INFORMATION}
         numbers |= {name: getattr(observed, name) for name in OF_CHANNEL}
         numbers |= asdict(observed.instrument)
@@ -79,11 +76,9 @@ class ChannelInformation:
     def from_dataset(cls, dataset: xr.Dataset) -> ChannelInformation:
         """The inverse of :meth:`to_dataset`."""
         arrays = {str(name): np.asarray(values) for name, values in dataset.data_vars.items()}
-        noise = arrays.get("perturbations")
         information = Information(
             *(arrays[name] for name in ("matrix", "vector", "reference")),
             *(np.asarray(float(dataset.attrs[name])) for name in OF_INFORMATION),
-            noise,
         )
         observed = Observed(
             float(dataset.attrs["frequency_mhz"]),

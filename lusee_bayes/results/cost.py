@@ -17,13 +17,12 @@ import numpy as np
 
 from lusee_bayes.core.engine import Demand
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.memory import gigabytes, memory_limit
-from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
 from lusee_bayes.experiment.comparison import ARRAYS, MOST_MEMORY
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.results.joint_components import is_iterative
 from lusee_bayes.results.positive_components import lmax_of_fields
+from lusee_bayes.sampling.calibration import BATCH, N_DRAWS
 
 # measured at lmax 12 to 80 and up to 3e5 data (docs/commands.md): what is there before anything is
 # computed, and what each datum takes from reading to the report
@@ -86,23 +85,16 @@ class Cost:
 
 def demand_of(costs: Sequence[Cost]) -> Demand:
     """What independent posteriors take, one or more."""
-    memory = max(cost.memory for cost in costs) - BASE_BYTES
-    seconds = sum(cost.operations for cost in costs) / _operations_a_second()
-    return Demand(len(costs), BASE_BYTES, memory, seconds)
+    return Demand(BASE_BYTES, max(cost.memory for cost in costs) - BASE_BYTES)
 
 
 def demand_of_channels(scenario: Scenario) -> Demand:
     """What the channels of a scenario take, of several frequencies."""
-    channels = scenario.channels()
-    demand = demand_of([posterior_cost(channels[0])] * len(channels))
+    demand = demand_of([posterior_cost(scenario.channels()[0])])
     if not scenario.joint:
         return demand
     # sums over channels, of every pair of components, and another one that is added
-    count = len(
-        scenario.spectral.fields
-        if scenario.spectral.model == "positive"
-        else scenario.spectral.components
-    )
+    count = scenario.spectral.n_maps(scenario.frequencies_mhz)
     sums = 16.0 * (count * (count + 1) / 2) * (scenario.lmax + 1) ** 4
     return replace(demand, task_bytes=demand.task_bytes + sums)
 
@@ -148,13 +140,12 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
     n_channels = max(1, len(scenario.frequencies_mhz))
     n_data = 16 * scenario.observation.n_samples() if n_data is None else n_data
     n_modes = (scenario.lmax + 1) ** 2
-    direct = scenario.joint and not is_iterative(scenario)
-    n, rounds = n_modes, 1
-    if scenario.joint and scenario.spectral.model == "positive":
-        n, rounds = len(scenario.spectral.fields) * (lmax_of_fields(scenario) + 1) ** 2, ROUNDS
-    elif direct:
-        n *= len(scenario.spectral.components)
-    squares = float(JOINT_SQUARES if direct else SQUARES) * float(n) ** 2
+    n, rounds, squares = n_modes, 1, SQUARES
+    if scenario.joint:
+        n, squares = scenario.spectral.n_maps(scenario.frequencies_mhz) * n_modes, JOINT_SQUARES
+        if scenario.spectral.model == "positive":
+            n, rounds = len(scenario.spectral.fields) * (lmax_of_fields(scenario) + 1) ** 2, ROUNDS
+    squares = float(squares) * float(n) ** 2
     if scenario.joint:
         # the normal matrix of every channel is kept
         squares += n_channels * n_modes**2 / 2.0
@@ -240,13 +231,15 @@ def require_resources(
         stages.say(cost.sizes() if n_draws else cost.line())
 
 
-def _smaller(scenario: Scenario) -> Iterator[tuple[str, float, Scenario]]:
+def _smaller(scenario: Scenario) -> Iterator[tuple[str, float | str, Scenario]]:
     """The scenario with less of one thing at a time."""
     if scenario.nside is not None:
         yield "nside", 64, scenario.model_copy(update={"nside": 64})
     for draws in (1000, 100, 0):
         output = scenario.output.model_copy(update={"draws": draws})
         yield "output.draws", draws, scenario.model_copy(update={"output": output})
+    if scenario.joint:
+        yield "joint", "false", scenario.model_copy(update={"joint": False})
     for lmax in range(scenario.lmax - 1, 0, -1):
         yield "lmax", lmax, scenario.model_copy(update={"lmax": lmax})
     section = scenario.observation
@@ -254,3 +247,8 @@ def _smaller(scenario: Scenario) -> Iterator[tuple[str, float, Scenario]]:
         step_s = float(ceil(section.step_s)) * 2.0**times
         fewer = section.model_copy(update={"step_s": step_s})
         yield "observation.step_s", step_s, scenario.model_copy(update={"observation": fewer})
+
+
+def demand_of_calibration(scenario: Scenario) -> Demand:
+    """What simulation-based calibration takes, in batches that use all processors."""
+    return replace(demand_of([posterior_cost(scenario, BATCH * N_DRAWS)]), side_by_side=1)

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.harmonics import columns_to_maps, lmax_of, mode_numbers
 from lusee_bayes.core.lazy import healpy, special
-from lusee_bayes.core.threads import in_threads
 from lusee_bayes.linear.levels import LEVELS, NAMES
 
 # draws that tell the scatter: it is then known to 4 %
@@ -168,33 +168,6 @@ class Counts:
             )
             for k, (name, size) in enumerate(zip(self.names, self.sizes, strict=True))
         )
-
-
-def p_of_shares(*counts: Counts) -> float:
-    """Probability of a share or rms pull as far from what is expected as the furthest one is.
-
-    Each is taken in units of its scatter. p is the share of draws whose furthest is as far, so
-    that it knows how many there are to choose from and how they depend on one another.
-    """
-    values = np.concatenate([one.values[:, :-1] for one in counts])
-    mean, scatter = values[..., 1:].mean(2), values[..., 1:].std(2)
-    off = values - mean[..., None]
-    # shares of the truth are told from the levels, which are also the mean over draws if the
-    # draws have these standard deviations
-    off[:, :-1, 0] = values[:, :-1, 0] - LEVELS
-    # a part that is known exactly tells nothing
-    known = scatter > 0
-    return _share((np.abs(off[known]) / scatter[known][:, None]).max(0))
-
-
-def p_of_largest(counts: Counts) -> float:
-    """Probability of a largest pull as large, in the last part."""
-    return _share(counts.values[-1, -1])
-
-
-def _share(values: Float[np.ndarray, " skies"]) -> float:
-    """Share of skies whose value is at least the truth's, the truth itself counted among them."""
-    return float((values >= values[0]).sum()) / len(values)
 
 
 def _statistics(

@@ -11,20 +11,22 @@ import xarray as xr
 from jaxtyping import Float
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import Described, counted, extent
 from lusee_bayes.core.harmonics import mode_numbers, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import peak_memory_gb
-from lusee_bayes.core.representation import Described, counted, extent
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.instrument.flight.reduced import Reduced
+from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.linear.fit import RULE, ChiSquare, Fit
+from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.cube_fit import ChannelFits
 from lusee_bayes.results.cube_unknowns import CubeUnknowns
-from lusee_bayes.results.joint_components import Components
 from lusee_bayes.results.prior_words import joint_prior_sentence
 from lusee_bayes.sky.landmarks import LANDMARKS
+from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 
 @dataclass(frozen=True, repr=False)
@@ -85,14 +87,10 @@ class CubeResult(Described):
         """chi^2 of every channel, and the tests of all of them together."""
         chi2, degrees = self.stacked("instrument_chi2"), self.stacked("instrument_chi2_expected")
         components, n_data = self.components, float(self.stacked("n_data").sum())
-        bound = components is not None and bool(np.isnan(components.chi2))
-        if components is None:
-            total = float(self.stacked("chi2_model").sum())
-        else:
-            total = float(self.stacked("chi2").sum()) if bound else components.chi2
-        rest = ChiSquare(total - float(chi2.sum()), n_data - float(degrees.sum()))
         joint = components is not None
-        return ChannelFits(self.frequencies_mhz, chi2, degrees, rest, bound, joint)
+        total = components.chi2 if joint else float(self.stacked("chi2_model").sum())
+        rest = ChiSquare(total - float(chi2.sum()), n_data - float(degrees.sum()))
+        return ChannelFits(self.frequencies_mhz, chi2, degrees, rest, joint)
 
     @cached_property
     def fit(self) -> Fit:
@@ -119,8 +117,7 @@ class CubeResult(Described):
         crosses = [c.ell_cross for c in self.channels if c.ell_cross is not None]
         if crosses:
             parts.append(f"SNR < 1 first at ell {min(crosses)} to {max(crosses)}")
-        if self.log_evidence is not None:
-            parts.append(f"ln evidence {self.log_evidence:.1f}")
+        parts.append(f"ln evidence {self.log_evidence:.1f}")
         components = self.components
         if components is not None and components.iterations:
             parts.append(
@@ -150,13 +147,12 @@ class CubeResult(Described):
         return [f"Not mapped, {f:g} MHz: {reason}" for f, reason in self.unmapped.items()]
 
     @property
-    def log_evidence(self) -> float | None:
-        """ln p of all data; None where it is not known."""
+    def log_evidence(self) -> float:
+        """ln p of all data."""
         if self.components is None:
             alone = float(np.sum([channel.log_evidence for channel in self.channels]))
             return alone + self.tie_log_evidence
-        found = self.components.log_evidence
-        return None if np.isnan(found) else found
+        return self.components.log_evidence
 
     def landmarks(self) -> dict[str, dict[str, np.ndarray]]:
         """Brightness, its standard deviation and, if known, the truth of some directions."""
@@ -242,18 +238,15 @@ class CubeResult(Described):
         components = self.components
         if components is None:
             return None
-        numbers = {
-            "chi2": components.chi2,
-            "log_evidence": components.log_evidence,
-            "information_bits": components.information_bits,
-            "refinement_sigma": components.refinement,
-        }
         return {
             "prior": self.prior_words(),
             "components": list(components.prior.names),
             "solver": components.solver,
             "iterations": components.iterations,
-            **{name: v for name, v in numbers.items() if not np.isnan(v)},
+            "chi2": components.chi2,
+            "log_evidence": components.log_evidence,
+            "information_bits": components.information_bits,
+            "refinement_sigma": components.refinement,
         }
 
     def spectra(self) -> list[dict[str, float]]:
@@ -308,3 +301,44 @@ class CubeResult(Described):
         """Cubes by name, in K: mean, std and, where the truth is known, truth and residual."""
         parts = [channel.maps() for channel in self.channels]
         return {name: np.stack([part[name] for part in parts]) for name in parts[0]}
+
+
+@dataclass(frozen=True)
+class Components:
+    """The joint posterior of the component maps: in K, of positive skies fields without unit.
+
+    Attributes
+    ----------
+    prior : SpectralPrior
+    mean : (components, modes) array
+    spread : (pairs, modes, modes) array
+        Their covariance (:func:`.paired`).
+    draws : (n, components, modes) array
+    chi2 : float
+        Of all data under the model, prior included: chi^2 of N_data if it holds.
+    log_evidence, information_bits : float
+    refinement : float
+        Distance left, in standard deviations.
+    mode : PositiveMode or None
+        Of positive skies.
+    """
+
+    prior: SpectralPrior
+    mean: Array
+    spread: Array
+    draws: Array
+    chi2: float
+    log_evidence: float
+    information_bits: float
+    refinement: float
+    mode: PositiveMode | None = None
+
+    @property
+    def solver(self) -> str:
+        """How the mean was found."""
+        return "direct" if self.mode is None else "Gauss-Newton rounds"
+
+    @property
+    def iterations(self) -> int:
+        """Rounds of positive skies."""
+        return 0 if self.mode is None else self.mode.rounds

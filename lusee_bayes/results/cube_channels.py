@@ -20,21 +20,10 @@ from lusee_bayes.results.channel import ChannelResult, channel_of_information
 from lusee_bayes.results.channel_files import ChannelFiles, identity_of
 from lusee_bayes.results.channel_information import ChannelInformation
 from lusee_bayes.results.coverage import N_DRAWS
-from lusee_bayes.results.cube import CubeResult
-from lusee_bayes.results.draws import (
-    deviations,
-    draw_key,
-    perturbation_key,
-    posterior_draws,
-    widths,
-)
+from lusee_bayes.results.cube import Components, CubeResult
+from lusee_bayes.results.draws import deviations, draw_key, posterior_draws
 from lusee_bayes.results.joint_channels import names_of
-from lusee_bayes.results.joint_components import (
-    LEAST_DRAWS,
-    Components,
-    is_iterative,
-    solve_components,
-)
+from lusee_bayes.results.joint_components import solve_components
 from lusee_bayes.results.smooth_receivers import ChannelAlone, tie_receivers, write_tied_sky
 
 
@@ -78,8 +67,7 @@ def cube_result(
     engine.work_in(folder)
     if not scenario.frequencies_mhz:
         raise InputError("the scenario names no frequencies_mhz; give --frequencies")
-    iterative = scenario.joint and is_iterative(scenario)
-    n_draws = max(scenario.output.draws, LEAST_DRAWS if iterative else 0)
+    n_draws = scenario.output.draws
     # workers may have other folders of their own
     files = ChannelFiles(folder.resolve(), identity_of(scenario, data, truth, n_draws))
     channels = tuple(channel.anchored() for channel in scenario.channels())
@@ -95,9 +83,8 @@ def cube_result(
         experiment = build(channel, measured)
         if truth:
             experiment = with_truth(experiment)
-        n_perturbations = n_draws if iterative else 0
         with explained(experiment):
-            information, inference = inform(experiment, perturbation_key(channel), n_perturbations)
+            information, inference = inform(experiment)
         known = ChannelInformation.of(experiment, information, inference)
         if scenario.joint:
             files.write(channel, wanted, known.to_dataset())
@@ -124,7 +111,6 @@ def cube_result(
             covariance,
             draws,
             compared=compared,
-            known_widths=widths(experiment, covariance, channel.map_nside),
             **numbers,
         )
         files.write(channel, wanted, found.to_dataset())
@@ -153,8 +139,8 @@ def cube_result(
         engine.each(skies, stages, "smooth receivers")
     if scenario.joint:
         left = _without(unmapped, scenario)
-        # coverage is compared with draws; after conjugate gradients with those that there are
-        known = (data is None or truth) and not iterative
+        # coverage is compared with draws
+        known = data is None or truth
         n_solved = max(n_draws, N_DRAWS) if known else n_draws
         components = solve_components(left, files, n_solved, engine, stages)
         # for workers of other processes

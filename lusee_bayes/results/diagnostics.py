@@ -26,7 +26,7 @@ from lusee_bayes.linear.pixel_variance import prior_pixel_std
 from lusee_bayes.linear.residuals import Residuals
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.diagnostics_file import group_variables
-from lusee_bayes.results.draws import pixel_draws
+from lusee_bayes.results.draws import posterior_draws
 from lusee_bayes.results.strengths import strengths, strengths_in_words
 from lusee_bayes.sky.priors import Prior
 
@@ -63,7 +63,8 @@ def diagnostics(
     """
     scenario, data = experiment.scenario, experiment.data
     posterior, nside, lmax = on_host(inference.posterior), channel.nside, experiment.scenario.lmax
-    draws = pixel_draws(experiment, posterior, N_DRAWS, nside)
+    skies = posterior_draws(experiment, posterior, N_DRAWS)
+    draws = np.stack([modes_to_map(sky, nside) for sky in skies])
     prior = on_host(inference.model.prior)
     usual = 0.0 if prior.white_mean is None else prior.colour(prior.white_mean)
     deviation = channel.mean - usual

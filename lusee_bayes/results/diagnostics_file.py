@@ -11,7 +11,7 @@ import xarray as xr
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.netcdf_files import read_dataset
+from lusee_bayes.core.formats import read_dataset
 from lusee_bayes.results.saved import DIAGNOSTICS
 
 

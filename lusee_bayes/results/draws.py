@@ -1,4 +1,4 @@
-"""Draws of a posterior, which of them a scenario's seed stands for, and standard deviations."""
+"""Draws of a posterior, which of them a scenario's seed stands for, and what is doubtful."""
 
 from __future__ import annotations
 
@@ -7,18 +7,15 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.parameter_draws import draws_with_parameters
-from lusee_bayes.linear.pixel_variance import pixel_std
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.coverage import N_DRAWS
 
-# what the seed is folded with for posterior draws, for perturbations of information, and for the
-# draws that coverage is compared with
-DRAWS, PERTURBATIONS, COMPARED = 1, 7, 8
+# what the seed is folded with for posterior draws, and for those that coverage is compared with
+DRAWS, COMPARED = 1, 8
 
 
 def draw_key(scenario: Scenario) -> PRNGKeyArray:
@@ -26,15 +23,10 @@ def draw_key(scenario: Scenario) -> PRNGKeyArray:
     return jax.random.fold_in(jax.random.key(scenario.seed), DRAWS)
 
 
-def perturbation_key(scenario: Scenario) -> PRNGKeyArray:
-    """The key of the perturbations of a scenario's information."""
-    return jax.random.fold_in(jax.random.key(scenario.seed), PERTURBATIONS)
-
-
 def posterior_draws(
     experiment: Experiment, posterior: Posterior, n: int, purpose: int = DRAWS
 ) -> Float[np.ndarray, "draws modes"]:
-    """Draw the sky: positive ones under a log-normal prior, else Gaussian.
+    """Draw the sky.
 
     Where the prior was learned, its parameters are drawn, too (:mod:`.parameter_draws`); not for
     data that do not fit, which would not let them be uncertain.
@@ -54,26 +46,10 @@ def posterior_draws(
         In K.
     """
     key = jax.random.fold_in(jax.random.key(experiment.scenario.seed), purpose)
-    if experiment.positive is not None:
-        return experiment.positive.drawn(key, n).skies
     if experiment.learned is not None and experiment.learned.fits:
         family = experiment.setup.family
         return draws_with_parameters(family, experiment.learned, posterior, key, n)
     return np.asarray(on_host(posterior).sample(key, n))
-
-
-def pixel_draws(
-    experiment: Experiment, posterior: Posterior, n: int, nside: int
-) -> Float[np.ndarray, "draws pixels"]:
-    """Draw the sky at the centres of HEALPix RING pixels, in K.
-
-    Under a log-normal prior these are the positive skies themselves, not their coefficients' maps.
-    """
-    if experiment.positive is not None:
-        key = draw_key(experiment.scenario)
-        return experiment.positive.pixels(experiment.positive.drawn(key, n), nside)
-    draws = posterior_draws(experiment, posterior, n)
-    return np.stack([modes_to_map(sky, nside) for sky in draws])
 
 
 def deviations(
@@ -84,32 +60,8 @@ def deviations(
     return draws - np.asarray(posterior.mean)
 
 
-def widths(
-    experiment: Experiment, covariance: Float[np.ndarray, "modes modes"], nside: int
-) -> tuple[Float[np.ndarray, " modes"], Float[np.ndarray, " pixels"]]:
-    """Standard deviations of modes and of pixels (HEALPix RING).
-
-    Parameters
-    ----------
-    experiment : Experiment
-    covariance : (modes, modes) array
-        Of the Gaussian posterior, in K^2.
-    nside : int
-        Of the pixels.
-
-    Returns
-    -------
-    (modes,) array, (pixels,) array
-        In K; under a log-normal prior those of its draws.
-    """
-    std, of_pixels = np.sqrt(np.diagonal(covariance)), pixel_std(covariance, nside)
-    if experiment.positive is None:
-        return std, of_pixels
-    return experiment.positive.std(), experiment.positive.pixel_std(of_pixels, nside)
-
-
 def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
-    """What is doubtful about an experiment's data, its prior, its rounds and its draws."""
+    """What is doubtful about an experiment's data, its prior and its rounds."""
     learned, found = experiment.learned, list(experiment.doubts)
     if learned is not None and not learned.settled:
         found.append(
@@ -127,4 +79,4 @@ def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
         )
     if inference.unsettled:
         found.append(inference.unsettled)
-    return (*found, *(() if experiment.positive is None else experiment.positive.doubts()))
+    return tuple(found)

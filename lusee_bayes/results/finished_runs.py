@@ -11,8 +11,7 @@ import xarray as xr
 from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import recover, require_files
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import recover, require_files, user_path
 from lusee_bayes.core.reading import read_json, read_table
 from lusee_bayes.results.diagnostics_file import read_diagnostics
 from lusee_bayes.results.provenance import Provenance

@@ -16,7 +16,8 @@ from lusee_bayes.core.files import replacing
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.version import __version__
 from lusee_bayes.results.cost import duration
-from lusee_bayes.results.forecast import Forecast, Variation, forecast
+from lusee_bayes.results.forecast import Forecast, Variation
+from lusee_bayes.runs.forecasting import forecast
 
 
 @dataclass(frozen=True)

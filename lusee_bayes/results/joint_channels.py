@@ -42,10 +42,6 @@ class ChannelsInFiles:
     engine: Engine
     stages: Stages
 
-    def read(self, channel: int) -> Information:
-        """What the data of a channel say."""
-        return _information(self.files, self.channels[channel])
-
     def each(
         self,
         function: Callable[[int, Information], dict[str, np.ndarray]],

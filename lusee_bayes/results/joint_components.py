@@ -2,84 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import numpy as np
 
-from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.engine import Engine
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.linear.iterative_joint import DIRECT_UNKNOWNS, solve_iteratively
 from lusee_bayes.linear.joint import component_posterior
 from lusee_bayes.linear.joint_skies import paired
-from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.channel_files import ChannelFiles
+from lusee_bayes.results.cube import Components
 from lusee_bayes.results.draws import draw_key
 from lusee_bayes.results.joint_channels import ChannelsInFiles
-from lusee_bayes.results.positive_components import lmax_of_fields, positive_mode
+from lusee_bayes.results.positive_components import positive_mode
 from lusee_bayes.sky.spectral_prior import SpectralPrior
-
-# draws where conjugate gradients have no other way to tell standard deviations
-LEAST_DRAWS = 50
-
-
-@dataclass(frozen=True)
-class Components:
-    """The joint posterior of the component maps: in K, of positive skies fields without unit.
-
-    Attributes
-    ----------
-    prior : SpectralPrior
-    mean : (components, modes) array
-    spread : (pairs, modes, modes) array or None
-        Their covariance (``joint.paired``); None after conjugate gradients.
-    draws : (n, components, modes) array
-    chi2 : float
-        Of all data under the model, prior included: chi^2 of N_data if it holds. NaN, as evidence
-        and information are, after conjugate gradients.
-    log_evidence, information_bits : float
-    refinement : float
-        Distance left, in standard deviations.
-    solver : str
-    iterations : int
-        Of conjugate gradients, or rounds of positive skies.
-    mode : PositiveMode or None
-        Of positive skies.
-    """
-
-    prior: SpectralPrior
-    mean: Array
-    spread: Array | None
-    draws: Array
-    chi2: float
-    log_evidence: float
-    information_bits: float
-    refinement: float
-    solver: str
-    iterations: int
-    mode: PositiveMode | None = None
-
-
-def is_iterative(scenario: Scenario) -> bool:
-    """Whether a joint posterior is solved by conjugate gradients: as said, or as it fits.
-
-    InputError for positive skies with too many unknowns for a direct solution.
-    """
-    section = scenario.spectral
-    if section.model == "positive":
-        lmax_of_fields(scenario)
-        return False
-    if section.solver != "auto":
-        return section.solver == "conjugate_gradients"
-    count = len(section.components)
-    if section.model == "kernel":
-        # as many principal spectra as matter: known once the prior is made, at most the channels
-        frequencies = np.array(scenario.frequencies_mhz)
-        count = section.prior(frequencies, np.ones((len(frequencies), 1))).n_components
-    return count * (scenario.lmax + 1) ** 2 > DIRECT_UNKNOWNS
 
 
 def solve_components(
@@ -103,7 +42,7 @@ def solve_components(
     Raises
     ------
     InputError
-        If conjugate gradients do not converge, or data are too precise to be solved for.
+        If data are too precise to be solved for, or positive skies do not settle.
     """
     channels = scenario.channels()
     at_hand = ChannelsInFiles(channels, files, engine, stages)
@@ -113,32 +52,7 @@ def solve_components(
     reference = np.array([np.asarray(s["reference"]) for s in small])
     skies = np.array([np.asarray(s["sky"]) for s in small])
     prior = scenario.spectral.prior(np.array(scenario.frequencies_mhz), skies)
-    if not is_iterative(scenario):
-        return _direct(prior, scenario, at_hand, reference, n_draws, stages)
-    section = scenario.spectral
-    with stages.progress("conjugate gradients", section.iterations) as report:
-        found = solve_iteratively(
-            prior,
-            (at_hand.read(number) for number in range(len(channels))),
-            reference,
-            draw_key(scenario),
-            tolerance=section.tolerance,
-            iterations=section.iterations,
-            report=report,
-        )
-    unknown = float("nan")
-    return Components(
-        prior,
-        found.mean,
-        None,
-        found.draws,
-        unknown,
-        unknown,
-        unknown,
-        found.distance,
-        "conjugate gradients",
-        found.iterations,
-    )
+    return _direct(prior, scenario, at_hand, reference, n_draws, stages)
 
 
 def _positive(
@@ -146,8 +60,8 @@ def _positive(
 ) -> Components:
     mode = positive_mode(scenario, channels, stages)
     with stages("joint posterior"):
-        found = _gaussian(mode.prior, mode.posterior, scenario, n_draws, mode.energy, mode.rounds)
-    return replace(found, refinement=mode.moved, solver="Gauss-Newton rounds", mode=mode)
+        found = _gaussian(mode.prior, mode.posterior, scenario, n_draws, mode.energy)
+    return replace(found, refinement=mode.moved, mode=mode)
 
 
 def _direct(
@@ -162,7 +76,7 @@ def _direct(
     with stages("joint posterior"):
         posterior = component_posterior(information, prior)
         chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
-        return _gaussian(prior, posterior, scenario, n_draws, chi2, 0)
+        return _gaussian(prior, posterior, scenario, n_draws, chi2)
 
 
 def _gaussian(
@@ -171,7 +85,6 @@ def _gaussian(
     scenario: Scenario,
     n_draws: int,
     chi2: float,
-    iterations: int,
 ) -> Components:
     components, modes = prior.n_components, posterior.mean.shape[0] // prior.n_components
     spread = jax.block_until_ready(paired(posterior.covariance(), prior))
@@ -185,6 +98,4 @@ def _gaussian(
         float(posterior.log_evidence),
         float(posterior.information_bits()),
         float(posterior.refinement),
-        "direct",
-        iterations,
     )

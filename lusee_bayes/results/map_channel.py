@@ -10,9 +10,10 @@ from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.plausibility import about_information
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.linear.metrics import expected_chi2, highest_altitude
+from lusee_bayes.linear.pixel_variance import pixel_std
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.coverage import Counts
-from lusee_bayes.results.draws import deviations, doubts, posterior_draws, widths
+from lusee_bayes.results.draws import deviations, doubts, posterior_draws
 
 
 def channel_of_posterior(
@@ -40,7 +41,7 @@ def channel_of_posterior(
     scenario, data, posterior = experiment.scenario, experiment.data, inference.posterior
     judged, found = inference if judged is None else judged, ()
     prior_variance = np.asarray(inference.model.prior.variance())
-    std, width = widths(experiment, covariance, scenario.map_nside)
+    std, width = np.sqrt(np.diagonal(covariance)), pixel_std(covariance, scenario.map_nside)
     fraction = np.divide(std**2, prior_variance, out=np.zeros(len(std)), where=prior_variance > 0)
     mean = np.asarray(posterior.mean)
     truth = None if data.truth is None else np.asarray(data.truth)

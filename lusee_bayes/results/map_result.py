@@ -11,9 +11,9 @@ import pandas as pd
 import xarray as xr
 
 from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages, peak_memory_gb
-from lusee_bayes.core.representation import Described
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.diagnosis import Diagnosis, diagnose
 from lusee_bayes.experiment.experiment import Experiment, explained
@@ -21,7 +21,7 @@ from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.terms import beam_rms_difference
-from lusee_bayes.instrument.flight.reduced import Reduced
+from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.linear.fit import LEVELS, RULE
 from lusee_bayes.linear.metrics import effective_resolution_deg
 from lusee_bayes.linear.residuals import residuals
@@ -208,11 +208,6 @@ def map_result(
     """
     stages = stages or Stages()
     scenario, data = experiment.scenario, experiment.data
-    if onto is not None and experiment.positive is not None:
-        raise InputError(
-            "a log-normal map cannot be updated: its posterior is not Gaussian; map all data "
-            "together, or use prior.model=modulated"
-        )
     earlier = None if onto is None else read_updatable(onto, scenario)
     digests = (data.digest(),)
     with stages("posterior"), explained(experiment):

@@ -10,14 +10,17 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.linear.iterative_joint import DIRECT_UNKNOWNS
 from lusee_bayes.linear.positive_joint import MAX_ROUNDS, PositiveMode, find_joint_mode
 from lusee_bayes.linear.positive_learning import COARSE_LMAX, learn_laws
 from lusee_bayes.results.joint_channels import ChannelsInFiles
 from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES
-from lusee_bayes.sky.modulated import DEVIATIONS
 from lusee_bayes.sky.positive_skies import PositiveSkies
 from lusee_bayes.sky.template import EmbeddedTemplate, galactic_share
+
+# highest ell of the fields, over that of the map
+FIELDS = 1.5
+# most fields' modes: every round factorises their matrix
+MOST_UNKNOWNS = 10_000
 
 
 def lmax_of_fields(scenario: Scenario, lmax: int | None = None) -> int:
@@ -39,14 +42,14 @@ def lmax_of_fields(scenario: Scenario, lmax: int | None = None) -> int:
     """
     lmax = scenario.lmax if lmax is None else lmax
     n_fields = len(scenario.spectral.fields)
-    highest = int(np.sqrt(DIRECT_UNKNOWNS / n_fields)) - 1
+    highest = int(np.sqrt(MOST_UNKNOWNS / n_fields)) - 1
     if highest < lmax:
         raise InputError(
             f"positive joint skies of lmax {lmax} have {n_fields * n_modes(lmax)} unknowns, more "
-            f"than the {DIRECT_UNKNOWNS} that are solved for directly; use lmax={highest}, fewer "
+            f"than the {MOST_UNKNOWNS} of one solution; use lmax={highest}, fewer "
             "spectral.fields, or spectral.model=components"
         )
-    return min(round(DEVIATIONS * lmax), highest)
+    return min(round(FIELDS * lmax), highest)
 
 
 def positive_skies(scenario: Scenario) -> PositiveSkies:

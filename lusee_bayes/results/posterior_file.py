@@ -12,7 +12,6 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.results.draws import pixel_draws
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.sky.priors import Prior
 
@@ -25,10 +24,8 @@ def write_posterior(result: MapResult, path: Path) -> None:
 def posterior_dataset(result: MapResult) -> xr.Dataset:
     """What posterior.nc holds: on dim ``mode`` with coords ``ell``, ``m``; all in K (K^2).
 
-    Draws under a log-normal prior are there as pixels, too (HEALPix RING of the maps, dim
-    ``pixel``): positive, which maps of coefficients up to an ell need not be. ``covariance`` and,
-    for :func:`.read_updatable`, L of the precision in units of the prior are there where the
-    scenario's ``output`` asks for them.
+    ``covariance`` and, for :func:`.read_updatable`, L of the precision in units of the prior are
+    there where the scenario's ``output`` asks for them.
     """
     scenario, posterior = result.scenario, result.inference.posterior
     ell, m = mode_numbers(scenario.lmax)
@@ -36,11 +33,6 @@ def posterior_dataset(result: MapResult) -> xr.Dataset:
         name: (*value, {"units": "K"}) for name, value in result.channel.variables().items()
     }
     attrs = {"format": formats.POSTERIOR, **about(scenario)}
-    if result.experiment.positive is not None and scenario.output.draws:
-        pixels = pixel_draws(
-            result.experiment, posterior, scenario.output.draws, scenario.map_nside
-        )
-        variables["draw_pixels"] = (("draw", "pixel"), pixels, {"units": "K"})
     if scenario.output.covariance:
         matrix = np.asarray(posterior.covariance())
         variables["covariance"] = (("mode", "mode_2"), matrix, {"units": "K2"})

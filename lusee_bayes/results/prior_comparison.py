@@ -6,7 +6,9 @@ with the prior that was learned from all. Where the sky is known, so is how ofte
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.progress import peak_memory_gb
@@ -15,12 +17,10 @@ from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.held_out import HeldOut, held_out
-from lusee_bayes.linear.importance import LogMean
 from lusee_bayes.linear.split import Split
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.errors import errors_by_latitude, snr_at_some_ell
 from lusee_bayes.results.map_channel import channel_of_posterior
-from lusee_bayes.results.prior_table import prior_table
 from lusee_bayes.results.prior_words import prior_sentence
 
 # a difference of two evidences of which each is good to one or two
@@ -45,8 +45,6 @@ class UnderPrior:
         ln p(d), with the sky and the prior's parameters, if it has any, integrated out (Laplace).
     n_parameters : int
         That were learned.
-    sampled : LogMean or None
-        The same by importance sampling; None where nothing was learned, or no draws asked for.
     held_out : tuple of HeldOut
         Empty where groups are not judged.
     split : Split
@@ -58,14 +56,11 @@ class UnderPrior:
     channel: ChannelResult
     log_evidence: float
     n_parameters: int
-    sampled: LogMean | None
     held_out: tuple[HeldOut, ...]
     split: Split
 
     @classmethod
-    def of(
-        cls, name: str, experiment: Experiment, log_evidence: float, sampled: LogMean | None
-    ) -> UnderPrior:
+    def of(cls, name: str, experiment: Experiment, log_evidence: float) -> UnderPrior:
         """Map the data, and leave out groups of them."""
         inference = infer(experiment)
         model, posterior = inference.model, inference.posterior
@@ -78,7 +73,6 @@ class UnderPrior:
             channel,
             log_evidence,
             0 if learned is None else len(learned.parameters),
-            sampled,
             held_out(model, posterior, experiment.data),
             Split.of(posterior, channel.chi2_model, model.n_data),
         )
@@ -92,7 +86,6 @@ class UnderPrior:
             "prior": self.words,
             "parameters": self.n_parameters,
             "log_evidence": self.log_evidence,
-            "sampled": None if self.sampled is None else _sampled(self.sampled),
             "held_out": [vars(one) for one in self.held_out],
             "chi2_instrument": self.split.instrument.chi2,
             "degrees_instrument": self.split.instrument.degrees,
@@ -102,16 +95,6 @@ class UnderPrior:
             "errors": errors_by_latitude(channel) if known else None,
             "snr": [{"ell": ell, "snr": value} for ell, value in snr.items()],
         }
-
-
-def _sampled(found: LogMean) -> dict[str, object]:
-    return {
-        "log_evidence": found.value,
-        "error": found.error,
-        "effective": found.effective,
-        "draws": found.draws,
-        "trusted": found.is_trusted,
-    }
 
 
 @dataclass(frozen=True)
@@ -163,26 +146,7 @@ class PriorComparison:
             best = max(self.priors, key=lambda one, k=k: one.held_out[k].log_density)
             if best is not self.best:
                 found.append(f"Each {kind} is predicted best from the others under {best.name}.")
-        return [*found, *self._sampling(), HELD_OUT]
-
-    def _sampling(self) -> list[str]:
-        """How far importance sampling bears Laplace's approximation out."""
-        sampled = [(one, one.sampled) for one in self.priors if one.sampled is not None]
-        good = [abs(found.value - one.log_evidence) for one, found in sampled if found.is_trusted]
-        poor = [
-            f"{one.name} ({one.n_parameters})" for one, found in sampled if not found.is_trusted
-        ]
-        lines = []
-        if good:
-            lines.append(
-                f"Importance sampling differs from Laplace's approximation by {max(good):.1f} at "
-                "most where enough draws count."
-            )
-        if poor:
-            lines.append(
-                f"It cannot check {', '.join(poor)}: too few draws count for so many parameters."
-            )
-        return lines
+        return [*found, HELD_OUT]
 
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         """Header and rows, a column for each prior."""
@@ -226,9 +190,6 @@ def _row(one: UnderPrior, best: float) -> dict[str, object]:
         "log_evidence": one.log_evidence,
         "log_evidence_less_best": one.log_evidence - best,
     }
-    found = {} if one.sampled is None else _sampled(one.sampled)
-    for key in ("log_evidence", "error", "effective", "draws"):
-        row[f"sampled_{key}"] = found.get(key, "")
     for held in one.held_out:
         row |= {f"{held.kind}_{key}": getattr(held, key) for key in ("n", "chi2", "log_density")}
     for name, part in (("instrument", one.split.instrument), ("prior", one.split.prior)):
@@ -239,3 +200,72 @@ def _row(one: UnderPrior, best: float) -> dict[str, object]:
             row |= {f"{part.name}: {key}": x for key, x in told.items() if key not in ("name", "n")}
         row |= {f"snr_{ell}": value for ell, value in snr_at_some_ell(channel).items()}
     return row
+
+
+def prior_table(
+    priors: Sequence[Mapping[str, Any]],
+) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Header and rows: a column for each prior.
+
+    Parameters
+    ----------
+    priors : sequence of mappings
+        Entries of priors.json.
+    """
+    header = ("", *(str(one["name"]) for one in priors))
+    evidence = [one["log_evidence"] for one in priors]
+    rows = [
+        ("ln evidence", *_numbers(evidence)),
+        ("less the best", *_less_best(evidence)),
+        ("parameters learned", *(str(one["parameters"]) for one in priors)),
+    ]
+    for k, held in enumerate(priors[0]["held_out"]):
+        found = [one["held_out"][k] for one in priors]
+        kind = f"{held['kind']}s left out"
+        rows += [
+            (f"{kind}: ln p less the best", *_less_best([one["log_density"] for one in found])),
+            (f"{kind}: chi2 of {held['n']}", *(f"{one['chi2']:.0f}" for one in found)),
+        ]
+    rows += [
+        (f"chi2 {words}", *(_of(one[f"chi2_{key}"], one[f"degrees_{key}"]) for one in priors))
+        for key, words in (("instrument", "no sky explains"), ("prior", "of the sky"))
+    ]
+    if all(one["coverage"] for one in priors):
+        rows += _known(priors)
+    return header, rows
+
+
+def _known(priors: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """What can be told where the sky is known."""
+
+    def each(cell: Callable[[Mapping[str, Any]], str]) -> list[str]:
+        return [cell(one) for one in priors]
+
+    rows = []
+    for k, part in enumerate(priors[0]["coverage"]):
+        name = str(part["name"])
+        rows += [
+            (f"68% hold, {name}", *each(lambda one, k=k: f"{one['coverage'][k]['held_68']:.1%}")),
+            (f"95% hold, {name}", *each(lambda one, k=k: f"{one['coverage'][k]['held_95']:.1%}")),
+            (f"rms pull, {name}", *each(lambda one, k=k: f"{one['coverage'][k]['rms']:.2f}")),
+        ]
+    rows += [
+        ("largest pull", *each(lambda one: f"{one['coverage'][-1]['largest']:.1f}")),
+        ("rms error [K]", *each(lambda one: f"{one['errors'][-1]['rms_error_k']:,.0f}")),
+    ]
+    for k, found in enumerate(priors[0]["snr"]):
+        name = f"SNR at ell {found['ell']}"
+        rows.append((name, *each(lambda one, k=k: f"{one['snr'][k]['snr']:.1f}")))
+    return rows
+
+
+def _numbers(values: Sequence[float]) -> list[str]:
+    return [f"{value:.1f}" for value in values]
+
+
+def _less_best(values: Sequence[float]) -> list[str]:
+    return [f"{value - max(values):.1f}" for value in values]
+
+
+def _of(chi2: float, degrees: float) -> str:
+    return f"{chi2:.0f} of {degrees:.0f}"

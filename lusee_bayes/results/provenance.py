@@ -7,9 +7,8 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from lusee_bayes.core.command_line import COMMAND
 from lusee_bayes.core.reading import read_json
-from lusee_bayes.core.version import release
+from lusee_bayes.core.version import COMMAND, release
 from lusee_bayes.experiment.data_files import Data, names_of_data
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario

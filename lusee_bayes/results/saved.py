@@ -121,6 +121,7 @@ CUBE_SUMMARY = Layout(
     attributes={
         "level": LEVEL,
         "verdict": TEXT,
+        "log_evidence": NUMBER,
         "n_data": COUNT,
         "n_modes": COUNT,
         "peak_memory_gb": NUMBER,
@@ -133,8 +134,7 @@ CHANNEL_SUMMARY = Layout(
         "n_data": COUNT,
         "n_missing": COUNT,
         "instrument_p": Attribute(low=0.0, high=1.0),
-        "chi2": NUMBER,
-        "chi2_expected": Attribute(optional=True),
+        **dict.fromkeys(("chi2", "chi2_expected"), NUMBER),
         "ell_cross": Attribute("integer", optional=True),
     },
 )
@@ -166,24 +166,6 @@ COVERAGE = Layout(
         **dict.fromkeys(("rms", "rms_scatter", "largest", "allowed"), NUMBER),
     },
 )
-SKIES = Layout(
-    "the coverage of given skies",
-    attributes={
-        "passed": Attribute("boolean"),
-        **dict.fromkeys(("verdict", "thresholds"), TEXT),
-        **dict.fromkeys(("frequency_mhz", "peak_memory_gb"), NUMBER),
-    },
-)
-SKY = Layout(
-    "the coverage of a given sky",
-    attributes={
-        "passed": Attribute("boolean"),
-        **dict.fromkeys(("name", "sentence"), TEXT),
-        **dict.fromkeys(("log_evidence", "chi2_model"), NUMBER),
-        "n_data": COUNT,
-        "level": LEVEL,
-    },
-)
 SKY_ERRORS = Layout(
     "the errors of a band of latitude",
     attributes={"name": TEXT, **dict.fromkeys(("rms_error_k", "std_over_sky"), NUMBER)},
@@ -199,14 +181,6 @@ PRIOR = Layout(
         "parameters": COUNT,
         "log_evidence": NUMBER,
         **{f"{x}_{y}": NUMBER for x in ("chi2", "degrees") for y in ("instrument", "prior")},
-    },
-)
-SAMPLED = Layout(
-    "an evidence by importance sampling",
-    attributes={
-        **dict.fromkeys(("log_evidence", "error", "effective"), NUMBER),
-        "draws": COUNT,
-        "trusted": Attribute("boolean"),
     },
 )
 HELD_OUT = Layout(

@@ -13,10 +13,9 @@ from jaxtyping import Float
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import recover
+from lusee_bayes.core.files import recover, user_path
+from lusee_bayes.core.formats import read_netcdf
 from lusee_bayes.core.harmonics import n_modes, power_spectrum
-from lusee_bayes.core.netcdf_files import read_netcdf
-from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import reading
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.posterior import Posterior

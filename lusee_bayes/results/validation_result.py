@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from math import ceil
+from dataclasses import dataclass
 
 import numpy as np
 
-from lusee_bayes.core.engine import Demand
-from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.levels import LEVELS
-from lusee_bayes.results.cost import demand_of, posterior_cost
 from lusee_bayes.results.sample_result import SampleResult
-from lusee_bayes.sampling.calibration import BATCH, N_DRAWS, Ranks
+from lusee_bayes.sampling.calibration import Ranks
 from lusee_bayes.sampling.validation import Check, Comparison
 
 
@@ -139,10 +135,3 @@ def allowed(check: Check) -> str:
     if check.lower == -check.upper:
         return f"+- {check.upper:.4g}"
     return f"{check.lower:.4g} to {check.upper:.4g}"
-
-
-def demand_of_calibration(scenario: Scenario, n_simulations: int) -> Demand:
-    """What simulation-based calibration takes, in batches that use all processors."""
-    demand = demand_of([posterior_cost(scenario, BATCH * N_DRAWS)])
-    n_batches = ceil(n_simulations / BATCH)
-    return replace(demand, n_tasks=n_batches, side_by_side=1)

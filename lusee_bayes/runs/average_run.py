@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from lusee_bayes.core.destinations import require_new
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import require_new, user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
 from lusee_bayes.experiment.data_files import Data, files_of, names_of_data, read_data
@@ -16,13 +15,13 @@ from lusee_bayes.experiment.setup import require_fitting, set_up
 from lusee_bayes.instrument.averaging import averaged, product_live_s
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.results.cost import require_resources
-from lusee_bayes.results.forecast import expected_posterior
+from lusee_bayes.runs.forecasting import expected_posterior
 from lusee_bayes.runs.origins import inputs_of
 
 
 @dataclass(frozen=True)
-class AverageRun:
-    """Data and their averages.
+class Averages:
+    """Data, their averages, and what these cost.
 
     Attributes
     ----------
@@ -73,7 +72,7 @@ def run_average(
     information: bool = True,
     replace: bool = False,
     stages: Stages | None = None,
-) -> AverageRun:
+) -> Averages:
     """Average data, write them whole or not at all, and work out what is lost.
 
     Parameters
@@ -134,7 +133,7 @@ def run_average(
             before = _bits(scenario, fine)
         with stages("and of the averages"):
             bits = (before, _bits(scenario, coarse))
-    return AverageRun(fine, coarse, bits)
+    return Averages(fine, coarse, bits)
 
 
 def _bits(scenario: Scenario, data: Visibilities) -> float:

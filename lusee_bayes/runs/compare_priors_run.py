@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.tables import write_csv
+from lusee_bayes.core.reading import write_csv
 from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import Experiment, observed, with_truth
-from lusee_bayes.experiment.learned_prior import about_sky, evidence_by_sampling, learned_prior
+from lusee_bayes.experiment.learned_prior import about_sky, learned_prior
 from lusee_bayes.experiment.named_priors import named_priors
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.linear.importance import LogMean, require_draws
 from lusee_bayes.linear.information import Information
 from lusee_bayes.report.figures import priors as prior_figures
 from lusee_bayes.results.cost import require_resources
@@ -24,6 +23,7 @@ from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
 from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.runs.folder import (
     Output,
+    Run,
     RunKind,
     require_marginal,
     require_single_frequency,
@@ -31,18 +31,6 @@ from lusee_bayes.runs.folder import (
     write_run,
 )
 from lusee_bayes.runs.origins import inputs_of, origin_of
-
-# draws of a prior's parameters
-DRAWS = 100
-
-
-@dataclass(frozen=True)
-class ComparePriorsRun:
-    """A finished comparison: its result, its folder and the files in it."""
-
-    result: PriorComparison
-    folder: Path
-    files: list[Path]
 
 
 def run_compare_priors(
@@ -52,12 +40,11 @@ def run_compare_priors(
     *,
     data: Data | None = None,
     truth: bool = False,
-    draws: int = DRAWS,
     name: str = "the scenario",
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> ComparePriorsRun:
+) -> Run[PriorComparison]:
     """Map one data set under several priors, and say which of them it prefers.
 
     A, N and the data are the same for all; what :func:`run_map` would find is found for each. The
@@ -75,8 +62,6 @@ def run_compare_priors(
         Visibilities to map; without them the scenario's own are simulated.
     truth : bool
         The given data are of the scenario's own sky.
-    draws : int
-        Of learned parameters, for importance sampling; 0 for none.
     name : str
         Of the scenario, for the title.
     engine : Engine, optional
@@ -96,12 +81,10 @@ def run_compare_priors(
     engine, stages = engine or ThisProcess(side_by_side=1), stages or Stages()
     require_single_frequency("compare-priors", bool(scenario.frequencies_mhz))
     require_marginal("compare-priors", "set treatment=marginalised", scenario.samples)
-    if draws:
-        require_draws(draws)
     sections = named_priors(priors, scenario, known_sky=data is None or truth)
     sections = {name: section.anchored() for name, section in sections.items()}
     names = ",".join(sections)
-    origin = origin_of(scenario, data, truth=truth or None, priors=names, draws=draws)
+    origin = origin_of(scenario, data, truth=truth or None, priors=names)
     with run_folder(
         folder, COMPARE_PRIORS, origin, replace=replace, inputs=inputs_of(scenario, data)
     ) as place:
@@ -115,31 +98,24 @@ def run_compare_priors(
 
         def under(prior: str) -> UnderPrior:
             setup = experiment.setup.with_prior(sections[prior])
-            return _under(prior, setup, experiment, information, draws)
+            return _under(prior, setup, experiment, information)
 
         engine.work_in(place)
         found = engine.each(Tasks(under, list(sections), list(sections)), stages, "priors")
         result = PriorComparison(name, scenario, tuple(found), stages.seconds)
         provenance = Provenance.of_experiment(experiment, data)
-        files = write_run(place, result, COMPARE_PRIORS, origin, stages, provenance)
-        return ComparePriorsRun(result, place, files)
+        return write_run(place, result, COMPARE_PRIORS, origin, stages, provenance)
 
 
-def _under(
-    name: str, setup: Setup, experiment: Experiment, information: Information, draws: int
-) -> UnderPrior:
+def _under(name: str, setup: Setup, experiment: Experiment, information: Information) -> UnderPrior:
     """What the data say under one prior, or a family of them."""
     if setup.family is None:
         evidence = float(information.posterior(setup.prior).log_evidence)
-        return UnderPrior.of(name, replace(experiment, setup=setup), evidence, None)
+        return UnderPrior.of(name, replace(experiment, setup=setup), evidence)
     learned = learned_prior(setup, setup.family, information)
-    sampled: LogMean | None = None
-    if draws:
-        seed = setup.scenario.seed
-        sampled = evidence_by_sampling(setup.family, information, learned, draws, seed)
     setup = replace(setup, prior=learned.prior)
     mapped = replace(experiment, setup=setup, learned=learned)
-    return UnderPrior.of(name, mapped, learned.log_evidence, sampled)
+    return UnderPrior.of(name, mapped, learned.log_evidence)
 
 
 def _write_texts(result: PriorComparison, folder: Path) -> None:

@@ -3,25 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.tables import write_csv
+from lusee_bayes.core.reading import write_csv
 from lusee_bayes.report.comparison_page import comparison_page
 from lusee_bayes.report.figures import comparison as comparison_figures
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, read_runs
-from lusee_bayes.runs.folder import FIGURES, Output, RunKind, run_folder, write_run
+from lusee_bayes.runs.folder import FIGURES, Output, Run, RunKind, run_folder, write_run
 from lusee_bayes.runs.origins import origin_of
-
-
-@dataclass(frozen=True)
-class ComparisonRun:
-    """A finished comparison: the runs that were compared, the folder and the files in it."""
-
-    runs: list[FinishedRun]
-    folder: Path
-    files: list[Path]
 
 
 def run_compare(
@@ -30,7 +20,7 @@ def run_compare(
     *,
     replace: bool = False,
     stages: Stages | None = None,
-) -> ComparisonRun:
+) -> Run[list[FinishedRun]]:
     """Set finished map runs side by side, and write page, table and figures in one transaction.
 
     Parameters
@@ -52,8 +42,7 @@ def run_compare(
     stages = stages or Stages()
     origin = origin_of()
     with run_folder(folder, COMPARISON, origin, replace=replace, inputs=folders) as place:
-        runs = read_runs(folders)
-        return ComparisonRun(runs, place, write_run(place, runs, COMPARISON, origin, stages))
+        return write_run(place, read_runs(folders), COMPARISON, origin, stages)
 
 
 def _write_page(runs: list[FinishedRun], folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Sessions of the spectrometer, simulated, in files of luseepy's layouts."""
+"""Sessions of the spectrometer, simulated, in files of luseepy's layout."""
 
 from __future__ import annotations
 
@@ -8,17 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from astropy.time import Time
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import transaction
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import transaction, user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.instrument.flight.clock import Clock
-from lusee_bayes.instrument.flight.gain_files import write_gain_table
-from lusee_bayes.instrument.flight.session_writing import write_session
+from lusee_bayes.flight.clock import Clock
+from lusee_bayes.flight.gain_model import write_gain_table
+from lusee_bayes.flight.session_files import write_session
 from lusee_bayes.runs.folder import RunKind, run_folder
 from lusee_bayes.runs.origins import inputs_of, origin_of
 
@@ -114,7 +112,6 @@ def _simulated(
                     made.rows(session),
                     _told(made.blocks(session), session.start, done),
                     kind=made.section.kind,
-                    layout=made.section.layout,
                 )
     paths = tuple(folder / name for name in names)
     return FlightFiles(paths, folder / SCENARIO, made.observation.n_times)
@@ -165,11 +162,10 @@ def _to_be_mapped(made: FlightSimulation, folder: Path) -> Scenario:
 
 
 def _clock_text(clock: Clock) -> str:
-    time = Time(clock.jd1, clock.jd2, format="jd", scale=clock.scale)
     record = {
         "format_version": 1,
         "reference_event": "simulated",
-        "clock_reference_isot": str(time.isot),
+        "clock_reference_isot": clock.isot,
         "time_scale": clock.scale,
         "clocks": {"spectrometer": {"clock_reference_raw_seconds": clock.raw_s}},
         "source": "simulated",

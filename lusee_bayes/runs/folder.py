@@ -6,15 +6,21 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from matplotlib.figure import Figure
 
-from lusee_bayes.core.compilation_cache import publish, use_compilation_cache
-from lusee_bayes.core.destinations import locked, require_folder
+from lusee_bayes.core.arrays import use_compilation_cache
 from lusee_bayes.core.errors import InputError, WorkersLost
-from lusee_bayes.core.files import MANIFEST, recover, require_apart, transaction
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import (
+    MANIFEST,
+    locked,
+    recover,
+    require_apart,
+    require_folder,
+    transaction,
+    user_path,
+)
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.report.figures.drawing import save
 from lusee_bayes.report.pages import PAGES, REPORT
@@ -22,10 +28,29 @@ from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.runs.origins import Origin, require_own
 
 FIGURES = "figures"
+Result = TypeVar("Result")
 
 
 class RunInterrupted(KeyboardInterrupt):
     """A run was interrupted; the message says what its folder holds."""
+
+
+@dataclass(frozen=True)
+class Run(Generic[Result]):
+    """A finished run.
+
+    Attributes
+    ----------
+    result : object
+        What it has found.
+    folder : Path
+    files : list of Path
+        What was written.
+    """
+
+    result: Result
+    folder: Path
+    files: list[Path]
 
 
 @dataclass(frozen=True)
@@ -133,8 +158,6 @@ def run_folder(
             except WorkersLost as error:
                 state = _state(folder, before, kind.unfinished, resume)
                 raise WorkersLost(f"{error}; {state}") from error
-            finally:
-                publish()
     finally:
         # nothing written: nothing left
         for place in ([folder / kind.unfinished] if kind.unfinished else []) + made:
@@ -167,12 +190,12 @@ def _state(folder: Path, before: int | None, unfinished: str, resume: str) -> st
 
 def write_run(
     folder: Path,
-    result: Any,
+    result: Result,
     kind: RunKind,
     origin: Origin,
     stages: Stages,
     provenance: Provenance | None = None,
-) -> list[Path]:
+) -> Run[Result]:
     """Draw all figures and write all files of a run, in one transaction.
 
     Parameters
@@ -190,8 +213,8 @@ def write_run(
 
     Returns
     -------
-    list of Path
-        The files, in the folder.
+    Run
+        With the files in the folder.
     """
     discard = [kind.unfinished] if kind.unfinished else []
     with transaction(folder, kind.name, discard, origin) as stage:
@@ -211,7 +234,7 @@ def write_run(
                 page = PAGES[kind.name](stage, folder.resolve().name)
                 (stage / REPORT).write_text(page, encoding="utf-8")
         files = sorted(path.relative_to(stage) for path in stage.rglob("*") if path.is_file())
-    return [folder / name for name in files]
+    return Run(result, folder, [folder / name for name in files])
 
 
 def require_marginal(what: str, advice: str, samples: bool) -> None:

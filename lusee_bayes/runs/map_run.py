@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from dataclasses import replace as replace_fields
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from lusee_bayes.core.engine import Engine
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.tables import rows_of, write_csv
+from lusee_bayes.core.reading import rows_of, write_csv
 from lusee_bayes.experiment.data_files import (
     Data,
     are_sessions,
@@ -21,9 +20,7 @@ from lusee_bayes.experiment.data_files import (
 from lusee_bayes.experiment.experiment import Experiment, build, with_truth
 from lusee_bayes.experiment.flight_data import visibilities_of
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.instrument.flight.reduced import Reduced
-from lusee_bayes.instrument.flight.reduced_file import write_reduced
-from lusee_bayes.linear.compact import CompactPosterior
+from lusee_bayes.flight.reduced import Reduced, write_reduced
 from lusee_bayes.report.figures import channel as channel_figures
 from lusee_bayes.report.figures import cube as cube_figures
 from lusee_bayes.report.figures import diagnostics as diagnostic_figures
@@ -37,11 +34,12 @@ from lusee_bayes.results.cube_channels import cube_result
 from lusee_bayes.results.diagnostics_file import write_diagnostics
 from lusee_bayes.results.map_files import cards, write_cube, write_map
 from lusee_bayes.results.map_result import MapResult, map_result
-from lusee_bayes.results.posterior_file import about, write_posterior
+from lusee_bayes.results.posterior_file import write_posterior
 from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.results.saved import REDUCED
 from lusee_bayes.runs.folder import (
     Output,
+    Run,
     RunKind,
     require_marginal,
     require_single_frequency,
@@ -50,24 +48,6 @@ from lusee_bayes.runs.folder import (
 )
 from lusee_bayes.runs.origins import inputs_of, origin_of
 from lusee_bayes.sky import write_alms
-
-
-@dataclass(frozen=True)
-class MapRun:
-    """A finished map run.
-
-    Attributes
-    ----------
-    result : MapResult or CubeResult
-        Of one frequency, or of several.
-    folder : Path
-    files : list of Path
-        What was written.
-    """
-
-    result: MapResult | CubeResult
-    folder: Path
-    files: list[Path]
 
 
 def run_map(
@@ -81,7 +61,7 @@ def run_map(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> MapRun:
+) -> Run[MapResult | CubeResult]:
     """Make a posterior map of a scenario, or of given data, and write its folder.
 
     The folder is written in one transaction. A run of several frequencies that was stopped goes on
@@ -121,7 +101,6 @@ def run_map(
         return _run_single(scenario, folder, data, truth, onto, diagnosed, replace, stages)
     output = scenario.output
     require_single_frequency("--covariance", output.covariance)
-    require_single_frequency("--compact", output.compact)
     require_single_frequency("--updatable", output.updatable)
     require_single_frequency("--onto", onto is not None)
     require_single_frequency("--diagnose", diagnosed)
@@ -136,7 +115,7 @@ def run_map(
         cube = cube_result(scenario, place, data=file, truth=truth, engine=engine, stages=stages)
         cube = replace_fields(cube, reduced=reduced)
         provenance = _provenance_of_channels(scenario, data, cube)
-        return MapRun(cube, place, write_run(place, cube, CUBE, origin, stages, provenance))
+        return write_run(place, cube, CUBE, origin, stages, provenance)
 
 
 def _run_single(
@@ -148,7 +127,7 @@ def _run_single(
     diagnosed: bool,
     replace: bool,
     stages: Stages,
-) -> MapRun:
+) -> Run[MapResult | CubeResult]:
     origin = origin_of(scenario, data, truth=truth or None, onto=onto)
     inputs = inputs_of(scenario, data, onto)
     with run_folder(folder, MAP, origin, replace=replace, inputs=inputs) as place:
@@ -165,7 +144,7 @@ def _run_single(
         if reduced is not None:
             result = replace_fields(result, reduced=_as_used(reduced, experiment))
         provenance = Provenance.of_experiment(experiment, data)
-        return MapRun(result, place, write_run(place, result, MAP, origin, stages, provenance))
+        return write_run(place, result, MAP, origin, stages, provenance)
 
 
 def _as_used(reduced: Reduced, experiment: Experiment) -> Reduced:
@@ -215,11 +194,6 @@ def _write_coefficients(result: MapResult, folder: Path) -> None:
     write_alms(folder / "mean_alm.fits", result.channel.mean, header)
 
 
-def _write_compact(result: MapResult, folder: Path) -> None:
-    compact = CompactPosterior.of(result.inference.posterior)
-    compact.write(folder / "posterior_compact.npz", about(result.scenario))
-
-
 def _write_reduced(result: MapResult | CubeResult, folder: Path) -> None:
     write_reduced(folder / REDUCED, result.reduced, result.scenario.to_yaml())
 
@@ -260,7 +234,6 @@ MAP = RunKind(
         Output(lambda result, folder: write_posterior(result, folder / "posterior.nc")),
         Output(_write_maps),
         Output(_write_coefficients),
-        Output(_write_compact, wanted=lambda result: result.scenario.output.compact),
         Output(
             lambda result, folder: write_csv(
                 folder / "spectra.csv", rows_of(result.channel.spectra())

@@ -11,37 +11,16 @@ from pathlib import Path
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.tables import write_csv
+from lusee_bayes.core.reading import write_csv
 from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios, read_case
 from lusee_bayes.paper.claim_table import claim_table, claims_as_markdown
 from lusee_bayes.paper.claims import Cases
 from lusee_bayes.paper.figures import FIGURES
-from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
+from lusee_bayes.runs.folder import Output, Run, RunKind, run_folder, write_run
 from lusee_bayes.runs.origins import origin_of
 
 CASES, UNFINISHED = "cases", "unfinished-cases"
 RESUME = "the same command continues from the finished cases"
-
-
-@dataclass(frozen=True)
-class PaperRun:
-    """The paper's cases.
-
-    Attributes
-    ----------
-    cases : mapping
-        Datasets (:func:`.compute_case`) by name.
-    claims : list of dict
-        The paper's claims with their verdicts, a row each.
-    folder : Path
-    files : list of Path
-        What was written.
-    """
-
-    cases: Cases
-    claims: list[dict[str, object]]
-    folder: Path
-    files: list[Path]
 
 
 @dataclass(frozen=True)
@@ -59,7 +38,7 @@ def run_paper(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> PaperRun:
+) -> Run[Cases]:
     """Compute what is missing of the paper's cases, then draw the figures and judge the claims.
 
     Cases that were computed before with the same scenario and version are kept. The folder changes
@@ -109,8 +88,8 @@ def run_paper(
         engine.each(Tasks(compute, names, names), stages, "cases")
         paths = {name: path_of(name) for name in names}
         cases = {name: read_case(path) for name, path in paths.items()}
-        files = write_run(place, _Computed(cases, paths), PAPER, origin, stages)
-        return PaperRun(cases, claim_table(cases), place, files)
+        run = write_run(place, _Computed(cases, paths), PAPER, origin, stages)
+        return Run(cases, place, run.files)
 
 
 def _write_cases(computed: _Computed, folder: Path) -> None:

@@ -3,32 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
 from lusee_bayes.core.engine import Engine, ThisProcess
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.reading import naming
-from lusee_bayes.core.tables import write_csv
+from lusee_bayes.core.reading import naming, write_csv
 from lusee_bayes.report.figures import plan as plan_figures
 from lusee_bayes.results.cost import posterior_cost, require_fits
 from lusee_bayes.results.forecast import Forecast, Variation, forecast_rows
 from lusee_bayes.results.forecasts import ForecastFiles, forecasts_of
-from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
+from lusee_bayes.runs.folder import Output, Run, RunKind, run_folder, write_run
 from lusee_bayes.runs.origins import inputs_of, origin_of
 
 UNFINISHED = "unfinished-forecasts"
 RESUME = "the same command continues from the finished forecasts"
-
-
-@dataclass(frozen=True)
-class PlanRun:
-    """A finished plan: a forecast for every variation, the folder and the files in it."""
-
-    forecasts: list[Forecast]
-    folder: Path
-    files: list[Path]
 
 
 def run_plan(
@@ -38,7 +27,7 @@ def run_plan(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> PlanRun:
+) -> Run[list[Forecast]]:
     """Forecast the information in every variation, and write table and figure in one transaction.
 
     A plan that was stopped goes on with the same call.
@@ -74,7 +63,7 @@ def run_plan(
         engine.work_in(place)
         files = ForecastFiles((place / UNFINISHED).resolve())
         forecasts = forecasts_of(variations, files, engine, stages)
-        return PlanRun(forecasts, place, write_run(place, forecasts, PLAN, origin, stages))
+        return write_run(place, forecasts, PLAN, origin, stages)
 
 
 # what the folder of a plan holds; a new file is one line here

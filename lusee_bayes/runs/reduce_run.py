@@ -3,38 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from lusee_bayes.core.destinations import require_new
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import require_new, user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.instrument.flight.reduced import Reduced
-from lusee_bayes.instrument.flight.reduced_file import write_reduced
+from lusee_bayes.flight.reduced import Reduced, write_reduced
 from lusee_bayes.runs.origins import inputs_of
-
-
-@dataclass(frozen=True)
-class ReduceRun:
-    """Reduced spectra, and the file that they are in.
-
-    Attributes
-    ----------
-    reduced : Reduced
-    path : Path
-    """
-
-    reduced: Reduced
-    path: Path
-
-    def lines(self) -> list[str]:
-        """Return what there is to say about it."""
-        return reduced_lines(self.reduced)
 
 
 def reduced_lines(reduced: Reduced) -> list[str]:
@@ -55,7 +34,7 @@ def run_reduce(
     *,
     replace: bool = False,
     stages: Stages | None = None,
-) -> ReduceRun:
+) -> Reduced:
     """Reduce sessions to the scenario's frequencies, and write them whole or not at all.
 
     Parameters
@@ -87,4 +66,4 @@ def run_reduce(
         )
     with stages("file"):
         write_reduced(path, reduced, scenario.to_yaml())
-    return ReduceRun(reduced, path)
+    return reduced

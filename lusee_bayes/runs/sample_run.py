@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import build
@@ -19,9 +18,10 @@ from lusee_bayes.report.figures import samples as sample_figures
 from lusee_bayes.results.cost import require_resources
 from lusee_bayes.results.map_files import write_cube, write_map
 from lusee_bayes.results.provenance import Provenance
-from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult, sample_result
-from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
+from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult
+from lusee_bayes.runs.folder import Output, Run, RunKind, run_folder, write_run
 from lusee_bayes.runs.origins import inputs_of, origin_of
+from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling.datatree import write_datatree
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.programs import Program, load_program
@@ -29,37 +29,9 @@ from lusee_bayes.sampling.programs import Program, load_program
 RESUME = "go on with --resume"
 
 
-@dataclass(frozen=True)
-class SampleRun:
-    """A finished sampling run.
-
-    Attributes
-    ----------
-    results : tuple of SampleResult
-        One for each frequency.
-    folder : Path
-    files : list of Path
-        What was written.
-    """
-
-    results: tuple[SampleResult, ...]
-    folder: Path
-    files: list[Path]
-
-
 def default_program(scenario: Scenario) -> Program:
-    """``log_normal`` under such a prior, ``systematics`` where something is sampled, or ``sky``.
-
-    InputError for a log-normal prior with something else to sample.
-    """
-    if scenario.prior.model != "lognormal":
-        return load_program("systematics" if scenario.samples else "sky")
-    if scenario.samples:
-        raise InputError(
-            "with prior.model=lognormal the sky and its prior are sampled, and nothing else; set "
-            "treatment=marginalised, or give a program of your own"
-        )
-    return load_program("log_normal")
+    """``systematics`` where something is sampled, or ``sky``."""
+    return load_program("systematics" if scenario.samples else "sky")
 
 
 def run_sample(
@@ -72,7 +44,7 @@ def run_sample(
     resume: bool = False,
     replace: bool = False,
     stages: Stages | None = None,
-) -> SampleRun:
+) -> Run[tuple[SampleResult, ...]]:
     """Sample the posterior of a program, and write the folder in one transaction.
 
     Several frequencies are sampled one after the other, each in a folder of its own, and their maps
@@ -122,9 +94,9 @@ def run_sample(
             where = place / f"{channel.frequency_mhz:.15g}MHz"
             own = Stages(stages.console, verbose=stages.verbose)
             runs.append(_run_single(channel, where, program, sampler, data, resume, replace, own))
-        results = tuple(result for run in runs for result in run.results)
-        files = write_run(place, (scenario, results), CUBES, origin, stages)
-        return SampleRun(results, place, [*(f for run in runs for f in run.files), *files])
+        results = tuple(result for run in runs for result in run.result)
+        cubes = write_run(place, (scenario, results), CUBES, origin, stages)
+        return Run(results, place, [*(f for run in runs for f in run.files), *cubes.files])
 
 
 def sample_origin(scenario: Scenario, data: Data | None, program: Program) -> dict[str, str]:
@@ -141,7 +113,7 @@ def _run_single(
     resume: bool,
     replace: bool,
     stages: Stages | None,
-) -> SampleRun:
+) -> Run[tuple[SampleResult, ...]]:
     stages = stages or Stages()
     origin = sample_origin(scenario, data, program)
     inputs = inputs_of(scenario, data, program.path)
@@ -151,8 +123,8 @@ def _run_single(
         experiment = build(scenario, measured, stages)
         result = sample_result(experiment, program, sampler, place, resume=resume, stages=stages)
         provenance = Provenance.of_experiment(experiment, data)
-        files = write_run(place, result, SAMPLE, origin, stages, provenance)
-        return SampleRun((result,), place, files)
+        run = write_run(place, result, SAMPLE, origin, stages, provenance)
+        return Run((result,), place, run.files)
 
 
 def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Path) -> None:

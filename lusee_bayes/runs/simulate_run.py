@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lusee_bayes.core.destinations import require_new
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import require_new, user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.experiment import Experiment, simulated
 from lusee_bayes.experiment.scenario import Scenario, load_scenario

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 from lusee_bayes.core.engine import Engine
@@ -14,25 +13,17 @@ from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.report.figures import samples as sample_figures
 from lusee_bayes.results.cost import require_resources
 from lusee_bayes.results.provenance import Provenance
-from lusee_bayes.results.sample_result import CHAINS, sample_result
+from lusee_bayes.results.sample_result import CHAINS
 from lusee_bayes.results.validation_result import ValidationResult
-from lusee_bayes.runs.folder import Output, RunKind, run_folder, write_run
+from lusee_bayes.runs.folder import Output, Run, RunKind, run_folder, write_run
 from lusee_bayes.runs.origins import inputs_of
 from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_origin
+from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling.calibration import calibrate_sky
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.least import require_draws, require_simulations
 from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.validation import validate_draws
-
-
-@dataclass(frozen=True)
-class ValidationRun:
-    """A finished validation: its result, its folder and the files in it."""
-
-    result: ValidationResult
-    folder: Path
-    files: list[Path]
 
 
 def run_validate(
@@ -47,7 +38,7 @@ def run_validate(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> ValidationRun:
+) -> Run[ValidationResult]:
     """Check the analytic posterior of a scenario by HMC and by simulated data sets.
 
     The folder is written in one transaction.
@@ -110,8 +101,7 @@ def run_validate(
         )
         result = ValidationResult(name, sampled, found, ranks)
         provenance = Provenance.of_experiment(experiment, data)
-        files = write_run(place, result, VALIDATION, origin, stages, provenance)
-        return ValidationRun(result, place, files)
+        return write_run(place, result, VALIDATION, origin, stages, provenance)
 
 
 def _of_sampled(output: Output) -> Output:

@@ -27,7 +27,6 @@ from numpyro.infer.util import potential_energy
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.linear.importance import LogMean
 from lusee_bayes.sampling.mode import LaplaceApproximation, laplace_approximation
 from lusee_bayes.sampling.programs import Program
 from lusee_bayes.sampling.promotion import numpyro_promotion
@@ -94,8 +93,11 @@ def estimate_evidence(
     laplace = laplace_approximation(program.model, arguments).require_converged()
     with numpyro_promotion():
         weights = np.asarray(_log_weights(program, arguments, laplace, n, jax.random.key(seed)))
-    found = LogMean.of(weights)
-    return Evidence(found.value, found.error, found.effective, laplace)
+    largest, relative = weights.max(), np.exp(weights - weights.max())
+    error = relative.std(ddof=1) / relative.mean() / np.sqrt(n)
+    effective = relative.sum() ** 2 / (relative**2).sum()
+    log_evidence = largest + np.log(relative.mean())
+    return Evidence(float(log_evidence), float(error), float(effective), laplace)
 
 
 @eqx.filter_jit

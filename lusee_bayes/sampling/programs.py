@@ -19,10 +19,10 @@ from jaxtyping import Float, Key, PRNGKeyArray
 from numpyro import handlers
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.command_line import printable
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import user_path
 from lusee_bayes.core.reading import read_text, require_file
+from lusee_bayes.core.version import printable
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.sampling.promotion import numpyro_promotion
 

@@ -16,12 +16,11 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_finite
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing
-from lusee_bayes.core.fits_files import is_fits, opened
+from lusee_bayes.core.files import replacing, user_path
+from lusee_bayes.core.formats import is_fits, opened
 from lusee_bayes.core.harmonics import from_healpy, lmax_of, n_modes, to_healpy
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import read_arrays
 from lusee_bayes.sky.files import SkyFile
 

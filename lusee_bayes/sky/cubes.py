@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.fits_files import is_fits, opened
+from lusee_bayes.core.formats import is_fits, opened
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.sky.files import SkyFile, modes_of_map

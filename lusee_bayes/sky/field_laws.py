@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.sky.learned_spectrum import PIVOT
 from lusee_bayes.sky.positive_skies import PositiveSkies
+from lusee_bayes.sky.prior_family import PIVOT
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 # A of each field, whose rms over the sky is seven times that, and the width of its mean: a template

@@ -16,20 +16,16 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.special import log_ndtr
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import is_traced, require_finite, require_positive
+from lusee_bayes.core.checks import Described, extent, is_traced, require_finite, require_positive
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import mode_numbers, modes_to_map, n_modes, per_mode
-from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.representation import Described, extent
+from lusee_bayes.core.harmonics import mode_numbers, n_modes, per_mode
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.sky.bright_sources import PointSource
-from lusee_bayes.sky.priors import DensePrior
 from lusee_bayes.sky.template import Template
 
 # band limit of the grid: this many times that of the map, and at least so much, since what the
@@ -77,19 +73,12 @@ class LogNormalSky(Described, eqx.Module):
         T on the grid, in K.
     source_modes : (sources, modes) array
         F_j y(n_j), in K.
-    template : Template
-        T in any direction.
-    sources : tuple of PointSource
-    frequency_mhz : float
     """
 
     spectrum: Float[Array, " ells"]
     grid: SphereGrid
     level: Float[Array, "rings phi"]
     source_modes: Float[Array, "sources modes"]
-    template: Template = eqx.field(static=True)
-    sources: tuple[PointSource, ...] = eqx.field(static=True)
-    frequency_mhz: float = eqx.field(static=True)
 
     @classmethod
     def of(
@@ -131,18 +120,14 @@ class LogNormalSky(Described, eqx.Module):
             grid,
             level,
             np.reshape(modes, (len(sources), n_modes(lmax))),
-            template,
-            sources,
-            float(frequency_mhz),
         )
 
     def description(self) -> tuple[str, ...]:
         return (
-            f"a template times exp of a Gaussian field, lmax = {self.lmax}, "
-            f"{self.frequency_mhz:g} MHz",
+            f"a template times exp of a Gaussian field, lmax = {self.lmax}",
             f"template {extent(self.level, 'K')}; C_ell of the logarithm "
             f"{extent(self.spectrum[1:], '')}",
-            f"{len(self.sources)} point sources; {self.size} white unknowns",
+            f"{len(self.source_modes)} point sources; {self.size} white unknowns",
         )
 
     @property
@@ -158,7 +143,7 @@ class LogNormalSky(Described, eqx.Module):
     @property
     def size(self) -> int:
         """Number of white unknowns: modes of the logarithm, then sources."""
-        return self.n_modes + len(self.sources)
+        return self.n_modes + len(self.source_modes)
 
     def with_power_law(
         self, amplitude: float | Float[Array, ""], tilt: float | Float[Array, ""]
@@ -182,7 +167,7 @@ class LogNormalSky(Described, eqx.Module):
     def root(self) -> Float[Array, " unknowns"]:
         """Return C^(1/2) of every mode of the logarithm, and 1 for every source."""
         xp = namespace(self.spectrum)
-        return xp.concatenate([xp.sqrt(per_mode(self.spectrum)), np.ones(len(self.sources))])
+        return xp.concatenate([xp.sqrt(per_mode(self.spectrum)), np.ones(len(self.source_modes))])
 
     def logarithm(self, white: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch modes"]:
         """Compute a, the modes of ln(sky / T) without sources."""
@@ -242,57 +227,6 @@ class LogNormalSky(Described, eqx.Module):
         slope = np.exp(-0.5 * eta**2 - log_ndtr(-eta)) / np.sqrt(2.0 * np.pi)
         matrix[:, self.n_modes :] = np.asarray(self.source_modes).T * slope
         return matrix
-
-    def linearised(self, white: Float[np.ndarray, " unknowns"]) -> DensePrior:
-        """Return the Gaussian prior that this one is to first order: m(u*) + J (u - u*).
-
-        Parameters
-        ----------
-        white : (unknowns,) array
-            u*.
-
-        Returns
-        -------
-        DensePrior
-            Of mean m(u*) - J u* and covariance J J^T, in NumPy's arrays.
-        """
-        jacobian = self.jacobian(white)
-        upper = np.linalg.qr(jacobian.T, mode="r")
-        upper *= np.where(np.diagonal(upper) < 0, -1.0, 1.0)[:, None]
-        mean = np.asarray(self.modes(np.asarray(white))) - jacobian @ white
-        return DensePrior(np.tril(upper.T), mean=mean)
-
-    def pixels(
-        self, white: Float[Array, "n unknowns"], nside: int
-    ) -> Float[np.ndarray, "n pixels"]:
-        """Compute the sky itself at the centres of HEALPix RING pixels: positive everywhere.
-
-        A source's flux is in the pixel that holds it.
-
-        Parameters
-        ----------
-        white : (n, unknowns) array
-            One u a row.
-        nside : int
-
-        Returns
-        -------
-        (n, pixels) array
-            In K.
-        """
-        white = np.asarray(white)
-        skies = self.template.pixels(nside)[None] * np.exp(
-            np.stack([modes_to_map(a, nside) for a in self.logarithm(white)])
-        )
-        for source, factor in zip(self.sources, self.source_factors(white).T, strict=True):
-            flux = factor * source.kelvin_steradian(self.frequency_mhz)
-            pixel = healpy.ang2pix(nside, *source.galactic(), lonlat=True)
-            skies[:, pixel] += flux / healpy.nside2pixarea(nside)
-        return skies
-
-    def sample(self, key, n: int) -> Float[Array, "n unknowns"]:
-        """Draw white unknowns of the prior."""
-        return jax.random.normal(key, (n, self.size), dtype=jnp.float64)
 
 
 def _require_power(spectrum: Float[Array, " ells"]) -> None:

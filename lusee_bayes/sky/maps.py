@@ -14,10 +14,9 @@ from astropy.io import fits
 from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.fits_files import is_fits, opened
-from lusee_bayes.core.hdf5_probe import require_readable_hdf5
+from lusee_bayes.core.files import user_path
+from lusee_bayes.core.formats import is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.layouts import Layout, Variable
-from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import reading
 from lusee_bayes.sky.files import SkyFile, modes_of_map
 

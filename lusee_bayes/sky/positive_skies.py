@@ -22,10 +22,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import require_positive, require_shape
+from lusee_bayes.core.checks import Described, extent, listed, require_positive, require_shape
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import n_modes
-from lusee_bayes.core.representation import Described, extent, listed
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.sky.bright_sources import FREE_FREE_SLOPE
 from lusee_bayes.sky.template import Template

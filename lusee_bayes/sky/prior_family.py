@@ -7,6 +7,10 @@ What learning theta needs of a family are S and sums over its derivatives, ::
 
 C being the posterior covariance. F is the covariance of g where the family holds, so that the
 Fisher information is the covariance of 1/2 h^T (dS / d theta_i) h over draws h ~ N(0, F).
+
+A C_ell that is learned has an amplitude, a tilt, a curvature and departures at half octaves, ::
+
+    ln C_ell = a + tilt x + curvature x^2 / 2 + sum_k d_k hat_k(x),    x = ln((ell + 1) / 10).
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -29,11 +34,29 @@ from scipy.special import (
     stdtrit,
 )
 
-from lusee_bayes.sky.priors import Prior
+from lusee_bayes.core.harmonics import per_mode, sum_over_m
+from lusee_bayes.sky.priors import HarmonicPrior, Prior
 
 # degrees of freedom of the parameters' Student distribution: near their centre they are held as by
 # a normal one of the same width, and a few may be far from it
 FREEDOM = 2.0
+
+# ell + 1 at which the amplitude is that of the spectrum
+PIVOT = 10.0
+# distance in ln(ell + 1) of the knots of departures
+SPACING = 0.5 * np.log(2.0)
+
+# Diffuse Galactic emission falls as ell^-2.4 to ell^-3.1 (La Porta et al. 2008, A&A 479, 641), with
+# little curvature. The hyperprior's tails leave room for skies that are unlike it.
+TILT, TILT_WIDTH = -2.7, 0.2
+CURVATURE_WIDTH = 0.3
+DEPARTURE_WIDTH = 0.15
+# standard deviation of ln C at the pivot: hardly anything is known
+LOG_AMPLITUDE_WIDTH = 6.0
+# standard deviation of the logarithm of C_0, which is not part of the spectrum's form
+LOG_MONOPOLE_WIDTH = 2.0
+# fluctuations relative to the mean, where the spectrum is started
+RELATIVE_STRENGTH = 0.05
 
 # variance of parameters' linear combinations, one a row
 Spread = Callable[[Float[np.ndarray, "rows parameters"]], Float[np.ndarray, " rows"]]
@@ -219,3 +242,122 @@ class PriorFamily(ABC):
         parameters : (parameters,) array
             Of ``coarse``.
         """
+
+
+@dataclass(frozen=True)
+class SpectrumBasis:
+    """ln C_ell as a linear function of its parameters.
+
+    Attributes
+    ----------
+    matrix : (ells, parameters) array
+    centre, width : (parameters,) array
+        What is expected of the parameters.
+    """
+
+    matrix: Float[np.ndarray, "ells parameters"]
+    centre: Float[np.ndarray, " parameters"]
+    width: Float[np.ndarray, " parameters"]
+
+    # of the parameters that are reported
+    names = ("ln C at ell = 9", "tilt", "curvature")
+
+    @classmethod
+    def around(cls, power: float, lmax: int) -> SpectrumBasis:
+        """Make the basis.
+
+        Parameters
+        ----------
+        power : float
+            Expected C_ell at the pivot, in K^2.
+        lmax : int
+        """
+        x = np.log((np.arange(lmax + 1) + 1.0) / PIVOT)
+        knots = np.arange(x[min(1, lmax)], x[-1] + SPACING, SPACING)
+        hats = np.maximum(0.0, 1.0 - np.abs(x[:, None] - knots) / SPACING)
+        matrix = np.column_stack([np.ones(lmax + 1), x, 0.5 * x**2, hats])
+        departures = np.full(len(knots), DEPARTURE_WIDTH)
+        return cls(
+            matrix,
+            np.concatenate([[np.log(power), TILT, 0.0], np.zeros(len(knots))]),
+            np.concatenate([[LOG_AMPLITUDE_WIDTH, TILT_WIDTH, CURVATURE_WIDTH], departures]),
+        )
+
+
+@dataclass(frozen=True)
+class IsotropicFamily(PriorFamily):
+    """S = diag(C_ell), with C_ell of :class:`SpectrumBasis` for ell > 0 and a C_0 of its own.
+
+    Attributes
+    ----------
+    spectrum : SpectrumBasis
+    log_monopole : float
+        Expected ln C_0.
+    """
+
+    spectrum: SpectrumBasis
+    log_monopole: float
+
+    @classmethod
+    def around(cls, temperature: float, lmax: int) -> IsotropicFamily:
+        """Make the family of skies of about a mean temperature, in K."""
+        power = 4.0 * np.pi * (RELATIVE_STRENGTH * temperature) ** 2 / 100.0
+        monopole = float(np.log(4.0 * np.pi * temperature**2))
+        return cls(SpectrumBasis.around(power, lmax), monopole)
+
+    @property
+    def hyperprior(self) -> Hyperprior:
+        return Hyperprior(
+            np.append(self.spectrum.centre, self.log_monopole),
+            np.append(self.spectrum.width, LOG_MONOPOLE_WIDTH),
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return SpectrumBasis.names
+
+    def at(self, parameters: Float[np.ndarray, " parameters"]) -> IsotropicMember:
+        return IsotropicMember(self, parameters)
+
+    def averaged(self, parameters, spread):
+        return np.diag(per_mode(np.exp(self.basis @ parameters + 0.5 * spread(self.basis))))
+
+    def prior(self, covariance):
+        lmax = self.basis.shape[0] - 1
+        return HarmonicPrior(np.diagonal(covariance)[np.arange(lmax + 1) ** 2].copy())
+
+    def start_from(self, coarse, parameters):
+        more = np.zeros(self.hyperprior.size - len(parameters))
+        return np.concatenate([parameters[:-1], more, parameters[-1:]])
+
+    @cached_property
+    def basis(self) -> Float[np.ndarray, "ells parameters"]:
+        """ln C_ell as a linear function of the parameters."""
+        form = self.spectrum.matrix.copy()
+        form[0] = 0.0
+        return np.column_stack([form, np.arange(len(form)) == 0])
+
+
+@dataclass(frozen=True)
+class IsotropicMember(Member):
+    """One prior of :class:`IsotropicFamily`."""
+
+    family: IsotropicFamily
+    parameters: Float[np.ndarray, " parameters"]
+
+    @cached_property
+    def spectrum(self) -> Float[np.ndarray, " ells"]:
+        """C_ell, in K^2."""
+        return np.exp(self.family.basis @ self.parameters)
+
+    @property
+    def covariance(self):
+        return np.diag(per_mode(self.spectrum))
+
+    def traces(self, matrix):
+        of_ells = sum_over_m(np.diagonal(matrix))
+        return self.family.basis.T @ (0.5 * self.spectrum * of_ells)
+
+    def forms(self, columns):
+        of_ells = sum_over_m((columns**2).T).T
+        return self.family.basis.T @ (0.5 * self.spectrum[:, None] * of_ells)

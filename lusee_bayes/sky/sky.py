@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import require_finite, require_float64
+from lusee_bayes.core.checks import Described, number, require_finite, require_float64
 from lusee_bayes.core.harmonics import lmax_of, power_spectrum
-from lusee_bayes.core.representation import Described, number
 
 
 class Sky(Described, eqx.Module):

@@ -17,10 +17,17 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import require_finite, require_float64, require_positive, require_shape
+from lusee_bayes.core.checks import (
+    Described,
+    extent,
+    listed,
+    require_finite,
+    require_float64,
+    require_positive,
+    require_shape,
+)
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import per_mode, power_spectrum
-from lusee_bayes.core.representation import Described, extent, listed
 from lusee_bayes.sky.priors import HarmonicPrior
 
 # spectra over the power law: x is frequency / reference, y frequency / turnover; ionised gas takes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.rotations import turn_about_z
+from lusee_bayes.core.harmonics import turn_about_z
 from lusee_bayes.instrument.beams import BeamSource, HemisphereGrid, Monopoles, stokes_beam
 from lusee_bayes.instrument.products import auto_indices, labels, to_matrix, to_real
 from lusee_bayes.testing.refusals import ROUNDING

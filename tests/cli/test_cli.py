@@ -141,7 +141,7 @@ def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
     assert again.sizes["draw"] == 3 and "covariance" in first and "covariance" not in again
 
 
-@pytest.mark.parametrize("flag", ["covariance", "compact", "updatable"])
+@pytest.mark.parametrize("flag", ["covariance", "updatable"])
 def test_options_of_the_output_reach_the_scenario(flag, monkeypatch):
     """What they make is tested beside run_map."""
     given = []

@@ -13,7 +13,7 @@ from rich.console import Console
 from lusee_bayes.cli.main import main
 from lusee_bayes.cli.options import show
 from lusee_bayes.cli.tables import checks_table, comparison_table
-from lusee_bayes.core.command_line import COMMAND
+from lusee_bayes.core.version import COMMAND
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
 from lusee_bayes.sampling.validation import Check
 

@@ -6,13 +6,13 @@ import sys
 
 import pytest
 
-from lusee_bayes.core.destinations import LOCK, locked, require_folder, require_target
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.files import LOCK, locked, require_folder, require_target
 
 HOLD = """
 import sys
 from pathlib import Path
-from lusee_bayes.core.destinations import locked
+from lusee_bayes.core.files import locked
 with locked(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.readline()

@@ -2,16 +2,18 @@
 
 import socketserver
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from lusee_bayes.core import workers
-from lusee_bayes.core.engine import Demand, Tasks, ThisProcess
+from lusee_bayes.core import engine
+from lusee_bayes.core.engine import Demand, Tasks, ThisProcess, open_engine
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.workers import open_engine, workers_that_pay
+
+DEMAND = Demand(base_bytes=1e9, task_bytes=1e9)
 
 
 def tasks_of(function, n):
@@ -33,9 +35,9 @@ def joined(a, b):
 @pytest.mark.parametrize("side_by_side", [1, 2, 5])
 @pytest.mark.parametrize("n", [1, 2, 3, 7, 12])
 def test_results_come_in_order_and_merge_as_a_tree(n, side_by_side):
-    engine = ThisProcess(side_by_side)
-    assert engine.each(tasks_of(lambda k: k * k, n), Stages(), "s") == [k * k for k in range(n)]
-    assert engine.reduced(tasks_of(str, n), joined, Stages(), "s") == tree([*map(str, range(n))])
+    found = ThisProcess(side_by_side)
+    assert found.each(tasks_of(lambda k: k * k, n), Stages(), "s") == [k * k for k in range(n)]
+    assert found.reduced(tasks_of(str, n), joined, Stages(), "s") == tree([*map(str, range(n))])
 
 
 def test_so_many_are_carried_out_at_a_time():
@@ -65,10 +67,11 @@ def test_a_failure_ends_the_stage():
         begun.append(k)
         if k == 1:
             raise InputError("of number 1")
+        time.sleep(0.2)
 
     with pytest.raises(InputError, match="of number 1"):
         ThisProcess(1).each(tasks_of(fail, 5), Stages(), "s")
-    assert begun == [0, 1]
+    assert begun[:2] == [0, 1] and len(begun) < 4
     assert ThisProcess().each(tasks_of(abs, 0), Stages(), "s") == []
     with pytest.raises(ValueError, match="2 items have 1 names"):
         Tasks(abs, [1, 2], ["one"])
@@ -76,63 +79,42 @@ def test_a_failure_ends_the_stage():
 
 @pytest.fixture
 def large(monkeypatch):
-    """A machine of 16 processors and 64 GB, without GPUs."""
-    monkeypatch.setattr(workers, "processors", lambda: 16)
-    monkeypatch.setattr(workers, "memory_limit", lambda: 64 * 10**9)
-    monkeypatch.setattr(workers, "_gpus", lambda: 0)
-
-
-@pytest.mark.usefixtures("large")
-def test_as_many_workers_as_pay():
-    demand = Demand(n_tasks=46, base_bytes=1e9, task_bytes=1e9, seconds=1000.0)
-    assert workers_that_pay(demand) == 4
-    assert workers_that_pay(replace(demand, seconds=30.0)) == 1
-    assert workers_that_pay(replace(demand, task_bytes=12e9)) == 2  # 25 GB each
-    assert workers_that_pay(replace(demand, n_tasks=5)) == 2
-    assert workers_that_pay(replace(demand, n_tasks=1)) == 1
-
-
-def test_every_gpu_has_a_worker(large, monkeypatch):
-    monkeypatch.setattr(workers, "_gpus", lambda: 3)
-    demand = Demand(n_tasks=46, base_bytes=1e9, task_bytes=1e9, seconds=1.0)
-    assert workers_that_pay(demand) == 3
-    for seen, devices in (("4,5,7", "457"), ("", "012")):
-        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", seen)
-        given = [workers._environment(k, 3)["CUDA_VISIBLE_DEVICES"] for k in range(3)]
-        assert given == list(devices)
-    assert workers._environment(0, 0) == {}
+    """A machine of 64 GB, without a cluster."""
+    monkeypatch.setattr(engine, "memory_limit", lambda: 64 * 10**9)
+    monkeypatch.delenv(engine.SCHEDULER, raising=False)
 
 
 @pytest.mark.usefixtures("large")
 def test_one_worker_is_this_process_which_needs_no_dask(monkeypatch):
-    demand = Demand(n_tasks=4, base_bytes=1e9, task_bytes=1e9, seconds=1.0)
-    monkeypatch.delenv(workers.SCHEDULER, raising=False)
-    monkeypatch.setattr(workers, "_dask_is_there", lambda: False)
+    monkeypatch.setattr(engine, "find_spec", lambda name: None)
     for n in (None, 1):
-        with open_engine(demand, n) as engine:
-            assert engine == ThisProcess(2)
+        with open_engine(DEMAND, n) as found:
+            assert found == ThisProcess(2)
     # two at a time would not fit
-    with open_engine(replace(demand, task_bytes=40e9)) as engine:
-        assert engine == ThisProcess(1)
+    with open_engine(replace(DEMAND, task_bytes=40e9)) as found:
+        assert found == ThisProcess(1)
     for given in ({"workers": 2}, {"cluster": "tcp://127.0.0.1:1"}):
         with (
-            pytest.raises(InputError, match=r"needs Dask; install it with pip install '\.\[clu"),
-            open_engine(demand, **given),
+            pytest.raises(InputError, match=r"need Dask; install it with pip install '\.\[clu"),
+            open_engine(DEMAND, **given),
         ):
             pass
 
 
-@pytest.mark.usefixtures("large")
-def test_what_cannot_be_started_is_refused():
-    demand = Demand(n_tasks=46, base_bytes=1e9, task_bytes=5e9, seconds=1000.0)
-    for given, message in (
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
         ({"workers": 2, "cluster": "tcp://x:1"}, "give one"),
-        ({"workers": 12}, "12 workers need about 72 GB of memory; this machine has 64 GB: use --w"),
-        ({"cluster": "nonsense:x"}, "'nonsense:x' is no address of a Dask scheduler .* as tcp://"),
-        ({"cluster": "tls://127.0.0.1:1"}, "needs certificates; name them in Dask's configuration"),
-    ):
-        with pytest.raises(InputError, match=message), open_engine(demand, **given):
-            pass
+        ({"workers": 12}, "12 workers need about 1.* GB of memory; this machine has .*: use fewer"),
+        ({"cluster": "nonsense:x"}, "no Dask scheduler answers at 'nonsense:x' .* as tcp://"),
+        ({"cluster": "tls://127.0.0.1:1"}, "no Dask scheduler answers .*TLS"),
+    ],
+)
+def test_what_cannot_be_started_is_refused(given, message):
+    pytest.importorskip("distributed")
+    demand = replace(DEMAND, task_bytes=1e13)
+    with pytest.raises(InputError, match=message), open_engine(demand, **given):
+        pass
 
 
 def test_sums_of_channels_are_added_and_not_changed():
@@ -158,8 +140,8 @@ def test_sums_of_channels_are_added_and_not_changed():
 )
 def test_what_is_no_scheduler_is_refused_in_seconds(answer, monkeypatch):
     """A Client would wait for ever, deaf to Ctrl-C, or ask for exabytes of memory."""
-    monkeypatch.setattr(workers, "ANSWER_S", 0.5)
-    demand = Demand(n_tasks=4, base_bytes=1e9, task_bytes=1e9, seconds=1.0)
+    dask_engine = pytest.importorskip("lusee_bayes.core.dask_engine")
+    monkeypatch.setattr(dask_engine, "ANSWER_S", 0.5)
 
     class Answer(socketserver.BaseRequestHandler):
         def handle(self):
@@ -172,7 +154,7 @@ def test_what_is_no_scheduler_is_refused_in_seconds(answer, monkeypatch):
         address = f"tcp://127.0.0.1:{server.server_address[1]}"
         with (
             pytest.raises(InputError, match="no Dask scheduler answers"),
-            open_engine(demand, cluster=address),
+            open_engine(DEMAND, cluster=address),
         ):
             pass
         server.shutdown()

@@ -8,9 +8,9 @@ import h5py
 import numpy as np
 import pytest
 
-from lusee_bayes.core import hdf5_probe
+from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.hdf5_probe import require_readable_hdf5
+from lusee_bayes.core.formats import require_readable_hdf5
 
 
 @pytest.fixture
@@ -26,8 +26,8 @@ def test_a_whole_file_is_readable(path):
 
 
 def test_a_file_without_end_is_refused(path, monkeypatch):
-    monkeypatch.setattr(hdf5_probe, "LIMIT_S", 0.2)
-    monkeypatch.setattr(hdf5_probe, "_read_all", lambda path, size: time.sleep(60))
+    monkeypatch.setattr(formats, "LIMIT_S", 0.2)
+    monkeypatch.setattr(formats, "_read_all", lambda path, size: time.sleep(60))
     start = time.monotonic()
     with pytest.raises(InputError, match="does not come to an end with it within 0.2 s"):
         require_readable_hdf5(path)
@@ -39,6 +39,6 @@ def test_a_file_that_ends_the_process_is_refused(path, monkeypatch):
         faulthandler.disable()  # of pytest, which would print where
         os.abort()
 
-    monkeypatch.setattr(hdf5_probe, "_read_all", end)
+    monkeypatch.setattr(formats, "_read_all", end)
     with pytest.raises(InputError, match="HDF5's library fails on it"):
         require_readable_hdf5(path)

@@ -18,7 +18,6 @@ from reference_linear import exact
 from scipy.linalg.lapack import dpotri
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.lapack import invert_factorised
 from lusee_bayes.core.linalg import (
     MAX_SUBSTITUTED,
     N_BLOCKS,
@@ -26,6 +25,7 @@ from lusee_bayes.core.linalg import (
     cholesky,
     gram_matrix,
     inverse_from_cholesky,
+    invert_factorised,
     invert_lower,
     outer_sandwich,
     precise_residual,

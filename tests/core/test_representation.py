@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import lusee_bayes as lb
-from lusee_bayes.core.representation import Described, listed
-from lusee_bayes.linear.compact import CompactPosterior
+from lusee_bayes.core.checks import Described, listed
 
 
 class Shown(Described):
@@ -40,7 +39,6 @@ def objects(small_map):
         "posterior": (inference.posterior, ["81 unknowns", "ln evidence", "bits"]),
         "experiment": (experiment, ["25 MHz", "lmax = 8", "monopole"]),
         "channel": (small_map.result.channel, ["25 MHz", "NSIDE", "mean", " K"]),
-        "compact": (CompactPosterior.of(inference.posterior), ["81 modes", "directions", " K"]),
         "result": (small_map.result, ["25 MHz", "chi2", "bits"]),
     }
 
@@ -49,7 +47,7 @@ def objects(small_map):
     "name",
     [
         *("data", "observation", "layout", "beams", "sky", "prior", "coupling", "noise"),
-        *("model", "posterior", "experiment", "result", "channel", "compact"),
+        *("model", "posterior", "experiment", "result", "channel"),
     ],
 )
 def test_objects_say_what_they_are(small_map, name):

@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from lusee_bayes.core import rotations as r
+from lusee_bayes.core import harmonics as r
 from lusee_bayes.core.harmonics import from_healpy, n_modes, synthesis_matrix, to_healpy
 
 LMAX = 10

@@ -8,7 +8,7 @@ from threading import Barrier, get_ident
 
 import pytest
 
-from lusee_bayes.core.threads import in_threads, once
+from lusee_bayes.core.engine import in_threads, once
 
 
 def test_results_come_in_the_order_of_the_items():

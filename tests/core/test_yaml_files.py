@@ -1,17 +1,13 @@
-"""YAML without what is misread: PyYAML agrees on all that is plain."""
-
-import re
+"""YAML: what is written comes back, plain values are what YAML 1.2 says, and errors are said."""
 
 import pytest
-import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.yaml_files import DEEPEST, parse_yaml, read_yaml
+from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
 
-# to PyYAML 1e6 is text, which it writes without quotes; here it is a number
-TEXT = st.text(max_size=10).filter(lambda text: not re.fullmatch(r"[-+]?\d+[eE][-+]?\d+", text))
+TEXT = st.text(max_size=10)
 LEAVES = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(allow_nan=False), TEXT)
 TREES = st.recursive(
     LEAVES,
@@ -20,18 +16,18 @@ TREES = st.recursive(
 )
 
 
-@settings(max_examples=200, database=None, deadline=None, derandomize=True)
+@settings(max_examples=50, database=None, deadline=None, derandomize=True)
 @given(TREES)
-def test_what_pyyaml_writes_comes_back(tree):
-    assert parse_yaml(yaml.safe_dump(tree), "the text") == tree
+def test_what_is_written_comes_back(tree):
+    assert parse_yaml(as_yaml(tree), "the text") == tree
 
 
 @pytest.mark.parametrize(
     ("text", "value"),
     [
-        ("1e6", 1e6), ("-1E-3", -1e-3), ("010", 10), ("1:30", "1:30"), ("0x10", "0x10"),
-        ("2027-02-30", "2027-02-30"), ("2027-01-15", "2027-01-15"), ("1_000", "1_000"),
-        ("\uff11\uff12", "\uff11\uff12"), (".5", 0.5), ("5.", 5.0), ("yes", True), ("~", None),
+        ("1e6", 1e6), ("-1E-3", -1e-3), ("010", 10), ("1:30", "1:30"), ("2027-02-30", "2027-02-30"),
+        ("2027-01-15T00:00:00Z", "2027-01-15T00:00:00Z"), (".5", 0.5), ("5.", 5.0), ("yes", "yes"),
+        ("true", True), ("~", None),
     ],
 )  # fmt: skip
 def test_numbers_are_decimal_and_dates_are_text(text, value):
@@ -42,17 +38,14 @@ def test_numbers_are_decimal_and_dates_are_text(text, value):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a: 1\nb: 2\na: 3", r"the key 'a' comes twice \(line 3\)"),
-        ("a: &x 1\nb: *x", "aliases are not supported"),
-        ("1: 2", "a key is no text"),
-        ("[1]: 2", "a key is no text"),
-        ("[" * (DEEPEST + 1) + "]" * (DEEPEST + 1), f"more than {DEEPEST} deep"),
+        ("a: 1\nb: 2\na: 3", r"duplicate key \"a\".* \(line 3\)"),
+        ("[" * 500 + "]" * 500, "is not valid YAML"),
         ("a: [1", "is not valid YAML"),
         ("!!python/object:os.system {}", "is not valid YAML"),
         ("a\0b", "is not valid YAML"),
     ],
 )
-def test_what_could_be_misread_is_refused(text, message):
+def test_what_is_not_valid_is_refused(text, message):
     with pytest.raises(InputError, match=message):
         parse_yaml(text, "the text")
 

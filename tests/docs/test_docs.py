@@ -11,12 +11,14 @@ import shlex
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
-import yaml
 from matplotlib.figure import Figure
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
+from lusee_bayes.core.harmonics import from_healpy
+from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.scenario import load_scenario, scenario_names
 
 ROOT = Path(__file__).parents[2]
@@ -82,8 +84,20 @@ def test_the_commands_of_the_readme_run(tmp_path, monkeypatch, no_figures):
             run_command(line)
 
 
+@pytest.mark.long
+def test_the_draws_of_the_readme_become_healpys(tmp_path, monkeypatch, no_figures):
+    blocks = [c for kind, c in FENCES.findall((ROOT / "README.md").read_text()) if kind == "python"]
+    (block,) = [b for b in blocks if "posterior.nc" in b]
+    monkeypatch.chdir(tmp_path)
+    run_command("lusee-bayes map fiducial --draws 100")
+    made = {}
+    exec(block, made)
+    assert len(made["skies"]) == 100
+    np.testing.assert_allclose(from_healpy(made["alm"]), made["skies"], rtol=1e-14)
+
+
 def test_the_citation_names_this_version():
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    citation = parse_yaml((ROOT / "CITATION.cff").read_text(), "the file")
     assert citation["cff-version"] == "1.2.0"
     # what the standard asks for
     assert {"authors", "message", "title"} <= set(citation)

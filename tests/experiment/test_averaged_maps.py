@@ -22,7 +22,7 @@ from lusee_bayes.experiment.simulate import simulate
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.results.forecast import expected_posterior
+from lusee_bayes.runs.forecasting import expected_posterior
 
 DRAWS = 12
 HOUR = 3600.0

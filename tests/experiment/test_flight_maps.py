@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
+from naive_flight import naive_band
 
 import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
@@ -14,19 +14,11 @@ from lusee_bayes.experiment.flight_data import per_kelvin_of, reduce_files
 from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.calibration import Calibration
-from lusee_bayes.instrument.flight import gain_files
 from lusee_bayes.instrument.products import auto_indices, labels
 from lusee_bayes.results.unknowns import unknowns_report
 from lusee_bayes.testing import assert_refused
 
 NAMES = "abcd"
-
-
-@pytest.fixture(scope="module")
-def flight(test_data):
-    if not (test_data / "flight").is_dir():
-        pytest.skip("no flight sessions")
-    return test_data / "flight"
 
 
 @pytest.fixture(scope="module")
@@ -75,34 +67,6 @@ def test_what_the_comb_spoils_and_nothing_else_is_left_out(mapped, truth):
     assert "3 of 124 times" in experiment.fitting.remark
 
 
-def naive_band(flight, name, row, navgf):
-    """A parabola through the channels about 10 MHz, and the variance of its middle."""
-    with h5py.File(flight / f"session_{name}.h5") as file:
-        counts = file["spectra/data"][row].astype(float)
-        codes = file["spectra/metadata/actual_gain"][row]
-        group = file["spectra_interpolated_telemetry"]
-        seen = {key: np.array([group[key][row]]) for key in group if not key.endswith("time")}
-    members = 0.025 * (navgf * np.arange(2048 // navgf)[:, None] + np.arange(navgf))
-    within = (np.abs(members - 10.0) <= 0.5 + 1e-9).all(axis=1)
-    if (name, row) in (("d", 4), ("d", 5)):
-        within &= np.arange(2048) % 4 != 2
-    table, gains = gain_files.read_gain_table(flight / "gain"), []
-    for port in range(4):
-        level = "LMH"[codes[port]]
-        basis = table.basis(level, port, members[within].ravel())
-        gain = basis[0] + table.strengths(level, port, seen)[0] @ basis[1:]
-        gains.append(gain.reshape(-1, navgf).mean(axis=1))
-    powers = np.stack([((members[within] - 10.0) ** k).mean(axis=1) for k in range(3)], axis=1)
-    weights = np.linalg.pinv(powers)[0]
-    values = {}
-    pairs = [(i, i, "R") for i in range(4)]
-    pairs += [(i, j, part) for i in range(4) for j in range(i + 1, 4) for part in "RI"]
-    for number, (i, j, part) in enumerate(pairs):
-        counted = counts[number, np.flatnonzero(within)]
-        values[f"{i}{j}{part}"] = weights @ (counted * 1e-18 / np.sqrt(gains[i] * gains[j]))
-    return [values[label] for label in labels()], 2.0**25 * navgf / (weights @ weights)
-
-
 def test_the_map_is_that_of_the_same_data_in_kelvin(flight, truth, mapped):
     """Data that are made by hand, a sum for each product, and know nothing of sessions."""
     _, found = mapped
@@ -111,7 +75,8 @@ def test_the_map_is_that_of_the_same_data_in_kelvin(flight, truth, mapped):
     bad = {(s, int(r)) for s, r in [*truth["comb"], *truth["saturated"]] if s == "c"}
     names = [(s, int(r)) for s, r in zip(truth["session"], truth["row"], strict=True)]
     keep = [k for k, name in enumerate(names) if name not in bad]
-    made = [naive_band(flight, *names[k], 4 if names[k][0] == "c" else 1) for k in keep]
+    combs = [("d", 4), ("d", 5)]
+    made = [naive_band(flight, *names[k], 10.0, comb=names[k] in combs) for k in keep]
     data = lb.Visibilities.from_arrays(
         np.array([values for values, _ in made]) / scale,
         truth["times_utc"][keep],
@@ -151,7 +116,7 @@ def test_the_known_sky_is_within_the_error_bars(mapped):
 def test_gains_that_are_off_are_found_and_the_map_holds(flight, monkeypatch):
     """Gains of every level of every port off by 1 %: the map is within wider error bars."""
     drawn = 1.0 + 0.01 * np.random.default_rng(4).standard_normal((3, 4))
-    original = gain_files.read_gain_table
+    original = gain_model.read_gain_table
 
     def off(path, model="quadratic"):
         table = original(path, model)
@@ -203,18 +168,12 @@ def test_beams_have_to_know_volts(flight):
     embedded = scenario_of(flight, "beam={model: monopole}", "noise.receiver=null")
     with pytest.raises(InputError, match="these beams know no volts"):
         read_data(files(flight)[:1], embedded)
-    said = scenario_of(
-        flight,
-        "beam={model: monopole}",
-        "noise.receiver=null",
-        "flight.per_kelvin_v2_hz=5.0e-23",
-    )
+    volts = "flight.per_kelvin_v2_hz=5.0e-23"
+    said = scenario_of(flight, "beam={model: monopole}", "noise.receiver=null", volts)
     data = read_data(files(flight)[:1], said)
     autos = data.grid()[auto_indices()]
     assert 1e5 < autos.min() < autos.max() < 2e5
-    assert_refused(
-        lambda: read_data(files(flight)[:1], scenario_of(flight, "flight.per_kelvin_v2_hz=5.0e-23"))
-    )
+    assert_refused(lambda: read_data(files(flight)[:1], scenario_of(flight, volts)))
 
 
 def test_a_session_is_given_once_and_other_files_are_not_mixed(flight):

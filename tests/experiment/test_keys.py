@@ -6,9 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
-import yaml
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.keys import keys_as_markdown, scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 
@@ -39,7 +39,7 @@ def leaves(tree, prefix=""):
 
 def test_every_key_of_a_written_scenario_is_listed_and_explained():
     scenario = load_scenario("fiducial", [*WITHIN.values(), "sky.sources=false"])
-    written = set(leaves(yaml.safe_load(scenario.to_yaml())))
+    written = set(leaves(parse_yaml(scenario.to_yaml(), "the file")))
     listed = {key.path for key in KEYS}
     parents = {path for path in written if any(p.startswith(f"{path}.") for p in listed)}
     assert written - parents <= listed

@@ -2,16 +2,16 @@
 
 import numpy as np
 import pytest
-import yaml
 from fits_files import write_images
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.reading import as_yaml, parse_yaml
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.schema import (
     FileSkySection,
     GalaxySection,
     IsotropicPriorSection,
-    ModulatedPriorSection,
+    LocalScalesPriorSection,
     MonopoleBeamSection,
     ResponseSection,
     ScalarBeamSection,
@@ -103,10 +103,10 @@ seed: 1
 
 def old_scenario(path, **changes):
     """The scenario of the old text with some sections' entries changed."""
-    tree = yaml.safe_load(OLD)
+    tree = parse_yaml(OLD, "the file")
     for section, entries in changes.items():
         tree[section] |= entries
-    path.write_text(yaml.safe_dump(tree))
+    path.write_text(as_yaml(tree))
     return load_scenario(path)
 
 
@@ -131,7 +131,7 @@ def test_the_old_fiducial_scenario_is_the_fiducial_scenario(tmp_path):
     assert found == load_scenario("fiducial", ["noise.radiometer.temperature=model"])
     assert found.prior == IsotropicPriorSection(spectrum="sky")
     # written again, it has no key of another kind
-    tree = yaml.safe_load(found.to_yaml())
+    tree = parse_yaml(found.to_yaml(), "the file")
     assert set(tree["beam"]) == set(MonopoleBeamSection.model_fields)
     assert set(tree["sky"]) == set(GalaxySection.model_fields)
     assert tree["prior"]["spectrum"] == "sky"
@@ -194,11 +194,11 @@ def test_the_sky_of_a_short_file(tmp_path, text, kind):
 
 def test_a_prior_takes_the_place_of_another(tmp_path):
     """``--set`` leaves the keys of the kind that was there, which the other kind drops."""
-    found = load_scenario("fiducial", ["prior.model=modulated", "prior.amplitude=0.03"])
-    assert found.prior == ModulatedPriorSection(amplitude=0.03)
+    found = load_scenario("fiducial", ["prior.model=local_scales", "prior.sources=false"])
+    assert found.prior == LocalScalesPriorSection(sources=False)
     (tmp_path / "again.yaml").write_text(found.to_yaml())
     assert load_scenario(tmp_path / "again.yaml") == found
-    plain = load_scenario("fiducial", ["prior.model=modulated"])
+    plain = load_scenario("fiducial", ["prior.model=local_scales"])
     (tmp_path / "plain.yaml").write_text(plain.to_yaml())
     back = load_scenario(tmp_path / "plain.yaml", ["prior.model=isotropic"])
     assert back == load_scenario("fiducial", ["prior.spectrum=learned"])
@@ -240,12 +240,12 @@ def test_the_file_tells_which_beams_they_are(tmp_path, response, scalar):
         (["sky.model=file"], "sky.file is missing"),
         (["prior.spectrum=maps"], "prior.spectrum is 'maps', but .*'learned' or 'sky'"),
         (["prior.model=gaussian"], "prior.model is 'gaussian', which is unknown"),
-        (["prior.amplitude=0.1"], "amplitude is an entry of model modulated, lognormal, not"),
+        (["prior.sources=false"], "sources is an entry of model local_scales, not of"),
         (
-            ["prior={model: modulated, scale: 2}"],
-            "scale is an entry of model isotropic, not of modulated",
+            ["prior={model: local_scales, scale: 2}"],
+            "scale is an entry of model isotropic, not of local_scales",
         ),
-        (["prior={model: modulated, amplitude: 0}"], "prior.amplitude is 0, but .*greater than 0"),
+        (["prior={model: isotropic, scale: 0}"], "prior.scale is 0, but .*greater than 0"),
         (["output.drawz=3"], "unknown key 'output.drawz'; did you mean 'draws'?"),
         (["output.draws=-1"], "output.draws is -1, but .*greater than or equal to 0"),
     ],

@@ -108,22 +108,3 @@ def test_many_frequencies_need_the_files_frequency():
         small_scenario(
             "prior.spectrum_file=a.txt", "frequencies_mhz=[10, 15, 20, 30]", "joint=true"
         )
-    with pytest.raises(InputError, match="say which in prior.file_frequency_mhz"):
-        small_scenario("prior={model: modulated, template: a.fits}", "frequencies_mhz=[10, 20]")
-
-
-def test_templates_of_files(files, tmp_path):
-    """The template of a prior is the file's map, at its frequency."""
-    _, pixels = files
-    text = "prior={model: modulated, amplitude: 0.04, template: mean.fits, file_frequency_mhz: 50}"
-    prior = small_scenario(text, lmax=LMAX).prior.prior(lb.galaxy_sky(25.0, LMAX))
-    np.testing.assert_allclose(prior.mean, 2**2.5 * map_to_modes(pixels, LMAX), rtol=1e-14)
-    deep = np.where(pixels < np.quantile(pixels, 0.1), -pixels, pixels)
-    healpy.write_map("deep.fits", deep, coord="G", column_units="K", dtype=np.float64)
-    text = "prior={model: modulated, amplitude: 0.04, template: deep.fits}"
-    with pytest.raises(InputError, match=r"the template must be positive.* smooth it"):
-        small_scenario(text, lmax=LMAX).prior.prior(lb.galaxy_sky(25.0, LMAX))
-    with pytest.raises(InputError, match="check prior.template"):
-        small_scenario("prior={model: modulated, amplitude: 0.04, template: no.fits}").prior.prior(
-            lb.galaxy_sky(25.0, LMAX)
-        )

@@ -1,9 +1,9 @@
 """Scenarios: defaults, overrides, round trip, and errors that help."""
 
 import pytest
-import yaml
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.keys import scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario, scenario_names
 from lusee_bayes.experiment.schema.section import FILES
@@ -101,20 +101,20 @@ def test_default_maps_have_two_pixels_for_each_ell():
 
 def test_yaml_of_the_package_holds_only_known_keys():
     for name in scenario_names():
-        assert yaml.safe_load(load_scenario(name).to_yaml())
+        assert parse_yaml(load_scenario(name).to_yaml(), "the file")
 
 
 def test_anchored_scenarios_name_the_same_files_in_any_folder(tmp_path, monkeypatch):
     settings = (
         "sky={model: file, file: a.fits}",
-        "prior={model: lognormal, template: b.fits}",
+        "prior={model: isotropic, mean_file: b.fits}",
         "observation.schedule=c.csv",
         "beam.file=d.nc",
     )
     scenario = load_scenario("fiducial", list(settings))
     monkeypatch.chdir(tmp_path)
     found = scenario.anchored()
-    names = found.sky.file, found.prior.template, found.observation.schedule, found.beam.file
+    names = found.sky.file, found.prior.mean_file, found.observation.schedule, found.beam.file
     assert names == tuple(str(tmp_path / name) for name in ("a.fits", "b.fits", "c.csv", "d.nc"))
     assert found.anchored() == found
     # what is no file has another name nowhere
@@ -126,5 +126,5 @@ def test_every_entry_that_names_a_file_is_known():
     keys = {entry.path.split(".")[-1] for entry in scenario_keys()}
     files = {key for key in keys if key == "file" or key.endswith("_file")}
     assert files <= set(FILES) and set(FILES) - files == {
-        *("schedule", "template", "clock", "gain_table", "lines"),
+        *("schedule", "clock", "gain_table", "lines"),
     }

@@ -10,8 +10,8 @@ from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.schedule_file import read_schedule
 from lusee_bayes.results.cost import posterior_cost, simulation_cost
-from lusee_bayes.results.forecast import forecast
 from lusee_bayes.results.variations import default_variations
+from lusee_bayes.runs.forecasting import forecast
 from lusee_bayes.runs.simulate_run import run_simulate
 
 STEP_S = 20000.0

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 
-from lusee_bayes.core.harmonics import mode_numbers
-from lusee_bayes.core.rotations import turn_about_z
+from lusee_bayes.core.harmonics import mode_numbers, turn_about_z
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.overrides import apply_override
 from lusee_bayes.experiment.scenario import Scenario

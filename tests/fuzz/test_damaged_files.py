@@ -13,6 +13,7 @@ from astropy.io import fits
 from changes import byte_changes, change_bytes, change_items, item_changes
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from layout_4 import write_layout_4
 from outcomes import SCALE, require_answer
 
 import lusee_bayes as lb
@@ -20,13 +21,12 @@ from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.flight.gain_model import read_gain_table
+from lusee_bayes.flight.reduced import read_reduced, write_reduced
+from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.instrument.beams import read_beam, sampled_beams, write_sampled_beams
-from lusee_bayes.instrument.flight.gain_files import read_gain_table
-from lusee_bayes.instrument.flight.reduced_file import read_reduced, write_reduced
-from lusee_bayes.instrument.flight.sessions import read_session
 from lusee_bayes.instrument.visibilities_file import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
-from lusee_bayes.linear.compact import read_compact
 from lusee_bayes.report.describe import describe
 from lusee_bayes.results.updatable import read_updatable
 from lusee_bayes.runs import folder as folder_module
@@ -77,7 +77,6 @@ READERS = {
     "updatable.nc": (describe, read_onto),
     "cube.nc": (describe,),
     "diagnostics.nc": (describe,),
-    "compact.npz": (describe, read_compact),
     "map.fits": (describe, read_sky),
     "cube.fits": (describe, read_sky),
     "alm.fits": (describe, read_sky),
@@ -86,7 +85,6 @@ READERS = {
     "session.h5": (describe, read_spectra),
     "session_4.h5": (describe, read_spectra),
     "session.fits": (describe, read_spectra),
-    "session_4.fits": (describe, read_spectra),
     "reduced.nc": (describe, lambda path: read_reduced(path).at(25.0, np.ones(4))),
     "gains.nc": (describe, read_gain_table),
 }
@@ -114,14 +112,12 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
     write_sampled_beams(folder / "sampled_fields.fits", sampled)
     products = sampled_beams([20.0, 30.0], products=np.ones((2, 4, 48)))
     write_sampled_beams(folder / "sampled_products.nc", products)
-    updatable = ["output={updatable: true, compact: true}"]
     with pytest.MonkeyPatch.context() as patch:
         # neither figures nor a page, which take longer than the map
         patch.setattr(map_run, "MAP", replace(map_run.MAP, figures={}))
         patch.setattr(folder_module, "PAGES", {})
-        run = lb.run_map(small_scenario(*updatable, lmax=2), folder / "run")
+        run = lb.run_map(small_scenario("output.updatable=true", lmax=2), folder / "run")
     shutil.copy(run.folder / "posterior.nc", folder / "updatable.nc")
-    shutil.copy(run.folder / "posterior_compact.npz", folder / "compact.npz")
     for name in ("posterior.nc", "diagnostics.nc"):
         shutil.copy(small_map.folder / name, folder / name)
     shutil.copy(small_map.folder / "mean.fits", folder / "map.fits")
@@ -138,13 +134,13 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
 
 def write_sessions(folder: Path) -> None:
     """Three spectra in every layout, and what is made of them."""
-    flight = "flight={per_kelvin_v2_hz: 1e-21, simulated: {layout: %d, kind: %s}}"
+    flight = "flight={per_kelvin_v2_hz: 1e-21, simulated: {kind: %s}}"
     size = ["observation.step_s=900", "observation.runs=[{cycles: 0.0012}]"]
-    for name in ("session.h5", "session_4.h5", "session_4.fits", "session.fits"):
-        layout, kind = 4 if "4" in name else 3, "fits" if name.endswith("fits") else "hdf5"
-        scenario = load_scenario("fiducial", ["lmax=2", *size, flight % (layout, kind)])
+    for name, kind in (("session.h5", "hdf5"), ("session.fits", "fits")):
+        scenario = load_scenario("fiducial", ["lmax=2", *size, flight % kind])
         made = run_simulate_flight(scenario, folder / name.replace(".", "_"))
         shutil.copy(made.sessions[0], folder / name)
+    write_layout_4(folder / "session_4.h5")
     known = load_scenario(str(made.scenario), ["observation.average_s=null"])
     write_reduced(folder / "reduced.nc", reduce_files(list(made.sessions), known))
     shutil.copy(made.scenario.parent / "gains.nc", folder / "gains.nc")

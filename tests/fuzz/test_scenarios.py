@@ -65,7 +65,7 @@ def load(overrides: list[str]) -> None:
 
 
 def load_scenario_text(text: str) -> Scenario:
-    from lusee_bayes.core.yaml_files import parse_yaml
+    from lusee_bayes.core.reading import parse_yaml
 
     return Scenario.model_validate(parse_yaml(text, "the resolved scenario"))
 

@@ -14,8 +14,7 @@ from reference import arm_response, hemisphere, steep_sky, vectors, visibilities
 from scipy.stats import norm, truncnorm
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import n_modes
-from lusee_bayes.core.rotations import Rotation, turn_about_z
+from lusee_bayes.core.harmonics import Rotation, n_modes, turn_about_z
 from lusee_bayes.instrument.beam_operator import BeamOperator
 from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, as_coupling
 from lusee_bayes.instrument.layout import DataLayout

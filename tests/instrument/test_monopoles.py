@@ -10,7 +10,7 @@ from reference import SPEED_OF_LIGHT, arm_response, layered_reflection, vectors
 
 import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.rotations import turn_about_z
+from lusee_bayes.core.harmonics import turn_about_z
 from lusee_bayes.instrument.beams import (
     HemisphereGrid,
     Monopoles,

@@ -15,7 +15,7 @@ from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 import lusee_bayes as lb
-from lusee_bayes.core.rotations import Rotation, generators, tilt_powers, turn_about_x, turn_about_y
+from lusee_bayes.core.harmonics import Rotation, generators, tilt_powers, turn_about_x, turn_about_y
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.pointing import (
     LEAST_ORDER,

@@ -195,7 +195,7 @@ def test_a_table_in_csv(write):
         Interval("2027-03-14T00:00:00", "2027-03-22T12:00:00", 30.0, 0.25, True),
         Interval("2027-03-22T13:00:00", "2027-03-23", -60.5, 1.0, False),
     )
-    assert intervals[2].where.endswith("schedule.csv, line 6")
+    assert intervals[2].where.endswith("schedule.csv, row 3")
     o = Observation.from_schedule(intervals, step_s=7200.0)
     assert o.turntable_deg == (0.0, 30.0, -60.5)
     assert o.times[0].isot[:16] == "2027-01-15T03:00"  # sunset is late on the 14th
@@ -209,33 +209,37 @@ HEADER = "start,end,turntable_deg,duty_cycle,night_only\n"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "schedule.csv is empty; give a table with the header start,end,turntable_deg"),
-        (f"# nights\n{HEADER}", "schedule.csv holds no interval below its header; give at least"),
-        ("start,end\n", "line 1: there is no column 'turntable_deg' in the header start,end; a"),
-        ("start,end,turntable_deg,duty\n", "line 1: a schedule has no column 'duty'"),
-        ("start,end,end,turntable_deg\n", "line 1: the column 'end' comes twice"),
-        (f"{HEADER}2027-01-01,2027-01-02\n", "line 2: there are 2 entries for the 5 columns"),
-        (f"{HEADER}\nsoon,2027-01-02,0,1,false\n", "line 3: start 'soon' is not a date; write it"),
-        (f"{HEADER}2027-01-01,61050.8,0,1,false\n", "line 2: end '61050.8' is not a date; write"),
-        (f"{HEADER}1827-01-01,2027-01-02,0,1,false\n", r"outside the ephemeris \(1900-2050\):"),
-        (f"{HEADER}2027-01-02,2027-01-01,0,1,false\n", "line 2: end 2027-01-01 does not come"),
-        (f"{HEADER}2027-01-01,2027-01-01,0,1,false\n", "line 2: end 2027-01-01 does not come aft"),
+        ("", "schedule.csv cannot be read as a schedule"),
+        (f"# nights\n{HEADER}", "schedule.csv: a schedule needs at least one interval"),
+        ("start,end\n", "schedule.csv has the columns start, end; a schedule has .*turntable_deg"),
+        ("start,end,turntable_deg,duty\n", "has the columns .*duty; a schedule has"),
+        ("start,end,end,turntable_deg\n", "has the columns start, end, end.1, turntable_deg; a"),
+        (f"{HEADER}2027-01-01\n", "row 1: turntable_deg is '', not a number"),
+        (f"{HEADER}2027-01-01,2027-01-02,0,1,false,5\n", "rows have more entries than the header"),
+        (f"{HEADER}\nsoon,2027-01-02,0,1,false\n", "row 1: start 'soon' is not a date; write it"),
+        (f"{HEADER}2027-01-01,61050.8,0,1,false\n", "row 1: end '61050.8' is not a date; write"),
+        (
+            f"{HEADER}1827-01-01,2027-01-02,0,1,false\n",
+            r"outside the ephemeris \(1900-2050\): 1827",
+        ),
+        (f"{HEADER}2027-01-02,2027-01-01,0,1,false\n", "row 1: end 2027-01-01 does not come aft"),
         (
             f"{HEADER}2027-01-01,2027-01-02,0,1,false\n2027-01-01T23:00:00,2027-01-03,0,1,false\n",
-            "line 3: the interval from 2027-01-01T23:00:00 begins 3600 s before",
+            "row 2: the interval from 2027-01-01T23:00:00 begins 3600 s before the one that "
+            "precedes it ends, 2027-01-02; give each stretch of time once",
         ),
         (
             f"{HEADER}2027-01-05,2027-01-06,0,1,false\n2027-01-01,2027-01-02,0,1,false\n",
-            "line 3: the interval from 2027-01-01 begins before the one that precedes it",
+            "row 2: the interval from 2027-01-01 begins before the one that precedes it, from "
+            "2027-01-05; sort the intervals by their start",
         ),
-        (f"{HEADER}2027-01-01,2027-01-02,0,1.5,false\n", "line 2: duty_cycle is 1.5; give the fra"),
-        (f"{HEADER}2027-01-01,2027-01-02,0,0,false\n", "line 2: duty_cycle is 0; give the"),
-        (f"{HEADER}2027-01-01,2027-01-02,0,nan,false\n", "line 2: duty_cycle is nan; give the fra"),
-        (f"{HEADER}2027-01-01,2027-01-02,0,half,\n", "line 2: duty_cycle is 'half', not a number"),
-        (f"{HEADER}2027-01-01,2027-01-02,north,1,\n", "line 2: turntable_deg is 'north', not a"),
-        (f"{HEADER}2027-01-01,2027-01-02,,1,\n", "line 2: turntable_deg is '', not a number"),
-        (f"{HEADER}2027-01-01,2027-01-02,inf,1,\n", "line 2: turntable_deg is inf; give an angle"),
-        (f"{HEADER}2027-01-01,2027-01-02,0,1,1\n", "line 2: night_only is '1'; write true or"),
+        (f"{HEADER}2027-01-01,2027-01-02,0,1.5,false\n", "row 1: duty_cycle is 1.5; give the fra"),
+        (f"{HEADER}2027-01-01,2027-01-02,0,0,false\n", "row 1: duty_cycle is 0; give the fraction"),
+        (f"{HEADER}2027-01-01,2027-01-02,0,half,\n", "row 1: duty_cycle is 'half', not a number"),
+        (f"{HEADER}2027-01-01,2027-01-02,north,1,\n", "row 1: turntable_deg is 'north', not a num"),
+        (f"{HEADER}2027-01-01,2027-01-02,,1,\n", "row 1: turntable_deg is '', not a number"),
+        (f"{HEADER}2027-01-01,2027-01-02,inf,1,\n", "row 1: turntable_deg is inf; give an angle"),
+        (f"{HEADER}2027-01-01,2027-01-02,0,1,1\n", "row 1: night_only is '1'; write true or false"),
     ],
 )
 def test_bad_tables_are_refused(write, text, message):
@@ -246,7 +250,7 @@ def test_bad_tables_are_refused(write, text, message):
 def test_an_interval_without_a_night_is_refused(write):
     # the Sun is up for two weeks from 1 February 2027 at this site
     text = f"{HEADER}2027-01-16,2027-01-17,0,1,true\n2027-02-05,2027-02-07,0,1,true\n"
-    with pytest.raises(InputError, match=r"schedule.csv, line 3 holds no lunar night; lengthen it"):
+    with pytest.raises(InputError, match=r"schedule.csv, row 2 holds no lunar night; lengthen it"):
         Observation.from_schedule(read_schedule(write(text)))
     unnamed = [Interval("2027-02-05", "2027-02-07", night_only=True)]
     with pytest.raises(InputError, match="interval 0 holds no lunar night"):
@@ -298,7 +302,7 @@ def test_a_command_table_of_opsim(write):
             apart = datetime.fromisoformat(text) - expected
             assert abs(apart.total_seconds()) < 3e-6
         assert (one.turntable_deg, one.duty_cycle, one.night_only) == (0.0, 1.0, False)
-    assert intervals[0].where.endswith("comtable.yml, line 5")
+    assert intervals[0].where.endswith("comtable.yml, entry 2")
     assert Observation.from_schedule(intervals).n_runs == 1
 
 
@@ -307,21 +311,24 @@ def test_a_command_table_of_opsim(write):
     [
         ("", "comtable.yml is no command table of OpSim: expected numbered entries"),
         ("- 1\n", "comtable.yml is no command table of OpSim"),
-        ("1: [\n", "comtable.yml cannot be read as a schedule"),
-        ("1: {start: 61050.8}\n", "line 1: the entry has no mode; a command table of OpSim has a"),
-        ("1: science\n", "line 1: the entry has no start"),
-        ("1: {start: [1], mode: science}\n", "line 1: the entry has no start"),
-        ("1:\n  start: noon\n  mode: science\n", "line 1: start is 'noon', not a number; give a"),
-        ("1: {start: nan, mode: science}\n", "line 1: sample times run outside the ephemeris"),
-        ("1: {start: 2461050.8, mode: science}\n", "line 1: sample times run outside the ephemer"),
+        ("1: [\n", "comtable.yml is not valid YAML"),
+        ("1: {start: 61050.8}\n", "entry 1: a command table of OpSim has a start .* and a mode"),
+        ("1: science\n", "entry 1: a command table of OpSim has a start"),
+        ("1: {start: [1], mode: science}\n", "entry 1: a command table of OpSim has a start"),
+        ("1:\n  start: noon\n  mode: science\n", "entry 1: a command table of OpSim has a start"),
+        ("1: {start: nan, mode: science}\n", "entry 1: sample times run outside the ephemeris"),
+        ("1: {start: 2461050.8, mode: science}\n", "entry 1: sample times run outside the ephemer"),
         (
             "1: {start: 61050.8, mode: science}\n2: {start: 61050.7, mode: maint}\n",
-            "line 2: start 61050.7 does not come after that of the entry before, 61050.8; sort",
+            "entry 2: start 61050.7 does not come after that of the entry before, 61050.8; sort",
         ),
-        ("1: {start: 61050.8, mode: maint}\n", "holds no entry in the mode science, the one in w"),
+        (
+            "1: {start: 61050.8, mode: maint}\n",
+            "comtable.yml: a schedule needs at least one",
+        ),
         (
             "1: {start: 61050.8, mode: maint}\n2: {start: 61051, mode: science}\n",
-            "line 2: the last entry is in the mode science, and nothing says when it ends; add an",
+            "entry 2: the last entry is in the mode science, and nothing says when it ends; add an",
         ),
     ],
 )

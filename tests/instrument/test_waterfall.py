@@ -10,7 +10,6 @@ import astropy.units as u
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import yaml
 from astropy.io import fits
 from astropy.time import Time, TimeDelta
 from fits_files import write_images
@@ -18,6 +17,7 @@ from fits_files import write_images
 from lusee_bayes.cli.main import main
 from lusee_bayes.cli.options import parse_frequencies
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import load_scenario
@@ -298,7 +298,7 @@ def test_simulate_writes_it_and_map_reads_it(tmp_path):
         np.testing.assert_array_equal(data[:, :, k].T, expected)
     with fits.open(path) as hdus:
         kept = hdus["scenario"].data.tobytes().decode()
-    assert yaml.safe_load(kept)["observation"]["runs"][0]["cycles"] == 0.1
+    assert parse_yaml(kept, "the file")["observation"]["runs"][0]["cycles"] == 0.1
     assert main(["map", "fiducial", "--data", str(path), "-o", str(tmp_path / "map"), *given]) == 0
     assert (tmp_path / "map" / "posterior.nc").is_file()
 

@@ -16,7 +16,7 @@ from lunarsky import LunarTopo, MoonLocation
 from reference import steep_sky
 
 import lusee_bayes as lb
-from lusee_bayes.core.rotations import Rotation
+from lusee_bayes.core.harmonics import Rotation
 from lusee_bayes.instrument.averaging import averaged, product_live_s
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.times import unannounced_leap_seconds

@@ -30,7 +30,6 @@ from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.coupling import DenseCoupling
-from lusee_bayes.linear.compact import CompactPosterior, read_compact
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.left_out_dense import DenseLeftOut
 from lusee_bayes.linear.left_out_structured import StructuredLeftOut
@@ -42,7 +41,7 @@ from lusee_bayes.linear.resolution import resolution_rows
 from lusee_bayes.linear.updating import updated
 from lusee_bayes.noise import beam_error_noise
 from lusee_bayes.noise.covariance import DenseCovariance, DiagonalCovariance
-from lusee_bayes.results.forecast import informed_modes
+from lusee_bayes.runs.forecasting import informed_modes
 from lusee_bayes.sampling.distributions import Marginal, SkyPrior
 from lusee_bayes.sampling.whitening import Whitening
 from lusee_bayes.sky.priors import DensePrior, HarmonicPrior
@@ -122,19 +121,6 @@ def test_textbook_matrices_and_scipys_evidence(n_data, form):
     assert_draws_follow(
         found.sample(jax.random.key(1), 4000), answer.mean + TURN @ MEAN, answer.covariance
     )
-
-
-@pytest.mark.parametrize(("n_data", "form"), [(40, "map"), (12, "data")])
-def test_a_compact_posterior_is_the_posterior(n_data, form, tmp_path):
-    full = solved(n_data, form, turned=True)
-    compact = CompactPosterior.of(full, tolerance=1e-12)
-    compact.write(tmp_path / "c.npz", {"lmax": 4})
-    compact, _ = read_compact(tmp_path / "c.npz")
-    np.testing.assert_allclose(compact.covariance(), full.covariance(), atol=1e-9)
-    np.testing.assert_allclose(compact.std(), full.std(), rtol=1e-9)
-    draws = compact.sample(np.random.default_rng(0), 4000)
-    assert_draws_follow(draws, np.asarray(full.mean), np.asarray(full.covariance()))
-    assert len(compact.variances) == min(n_data, N)
 
 
 def test_densities_and_coordinates():

@@ -23,8 +23,8 @@ from lusee_bayes.linear.learning import (
 )
 from lusee_bayes.linear.marginal_information import marginalised
 from lusee_bayes.linear.parameter_draws import draws_with_parameters, information_behind
-from lusee_bayes.sky.isotropic_family import IsotropicFamily
 from lusee_bayes.sky.local_scales import embedded_local_scales
+from lusee_bayes.sky.prior_family import IsotropicFamily
 
 LMAX, N_DATA = 6, 120
 

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -175,19 +174,6 @@ def test_information_under_another_prior():
     got = found.posterior(other)
     np.testing.assert_allclose(got.mean, expected.mean, rtol=0, atol=1e-11)
     np.testing.assert_allclose(got.log_evidence, expected.log_evidence, rtol=1e-11)
-
-
-@pytest.mark.long
-def test_perturbations_are_draws_with_the_normal_matrix_as_covariance():
-    gaussian = model()
-    n = 4000
-    found, _ = gaussian.inform(jnp.zeros(gaussian.n_data), jax.random.key(1), n)
-    lower = np.linalg.cholesky(np.asarray(found.matrix))
-    z = np.linalg.solve(lower, np.asarray(found.perturbations).T)
-    # sample covariance of n draws: 1 / sqrt(n) off the diagonal, sqrt(2 / n) on it
-    assert np.abs(z @ z.T / n - np.eye(len(z))).max() < 5.5 * np.sqrt(2.0 / n)
-    with pytest.raises(InputError, match="give a key"):
-        gaussian.inform(jnp.zeros(gaussian.n_data), None, 2)
 
 
 @pytest.mark.parametrize("kind", ["diagonal", "low rank"])

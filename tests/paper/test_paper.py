@@ -52,7 +52,7 @@ def four(monkeypatch):
 
 
 def run_cases(folder, *overrides):
-    return runs.run_paper(folder, [*TINY, *overrides]).cases
+    return runs.run_paper(folder, [*TINY, *overrides]).result
 
 
 @pytest.fixture

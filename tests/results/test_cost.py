@@ -32,3 +32,23 @@ def test_a_plan_that_does_not_fit_is_refused_before_it_starts(tmp_path, monkeypa
     with pytest.raises(InputError, match="memory"):
         run_plan([Variation("fiducial", AS_GIVEN, AS_GIVEN, scenario)], tmp_path / "plan")
     assert not (tmp_path / "plan").exists()
+
+
+def test_a_joint_posterior_that_does_not_fit_is_refused_with_what_would(monkeypatch):
+    frequencies = "frequencies_mhz=[10,15,20,25,30]"
+    scenario = load_scenario("fiducial", ["lmax=100", frequencies, "joint=true"])
+    found = cost.posterior_cost(scenario)
+    assert found.n_unknowns == 3 * 101**2 and found.memory > 8.0 * 4 * found.n_unknowns**2
+    monkeypatch.setattr(cost, "memory_limit", lambda: 16e9)
+    refused = r"30,603 unknowns; this process may use 16 GB; joint=false would fit"
+    with pytest.raises(InputError, match=refused):
+        cost.require_fits(found, scenario)
+    monkeypatch.setattr(cost, "memory_limit", lambda: 3e9)
+    with pytest.raises(InputError, match=r"may use 3 GB; lmax=\d\d would fit"):
+        cost.require_fits(found, scenario)
+
+
+def test_the_maps_of_a_kernel_are_its_principal_spectra():
+    kernel = ["frequencies_mhz=[10,15,20,25,30]", "joint=true", "spectral.model=kernel"]
+    stiff, loose = (cost_of(*kernel, f"spectral.length={length}") for length in (10.0, 0.1))
+    assert stiff.n_unknowns < loose.n_unknowns == 5 * 81

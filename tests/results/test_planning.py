@@ -22,16 +22,15 @@ from lusee_bayes.instrument.products import all_products
 from lusee_bayes.linear.metrics import ell_cross
 from lusee_bayes.linear.model import FORMS, LinearGaussian
 from lusee_bayes.results import variations
-from lusee_bayes.results.forecast import (
-    Variation,
+from lusee_bayes.results.forecast import Variation, forecast_rows
+from lusee_bayes.results.forecasts import ForecastFiles, forecasts_of
+from lusee_bayes.results.variations import default_variations
+from lusee_bayes.runs.forecasting import (
     expected_snr_squared,
     forecast,
-    forecast_rows,
     informed_modes,
     without_ports,
 )
-from lusee_bayes.results.forecasts import ForecastFiles, forecasts_of
-from lusee_bayes.results.variations import default_variations
 
 # many shapes, each of which is compiled
 pytestmark = pytest.mark.long

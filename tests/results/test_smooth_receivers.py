@@ -232,7 +232,6 @@ def test_seeds_of_simulated_receivers(response_file):
     ("override", "message"),
     [
         ("joint=true", "with joint, leave it out"),
-        ("prior={model: lognormal}", r"not those of prior\.model=lognormal"),
         ("noise.receiver.smooth_octaves=0", "greater than 0"),
     ],
 )

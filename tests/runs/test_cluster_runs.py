@@ -41,7 +41,8 @@ class Cluster:
 
     def __init__(self, folder: Path):
         self.folder, self.workers = folder, []
-        self.environment = os.environ | {"MPLBACKEND": "agg", "DASK_LUSEE_BAYES__PATIENCE": "3s"}
+        patience = {"DASK_DISTRIBUTED__SCHEDULER__NO_WORKERS_TIMEOUT": "3s"}
+        self.environment = os.environ | {"MPLBACKEND": "agg"} | patience
         self.environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
         self.start()
 
@@ -179,7 +180,7 @@ def test_all_workers_killed(cluster, alone, tmp_path):
         cluster.kill(worker)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 1
-    assert errors.startswith(f"lusee-bayes: the Dask scheduler at {cluster.address} has had no ")
+    assert errors.startswith("lusee-bayes: the Dask scheduler is gone, has no workers, or has ")
     assert errors.endswith("the same command continues from the finished channels\n")
     cluster.add()
     goes_on(cluster, tmp_path / "a", "--joint")
@@ -194,8 +195,8 @@ def test_the_scheduler_killed(cluster, alone, tmp_path):
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 1
     assert errors == (
-        f"lusee-bayes: the Dask scheduler at {cluster.address} is gone, or has forgotten this run; "
-        f"no results are written in '{tmp_path}/a'; the same command continues from the finished "
+        "lusee-bayes: the Dask scheduler is gone, has no workers, or has forgotten this run; no "
+        f"results are written in '{tmp_path}/a'; the same command continues from the finished "
         "channels\n"
     )
     for worker in cluster.workers:
@@ -244,15 +245,11 @@ def test_workers_of_a_killed_command_end_with_it(tmp_path):
     [
         (["plan", "fiducial", "--set", "lmax=6", "--vary", "frequency_mhz=10,20,30"], "plan.csv"),
         (
-            ["validate", "fiducial", *MAP[6:], "--skies", "embedded:2", "smooth"],
-            "coverage.csv",
-        ),
-        (
             ["compare-priors", "fiducial", *MAP[6:], "--priors", "isotropic,local_scales"],
             "priors.csv",
         ),
     ],
-    ids=["plan", "validate", "compare-priors"],
+    ids=["plan", "compare-priors"],
 )
 def test_other_commands_say_the_same(arguments, same, cluster, tmp_path):
     tables = []

@@ -11,7 +11,7 @@ import xarray as xr
 from astropy.io import fits
 
 from lusee_bayes.cli.main import main
-from lusee_bayes.core import workers
+from lusee_bayes.core import engine as engine_module
 from lusee_bayes.core.engine import ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map
@@ -153,25 +153,6 @@ def test_the_independent_means_of_a_joint_run_are_those_of_an_independent_run(jo
     assert (np.abs(a["mean"].values - b["mean"].values) / b["std"].values).max() > 0.05
 
 
-@pytest.mark.long
-def test_conjugate_gradients_give_the_same_maps(joint, tmp_path, numbers_alone):
-    components = ["spectral.components=[power_law, curvature]", "joint=true"]
-    cg = [*components, "spectral.solver=conjugate_gradients"]
-    run_map(three(*cg), tmp_path / "cg")
-    got, expected = posterior_of(tmp_path / "cg"), posterior_of(joint)
-    far = np.abs(got["mean"].values - expected["mean"].values) / expected["std"].values
-    assert far.max() < 1e-6
-    # of 50 draws: a tenth each, and 75 of them
-    assert np.abs(got["std"].values / expected["std"].values - 1).max() < 0.45
-    summary = json.loads((tmp_path / "cg" / "summary.json").read_text())
-    assert summary["log_evidence"] is None and summary["joint"]["iterations"] >= 1
-    assert summary["joint"]["refinement_sigma"] <= 1e-7
-    slow = ["spectral.iterations=1", "spectral.tolerance=1e-30"]
-    with pytest.raises(InputError, match="conjugate gradients did not converge: after 1 iter"):
-        run_map(three(*cg, *slow), tmp_path / "slow")
-    assert not (tmp_path / "slow" / "posterior.nc").exists()
-
-
 @pytest.fixture
 def made(monkeypatch):
     """Channels whose posterior was really computed, in order."""
@@ -181,7 +162,7 @@ def made(monkeypatch):
         done.append(experiment.scenario.frequency_mhz)
         return inform(experiment, *arguments)
 
-    for module in (workers, cube_channels):
+    for module in (engine_module, cube_channels):
         monkeypatch.setattr(module, "ThisProcess", lambda *_: ThisProcess(1))
     monkeypatch.setattr(cube_channels, "inform", counting)
     return done
@@ -323,7 +304,7 @@ def test_a_run_with_a_channel_that_cannot_be_mapped_goes_on(
         (["--workers", "2"], "give --frequencies"),
         (["--cluster", "tcp://127.0.0.1:1"], "give --frequencies"),
         (["--workers", "0", "--frequencies", "20,25"], "expected a whole number from 1"),
-        (["--frequencies", "20,25", "--compact"], "--compact is for a single frequency"),
+        (["--frequencies", "20,25", "--covariance"], "--covariance is for a single frequency"),
         (["--frequencies", "20,25", "--onto", "x"], "--onto is for a single frequency"),
         (["--frequencies", "20,25", "--joint"], "need at least as many channels, got 2"),
         (["--set", "spectral.components=[hot]", "--frequencies", "20,25"], "spectral.components"),

@@ -16,8 +16,7 @@ import h5py
 import numpy as np
 import pytest
 
-from lusee_bayes.core.destinations import LOCK
-from lusee_bayes.core.files import MANIFEST, SCRATCH, recover
+from lusee_bayes.core.files import LOCK, MANIFEST, SCRATCH, recover
 
 pytestmark = pytest.mark.long
 

@@ -26,8 +26,8 @@ from reference_linear import z_of
 
 import lusee_bayes
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.destinations import LOCK
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.files import LOCK
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.experiment import Experiment, build
@@ -35,10 +35,10 @@ from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.results import sample_result as results
 from lusee_bayes.results.map_channel import channel_of_posterior
-from lusee_bayes.results.sample_result import sample_result
 from lusee_bayes.runs import sample_run, validate_run
 from lusee_bayes.runs.folder import run_folder, write_run
 from lusee_bayes.runs.sample_run import SAMPLE
+from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling import checkpoints
 from lusee_bayes.sampling.datatree import read_datatree
 from lusee_bayes.sampling.hmc import CHUNK, Sampler

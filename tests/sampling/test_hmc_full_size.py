@@ -23,7 +23,7 @@ LMAX = int(os.environ.get("LUSEE_BAYES_TEST_LMAX", "31"))
 @pytest.mark.long
 @pytest.mark.parametrize(
     "scenario",
-    [("gain_1e-2",), ("fiducial", "prior={model: modulated, amplitude: 0.04}")],
+    [("gain_1e-2",), ("fiducial", "prior.model=local_scales")],
     ids=["gains", "correlated modes"],
 )
 def test_nuts_agrees_with_every_mean_every_variance_and_the_covariance(scenario):

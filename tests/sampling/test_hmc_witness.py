@@ -33,7 +33,7 @@ NOISES = {
     "exact": ("fiducial", "noise.radiometer.form=exact"),
     "gain": ("gain_1e-2",),
     "beam": ("beam_4MHz",),
-    "correlated modes": ("fiducial", "prior={model: modulated, amplitude: 0.04}"),
+    "correlated modes": ("fiducial", "prior.model=local_scales"),
 }
 # a chain or two of each structure of N is run every time, the others by make long
 EVERY_NOISE = pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.inference import infer
 from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.products import auto_indices
-from lusee_bayes.results.sample_result import coordinates, sample_result
+from lusee_bayes.runs.sampling import coordinates, sample_result
 from lusee_bayes.sampling.hmc import Sampler, sample
 from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.promotion import numpyro_promotion
@@ -195,8 +195,8 @@ def burst():
     white = coordinates(
         PROGRAM,
         {name: value for name, value in arguments.items() if name != "data"},
-        experiment,
-        gaussian.condition(dirty),
+        experiment.data,
+        infer(experiment),
         ["sky"],
     )
     chains = sample(

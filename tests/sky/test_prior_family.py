@@ -8,27 +8,20 @@ from scipy.integrate import quad
 
 from lusee_bayes.core.harmonics import n_modes, per_mode, synthesis_matrix
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.sky.isotropic_family import IsotropicFamily
-from lusee_bayes.sky.local_scales import embedded_local_scales
-from lusee_bayes.sky.local_strength import windows
-from lusee_bayes.sky.modulated import Modulation
-from lusee_bayes.sky.modulated_family import ModulatedFamily
-from lusee_bayes.sky.prior_family import Hyperprior, PriorFamily
-from lusee_bayes.sky.template import EmbeddedTemplate
+from lusee_bayes.sky.local_scales import embedded_local_scales, windows
+from lusee_bayes.sky.prior_family import Hyperprior, IsotropicFamily, PriorFamily
 
 LMAX = 5
 
 
 def families() -> dict[str, PriorFamily]:
-    modulation = Modulation.of(EmbeddedTemplate(25.0), LMAX)
     return {
         "isotropic": IsotropicFamily.around(2e4, LMAX),
-        "modulated": ModulatedFamily.of(modulation),
         "local scales": embedded_local_scales(25.0, LMAX),
     }
 
 
-@pytest.fixture(scope="module", params=["isotropic", "modulated", "local scales"])
+@pytest.fixture(scope="module", params=["isotropic", "local scales"])
 def family(request):
     return families()[request.param]
 
@@ -150,7 +143,6 @@ def test_the_hyperprior_is_a_density():
 def test_a_coarse_start_keeps_what_both_have(family):
     coarse = {
         "IsotropicFamily": lambda: IsotropicFamily.around(2e4, 3),
-        "ModulatedFamily": lambda: ModulatedFamily.of(Modulation.of(EmbeddedTemplate(25.0), 3)),
         "LocalScales": lambda: embedded_local_scales(25.0, 3),
     }[type(family).__name__]()
     found = family.start_from(coarse, coarse.hyperprior.start() + 0.1)

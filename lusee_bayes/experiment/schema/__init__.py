@@ -11,7 +11,6 @@ from lusee_bayes.experiment.schema.beam import (
 )
 from lusee_bayes.experiment.schema.flight import FlightSection
 from lusee_bayes.experiment.schema.flight_simulated import FlightSimulatedSection
-from lusee_bayes.experiment.schema.log_normal import LogNormalPriorSection
 from lusee_bayes.experiment.schema.noise import (
     BeamErrorSection,
     GainSection,
@@ -26,7 +25,7 @@ from lusee_bayes.experiment.schema.prior import (
     PRIOR_SECTIONS,
     IsotropicPriorSection,
     LocalScalesPriorSection,
-    ModulatedPriorSection,
+    LogNormalSection,
     PriorSection,
 )
 from lusee_bayes.experiment.schema.section import Frequency, Section, Seed
@@ -59,8 +58,7 @@ __all__ = [
     "GalaxySection",
     "IsotropicPriorSection",
     "LocalScalesPriorSection",
-    "LogNormalPriorSection",
-    "ModulatedPriorSection",
+    "LogNormalSection",
     "MonopoleBeamSection",
     "NoiseAbout",
     "NoiseSection",

@@ -1,10 +1,10 @@
-"""Sessions of the spectrometer that are simulated: their layout, and what disturbs them."""
+"""Sessions of the spectrometer that are simulated, and what disturbs them."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from lusee_bayes.experiment.schema.section import LARGEST, Frequency, Positive, Section
 
@@ -17,8 +17,6 @@ class FlightSimulatedSection(Section):
 
     Attributes
     ----------
-    layout : {3, 4}
-        Of luseepy's ingest.
     kind : {"hdf5", "fits"}
         Of file.
     navgf : {1, 2, 3, 4}
@@ -57,7 +55,6 @@ class FlightSimulatedSection(Section):
         Power of a burst, in multiples of the radiometer noise of a spectrum in 1 MHz.
     """
 
-    layout: Literal[3, 4] = 3
     kind: Literal["hdf5", "fits"] = "hdf5"
     navgf: Literal[1, 2, 3, 4] = 1
     levels: Levels = "MMMM"
@@ -78,11 +75,6 @@ class FlightSimulatedSection(Section):
     burst_s: Positive = 600.0
     burst_factor: Positive = 30.0
 
-    @model_validator(mode="after")
-    def _layouts_have_what_they_need(self) -> FlightSimulatedSection:
-        if self.layout == 4 and self.clock == "unknown":
-            raise ValueError(
-                "telemetry of layout 4 has a clock of its own, which nothing ties to the spectra "
-                "where the clock is unknown; use layout: 3, or clock: known"
-            )
-        return self
+    def disturbances(self) -> dict[str, Any]:
+        """Return gains and disturbances, as :meth:`.Disturbances.drawn` takes them."""
+        return self.model_dump(exclude={"kind", "session_h", "clock", "radiometer"})

@@ -18,13 +18,10 @@ class OutputSection(Section):
         Number of posterior draws ``posterior.nc`` keeps.
     covariance : bool
         Keep the posterior covariance in ``posterior.nc``.
-    compact : bool
-        Write ``posterior_compact.npz``, from which NumPy alone makes draws.
     updatable : bool
         Keep in ``posterior.nc`` what new data need to be added later.
     """
 
     draws: Annotated[int, Field(ge=0)] = 0
     covariance: bool = False
-    compact: bool = False
     updatable: bool = False

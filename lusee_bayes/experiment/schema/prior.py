@@ -12,19 +12,21 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from lusee_bayes.core.harmonics import n_modes
-from lusee_bayes.experiment.schema.log_normal import LogNormalPriorSection
 from lusee_bayes.experiment.schema.section import Megahertz, Positive, Section, without_other_kinds
-from lusee_bayes.experiment.schema.template import LEARNED, TemplateSection
+from lusee_bayes.sampling.log_normal_prior import LogNormalPrior
 from lusee_bayes.sky import BRIGHT_SOURCES, Sky
-from lusee_bayes.sky.isotropic_family import IsotropicFamily
 from lusee_bayes.sky.local_scales import embedded_local_scales
-from lusee_bayes.sky.modulated import Modulation, relative_spectrum
-from lusee_bayes.sky.modulated_family import ModulatedFamily
-from lusee_bayes.sky.prior_family import PriorFamily
+from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
+from lusee_bayes.sky.prior_family import IsotropicFamily, PriorFamily
 from lusee_bayes.sky.prior_files import read_mean, read_spectrum
 from lusee_bayes.sky.priors import HarmonicPrior, Prior
 from lusee_bayes.sky.template import EmbeddedTemplate
+
+# where C_ell comes from
+LEARNED = "learned from these data"
+# what is expected of A and of the tilt where they are sampled: as of relative deviations
+AMPLITUDE, TILT = 0.04, -2.5
+LOG_AMPLITUDE_STD, TILT_STD = 1.0, 0.5
 
 
 class IsotropicPriorSection(Section):
@@ -136,69 +138,6 @@ class IsotropicPriorSection(Section):
         return not known or bool(self.band_edges)
 
 
-class ModulatedPriorSection(TemplateSection):
-    """A template, and Gaussian deviations in proportion to it.
-
-    Their C_ell is learned from the data, or A^2 ((ell + 1) / 10)^tilt where A is given.
-
-    Attributes
-    ----------
-    template : str
-        ``embedded``, the diffuse Galaxy without random structure, or a file: a map in K, Galactic,
-        coefficients, or posterior.nc of another map.
-    file_frequency_mhz : float
-        What the file was made for; by default what it says, or the scenario's frequency.
-    spectral_index : float
-        Scales the file from its frequency to the scenario's.
-    smoothing_deg : float
-        Full width at half maximum of a Gaussian beam that the file's sky is smoothed with.
-    amplitude : float
-        A, of deviations relative to the template; by default C_ell is learned.
-    tilt : float
-        Slope of C_ell.
-    scale_std : float
-        Standard deviation of the template's overall scale, about 1.
-    monopole_std : float
-        Standard deviation of the monopole, over that of the template.
-    sources : bool
-        Give the catalogue's sources fluxes of their own, each as uncertain as it is large; a file
-        holds them already, the embedded template does not.
-    """
-
-    model: Literal["modulated"] = "modulated"
-    tilt: Annotated[float, Field(ge=-20, le=20)] = -2.4
-    scale_std: Positive = 0.5
-    monopole_std: Positive = 1.0
-    sources: bool = True
-
-    def family(self, frequency_mhz: float, lmax: int) -> PriorFamily | None:
-        """The family that data choose a prior of, up to an ell; None if C_ell is given."""
-        if not self.is_learned:
-            return None
-        return ModulatedFamily.of(self.modulation(frequency_mhz, lmax))
-
-    def prior(self, sky: Sky) -> Prior:
-        """S and the mean at the frequency and up to the lmax of a model sky."""
-        modulation = self.modulation(sky.frequency_mhz, sky.lmax)
-        spectrum = relative_spectrum(modulation.lmax_deviations, self.amplitude, self.tilt)
-        return modulation.prior(spectrum)
-
-    def modulation(self, frequency_mhz: float, lmax: int) -> Modulation:
-        """All of the prior but C_ell."""
-        sources = BRIGHT_SOURCES if self.sources else ()
-        fluxes = np.reshape(
-            [source.modes(frequency_mhz, lmax) for source in sources], (-1, n_modes(lmax))
-        )
-        return Modulation.of(
-            self.template_at(frequency_mhz, lmax),
-            lmax,
-            sources=fluxes,
-            sources_in_template=self.has_files,
-            scale_std=self.scale_std,
-            monopole_std=self.monopole_std,
-        )
-
-
 class LocalScalesPriorSection(Section):
     """A template, and Gaussian deviations whose strength at every place and scale is learned.
 
@@ -245,8 +184,6 @@ PRIOR_SECTIONS = {
     for section in (
         LocalScalesPriorSection,
         IsotropicPriorSection,
-        ModulatedPriorSection,
-        LogNormalPriorSection,
     )
 }
 
@@ -273,3 +210,45 @@ def _mean_temperature(frequency_mhz: float) -> float:
 PriorSection = Annotated[
     reduce(or_, PRIOR_SECTIONS.values()), Field(discriminator="model"), BeforeValidator(_one_kind)
 ]
+
+
+class LogNormalSection(Section):
+    """The positive sky of the program ``log_normal``, which has a prior of its own.
+
+    It is the embedded diffuse Galaxy times the exponential of a Gaussian field, whose C_ell is
+    A^2 ((ell + 1) / 10)^tilt. A and the tilt are sampled with the sky, or given.
+
+    Attributes
+    ----------
+    amplitude : float
+        A, of the logarithm of the sky over the Galaxy; sampled, with the tilt, if it is left out.
+    tilt : float
+        Slope of C_ell; needed with A.
+    scale_std : float
+        Standard deviation of the logarithm of the Galaxy's overall scale.
+    sources : bool
+        Add the catalogue's sources, each with a positive flux that may be small.
+    """
+
+    amplitude: Positive | None = None
+    tilt: Annotated[float, Field(ge=-20, le=20)] | None = None
+    scale_std: Positive = 0.5
+    sources: bool = True
+
+    @model_validator(mode="after")
+    def _both_or_neither(self) -> LogNormalSection:
+        if (self.amplitude is None) != (self.tilt is None):
+            raise ValueError("give both amplitude and tilt, or neither, and they are sampled")
+        return self
+
+    def prior(self, frequency_mhz: float, lmax: int) -> LogNormalPrior:
+        """The prior up to an ell."""
+        amplitude, tilt, widths = AMPLITUDE, TILT, (LOG_AMPLITUDE_STD, TILT_STD)
+        if self.amplitude is not None and self.tilt is not None:
+            amplitude, tilt, widths = self.amplitude, self.tilt, None
+        level = np.array([4.0 * np.pi * self.scale_std**2])
+        spectrum = deviation_spectrum(lmax, amplitude, tilt, level)
+        sources = BRIGHT_SOURCES if self.sources else ()
+        template = EmbeddedTemplate(frequency_mhz)
+        sky = LogNormalSky.of(template, spectrum, frequency_mhz, sources)
+        return LogNormalPrior.of(sky, amplitude, tilt, widths)

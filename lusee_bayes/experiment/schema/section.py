@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from lusee_bayes.core.paths import user_path
-from lusee_bayes.core.units import LARGEST_MHZ, NOT_HZ
+from lusee_bayes.core.files import user_path
+from lusee_bayes.core.layouts import LARGEST_MHZ, NOT_HZ
 
 S = TypeVar("S", bound="Section")
 
@@ -50,7 +50,6 @@ FILES = (
     "mean_file",
     "schedule",
     "spectrum_file",
-    "template",
 )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from lusee_bayes.experiment.schema.section import Megahertz, Positive, Section
 from lusee_bayes.sky.positive_skies import check_fields
@@ -43,12 +43,6 @@ class SpectralSection(Section):
     residual : float
         rms of what each channel has of its own, over that of its sky; by default what the
         components leave of the skies, 0.01 with the kernel.
-    solver : {"auto", "direct", "conjugate_gradients"}
-        ``auto``: conjugate gradients where the direct solution does not fit.
-    tolerance : float
-        Relative residual at which conjugate gradients stop.
-    iterations : int
-        Most iterations of conjugate gradients.
     """
 
     model: Literal["components", "kernel", "positive"] = "components"
@@ -64,17 +58,6 @@ class SpectralSection(Section):
     turnover_mhz: Megahertz = 5.0
     length: Positive = 1.0
     residual: Annotated[float, Field(ge=0, le=1)] | None = None
-    solver: Literal["auto", "direct", "conjugate_gradients"] = "auto"
-    tolerance: Positive = 1e-7
-    iterations: Annotated[int, Field(ge=1)] = 500
-
-    @model_validator(mode="after")
-    def _positive_skies_are_solved_directly(self) -> SpectralSection:
-        if self.model == "positive" and self.solver == "conjugate_gradients":
-            raise ValueError(
-                "positive skies are solved for directly, round by round; leave out spectral.solver"
-            )
-        return self
 
     def require_channels(self, n: int) -> None:
         """InputError for so few channels that they cannot share a posterior."""
@@ -82,6 +65,16 @@ class SpectralSection(Section):
             check_components(self.components, n, self.residual)
         if self.model == "positive":
             check_fields(self.fields, n)
+
+    def n_maps(self, frequencies_mhz: tuple[float, ...]) -> int:
+        """How many maps the skies of these channels are made of."""
+        if self.model == "positive":
+            return len(self.fields)
+        if self.model == "components":
+            return len(self.components)
+        # as many principal spectra as matter
+        frequencies = np.array(frequencies_mhz)
+        return self.prior(frequencies, np.ones((len(frequencies), 1))).n_components
 
     def prior(self, frequencies_mhz: np.ndarray, skies: np.ndarray) -> SpectralPrior:
         """The prior on linear skies of all channels; ``skies`` (channels, modes) model them."""

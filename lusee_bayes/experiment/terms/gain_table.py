@@ -27,7 +27,6 @@ class GainTableTerm(Term):
 
     key = "noise.gain_table"
     remedy = "noise.gain_table.treatment=sampled"
-    fixed = "use noise.gain_table.treatment=ignored"
 
     def moves(self, scenario: Scenario) -> bool:
         section = scenario.noise.gain_table

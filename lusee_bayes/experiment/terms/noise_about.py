@@ -21,7 +21,6 @@ from lusee_bayes.experiment.terms.term import Around
 from lusee_bayes.instrument.gaps import without_gaps
 from lusee_bayes.instrument.products import all_products, auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.sampling.log_normal.prior import LogNormalPrior
 
 # in standard deviations of a common amplitude
 HARMLESS_BIAS = 0.1
@@ -35,7 +34,7 @@ def radiometer_about(setup: Setup) -> NoiseAbout:
     if not setup.measured:
         return "model"
     harmless = _has_autos(setup) and common_bias(setup) < HARMLESS_BIAS
-    return "measured" if harmless else _predicted(setup)
+    return "measured" if harmless else "posterior"
 
 
 def gains_about(setup: Setup) -> NoiseAbout:
@@ -43,12 +42,7 @@ def gains_about(setup: Setup) -> NoiseAbout:
     chosen = setup.scenario.noise.gain.visibilities
     if chosen is not None:
         return chosen
-    return _predicted(setup) if setup.measured else "model"
-
-
-def _predicted(setup: Setup) -> NoiseAbout:
-    """The map's prediction; a log-normal sky is found under one N, and has none."""
-    return "measured" if isinstance(setup.family, LogNormalPrior) else "posterior"
+    return "posterior" if setup.measured else "model"
 
 
 def common_bias(setup: Setup) -> float:

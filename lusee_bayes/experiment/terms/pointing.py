@@ -28,7 +28,6 @@ class PointingTerm(Term):
 
     key = "noise.pointing"
     remedy = "smaller standard deviations in noise.pointing, or its treatment=sampled"
-    fixed = "use noise.pointing.around=model"
 
     def moves(self, scenario: Scenario) -> bool:
         section = scenario.noise.pointing

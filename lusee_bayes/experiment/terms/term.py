@@ -61,13 +61,10 @@ class Term(ABC):
         Where a scenario says it, such as ``noise.gain``.
     remedy : str
         What may help where it :meth:`moves` and rounds do not settle.
-    fixed : str
-        How it does not move.
     """
 
     key: ClassVar[str]
     remedy: ClassVar[str] = ""
-    fixed: ClassVar[str] = ""
 
     @abstractmethod
     def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from lusee_bayes.core.arrays import Array, as_complex, namespace
-from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.checks import Described, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.representation import Described
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
 
 SPEED_OF_LIGHT = 299792458.0  # m/s

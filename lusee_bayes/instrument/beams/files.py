@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.fits_files import image_names, is_fits
+from lusee_bayes.core.formats import image_names, is_fits
 from lusee_bayes.core.reading import require_file
 from lusee_bayes.instrument.beams.response_file import PortResponse, read_response
 from lusee_bayes.instrument.beams.sampled import SampledBeams

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.units import UNSTATED
+from lusee_bayes.core.layouts import UNSTATED
 
 # what this package assumes of the images, in lower case
 CONVENTIONS: Mapping[str, str] = {

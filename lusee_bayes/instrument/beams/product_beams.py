@@ -7,10 +7,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import require_float64
+from lusee_bayes.core.checks import Described, extent, listed, require_float64
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import lmax_of
-from lusee_bayes.core.representation import Described, extent, listed
 from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.products import auto_indices, labels, to_real
 

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core.fits_files import read_fits
+from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.instrument.beams.gridded import at_frequency
 from lusee_bayes.instrument.products import N_ANTENNAS

@@ -25,7 +25,7 @@ from scipy.constants import Boltzmann, physical_constants
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.fits_files import read_fits
+from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.instrument.beams.circuit import Circuit
 from lusee_bayes.instrument.beams.fields import SPEED_OF_LIGHT, AntennaFields

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
+from lusee_bayes.core.checks import Described, listed
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.representation import Described, listed
-from lusee_bayes.core.units import require_mhz
+from lusee_bayes.core.layouts import require_mhz
 from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid
 from lusee_bayes.instrument.beams.gridded import at_frequency

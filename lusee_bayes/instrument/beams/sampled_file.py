@@ -17,11 +17,9 @@ from astropy.io import fits
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing
-from lusee_bayes.core.fits_files import image_names, is_fits, read_fits
+from lusee_bayes.core.files import replacing, user_path
+from lusee_bayes.core.formats import image_names, is_fits, read_fits, read_netcdf
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
-from lusee_bayes.core.netcdf_files import read_netcdf
-from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import naming
 from lusee_bayes.instrument.beams.sampled import SampledBeams, sampled_beams
 from lusee_bayes.instrument.products import labels

@@ -20,7 +20,7 @@ from jaxtyping import Complex, Float
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.fits_files import read_fits
+from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.instrument.beams.fields import AntennaFields
 from lusee_bayes.instrument.beams.grid import HemisphereGrid

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.fits_files import has_words
-from lusee_bayes.core.formats import UVBEAM_WORDS
+from lusee_bayes.core.files import user_path
+from lusee_bayes.core.formats import UVBEAM_WORDS, has_words
 from lusee_bayes.core.lazy import pyuvdata
-from lusee_bayes.core.paths import user_path
 from lusee_bayes.core.reading import reading
 from lusee_bayes.instrument.beams.sampled import SampledBeams, sampled_beams
 

@@ -13,8 +13,7 @@ import equinox as eqx
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import require_finite, require_float64, require_shape
-from lusee_bayes.core.representation import Described
+from lusee_bayes.core.checks import Described, require_finite, require_float64, require_shape
 
 
 class Coupling(Described, eqx.Module):

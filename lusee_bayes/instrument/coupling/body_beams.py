@@ -6,8 +6,14 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, compiled, namespace
-from lusee_bayes.core.harmonics import lmax_of, mode_numbers
-from lusee_bayes.core.rotations import tilts, turn_about_x, turn_about_y, turn_about_z
+from lusee_bayes.core.harmonics import (
+    lmax_of,
+    mode_numbers,
+    tilts,
+    turn_about_x,
+    turn_about_y,
+    turn_about_z,
+)
 from lusee_bayes.instrument.pointing import Pointing
 
 

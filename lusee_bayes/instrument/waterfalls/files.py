@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lusee_bayes.core.fits_files import image_names
+from lusee_bayes.core.formats import image_names
 from lusee_bayes.core.reading import require_file
 from lusee_bayes.instrument.waterfalls.four_port import read_four_port
 from lusee_bayes.instrument.waterfalls.scalar import read_scalar

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.fits_files import read_fits
+from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming
 from lusee_bayes.instrument.beams.gridded import Interpolation

@@ -12,7 +12,7 @@ from astropy.io import fits
 from jaxtyping import Complex, Float
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import user_path
 from lusee_bayes.instrument.beams.circuit import Circuit
 from lusee_bayes.instrument.beams.gridded import Interpolation
 from lusee_bayes.instrument.products import all_products, labels, to_matrix

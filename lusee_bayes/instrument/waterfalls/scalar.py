@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Int
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.fits_files import read_fits
+from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming
 from lusee_bayes.instrument.observation import Observation

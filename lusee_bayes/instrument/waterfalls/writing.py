@@ -13,8 +13,7 @@ from astropy.time import Time
 from jaxtyping import Complex, Float
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing
-from lusee_bayes.core.paths import user_path
+from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import N_ANTENNAS, all_products

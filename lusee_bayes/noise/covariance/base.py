@@ -20,9 +20,8 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import is_traced
+from lusee_bayes.core.checks import Described, is_traced
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.representation import Described
 from lusee_bayes.instrument.layout import DataLayout
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float, Shaped
 
-from lusee_bayes.core.yaml_files import parse_yaml
+from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.linear.metrics import ell_cross
 
 Cases = Mapping[str, xr.Dataset]

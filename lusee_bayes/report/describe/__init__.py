@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from pkgutil import resolve_name
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.fits_files import has_words, image_names, is_fits
-from lusee_bayes.core.reading import reading, require_file
+from lusee_bayes.core.formats import has_words, image_names, is_fits
+from lusee_bayes.core.reading import require_file
 
 # the package's own netCDF files, by their attribute ``format``. What describes a kind is named by
 # path and imported when there is such a file: each needs libraries that others do not
@@ -30,15 +29,8 @@ def _has_image(*names: str) -> Callable[[Path], bool]:
     return lambda path: is_fits(path) and bool(set(names) & set(image_names(path)))
 
 
-def _is_compact(path: Path) -> bool:
-    if not zipfile.is_zipfile(path):
-        return False
-    with reading(path, "NumPy's .npz"), zipfile.ZipFile(path) as file:
-        return "directions.npy" in file.namelist()
-
-
 def _is_session(path: Path) -> bool:
-    return bool(resolve_name("lusee_bayes.instrument.flight.sessions:is_session")(path))
+    return bool(resolve_name("lusee_bayes.flight.session_files:is_session")(path))
 
 
 # other files: how each kind is recognised; what is none of them is a sky
@@ -49,7 +41,6 @@ KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
     (lambda path: has_words(path, formats.UVBEAM_WORDS), "beam_files:describe_sampled_beams"),
     (_has_image("combinations", "products"), "data_files:describe_waterfall"),
     (_is_session, "flight:describe_session"),
-    (_is_compact, "compact:describe_compact"),
     (lambda path: True, "skies:describe_sky"),
 )
 

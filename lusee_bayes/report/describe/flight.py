@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lusee_bayes.instrument.flight.reduced_file import read_reduced
-from lusee_bayes.instrument.flight.sessions import read_session
+from lusee_bayes.flight.reduced import read_reduced
+from lusee_bayes.flight.session_files import read_session
 
 
 def describe_session(path: Path) -> str:
@@ -35,7 +35,7 @@ def describe_reduced(path: Path) -> str:
 
 def describe_gains(path: Path) -> str:
     """A gain table."""
-    from lusee_bayes.instrument.flight.gain_files import read_gain_table
+    from lusee_bayes.flight.gain_model import read_gain_table
 
     table = read_gain_table(path)
     errors = "errors not known" if table.component_std is None else "errors known"

@@ -10,7 +10,7 @@ from lusee_bayes.core.layouts import Layout
 from lusee_bayes.core.reading import read_json
 from lusee_bayes.results.provenance import Provenance
 
-FIGURES = ("summary.json", "sampling.json", "coverage.json", "priors.json")
+FIGURES = ("summary.json", "sampling.json", "priors.json")
 
 
 def describe_folder(folder: Path) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.netcdf_files import read_netcdf
+from lusee_bayes.core.formats import read_netcdf
 from lusee_bayes.results.saved import CUBE, POSTERIOR
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lusee_bayes.core.fits_files import is_fits, opened
+from lusee_bayes.core.formats import is_fits, opened
 from lusee_bayes.sky import read_sky_file
 
 

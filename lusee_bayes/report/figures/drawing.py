@@ -18,7 +18,7 @@ from matplotlib.patches import Circle
 from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from lusee_bayes.core.command_line import printable
+from lusee_bayes.core.version import printable
 from lusee_bayes.instrument.beams import HemisphereGrid
 
 # safe for colour-blind readers: perceptually uniform, and a blue-orange pair (Okabe-Ito) for lines

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lusee_bayes.instrument.flight.gain_table import LETTERS
-from lusee_bayes.instrument.flight.reduced import REASONS, USED, Reduced
+from lusee_bayes.flight.gain_model import LETTERS
+from lusee_bayes.flight.reduced import REASONS, USED, Reduced
 from lusee_bayes.instrument.products import all_products, labels
 from lusee_bayes.instrument.times import unannounced_leap_seconds
 from lusee_bayes.report.figures.drawing import BLUE, GREY, ORANGE, plain_ticks

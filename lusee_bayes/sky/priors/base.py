@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.representation import Described
+from lusee_bayes.core.checks import Described
 
 
 class Prior(Described, eqx.Module):

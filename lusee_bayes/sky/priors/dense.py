@@ -7,10 +7,15 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
+from lusee_bayes.core.checks import (
+    extent,
+    is_traced,
+    require_finite,
+    require_float64,
+    require_shape,
+)
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import cholesky, outer_sandwich, sandwich, solve_lower, times_lower
-from lusee_bayes.core.representation import extent
 from lusee_bayes.sky.priors.base import Prior
 
 # largest difference of S_ij and S_ji, in prior standard deviations of both

@@ -1,0 +1,247 @@
+"""One number for a band of channels: the spectrum at its middle, by a polynomial.
+
+Spectra are steep: the mean of f^-2.5 over 1 MHz about 10 MHz is 0.4 % above its middle, hundreds
+of times the noise. So a polynomial is fitted to the channels of every spectrum, and its value at
+the middle is taken: for degree 2, what is left out is of fourth order. A value is sum_k w_k x_k
+with weights that depend on the flags alone; its variance is that of n independent samples of
+voltages, n = frames / sum_kl w_k s_k C_kl s_l w_l, C the noise that channels share and s the shape
+of the spectrum.
+
+C is that of a polyphase filter bank. One of T taps weights T frames of N samples with a window
+times the impulse response of a channel, h, before the Fourier transform: y_k(t) = sum_n h(n)
+x(n + N t) exp(-2 pi i k n / N). For white noise, ::
+
+    <y_k(t) conj(y_k+d(t + s))> ~ c_d(s) = sum_n h(n) h(n - s N) exp(2 pi i d n / N),
+
+and the powers of two channels, averaged over many frames, have the covariance ::
+
+    sum_s |c_d(s)|^2,
+
+of which c_0(0)^2 would be that of independent frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.flight.session import Averaging
+
+# a spectrum with so many flags that its value has this many times the variance is not used
+MOST_VARIANCE = 4.0
+ROUNDING_MHZ = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelBand:
+    """The bins of a band, and the polynomials over them.
+
+    Attributes
+    ----------
+    frequency_mhz : float
+        The middle.
+    first, last : int
+        Bins first to last - 1 lie within the band, with all their channels.
+    basis : (bins, terms) array
+        Powers of the distance from the middle in half bandwidths, averaged over the channels of
+        each bin.
+    finer : (bins, more) array
+        The same with two further powers.
+    shared : (bins, bins) array
+        Covariance of the noise of the bins for a flat spectrum of 1 and one frame.
+    """
+
+    frequency_mhz: float
+    first: int
+    last: int
+    basis: Float[np.ndarray, "bins terms"]
+    finer: Float[np.ndarray, "bins more"]
+    shared: Float[np.ndarray, "bins bins"]
+
+    @classmethod
+    def of(
+        cls,
+        frequency_mhz: float,
+        bandwidth_mhz: float,
+        degree: int,
+        averaging: Averaging,
+        middles_mhz: Float[np.ndarray, " channels"],
+        shared_noise: tuple[float, ...] = (1.0,),
+    ) -> ChannelBand:
+        """Find the bins of a band.
+
+        Parameters
+        ----------
+        frequency_mhz, bandwidth_mhz : float
+            Channels with their middles within the bandwidth, ends included.
+        degree : int
+            Of the polynomial.
+        averaging : Averaging
+            Which channels the bins hold.
+        middles_mhz : (channels,) array
+        shared_noise : tuple of float
+            :func:`.shared_noise`.
+
+        Raises
+        ------
+        InputError
+            If there are too few of them for the polynomial.
+        """
+        channels = averaging.channels()
+        x = (middles_mhz[channels] - frequency_mhz) / (bandwidth_mhz / 2.0)
+        within = np.flatnonzero((np.abs(x) <= 1.0 + ROUNDING_MHZ).all(axis=1))
+        # two further powers are fitted to find lines
+        if len(within) < degree + 4:
+            raise InputError(
+                f"the band of {bandwidth_mhz:g} MHz about {frequency_mhz:g} MHz has {len(within)} "
+                f"bins, and a polynomial of degree {degree} needs {degree + 4} to be checked; "
+                "use a larger flight.bandwidth_hz or a lower flight.degree"
+            )
+        first, last = int(within[0]), int(within[-1]) + 1
+        powers = np.arange(degree + 3)
+        finer = (x[first:last, :, None] ** powers).mean(axis=1)
+        apart = np.abs(channels[first:last, :, None, None] - channels[None, None, first:last])
+        known = np.array([*shared_noise, 0.0])
+        shared = known[np.minimum(apart, len(known) - 1)].mean(axis=(1, 3))
+        return cls(frequency_mhz, first, last, finer[:, : degree + 1], finer, shared)
+
+    def values(
+        self,
+        spectra: Float[np.ndarray, "rows products bins"],
+        autos: Float[np.ndarray, "rows bins"],
+        good: Bool[np.ndarray, "rows bins"],
+    ) -> tuple[
+        Float[np.ndarray, "rows products"],
+        Float[np.ndarray, " rows"],
+        Float[np.ndarray, "rows products"],
+    ]:
+        """Return the spectrum at the middle.
+
+        Parameters
+        ----------
+        spectra : (rows, products, bins) array
+            Of the band's bins.
+        autos : (rows, bins) array
+            Mean of the autos, which shape the noise.
+        good : (rows, bins) array of bool
+            Which bins to use.
+
+        Returns
+        -------
+        (rows, products) array
+            In the unit of the spectra.
+        (rows,) array
+            Variance in units of the value's own square, for one frame; infinite where too many bins
+            are flagged.
+        (rows, products) array
+            What two further powers would add.
+        """
+        weights, possible = point_weights(self.basis, good)
+        finer, _ = point_weights(self.finer, good)
+        shape = np.where(good, autos, 0.0)
+        middle = np.einsum("rk,rk->r", weights, shape)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scaled = weights * shape / middle[:, None]
+        variance = np.einsum("rk,kl,rl->r", scaled, self.shared, scaled)
+        whole, _ = point_weights(self.basis, np.ones((1, len(self.basis)), dtype=bool))
+        at_best = float((whole @ self.shared @ whole.T)[0, 0])
+        usable = possible & (middle > 0.0) & (variance <= MOST_VARIANCE * at_best)
+        variance = np.where(usable, variance, np.inf)
+        clean = np.where(good[:, None], spectra, 0.0)
+        values = np.einsum("rpk,rk->rp", clean, weights)
+        return values, variance, np.einsum("rpk,rk->rp", clean, finer) - values
+
+
+def point_weights(
+    basis: Float[np.ndarray, "points terms"], good: Bool[np.ndarray, "rows points"]
+) -> tuple[Float[np.ndarray, "rows points"], Bool[np.ndarray, " rows"]]:
+    """Return the weights by which a least-squares polynomial is evaluated in the middle.
+
+    Parameters
+    ----------
+    basis : (points, terms) array
+        Powers, of which the middle has the first alone.
+    good : (rows, points) array of bool
+
+    Returns
+    -------
+    (rows, points) array
+        Zero where not good.
+    (rows,) array of bool
+        Whether there are enough points.
+    """
+    terms = basis.shape[1]
+    normal = np.einsum("rk,ka,kb->rab", good.astype(float), basis, basis, optimize=True)
+    possible = good.sum(axis=1) > terms
+    normal[~possible] = np.eye(terms)
+    unit = np.zeros((terms, 1))
+    unit[0] = 1.0
+    solved = np.linalg.solve(normal, np.broadcast_to(unit, (len(good), terms, 1)))[..., 0]
+    return np.where(good & possible[:, None], solved @ basis.T, 0.0), possible
+
+
+Taper = Literal["rectangular", "hann", "hamming", "blackman"]
+# covariances do not depend on the length of a frame where it is long
+FRAME = 512
+# beyond that many channels apart nothing is shared
+REACH = 6
+# coefficients of cos(2 pi j n / N T) of each window
+WINDOWS: dict[Taper, tuple[float, ...]] = {
+    "rectangular": (1.0,),
+    "hann": (0.5, -0.5),
+    "hamming": (0.54, -0.46),
+    "blackman": (0.42, -0.5, 0.08),
+}
+
+
+@lru_cache(maxsize=16)
+def shared_noise(taps: int, taper: Taper) -> tuple[float, ...]:
+    """Return the covariance of the powers of channels 0, 1, ... apart.
+
+    Parameters
+    ----------
+    taps : int
+        Number of frames that a spectrum is made of: 1 is a windowed Fourier transform; 0 stands for
+        channels that share nothing.
+    taper : {"rectangular", "hann", "hamming", "blackman"}
+
+    Returns
+    -------
+    tuple of float
+        In units of the variance of independent frames in independent channels; the first is above
+        one where frames overlap.
+
+    Raises
+    ------
+    InputError
+        For fewer taps than none.
+    """
+    if taps < 0:
+        raise InputError(f"a filter bank has no {taps} taps; give 0 for independent channels")
+    if taps == 0:
+        return (1.0,)
+    h = impulse_response(taps, taper)
+    found = np.zeros(REACH + 1)
+    for shift in range(-taps + 1, taps):
+        overlap = np.zeros_like(h)
+        if shift >= 0:
+            overlap[shift * FRAME :] = h[shift * FRAME :] * h[: len(h) - shift * FRAME]
+        else:
+            overlap[: shift * FRAME] = h[: shift * FRAME] * h[-shift * FRAME :]
+        # frames fold onto one: exp(2 pi i d n / N) has their period
+        folded = overlap.reshape(taps, FRAME).sum(axis=0)
+        found += np.abs(np.fft.fft(folded)[: REACH + 1]) ** 2
+    return tuple((found / (h @ h) ** 2).tolist())
+
+
+def impulse_response(taps: int, taper: Taper) -> Float[np.ndarray, " samples"]:
+    """Return h: a window, times the sinc of one channel where there are several taps."""
+    n = taps * FRAME
+    t = (np.arange(n) + 0.5) / n
+    window = sum(c * np.cos(2.0 * np.pi * j * t) for j, c in enumerate(WINDOWS[taper]))
+    return window * np.sinc((t - 0.5) * taps) if taps > 1 else window

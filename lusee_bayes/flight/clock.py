@@ -1,0 +1,244 @@
+"""The mission clock: which UTC its seconds stand for.
+
+A file of luseepy's layout 3 says it by ``mjd_epoch_offset_days``, ``raw_time_subtract_seconds`` and
+``time_scale``, which may be "unknown"; one of layout 4 by a clock reference, or not at all. A clock
+file says it from outside: luseepy's clock reference, format 1, which is JSON, ::
+
+    {"format_version": 1, "reference_event": "landing",
+     "clock_reference_isot": "2027-01-10T00:00:00", "time_scale": "utc",
+     "clocks": {"spectrometer": {"clock_reference_raw_seconds": 123.0}},
+     "source": "mission timing record", "assumed": false}
+
+with ``rate``, the seconds of ``time_scale`` in a second of the clock, where it is not 1: above 1
+for a clock that runs slow. With ``stated_utc_isot`` in place of ``clocks`` the file corrects the
+UTC that sessions state: when they state that, it was ``clock_reference_isot``, and ``rate`` is the
+seconds of ``time_scale`` in a second of theirs.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.time import Time
+from jaxtyping import Float
+
+from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.layouts import Attribute, Layout
+from lusee_bayes.core.reading import naming, read_json
+from lusee_bayes.instrument.times import scale_of, unannounced_leap_seconds, utc_of
+
+DAY_S, MJD_ZERO = 86400.0, 2400000.5
+# two clocks that differ by less are one
+SAME_S = 1e-3
+# a clock that is off by more is none
+MOST_OFF = 1e-2
+FORMAT = Layout(
+    "a clock reference",
+    attributes={
+        "format_version": Attribute("integer", low=1.0, high=1.0),
+        "clock_reference_isot": Attribute("text"),
+        "time_scale": Attribute("text"),
+        "source": Attribute("text"),
+        "rate": Attribute(low=1.0 - MOST_OFF, high=1.0 + MOST_OFF, optional=True),
+        "stated_utc_isot": Attribute("text", optional=True),
+    },
+)
+KEYS = {*FORMAT.attributes, "reference_event", "clocks", "assumed", "source_sha256"}
+# the clocks of luseepy's records, and what each has
+CLOCKS = ("spectrometer", "dcb")
+ANCHOR = Layout(
+    "what the clock showed at clock_reference_isot",
+    attributes={"clock_reference_raw_seconds": Attribute()},
+)
+ISO = re.compile(r"\d{4}-\d{2}-\d{2}T\d{2}:\d{2}:\d{2}(\.\d+)?")
+
+
+@dataclass(frozen=True)
+class Clock:
+    """A mission clock.
+
+    Attributes
+    ----------
+    source : str
+        Who says so, for messages.
+    jd1, jd2 : float
+        A time, as a Julian date in two parts.
+    scale : str
+        Of this time: utc, tai, tt or tdb.
+    raw_s : float
+        What the clock shows then.
+    rate : float
+        Seconds of ``scale`` in a second of the clock.
+    stated : Time or None
+        For a clock that corrects what sessions state: the UTC that they state then; ``raw_s`` does
+        not count.
+    """
+
+    source: str
+    jd1: float
+    jd2: float
+    scale: str
+    raw_s: float
+    rate: float = 1.0
+    stated: Time | None = None
+
+    def utc(self, raw_s: Float[np.ndarray, " times"]) -> Time:
+        """Return UTC at readings of the clock.
+
+        Parameters
+        ----------
+        raw_s : (times,) array
+            In seconds.
+
+        Raises
+        ------
+        InputError
+            If one is outside the ephemeris.
+        """
+        days = self.rate * (raw_s - self.raw_s) / DAY_S
+        whole = np.floor(days)
+        return utc_of(self.jd1 + whole, self.jd2 + (days - whole), self.scale)
+
+    @property
+    def isot(self) -> str:
+        """The reference time as text, in its own scale."""
+        with unannounced_leap_seconds():
+            time = Time(self.jd1, self.jd2, format="jd", scale=self.scale, precision=9)
+            return str(time.isot)
+
+    def correcting(self, said: Clock) -> Clock:
+        """Return the clock of a session by what it says itself, corrected by this one."""
+        with unannounced_leap_seconds():
+            since_s = float((self.stated - said.utc(np.array([said.raw_s]))[0]).sec)
+        return replace(
+            self, raw_s=said.raw_s + since_s / said.rate, rate=self.rate * said.rate, stated=None
+        )
+
+    def differs_s(self, other: Clock, raw_s: Float[np.ndarray, " times"]) -> float:
+        """Return by how many seconds two clocks differ at most at some readings."""
+        ends = np.array([raw_s.min(), raw_s.max()])
+        with unannounced_leap_seconds():
+            return float(np.abs((self.utc(ends) - other.utc(ends)).sec).max())
+
+
+def read_clock(path: str | Path) -> Clock:
+    """Read a clock file.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, lacks something, has an entry that is not known, or a date or scale
+        that is none.
+    """
+    hint = "write luseepy's clock reference (format_version 1), see docs/howto/first_light.md"
+    found = read_json(path, FORMAT, hint)
+    _require_known(path, found, KEYS)
+    with naming(path):
+        scale = scale_of("time_scale", found["time_scale"])
+        time = _time(found, "clock_reference_isot", scale)
+        stated = _time(found, "stated_utc_isot", "utc") if "stated_utc_isot" in found else None
+    if (stated is None) == ("clocks" not in found):
+        raise InputError(
+            f"{path} needs either clocks, for sessions whose UTC is not known, or stated_utc_isot, "
+            "to correct the UTC that sessions state; see docs/howto/first_light.md"
+        )
+    raw_s = 0.0 if stated is not None else _spectrometer_s(path, found["clocks"])
+    rate = float(found.get("rate", 1.0))
+    return Clock(str(path), float(time.jd1), float(time.jd2), scale, raw_s, rate, stated)
+
+
+def _time(found: dict[str, Any], key: str, scale: str) -> Time:
+    text = found[key]
+    try:
+        if not ISO.fullmatch(text):
+            raise ValueError("write it as 2027-01-15T00:00:00")
+        with unannounced_leap_seconds():
+            return Time(text, format="isot", scale=scale)
+    except ValueError as error:
+        raise InputError(f"{key} '{text}' is no date: {error}") from error
+
+
+def _spectrometer_s(path: str | Path, clocks: Any) -> float:
+    """What the spectrometer's clock showed at the reference."""
+    if not isinstance(clocks, dict) or "spectrometer" not in clocks:
+        raise InputError(
+            f"{path} has no clocks.spectrometer with a clock_reference_raw_seconds: what the "
+            "spectrometer's clock showed at clock_reference_isot"
+        )
+    _require_known(f"{path}: clocks", clocks, CLOCKS)
+    raw_s = {}
+    for name, one in clocks.items():
+        where = f"{path}: clocks.{name}"
+        if not isinstance(one, dict):
+            raise InputError(f"{where} is {one!r}, expected an object: {ANCHOR.what}")
+        _require_known(where, one, ANCHOR.attributes)
+        raw_s[name] = ANCHOR.checked(where, {}, one).values["clock_reference_raw_seconds"]
+    return raw_s["spectrometer"]
+
+
+def _require_known(where: str | Path, found: dict[str, Any], known: Iterable[str]) -> None:
+    for key in found:
+        if key in known:
+            continue
+        hint = nearest(key, known)
+        if key in KEYS:
+            hint = f"write {key} beside clocks, not in it"
+        raise InputError(f"{where}: unknown entry '{key}'; {hint}")
+
+
+def clock_of(
+    path: str | Path,
+    said: Clock | None,
+    given: Clock | None,
+    raw_s: Float[np.ndarray, " times"],
+) -> Clock:
+    """Return the clock of a session: its own, a clock file's, or its own as corrected by the file.
+
+    A clock file that does not correct the session's clock must not contradict it.
+
+    Parameters
+    ----------
+    path : str or Path
+        Of the session.
+    said, given : Clock or None
+        By the session itself, and by the user's clock file.
+    raw_s : (times,) array
+        The session's readings.
+
+    Raises
+    ------
+    InputError
+        If neither says it, both do and differ by more than a millisecond, or there is nothing to
+        correct.
+    """
+    if given is None and said is None:
+        raise InputError(
+            f"{path} does not say which UTC its clock stands for (its time scale is unknown), and "
+            "a wrong scale or epoch turns the map; give --clock clock.json (epoch, scale, rate)"
+        )
+    if given is not None and given.stated is not None:
+        if said is None:
+            raise InputError(
+                f"{path} states no UTC that {given.source} could correct; give a clock file with "
+                "clocks in place of stated_utc_isot"
+            )
+        return given.correcting(said)
+    if given is None or said is None:
+        return said or given
+    differ = given.differs_s(said, raw_s)
+    if differ > SAME_S:
+        raise InputError(
+            f"{path} and {given.source} differ by {differ:.6g} s about the clock: the session says "
+            f"{said.scale.upper()}, the clock file {given.scale.upper()}; leave out --clock, or "
+            "give one with stated_utc_isot, which corrects the session's"
+        )
+    return given

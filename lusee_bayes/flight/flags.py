@@ -1,0 +1,533 @@
+"""What is no sky: channels off a smooth spectrum, combs, and spectra off a smooth curve in time.
+
+Points off a curve are found one after the other: the worst are left out, the curve is fitted again,
+and so on until none is further out than noise allows; points that then lie on the curve come back.
+A point stands out if any of the autos does.
+
+**Lines.** The calibrator sends a comb at 50 kHz + n 100 kHz, in channels 2, 6, 10, ... counted from
+0 (coreloop's ``lusee_commands.h`` has the notch index 2 by default, for 50 + 100 n kHz), and the
+notch filter subtracts the mean of the same channels. Layout 3 does not say when either is on. So
+every spectrum is asked: the difference of these channels from their neighbours, over the whole
+band, finds a comb of a small part of the noise in a channel, and a notch as well, which makes it
+negative. Where four channels are averaged nothing looks like a line, and only time tells.
+
+**Bursts** of Jupiter and the Sun, and interference. Within a few hours the sky's visibilities
+change smoothly. A polynomial in time is fitted to the autos of a band; spectra off it, or stretches
+of them that are off together, are flagged. Noise is that of the radiometer, or what the data show
+where that is more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.core.lazy import special
+from lusee_bayes.core.reading import read_table
+from lusee_bayes.flight.bands import ChannelBand
+from lusee_bayes.flight.session import CHANNEL_MHZ, Averaging
+
+# of the points beyond the threshold, those within this share of the worst go in one round
+WORST = 0.5
+MAX_ROUNDS = 60
+# standard deviation of a Gaussian over the median of its absolute values
+MAD = 1.4826
+
+
+def threshold(false_alarm: float, n_tests: int) -> float:
+    """Return how many standard deviations out a point may be.
+
+    Parameters
+    ----------
+    false_alarm : float
+        Chance that a point of pure noise is further out in any of its tests.
+    n_tests : int
+        Tests that a point has to pass, on both sides.
+    """
+    return float(-special.ndtri(false_alarm / (2.0 * n_tests)))
+
+
+def outliers(
+    values: Float[np.ndarray, "rows autos points"],
+    noise: Float[np.ndarray, "rows autos points"],
+    good: Bool[np.ndarray, "rows points"],
+    basis: Float[np.ndarray, "points terms"],
+    limit: float,
+) -> tuple[Bool[np.ndarray, "rows points"], Float[np.ndarray, "rows autos points"]]:
+    """Find points off a curve, in every row on its own.
+
+    Parameters
+    ----------
+    values : (rows, autos, points) array
+    noise : (rows, autos, points) array
+        Standard deviations.
+    good : (rows, points) array of bool
+        Points to be looked at.
+    basis : (points, terms) array
+        What the curve is made of.
+    limit : float
+        :func:`threshold`.
+
+    Returns
+    -------
+    (rows, points) array of bool
+        Those that stand out.
+    (rows, autos, points) array
+        Distances from the curve through the others in standard deviations, 0 where not good.
+    """
+    kept, z = good.copy(), np.zeros_like(values)
+    if not len(values):
+        return good & ~kept, z
+    active = np.arange(len(values))
+    for _ in range(MAX_ROUNDS):
+        z[active] = distances(values[active], noise[active], good[active], kept[active], basis)
+        worst = np.abs(z[active]).max(axis=1)
+        among = np.where(kept[active], worst, 0.0)
+        most = among.max(axis=1, keepdims=True)
+        out = (among > limit) & (among >= WORST * most)
+        # a curve needs more points than it has terms
+        enough = (kept[active] & ~out).sum(axis=1) > basis.shape[1]
+        out &= enough[:, None]
+        if not out.any():
+            break
+        kept[active] &= ~out
+        active = active[out.any(axis=1)]
+    back = good & ~kept & (np.abs(z).max(axis=1) <= limit)
+    kept |= back
+    return good & ~kept, z
+
+
+def distances(
+    values: Float[np.ndarray, "rows autos points"],
+    noise: Float[np.ndarray, "rows autos points"],
+    good: Bool[np.ndarray, "rows points"],
+    kept: Bool[np.ndarray, "rows points"],
+    basis: Float[np.ndarray, "points terms"],
+) -> Float[np.ndarray, "rows autos points"]:
+    """Return how far points are from the curve through some of them.
+
+    Parameters
+    ----------
+    values, noise, good, basis
+        As :func:`outliers`.
+    kept : (rows, points) array of bool
+        Those that the curve goes through.
+
+    Returns
+    -------
+    (rows, autos, points) array
+        In standard deviations, the curve's own uncertainty included; 0 where not good.
+    """
+    curve, leverage = fitted_curves(values, kept, basis)
+    own = np.where(kept, 1.0 - leverage, 1.0 + leverage)
+    scale = noise * np.sqrt(np.maximum(own, 1e-3))[:, None]
+    return np.where(good[:, None], (values - curve) / scale, 0.0)
+
+
+def fitted_curves(
+    values: Float[np.ndarray, "rows autos points"],
+    kept: Bool[np.ndarray, "rows points"],
+    basis: Float[np.ndarray, "points terms"],
+) -> tuple[Float[np.ndarray, "rows autos points"], Float[np.ndarray, "rows points"]]:
+    """Return the curve through some points, and its variance in units of that of a point.
+
+    Parameters
+    ----------
+    values, kept, basis
+        As :func:`distances`.
+    """
+    terms = basis.shape[1]
+    normal = np.einsum("rk,ka,kb->rab", kept.astype(float), basis, basis, optimize=True)
+    normal[kept.sum(axis=1) <= terms] = np.eye(terms)
+    inverse = np.linalg.inv(normal)
+    pulled = np.einsum("rpk,ka->rpa", np.where(kept[:, None], values, 0.0), basis)
+    curve = np.einsum("rab,rpb,ka->rpk", inverse, pulled, basis, optimize=True)
+    leverage = np.einsum("rab,ka,kb->rk", inverse, basis, basis, optimize=True)
+    return curve, leverage
+
+
+def robust_scale(
+    z: Float[np.ndarray, "rows points"], good: Bool[np.ndarray, "rows points"]
+) -> float:
+    """Return the standard deviation of distances by their median; NaN if there are none."""
+    return float(MAD * np.median(np.abs(z[good]))) if good.any() else np.nan
+
+
+# of the calibrator: every fourth channel, from this one on
+COMB_FIRST, COMB_SPACING = 2, 4
+# where the spectrum is smooth enough for neighbours to tell a channel
+COMB_MHZ = (5.0, 45.0)
+# neighbours by which a channel is predicted to third order, none of which is of the comb
+AROUND = ((-3, -1.0 / 16.0), (-1, 9.0 / 16.0), (1, 9.0 / 16.0), (3, -1.0 / 16.0))
+# standard deviations of a whole spectrum: no chance, since neighbours never tell it exactly
+COMB_LIMIT = 8.0
+# a line is in its channel and those beside it; half-way between two, in four
+BESIDE_MHZ = 1.5 * CHANNEL_MHZ + 1e-9
+TABLE = Layout(
+    "known lines",
+    {
+        "frequency_mhz": Variable(("line",), low=0.0, high=60.0),
+        "source": Variable(("line",), "text"),
+    },
+)
+
+
+@dataclass(frozen=True)
+class KnownLines:
+    """Lines that are there all of the time.
+
+    Attributes
+    ----------
+    frequency_mhz : (lines,) array
+    source : tuple of str
+        Who says so.
+    """
+
+    frequency_mhz: Float[np.ndarray, " lines"]
+    source: tuple[str, ...]
+
+    def bins(
+        self, averaging: Averaging, middles_mhz: Float[np.ndarray, " channels"]
+    ) -> Bool[np.ndarray, " bins"]:
+        """Return the bins that hold a line, or a channel beside one."""
+        near = np.abs(middles_mhz[:, None] - self.frequency_mhz) <= BESIDE_MHZ
+        return near.any(axis=1)[averaging.channels()].any(axis=1)
+
+
+NO_LINES = KnownLines(np.zeros(0), ())
+
+
+def read_lines(path: str | Path) -> KnownLines:
+    """Read a CSV table of lines: ``frequency_mhz``, and the ``source`` of each.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    found = read_table(path, TABLE, "write a line 'frequency_mhz,source' and one for each")
+    return KnownLines(found["frequency_mhz"], tuple(map(str, found["source"])))
+
+
+def comb_bins(averaging: Averaging) -> Bool[np.ndarray, " bins"]:
+    """Return the bins that hold a channel of the comb."""
+    return (averaging.channels() % COMB_SPACING == COMB_FIRST).any(axis=1)
+
+
+def comb_strength(
+    autos: Float[np.ndarray, "rows ports bins"],
+    frames: Float[np.ndarray, " rows"],
+    averaging: Averaging,
+    middles_mhz: Float[np.ndarray, " channels"],
+) -> Float[np.ndarray, " rows"]:
+    """Return by how many standard deviations the comb's channels differ from their neighbours.
+
+    Parameters
+    ----------
+    autos : (rows, ports, bins) array
+        In V^2/Hz; the gain's steps from level to level do not matter.
+    frames : (rows,) array
+    averaging : Averaging
+    middles_mhz : (channels,) array
+
+    Returns
+    -------
+    (rows,) array
+        Of the port where it is most; 0 where every bin holds a channel of the comb.
+    """
+    comb = comb_bins(averaging)
+    if comb.all():
+        return np.zeros(len(autos))
+    mhz = middles_mhz[averaging.channels()].mean(axis=1)
+    at = np.flatnonzero(comb & (mhz > COMB_MHZ[0]) & (mhz < COMB_MHZ[1]))
+    around = sum(weight * autos[..., at + offset] for offset, weight in AROUND)
+    spread = np.sqrt(1.0 + sum(weight**2 for _, weight in AROUND))
+    noise = np.abs(around) * spread / np.sqrt(frames * averaging.members)[:, None, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = (autos[..., at] - around) / noise
+    known = np.isfinite(z)
+    count = np.maximum(known.sum(axis=2), 1)
+    # a strong line of its own is no comb
+    clipped = np.clip(np.where(known, z, 0.0), -COMB_LIMIT, COMB_LIMIT)
+    strength = clipped.sum(axis=2) / np.sqrt(count)
+    most = np.abs(strength).argmax(axis=1)
+    return np.take_along_axis(strength, most[:, None], axis=1)[:, 0]
+
+
+def line_flags(
+    band: ChannelBand,
+    autos: Float[np.ndarray, "rows ports bins"],
+    frames: Float[np.ndarray, " rows"],
+    good: Bool[np.ndarray, "rows bins"],
+    limit: float,
+) -> tuple[Bool[np.ndarray, "rows bins"], Float[np.ndarray, "rows ports bins"]]:
+    """Find bins of a band that do not lie on a smooth spectrum, in each spectrum on its own.
+
+    Parameters
+    ----------
+    band : ChannelBand
+    autos : (rows, ports, bins) array
+        Of the band, in V^2/Hz.
+    frames : (rows,) array
+    good : (rows, bins) array of bool
+        Bins to be looked at.
+    limit : float
+        :func:`.threshold`.
+
+    Returns
+    -------
+    (rows, bins) array of bool
+    (rows, ports, bins) array
+        Distances from the spectrum, in standard deviations.
+    """
+    # the level of the spectrum, which a strong line must not raise; ports that are absent are zero
+    usable = np.where((good | ~good.any(axis=1)[:, None])[:, None], autos, np.nan)
+    level = np.nanmedian(usable, axis=2)
+    own = np.sqrt(np.diagonal(band.shared))
+    noise = np.abs(level)[..., None] * own / np.sqrt(frames)[:, None, None]
+    return outliers(autos, np.where(noise > 0.0, noise, 1.0), good, band.finer, limit)
+
+
+# a polynomial of this degree takes up what the sky does within four hours, to less than the noise
+# of a spectrum: 2e-5 of what ell = 47 has
+DEGREE, SPAN_S = 5, 14400.0
+# with fewer spectra within a span, there is no telling
+LEAST = 16
+# lengths of stretches that are tested, in spectra
+LENGTHS = (1, 2, 4, 8, 16)
+
+
+def n_tests(ports: int) -> int:
+    """Return how many tests a spectrum has to pass."""
+    return ports * len(LENGTHS)
+
+
+def burst_flags(
+    seconds: Float[np.ndarray, " rows"],
+    autos: Float[np.ndarray, "rows ports"],
+    noise: Float[np.ndarray, "rows ports"],
+    good: Bool[np.ndarray, " rows"],
+    false_alarm: float,
+) -> tuple[Bool[np.ndarray, " rows"], Float[np.ndarray, " spans"]]:
+    """Find spectra off a smooth curve in time.
+
+    Parameters
+    ----------
+    seconds : (rows,) array
+        Times.
+    autos : (rows, ports) array
+        Of a band.
+    noise : (rows, ports) array
+        Their standard deviations; infinite for autos that are absent.
+    good : (rows,) array of bool
+        Spectra to be looked at.
+    false_alarm : float
+        Chance that one of pure noise is flagged, shared by all tests.
+
+    Returns
+    -------
+    (rows,) array of bool
+    (spans,) array
+        Scatter over the noise expected, of every span of four hours; NaN where there are not enough
+        spectra.
+    """
+    flagged, scatter = np.zeros(len(seconds), dtype=bool), []
+    limit = threshold(false_alarm, n_tests(autos.shape[1]))
+    autos = _filled(seconds, autos, np.isfinite(noise) & good[:, None])
+    for at in _spans(seconds):
+        scale = np.nan
+        if good[at].sum() >= LEAST:
+            flagged[at], scale = _one_span(seconds[at], autos[at], noise[at], good[at], limit)
+        scatter.append(scale)
+    return flagged, np.array(scatter)
+
+
+def _filled(
+    seconds: Float[np.ndarray, " rows"],
+    autos: Float[np.ndarray, "rows ports"],
+    known: Bool[np.ndarray, "rows ports"],
+) -> Float[np.ndarray, "rows ports"]:
+    """Autos with what lies between their neighbours in place of others, so as to bend no curve."""
+    found = autos.copy()
+    for port, at in enumerate(known.T):
+        if at.any():
+            found[~at, port] = np.interp(seconds[~at], seconds[at], autos[at, port])
+    return found
+
+
+def _spans(seconds: Float[np.ndarray, " rows"]) -> list[np.ndarray]:
+    """Rows of spans of equal length, none longer than ``SPAN_S``."""
+    whole = seconds[-1] - seconds[0]
+    n = max(1, int(np.ceil(whole / SPAN_S - 1e-9)))
+    number = np.minimum((seconds - seconds[0]) * n // max(whole, 1.0), n - 1).astype(int)
+    return [found for k in range(n) if (found := np.flatnonzero(number == k)).size]
+
+
+def _one_span(
+    seconds: Float[np.ndarray, " span"],
+    autos: Float[np.ndarray, "span ports"],
+    noise: Float[np.ndarray, "span ports"],
+    good: Bool[np.ndarray, " span"],
+    limit: float,
+) -> tuple[Bool[np.ndarray, " span"], float]:
+    x = np.polynomial.chebyshev.chebvander(
+        2.0 * (seconds - seconds[0]) / max(seconds[-1] - seconds[0], 1.0) - 1.0, DEGREE
+    )
+    values = np.where(good[:, None], autos, 0.0).T[None]
+    sigma = np.where(good[:, None], noise, 1.0).T[None]
+    # noise from spectrum to spectrum, which a burst changes at its ends alone
+    scale = _from_neighbours(values[0] / sigma[0], good)
+    kept = _without_the_highest(values, sigma * np.maximum(scale, 1.0)[:, None], good, x, limit)
+    # and about the curve
+    z = distances(values, sigma, good[None], kept[None], x)
+    about = np.array([robust_scale(z[:, p], kept[None]) for p in range(autos.shape[1])])
+    scale = np.maximum(scale, about)
+    sigma = sigma * np.maximum(scale, 1.0)[None, :, None]
+    kept = _with_what_fits(values, sigma, good, kept, x, limit)
+    while kept.sum() >= LEAST // 2:
+        out, z = outliers(values, sigma, kept[None], x, limit)
+        found = out[0] | _about_stretches(z[0], kept & ~out[0], limit)
+        if not found.any():
+            break
+        kept &= ~found
+    kept = _with_what_fits(values, sigma, good, kept, x, limit)
+    # what lies between spectra that are flagged, each of them far off
+    z = distances(values, sigma, good[None], kept[None], x)[0]
+    known = good & _curve_is_known(values, kept, x)
+    kept &= ~_flagged_stretches(z, kept | known, limit)
+    return good & ~kept, float(np.median(scale))
+
+
+def _from_neighbours(
+    z: Float[np.ndarray, "ports span"], good: Bool[np.ndarray, " span"]
+) -> Float[np.ndarray, " ports"]:
+    """Standard deviation of each port, by differences of one spectrum and the next."""
+    both = (good[1:] & good[:-1])[None]
+    steps = np.diff(z, axis=1) / np.sqrt(2.0)
+    return np.array([robust_scale(port[None], both) for port in steps])
+
+
+def _without_the_highest(
+    values: Float[np.ndarray, "1 ports span"],
+    sigma: Float[np.ndarray, "1 ports span"],
+    good: Bool[np.ndarray, " span"],
+    x: Float[np.ndarray, "span terms"],
+    limit: float,
+) -> Bool[np.ndarray, " span"]:
+    """Good spectra but those above the curve, which bursts pull up when they are long."""
+    kept = good.copy()
+    for _ in range(MAX_ROUNDS):
+        z = distances(values, sigma, good[None], kept[None], x)[0].max(axis=0)
+        above = np.where(kept, z, 0.0)
+        left = kept & ~((above > limit) & (above >= WORST * above.max()))
+        if (left == kept).all() or left.sum() < LEAST // 2:
+            break
+        kept = left
+    return kept
+
+
+def _with_what_fits(
+    values: Float[np.ndarray, "1 ports span"],
+    sigma: Float[np.ndarray, "1 ports span"],
+    good: Bool[np.ndarray, " span"],
+    kept: Bool[np.ndarray, " span"],
+    x: Float[np.ndarray, "span terms"],
+    limit: float,
+) -> Bool[np.ndarray, " span"]:
+    """Spectra that are kept, and others on the curve through them, alone and in stretches.
+
+    Where the curve is not known well, as at the ends of a span, they come back one after the other.
+    """
+    for _ in range(MAX_ROUNDS):
+        curve, _ = fitted_curves(values, kept[None], x)
+        z = ((values - curve) / sigma)[0]
+        more = good & ~kept & (np.abs(z).max(axis=0) <= limit)
+        known = good & _curve_is_known(values, kept, x)
+        more = kept | (more & ~_flagged_stretches(z, kept | more | known, limit))
+        if (more == kept).all():
+            break
+        kept = more
+    return kept
+
+
+def _curve_is_known(
+    values: Float[np.ndarray, "1 ports span"],
+    kept: Bool[np.ndarray, " span"],
+    x: Float[np.ndarray, "span terms"],
+) -> Bool[np.ndarray, " span"]:
+    """Where the error of the curve, which a stretch has in common, is below its sum's noise."""
+    _, leverage = fitted_curves(values, kept[None], x)
+    return leverage[0] <= 1.0 / LENGTHS[-1]
+
+
+def _about_stretches(
+    z: Float[np.ndarray, "ports span"], kept: Bool[np.ndarray, " span"], limit: float
+) -> Bool[np.ndarray, " span"]:
+    """All stretches whose sum is beyond the limit, and so more than is off."""
+    sums, counts = _sums(z, kept)
+    found = np.zeros(len(kept), dtype=bool)
+    for length in LENGTHS[1:]:
+        if length <= len(kept) // 2:
+            for start in np.flatnonzero((_sizes_of(sums, counts, length) > limit).any(axis=0)):
+                found[start : start + length] = True
+    return found & kept
+
+
+def _flagged_stretches(
+    z: Float[np.ndarray, "ports span"], good: Bool[np.ndarray, " span"], limit: float
+) -> Bool[np.ndarray, " span"]:
+    """Those in stretches whose sum is beyond the limit, the furthest first, and no more."""
+    left = good.copy()
+    lengths = [length for length in LENGTHS[1:] if length <= len(good) // 2]
+    while lengths:
+        sums, counts = _sums(z, left)
+        sizes = [_sizes_of(sums, counts, length) for length in lengths]
+        most = int(np.argmax([size.max() for size in sizes]))
+        if sizes[most].max() <= limit:
+            break
+        port, start = np.unravel_index(sizes[most].argmax(), sizes[most].shape)
+        ends = slice(start, start + lengths[most] + 1)
+        first, last = _part(sums[port, ends], counts[ends], limit)
+        left[start + first : start + last] = False
+    return good & ~left
+
+
+def _sums(
+    z: Float[np.ndarray, "ports span"], good: Bool[np.ndarray, " span"]
+) -> tuple[Float[np.ndarray, "ports ends"], Float[np.ndarray, " ends"]]:
+    """Of all before each spectrum, and their number."""
+    sums = np.cumsum(np.pad(np.where(good, z, 0.0), ((0, 0), (1, 0))), axis=1)
+    return sums, np.cumsum(np.pad(good, (1, 0)).astype(float))
+
+
+def _sizes_of(
+    sums: Float[np.ndarray, "ports ends"], counts: Float[np.ndarray, " ends"], length: int
+) -> Float[np.ndarray, "ports starts"]:
+    """By how much stretches of a length stand out; 0 where half of them are missing."""
+    n = counts[length:] - counts[:-length]
+    return _sizes(sums[:, length:] - sums[:, :-length], np.where(n > length / 2, n, np.inf))
+
+
+def _part(
+    sums: Float[np.ndarray, " ends"], counts: Float[np.ndarray, " ends"], limit: float
+) -> tuple[int, int]:
+    """First and last end of the part of a stretch that stands out most.
+
+    Not of two parts with a gap between them that fits, if they lower chi^2 by more than the limit
+    squared where each has a mean of its own: then the one of them that stands out more.
+    """
+    drop = np.triu(_sizes(sums - sums[:, None], counts - counts[:, None]) ** 2)
+    first, last = (int(k) for k in np.unravel_index(drop.argmax(), drop.shape))
+    apart = np.triu(drop[first, : last + 1, None] + drop[None, : last + 1, last], 1)
+    if apart.max() - drop[first, last] > limit**2:
+        left, right = (int(k) for k in np.unravel_index(apart.argmax(), apart.shape))
+        return (first, left) if drop[first, left] > drop[right, last] else (right, last)
+    return first, last
+
+
+def _sizes(total: Float[np.ndarray, "*n"], count: Float[np.ndarray, "..."]) -> np.ndarray:
+    return np.abs(total) / np.sqrt(np.maximum(count, 1.0))

@@ -1,0 +1,456 @@
+"""Gains of the spectrometer: counts for a spectral density, by level, port and frequency.
+
+As in luseepy's ``GainModel``: for each level (L, M, H) and port a mean gain and two components at
+some frequencies, with strengths that are predicted by the telemetry, ::
+
+    G(f) = mean(f) + q_1 v_1(f) + q_2 v_2(f),    q_r = sum_k c_rk phi_k,
+    phi = 1, F, A, V, D, I, F^2, A^2, F A,
+
+F the temperature of the FPGA, A that of the port's ADC (0 for ports 0 and 1, 1 for 2 and 3), V and
+I voltage and current of its 1.8 V, D the 1.2 V. Between the frequencies all three go by cubic
+splines; beyond them there is no gain. An auto in nV^2/Hz is counts / G, a cross is
+counts / sqrt(G_a G_b).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+
+from lusee_bayes.core import formats
+from lusee_bayes.core.checks import require_positive, require_shape
+from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.files import replacing, user_path
+from lusee_bayes.core.formats import read_netcdf
+from lusee_bayes.core.layouts import Layout, Variable, require_mhz
+from lusee_bayes.core.lazy import interpolate
+from lusee_bayes.core.reading import read_table, reading, require_file
+from lusee_bayes.flight.session import LEVELS, PORTS, TELEMETRY
+
+LETTERS = tuple(LEVELS.values())
+N_COMPONENTS, N_TERMS = 2, 9
+# one nV^2/Hz
+NANO2 = 1e-18
+
+
+@dataclass(frozen=True, eq=False)
+class GainModel:
+    """Gains of all levels and ports.
+
+    Attributes
+    ----------
+    path : str
+        Where it comes from, for messages.
+    anchor_mhz : (levels, ports, anchors) array
+        Frequencies, growing.
+    mean : (levels, ports, anchors) array
+        Counts for 1 nV^2/Hz.
+    component : (levels, ports, components, anchors) array
+        v_r, in the same unit.
+    coefficient : (levels, ports, components, terms) array
+        c_rk, in the order of phi.
+    component_std : (levels, ports, components) array or None
+        By how much the strengths q_r may be off; None if it is not known.
+    kind : str
+        How it was read, for reports.
+    """
+
+    path: str
+    anchor_mhz: Float[np.ndarray, "levels ports anchors"]
+    mean: Float[np.ndarray, "levels ports anchors"]
+    component: Float[np.ndarray, "levels ports components anchors"]
+    coefficient: Float[np.ndarray, "levels ports components terms"]
+    component_std: Float[np.ndarray, "levels ports components"] | None = None
+    kind: str = "made"
+
+    def __post_init__(self):
+        lead = (len(LETTERS), PORTS)
+        require_shape(f"{self.path}: mean", self.mean, (*lead, None))
+        anchors = self.mean.shape[2]
+        require_shape(f"{self.path}: anchor_mhz", self.anchor_mhz, (*lead, anchors))
+        shape = (*lead, N_COMPONENTS, anchors)
+        require_shape(f"{self.path}: component", self.component, shape)
+        shape = (*lead, N_COMPONENTS, N_TERMS)
+        require_shape(f"{self.path}: coefficient", self.coefficient, shape)
+        if not (np.diff(self.anchor_mhz, axis=2) > 0.0).all():
+            raise InputError(f"{self.path}: the frequencies of the gains do not grow")
+        require_mhz(f"{self.path}: the frequencies of the gains", self.anchor_mhz)
+        require_positive(f"{self.path}: the mean gain", self.mean, "give counts for 1 nV^2/Hz")
+
+    @cached_property
+    def _splines(self) -> dict[tuple[int, int], interpolate.CubicSpline]:
+        return {
+            (level, port): interpolate.CubicSpline(
+                self.anchor_mhz[level, port],
+                np.vstack([self.mean[level, port], self.component[level, port]]).T,
+                extrapolate=False,
+            )
+            for level in range(len(LETTERS))
+            for port in range(PORTS)
+        }
+
+    def basis(
+        self, level: str, port: int, frequencies_mhz: Float[np.ndarray, " frequencies"]
+    ) -> Float[np.ndarray, "3 frequencies"]:
+        """Return mean, v_1 and v_2 at some frequencies.
+
+        Parameters
+        ----------
+        level : {"L", "M", "H"}
+        port : int
+        frequencies_mhz : (frequencies,) array
+
+        Returns
+        -------
+        (3, frequencies) array
+            Counts for 1 nV^2/Hz; NaN where the table has no gain.
+        """
+        return self._splines[LETTERS.index(level), port](frequencies_mhz).T
+
+    def with_component_std(self, std: tuple[float, ...] | None) -> GainModel:
+        """Return the same with errors of the components of each level of each port, if any.
+
+        Raises
+        ------
+        InputError
+            If the table has some itself.
+        """
+        if std is None:
+            return self
+        if self.component_std is not None:
+            raise InputError(
+                f"{self.path} says by how much its components may be off, and so does "
+                "flight.component_std; leave that out"
+            )
+        return replace(self, component_std=np.broadcast_to(std, self.component.shape[:3]).copy())
+
+    def strengths(
+        self, level: str, port: int, telemetry: Mapping[str, Float[np.ndarray, " rows"]]
+    ) -> Float[np.ndarray, "rows components"]:
+        """Return q_1 and q_2 for telemetry.
+
+        Parameters
+        ----------
+        level : {"L", "M", "H"}
+        port : int
+        telemetry : mapping of str to (rows,) array
+            All of :data:`.TELEMETRY`.
+
+        Raises
+        ------
+        InputError
+            If something of it is missing.
+        """
+        phi = _telemetry_terms(port, telemetry)
+        return phi @ self.coefficient[LETTERS.index(level), port].T
+
+
+def _telemetry_terms(
+    port: int, telemetry: Mapping[str, Float[np.ndarray, " rows"]]
+) -> Float[np.ndarray, "rows terms"]:
+    lacking = [name for name in TELEMETRY if name not in telemetry]
+    if lacking:
+        raise InputError(
+            f"the telemetry lacks {', '.join(lacking)}, by which the gain table predicts gains; "
+            "ingest the session with its telemetry, interpolated to the spectra"
+        )
+    fpga = telemetry["THERM_FPGA"]
+    adc = telemetry["SPE_ADC0_T" if port < 2 else "SPE_ADC1_T"]
+    v18, v12, i18 = (telemetry[name] for name in ("SPE_1VAD8_V", "VMON_1V2D", "SPE_1VAD8_C"))
+    ones = np.ones_like(fpga)
+    return np.stack([ones, fpga, adc, v18, v12, i18, fpga**2, adc**2, fpga * adc], axis=1)
+
+
+# first and last frequency of curves, and how many
+CURVE_MHZ = (0.5, 51.0, 203)
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Gains over frequency, at the mean telemetry.
+
+    Attributes
+    ----------
+    frequencies_mhz : (curve,) array
+    gain : (levels, ports, curve) array
+        Counts for 1 nV^2/Hz; NaN for levels that no spectrum has.
+    std : (levels, ports, curve) array
+        By how much they may be off; 0 where that is not known.
+    """
+
+    frequencies_mhz: Float[np.ndarray, " curve"]
+    gain: Float[np.ndarray, "levels ports curve"]
+    std: Float[np.ndarray, "levels ports curve"]
+
+
+def gain_curves(
+    table: GainModel,
+    gain_std: float | None,
+    levels: Shaped[np.ndarray, "rows ports"],
+    telemetry: Mapping[str, Float[np.ndarray, " rows"]],
+) -> Curves:
+    """Return the gains of every level of every port that some spectrum has.
+
+    Parameters
+    ----------
+    table : GainModel
+    gain_std : float or None
+        By how much the gains of a level of a port may be off, relative.
+    levels : (rows, ports) array of str
+    telemetry : mapping of str to (rows,) array
+    """
+    mhz = np.linspace(*CURVE_MHZ)
+    shape = (len(LETTERS), PORTS, len(mhz))
+    gain, std = np.full(shape, np.nan), np.zeros(shape)
+    mean = {name: np.array([values.mean()]) for name, values in telemetry.items()}
+    for number, level in enumerate(LETTERS):
+        for port in np.flatnonzero((levels == level).any(axis=0)).tolist():
+            basis = table.basis(level, port, mhz)
+            gain[number, port] = basis[0] + table.strengths(level, port, mean)[0] @ basis[1:]
+            variance = (gain_std or 0.0) ** 2 * np.square(gain[number, port])
+            if table.component_std is not None:
+                components = table.component_std[number, port][:, None] * basis[1:]
+                variance = variance + np.square(components).sum(axis=0)
+            std[number, port] = np.sqrt(variance)
+    return Curves(mhz, gain, std)
+
+
+def draw_gains(
+    table: GainModel, gain_std: float | None, generator: np.random.Generator
+) -> tuple[GainModel, dict[str, float]]:
+    """Draw gains of which a table is the mean.
+
+    With independent standard normal z for each level of each port,
+    G = (1 + gain_std z_0) (mean + q_1 v_1 + q_2 v_2) + sum_r component_std_r z_r v_r.
+
+    Parameters
+    ----------
+    table : GainModel
+        With its ``component_std``, or None where its components are exact.
+    gain_std : float or None
+        Relative to the gain; None if it is exact.
+    generator : numpy.random.Generator
+
+    Returns
+    -------
+    table : GainModel
+        The gains that are drawn, for the same telemetry.
+    errors : dict
+        z by the names that averages of spectra have for them, as M0 and M0 PC1.
+
+    Raises
+    ------
+    InputError
+        If a gain is drawn below zero.
+    """
+    mean, coefficient = table.mean.copy(), table.coefficient.copy()
+    errors: dict[str, float] = {}
+    for number, level in enumerate(LETTERS):
+        for port in range(PORTS):
+            name, place = f"{level}{port}", (number, port)
+            if gain_std is not None:
+                errors[name] = float(generator.standard_normal())
+                factor = 1.0 + gain_std * errors[name]
+                if factor <= 0.0:
+                    raise InputError(
+                        f"with a standard deviation of {gain_std:g} of itself the gain of {name} "
+                        "was drawn below zero; give a smaller flight.gain_std"
+                    )
+                mean[place] *= factor
+                coefficient[place] *= factor
+            if table.component_std is not None:
+                for r in range(N_COMPONENTS):
+                    z = errors[f"{name} PC{r + 1}"] = float(generator.standard_normal())
+                    coefficient[(*place, r, 0)] += table.component_std[(*place, r)] * z
+    return replace(table, mean=mean, coefficient=coefficient), errors
+
+
+COEFFICIENTS = "alpha_refit.csv"
+MODELS = ("quadratic", "linear")
+DIMS = ("level", "port", "component", "anchor")
+LAYOUT = Layout(
+    "a gain table",
+    {
+        "level": Variable(("level",), "text", choices=LETTERS),
+        "anchor_mhz": Variable(("level", "port", "anchor"), low=0.0, unit="MHz"),
+        "mean": Variable(("level", "port", "anchor")),
+        "components": Variable(DIMS),
+        "coefficient": Variable((*DIMS[:3], "term")),
+        "component_std": Variable(DIMS[:3], low=0.0, optional=True),
+    },
+)
+CSV = Layout(
+    "luseepy's coefficients of gains",
+    {name: Variable(("row",), "text") for name in ("gain_setting", "component", "model", "term")}
+    | {"alpha_refit": Variable(("row",))},
+)
+HINT = "give the folder of luseepy's gain model (lusee/data/gain), or a netCDF file"
+
+
+def read_gain_table(path: str | Path, model: str = "quadratic") -> GainModel:
+    """Read a gain table.
+
+    Parameters
+    ----------
+    path : str or Path
+        A folder with ``{L,M,H}{0..3}_{mean,eigvecs,freqs}.npy`` and ``alpha_refit.csv`` of luseepy,
+        or a file of :func:`write_gain_table`.
+    model : {"quadratic", "linear"}
+        Which of luseepy's coefficients.
+
+    Raises
+    ------
+    InputError
+        If something is missing or not as it should be.
+    """
+    path = user_path(path)
+    if path.is_dir():
+        return _read_folder(path, model)
+    require_file(path, "a gain table", HINT)
+    found = read_netcdf(path, formats.GAINS, LAYOUT, HINT).arrays
+    if tuple(map(str, found["level"])) != LETTERS:
+        raise InputError(f"{path}: levels are {found['level']}; expected {', '.join(LETTERS)}")
+    return GainModel(
+        str(path),
+        found["anchor_mhz"],
+        found["mean"],
+        found["components"],
+        found["coefficient"],
+        found.get("component_std"),
+        "netCDF",
+    )
+
+
+def write_gain_table(path: str | Path, table: GainModel) -> Path:
+    """Write a gain table as netCDF, whole or not at all."""
+    variables = {
+        "anchor_mhz": (("level", "port", "anchor"), table.anchor_mhz, {"units": "MHz"}),
+        "mean": (("level", "port", "anchor"), table.mean, {"units": "count / (nV^2/Hz)"}),
+        "components": (DIMS, table.component),
+        "coefficient": ((*DIMS[:3], "term"), table.coefficient),
+    }
+    if table.component_std is not None:
+        variables["component_std"] = (DIMS[:3], table.component_std)
+    dataset = xr.Dataset(
+        variables, coords={"level": list(LETTERS)}, attrs={"format": formats.GAINS}
+    )
+    with replacing(path) as partial:
+        dataset.to_netcdf(partial, engine="h5netcdf")
+    return user_path(path)
+
+
+def _read_folder(folder: Path, model: str) -> GainModel:
+    if model not in MODELS:
+        raise InputError(f"unknown model of gains '{model}'; {nearest(model, MODELS)}")
+    arrays: dict[str, list[list[np.ndarray]]] = {"freqs": [], "mean": [], "eigvecs": []}
+    for level in LETTERS:
+        for name, rows in arrays.items():
+            rows.append(
+                [_gain_array(folder / f"{level}{port}_{name}.npy") for port in range(PORTS)]
+            )
+    vectors = [[v[:, :N_COMPONENTS].T for v in row] for row in arrays["eigvecs"]]
+    shapes = {v.shape for row in arrays["mean"] for v in row}
+    if len(shapes) > 1:
+        raise InputError(f"{folder}: gains have different numbers of frequencies, {shapes}")
+    return GainModel(
+        str(folder),
+        np.array(arrays["freqs"]),
+        np.array(arrays["mean"]),
+        np.array(vectors),
+        _coefficients(folder / COEFFICIENTS, model),
+        kind=f"luseepy's gain model, {model} coefficients",
+    )
+
+
+def _gain_array(path: Path) -> np.ndarray:
+    require_file(path, "a gain table", HINT)
+    with reading(path, "an array of luseepy's gain model"), path.open("rb") as file:
+        values = np.load(file, allow_pickle=False)
+    if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+        raise InputError(f"{path} holds other values than finite numbers")
+    two = path.stem.endswith("eigvecs")
+    if values.ndim != (2 if two else 1) or (two and values.shape[1] < N_COMPONENTS):
+        expected = "a matrix" if two else "a list"
+        raise InputError(f"{path} has shape {values.shape}, expected {expected}")
+    return values.astype(np.float64)
+
+
+def _coefficients(path: Path, model: str) -> np.ndarray:
+    columns = read_table(path, CSV, HINT)
+    places = {
+        f"{level}{port} PC{r + 1} {term}": (i, port, r, k)
+        for i, level in enumerate(LETTERS)
+        for port in range(PORTS)
+        for r in range(N_COMPONENTS)
+        for k, term in enumerate(_terms(port))
+    }
+    found, seen = np.zeros((len(LETTERS), PORTS, N_COMPONENTS, N_TERMS)), set()
+    names = ("gain_setting", "component", "model", "term", "alpha_refit")
+    for number, (setting, component, family, term, value) in enumerate(
+        zip(*(columns[name] for name in names), strict=True), start=2
+    ):
+        if str(family).strip().lower() != model:
+            continue
+        name = f"{setting.strip().upper()} {component.strip().upper()} {term.strip()}"
+        if name not in places:
+            raise InputError(
+                f"{path}: line {number}: unknown coefficient '{name}'; {nearest(name, places)}"
+            )
+        if name in seen:
+            raise InputError(f"{path}: line {number} gives {name} a second time")
+        seen.add(name)
+        found[places[name]] = value
+    given = {name.rpartition(" ")[0] for name in seen}
+    lacking = dict.fromkeys(one for name in places if (one := name.rpartition(" ")[0]) not in given)
+    if lacking:
+        raise InputError(f"{path} has no coefficients of model {model} for {', '.join(lacking)}")
+    return found
+
+
+def _terms(port: int) -> tuple[str, ...]:
+    """Luseepy's names of phi."""
+    adc, fpga = f"SPE_ADC{port // 2}_T", "THERM_FPGA"
+    squares = (f"{fpga}*{fpga}", f"{adc}*{adc}", f"{fpga}*{adc}")
+    return ("1", fpga, adc, "SPE_1VAD8_V", "VMON_1V2D", "SPE_1VAD8_C", *squares)
+
+
+MEAN = {"L": 7e-4, "M": 3e-2, "H": 1.5}
+ANCHORS_MHZ = np.array([0.1, 0.7, 1.1, 3.1, *np.linspace(7.1, 70.1, 12)])
+# what q_1 and q_2 have of each feature of the telemetry: 1, F, A, V, D, I, F^2, A^2, F A
+TERMS = np.array(
+    [
+        [0.0, 2e-4, 1e-4, 1e-2, 1e-2, 5e-2, 1e-6, 1e-6, 0.0],
+        [1e-3, 1e-4, -1e-4, 0.0, 0.0, 0.0, 0.0, 1e-6, -1e-6],
+    ]
+)
+# the gain falls towards the ends of the band
+LOW_MHZ, HIGH_MHZ = 0.2, 80.0
+
+
+def synthetic_gains(path: str = "made up") -> GainModel:
+    """Return the table.
+
+    Parameters
+    ----------
+    path : str
+        Where it will be, for messages.
+    """
+    lead = (len(LETTERS), PORTS)
+    f = ANCHORS_MHZ
+    shape = (f / (f + LOW_MHZ)) ** 2 / (1.0 + (f / HIGH_MHZ) ** 2)
+    ports = 1.0 + 0.04 * np.arange(PORTS)
+    mean: Float[np.ndarray, "levels ports anchors"] = (
+        np.array([MEAN[level] for level in LETTERS])[:, None, None] * ports[:, None] * shape
+    )
+    slope = np.log(f / 20.0) / 5.0
+    component = np.stack([mean, mean * slope], axis=2)
+    # every level and port has a law of its own
+    factor = 1.0 + 0.1 * np.arange(len(LETTERS) * PORTS).reshape(*lead, 1, 1)
+    coefficient = np.broadcast_to(TERMS, (*lead, N_COMPONENTS, N_TERMS)) * factor
+    return GainModel(path, np.broadcast_to(f, (*lead, len(f))).copy(), mean, component, coefficient)

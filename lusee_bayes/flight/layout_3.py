@@ -1,0 +1,163 @@
+"""Layout 3 of ``lusee.ingest``, in HDF5 and in FITS: the same under other names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from astropy.io import fits
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.formats import IMAGE_DTYPES
+from lusee_bayes.core.layouts import Attribute, Content, Layout, Unread
+from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, SAME_S, Clock
+from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Read, Session, session_of
+from lusee_bayes.instrument.times import scale_of
+
+Opener = Callable[[], AbstractContextManager[Read]]
+
+INTERPOLATED = "spectra_interpolated_telemetry"
+# what luseepy makes of the scale of a mission clock that nobody has established
+UNKNOWN = "unknown"
+CLOCK_WORDS = {
+    "constants.raw_time_subtract_seconds": Attribute(),
+    "constants.mjd_epoch_offset_days": Attribute(),
+    "constants.time_scale": Attribute("text", optional=True),
+}
+LAYOUT_3 = Layout("a session of lusee.ingest, layout 3", ROWS, SAID | CLOCK_WORDS)
+# tables of FITS, with what comes before the names of their columns in HDF5
+TABLES = {"SPECTRA_TIMES": "spectra", "SPECTRA_META": META, "SPEC_INTERP": "telemetry"}
+# columns and words that have another name there
+COLUMNS = {"spectra/RAW_TIME": "spectra/raw_times", "spectra/MJD_TIME": "spectra/mjd_times"}
+WORDS = {
+    "CONSTANTS": {
+        "LUN_LAT": "constants.lun_lat_deg",
+        "LUN_LON": "constants.lun_long_deg",
+        "RAWSHFT": "constants.raw_time_subtract_seconds",
+        "MJDOFF": "constants.mjd_epoch_offset_days",
+        "TIMESYS": "constants.time_scale",
+    },
+    "SESSION_INV": {"SW_VERS": "session_invariants.software_version"},
+    "SPECTRA": {
+        "BUNIT": "spectra/data.units",
+        "REPRESENTATION": "spectra/data.representation",
+        "BITSREST": "spectra/data.bitslice_restored",
+        "BITSREF": "spectra/data.bitslice_reference",
+        "NORMVER": "spectra/data.normalization_version",
+    },
+}
+
+
+def session_of_hdf5(path: Path, file: h5py.File, opener: Opener) -> Session:
+    """Make a session of an open file.
+
+    Parameters
+    ----------
+    path : Path
+    file : h5py.File
+    opener : callable
+        Opens the spectra.
+
+    Raises
+    ------
+    InputError
+        If something is missing or not as it should be.
+    """
+    if "spectra" not in file or "data" not in file["spectra"]:
+        raise InputError(
+            f"{path} has no spectra/data: the session holds no spectra (it has "
+            f"{', '.join(file) or 'nothing'})"
+        )
+    arrays: dict[str, Unread] = {
+        f"{group}/{name}": item
+        for group in ("spectra", META)
+        if group in file
+        for name, item in file[group].items()
+        if isinstance(item, h5py.Dataset)
+    }
+    values = {
+        f"{name}.{key}": value
+        for name in ("constants", "session_invariants", "spectra/data")
+        if name in file
+        for key, value in file[name].attrs.items()
+    }
+    arrays |= _interpolated(path, file)
+    return _checked_session(path, "HDF5", arrays, values, opener)
+
+
+def session_of_fits(path: Path, hdus: fits.HDUList, opener: Opener) -> Session:
+    """Make a session of an open file, as :func:`session_of_hdf5`."""
+    names = [hdu.name for hdu in hdus]
+    if "SPECTRA" not in names:
+        raise InputError(
+            f"{path} has no image SPECTRA: the session holds no spectra (it has "
+            f"{', '.join(names[1:]) or 'nothing'})"
+        )
+    arrays: dict[str, Unread | _Cube] = {"spectra/data": _Cube(hdus["SPECTRA"])}
+    for table, place in TABLES.items():
+        if table not in names:
+            continue
+        for column in hdus[table].columns.names:
+            name = f"{place}/{column}"
+            arrays[COLUMNS.get(name, name)] = np.asarray(hdus[table].data[column])
+    values: dict[str, Any] = {
+        ours: hdus[hdu].header[word]
+        for hdu, words in WORDS.items()
+        if hdu in names
+        for word, ours in words.items()
+        if word in hdus[hdu].header
+    }
+    return _checked_session(path, "FITS", arrays, values, opener)
+
+
+class _Cube:
+    """The spectra of a FITS file, not yet read."""
+
+    def __init__(self, hdu: fits.ImageHDU):
+        self.shape = tuple(hdu.shape)
+        self.dtype = np.dtype(IMAGE_DTYPES[hdu.header["BITPIX"]])
+
+
+def _interpolated(path: Path, file: h5py.File) -> dict[str, Unread]:
+    """Telemetry at the times of the spectra, as the file has it."""
+    if INTERPOLATED not in file:
+        return {}
+    group = file[INTERPOLATED]
+    if "time" in group and "raw_times" in file["spectra"]:
+        theirs, ours = np.asarray(group["time"]), np.asarray(file["spectra/raw_times"])
+        if theirs.shape != ours.shape or not np.array_equal(theirs, ours):
+            raise InputError(f"{path}: {INTERPOLATED}/time are not the times of the spectra")
+    return {f"telemetry/{name}": group[name] for name in TELEMETRY if name in group}
+
+
+def _checked_session(
+    path: Path, kind: str, arrays: dict[str, Any], values: dict[str, Any], opener: Opener
+) -> Session:
+    found = LAYOUT_3.checked(path, arrays, values)
+    return session_of(path, 3, kind, found, arrays, _clock_by_epoch(path, found), opener)
+
+
+def _clock_by_epoch(path: Path, found: Content) -> Clock | None:
+    scale = found.values.get("constants.time_scale", UNKNOWN).lower()
+    mjd = found.values["constants.mjd_epoch_offset_days"]
+    # luseepy writes zero where the epoch is not known
+    if mjd == 0.0:
+        return None
+    raw_s = found.values["constants.raw_time_subtract_seconds"]
+    readings = found.arrays["spectra/raw_times"]
+    by_epoch = mjd + (readings - raw_s) / DAY_S
+    theirs = found.arrays.get("spectra/mjd_times", by_epoch)
+    off = np.flatnonzero(np.abs(theirs - by_epoch) > SAME_S / DAY_S)
+    if off.size:
+        k = int(off[0])
+        raise InputError(
+            f"{path}: mjd_times of spectrum {k} is {theirs[k]:.9g}, raw_times {readings[k]:.9g} s "
+            f"with the epoch of the constants {by_epoch[k]:.9g}; ingest the session again"
+        )
+    if scale == UNKNOWN:
+        return None
+    return Clock(str(path), MJD_ZERO, mjd, scale_of(f"{path}: time_scale", scale), raw_s)

@@ -1,0 +1,230 @@
+"""Layout 4 of ``lusee.ingest`` in HDF5.
+
+It has row-aligned metadata as a union of fields (``metadata/fields/NAME/variant_000/data``), raw
+telemetry on its own clock, and a clock reference in place of an MJD offset; all is brought to the
+names of layout 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from astropy.time import Time
+from jaxtyping import Float
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.layouts import Layout, Unread
+from lusee_bayes.flight.clock import Clock
+from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Read, Session, session_of
+from lusee_bayes.instrument.times import scale_of, unannounced_leap_seconds
+
+LAYOUT_4 = Layout("a session of lusee.ingest, layout 4", ROWS, SAID)
+# names of layout 4 for those of layout 3
+NAMES = [name.removeprefix(f"{META}/") for name in ROWS if name.startswith(META)]
+FIELDS = {name: name.lower() for name in (*NAMES, "actual_gain")}
+# groups of data that are no spectra of all channels, and what they are called
+UNUSED = {
+    "tr_spectra": "time-resolved spectra",
+    "calibrator/zoom_spectra": "zoom spectra",
+    "grimm_spectra": "Grimm's spectra",
+    "calibrator/metadata": "calibrator metadata",
+    "calibrator/data": "calibrator data",
+    "calibrator/raw_pfb": "calibrator's raw filter bank",
+    "calibrator/debug": "calibrator debug pages",
+    "waveform": "waveforms",
+    "housekeeping": "housekeeping",
+}
+# ticks of the clock of the telemetry in a second
+TICKS = 65536
+
+
+def session_of_4(
+    path: Path, file: h5py.File, opener: Callable[[], AbstractContextManager[Read]]
+) -> Session:
+    """Make a session of a file of layout 4.
+
+    Parameters
+    ----------
+    path : Path
+    file : h5py.File
+        Open.
+    opener : callable
+        Opens the spectra.
+
+    Raises
+    ------
+    InputError
+        If something is missing or not as it should be.
+    """
+    cube = _dataset(file, "spectra/data")
+    if cube is None:
+        raise InputError(
+            f"{path} has no spectra/data: the session holds no spectra (it has "
+            f"{', '.join(file) or 'nothing'})"
+        )
+    values = {
+        f"{name}.{key}": value
+        for name in ("constants", "session_invariants", "spectra/data")
+        for key, value in _attributes(file, name).items()
+    }
+    arrays = {"spectra/data": cube, **_metadata(path, file, cube.shape[0] if cube.shape else 0)}
+    if (raw_s := _dataset(file, "spectra/raw_seconds")) is not None:
+        arrays["spectra/raw_times"] = raw_s
+        _require_valid(path, _dataset(file, "spectra/raw_time_valid"))
+    clock = _clock_by_reference(path, file)
+    if clock is not None and raw_s is not None:
+        arrays |= _telemetry_at_rows(path, file, clock, np.asarray(raw_s))
+    found = LAYOUT_4.checked(path, arrays, values)
+    return session_of(path, 4, "HDF5", found, arrays, clock, opener, _unused(file))
+
+
+def _unused(file: h5py.File) -> dict[str, int]:
+    """How many rows the families have that maps do not use."""
+    return {
+        name: int(np.ravel(file[path].attrs.get("count", 0))[0])
+        for path, name in UNUSED.items()
+        if path in file
+    }
+
+
+def _attributes(file: h5py.File, path: str) -> dict[str, Any]:
+    """What a group or an array says of itself; nothing where there is none."""
+    item = file.get(path)
+    return {} if item is None else dict(item.attrs)
+
+
+def _dataset(file: h5py.File, path: str) -> Unread | None:
+    """An array, not yet read, or None."""
+    item = file.get(path)
+    if not isinstance(item, h5py.Dataset):
+        return None
+    if h5py.check_string_dtype(item.dtype) is not None:
+        return np.array(item.asstr()[()], dtype=np.str_)
+    return item
+
+
+def _metadata(path: Path, file: h5py.File, n: int) -> dict[str, Unread]:
+    """Fields that all rows have, in one shape."""
+    found: dict[str, Unread] = {}
+    for ours, theirs in FIELDS.items():
+        values = _dataset(file, f"{META}/fields/{theirs}/variant_000/data")
+        if values is None:
+            continue
+        if tuple(values.shape)[:1] != (n,):
+            raise InputError(
+                f"{path}: {META}/fields/{theirs} is there in the shape {tuple(values.shape)} for "
+                f"{n} spectra, or has several shapes; ingest the session again"
+            )
+        rows = _dataset(file, f"{META}/fields/{theirs}/variant_000/row_indices")
+        if rows is not None and not np.array_equal(np.asarray(rows), np.arange(n)):
+            raise InputError(
+                f"{path}: row_indices of {META}/fields/{theirs} are not 0 to {n - 1}, a number for "
+                "each spectrum; ingest the session again"
+            )
+        found[f"{META}/{ours}"] = values
+    if (navgf := _dataset(file, "spectra/navgf")) is not None:
+        told = np.asarray(found.setdefault(f"{META}/Navgf", navgf))
+        if not np.array_equal(told, np.asarray(navgf)):
+            raise InputError(
+                f"{path}: spectra/navgf is {_values(navgf)}, navgf of the metadata is "
+                f"{_values(told)}; ingest the session again"
+            )
+    return found
+
+
+def _values(numbers: Unread) -> str:
+    """Which values an array has."""
+    return ", ".join(map(str, np.unique(np.asarray(numbers)).tolist()))
+
+
+def _require_valid(path: Path, valid: Unread | None) -> None:
+    """InputError where a file marks times of its spectra as invalid."""
+    marks = np.ones(1) if valid is None else np.asarray(valid)
+    if not marks.all():
+        raise InputError(
+            f"{path}: raw_time_valid marks the clock of {int((marks == 0).sum())} of {marks.size} "
+            "spectra as invalid; ingest the session again without them"
+        )
+
+
+def _clock_by_reference(path: Path, file: h5py.File) -> Clock | None:
+    said = _attributes(file, "clock_reference")
+    if not bool(said.get("available")):
+        return None
+    scale = scale_of(f"{path}: time_scale", str(said["time_scale"]))
+    raw_s = _anchors(file).get("spectrometer")
+    if raw_s is None:
+        return None
+    with unannounced_leap_seconds():
+        time = Time(str(said["clock_reference_isot"]), format="isot", scale=scale)
+    return Clock(str(path), float(time.jd1), float(time.jd2), scale, raw_s)
+
+
+def _anchors(file: h5py.File) -> dict[str, float]:
+    """What each clock showed at the reference."""
+    names = _dataset(file, "clock_reference/clock_sources")
+    raw_s = _dataset(file, "clock_reference/clock_reference_raw_seconds")
+    if names is None or raw_s is None:
+        return {}
+    values = np.asarray(raw_s, dtype=np.float64).tolist()
+    return dict(zip(np.asarray(names).tolist(), values, strict=True))
+
+
+def _telemetry_at_rows(
+    path: Path, file: h5py.File, clock: Clock, raw_s: Float[np.ndarray, " rows"]
+) -> dict[str, Unread]:
+    """Telemetry at the times of the spectra, where both clocks have a reference."""
+    anchor = _anchors(file).get("dcb")
+    if anchor is None or "telemetry" not in file:
+        return {}
+    parts = ("field_names", "mission_seconds", "lusee_subsecs", "values")
+    found = {name: _dataset(file, f"telemetry/{name}") for name in parts}
+    for name, array in found.items():
+        if array is None:
+            raise InputError(
+                f"{path}: telemetry has no {name} (it has "
+                f"{', '.join(file['telemetry']) or 'nothing'}); ingest the session again "
+                "with luseepy's present version"
+            )
+    names = np.asarray(found["field_names"]).tolist()
+    seconds, ticks, values = (np.asarray(found[name], dtype=np.float64) for name in parts[1:])
+    times_s = seconds + ticks / TICKS - anchor + clock.raw_s
+    return {
+        f"telemetry/{name}": _interpolated_to(
+            f"{path}: telemetry {name}", raw_s, times_s, values[:, names.index(name)]
+        )
+        for name in TELEMETRY
+        if name in names
+    }
+
+
+def _interpolated_to(
+    where: str,
+    raw_s: Float[np.ndarray, " rows"],
+    times_s: Float[np.ndarray, " times"],
+    values: Float[np.ndarray, " times"],
+) -> Float[np.ndarray, " rows"]:
+    """Interpolate telemetry linearly to the times of spectra, both of one clock.
+
+    Raises
+    ------
+    InputError
+        If the telemetry does not cover them: nothing is extrapolated.
+    """
+    order = np.argsort(times_s, kind="stable")
+    times_s, values = times_s[order], values[order]
+    good = np.isfinite(values)
+    times_s, values = times_s[good], values[good]
+    # a spectrum is longer than the telemetry's step, so that its ends may lack half a step
+    slack = 2.0 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+    if not len(times_s) or raw_s[0] < times_s[0] - slack or raw_s[-1] > times_s[-1] + slack:
+        raise InputError(
+            f"{where} does not cover the spectra, so that their gain is not known; ingest the "
+            "session with its telemetry"
+        )
+    return np.interp(raw_s, times_s, values)

@@ -1,0 +1,472 @@
+"""Reduce sessions of any length: calibrate, flag and average, one piece after the other.
+
+Counts are read slab by slab. All spectra of a few bins of time make a piece: calibrated and put
+into bands, each is a bin of its own, of which bursts are flagged; then they are averaged into the
+bins of the whole. No more of the spectra is ever in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import astropy.units as u
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from lusee_bayes.core.engine import in_threads
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.flight.bands import ChannelBand
+from lusee_bayes.flight.flags import (
+    COMB_LIMIT,
+    burst_flags,
+    comb_bins,
+    comb_strength,
+    line_flags,
+    robust_scale,
+    threshold,
+)
+from lusee_bayes.flight.gain_model import NANO2, Curves, gain_curves
+from lusee_bayes.flight.recipe import Recipe, Timeline, timeline
+from lusee_bayes.flight.reduced import (
+    BURST,
+    COMB,
+    CORRECTED,
+    NO_DATA,
+    PRODUCT,
+    SATURATED,
+    TOO_MANY,
+    USED,
+    Reduced,
+)
+from lusee_bayes.flight.session import (
+    AUTOS,
+    AVERAGING,
+    FIRST_PORT,
+    IMAGINARY,
+    NO_LEVEL,
+    OF_FLIGHT,
+    PORTS,
+    SECOND_PORT,
+    Read,
+    Session,
+    channel_mhz,
+)
+from lusee_bayes.instrument.averaging import by_the_rule
+from lusee_bayes.instrument.times import unannounced_leap_seconds
+
+# spectra that are worked on at once, and at least how many make a piece between two bins
+SLAB, PIECE = 128, 1024
+
+
+def reduce_sessions(
+    sessions: Sequence[Session], recipe: Recipe, stages: Stages | None = None
+) -> Reduced:
+    """Reduce sessions.
+
+    Parameters
+    ----------
+    sessions : sequence of Session
+    recipe : Recipe
+    stages : Stages, optional
+        Told how far it is.
+
+    Raises
+    ------
+    InputError
+        If clocks, sites or times are not known or contradict each other, a session lacks telemetry,
+        or bands have too few channels.
+    """
+    stages = stages or Stages()
+    line = timeline(sessions, recipe)
+    if recipe.average_s is not None and recipe.average_s < line.observation.step_s:
+        raise InputError(
+            f"the spectra are to be averaged over {recipe.average_s:g} s, and last for "
+            f"{line.observation.step_s:g} s; use a longer observation.average_s, or none"
+        )
+    like = _in_common(line, recipe)
+    level = np.concatenate([s.level for s in line.sessions])
+    first = np.searchsorted(line.bin_of, np.arange(line.n_bins))
+    whole = Reduced.blank(like, line.observation, line.bin_of, level[first])
+    numbers = range(len(recipe.frequencies_mhz))
+    spans, slabs = [], []
+    with (
+        stages.progress("spectra", len(line.bin_of)) as done,
+        ExitStack() as files,
+        ThreadPoolExecutor(1) as ahead,
+    ):
+        pieces = _pieces(line)
+        counts = _read_ahead(ahead, files, line, pieces)
+        states: dict[Any, State] = {}
+        for piece in pieces:
+            keep = np.zeros(len(level), dtype=bool)
+            keep[piece] = True
+            starts = range(0, int(keep.sum()), SLAB)
+            spectra = Reduced.blank(
+                like,
+                line.observation.select(keep),
+                np.arange(keep.sum()),
+                level[piece],
+                len(starts),
+            )
+            for start in starts:
+                slab = _slab(line, recipe, states, piece.start + start, next(counts))
+                in_threads(partial(slab, spectra, start), numbers)
+            finish = partial(_finish, spectra, whole, piece, recipe.false_alarm)
+            spans.append(np.stack(in_threads(finish, numbers)))
+            slabs.append(spectra.slab_scatter)
+            done(piece.stop)
+    return replace(
+        whole,
+        span_scatter=np.concatenate(spans, axis=1),
+        slab_scatter=np.concatenate(slabs, axis=1),
+    )
+
+
+def _in_common(line: Timeline, recipe: Recipe) -> dict[str, Any]:
+    """What does not depend on the spectra."""
+    return {
+        "frequencies_mhz": np.array(recipe.frequencies_mhz),
+        "bandwidth_mhz": recipe.bandwidth_mhz,
+        "average_s": recipe.average_s,
+        "component_std": recipe.table.component_std,
+        "gain_std": recipe.gain_std,
+        "curves": _curves(line, recipe),
+        "sessions": tuple(_said_of(s, recipe) for s in line.sessions),
+        "recipe": recipe.words(),
+    }
+
+
+def _curves(line: Timeline, recipe: Recipe) -> Curves:
+    sessions = line.sessions
+    telemetry = {
+        name: np.concatenate([s.telemetry[name] for s in sessions])
+        for name in sessions[0].telemetry
+    }
+    levels = np.concatenate([s.level for s in sessions])
+    return gain_curves(recipe.table, recipe.gain_std, levels, telemetry)
+
+
+def _pieces(line: Timeline) -> list[slice]:
+    """Rows of whole bins of one state, as few as ``PIECE`` allows."""
+    run, bin_of = line.observation.run, line.bin_of
+    ends = np.flatnonzero(np.append(np.diff(bin_of) != 0, True)) + 1
+    pieces, start = [], 0
+    for k, end in enumerate(ends):
+        last = k + 1 == len(ends)
+        if last or end - start >= PIECE or run[ends[k + 1] - 1] != run[start]:
+            pieces.append(slice(start, int(end)))
+            start = int(end)
+    return pieces
+
+
+def _read_ahead(
+    ahead: ThreadPoolExecutor, files: ExitStack, line: Timeline, pieces: list[slice]
+) -> Iterator[np.ndarray]:
+    """Counts of every slab of every piece; the next are read meanwhile."""
+    reads: dict[int, Read] = {}
+
+    def counts(rows: slice) -> np.ndarray:
+        session = int(line.session[rows.start])
+        if session not in reads:
+            reads[session] = files.enter_context(line.sessions[session].spectra())
+        first = int(line.row[rows.start])
+        return reads[session](first, first + rows.stop - rows.start)
+
+    slabs = [
+        slice(start, min(start + SLAB, piece.stop))
+        for piece in pieces
+        for start in range(piece.start, piece.stop, SLAB)
+    ]
+    following: Future[np.ndarray] = ahead.submit(counts, slabs[0])
+    for after in [*slabs[1:], None]:
+        read = following.result()
+        if after is not None:
+            following = ahead.submit(counts, after)
+        yield read
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What is the same for many spectra: the bands, the gains' splines, the known lines.
+
+    Attributes
+    ----------
+    recipe : Recipe
+    navgf : int
+    levels : tuple of str
+        Of the ports.
+    bands : tuple of ChannelBand
+    basis : (ports, 3, bins) array
+        Mean and components of the gains, averaged over the channels of every bin; NaN where there
+        are none.
+    known : (bins,) array of bool
+        Bins with known lines.
+    """
+
+    recipe: Recipe
+    navgf: int
+    levels: tuple[str, ...]
+    bands: tuple[ChannelBand, ...]
+    basis: Float[np.ndarray, "ports 3 bins"]
+    known: Bool[np.ndarray, " bins"]
+
+    @classmethod
+    def of(cls, recipe: Recipe, navgf: int, levels: tuple[str, ...]) -> State:
+        """Prepare bands and gains.
+
+        Raises
+        ------
+        InputError
+            If a band has too few bins.
+        """
+        averaging, middles = AVERAGING[navgf], channel_mhz(recipe.origin)
+        channels = averaging.channels()
+        basis = np.full((PORTS, 3, averaging.n_bins), np.nan)
+        for port, level in enumerate(levels):
+            if level != NO_LEVEL:
+                splines = recipe.table.basis(level, port, middles)
+                basis[port] = splines[:, channels].mean(axis=2)
+        bands = tuple(
+            ChannelBand.of(
+                f, recipe.bandwidth_mhz, recipe.degree, averaging, middles, recipe.shared_noise
+            )
+            for f in recipe.frequencies_mhz
+        )
+        known = recipe.lines.bins(averaging, middles)
+        if recipe.comb == "always":
+            known = known | comb_bins(averaging)
+        return cls(recipe, navgf, levels, bands, basis, known)
+
+    def strengths(
+        self, telemetry: Mapping[str, Float[np.ndarray, " rows"]], n_rows: int
+    ) -> Float[np.ndarray, "rows ports 3"]:
+        """Return 1, q_1 and q_2 of every port; NaN where it has no level."""
+        found = np.full((n_rows, PORTS, 3), np.nan)
+        for port, level in enumerate(self.levels):
+            if level != NO_LEVEL:
+                found[:, port, 0] = 1.0
+                found[:, port, 1:] = self.recipe.table.strengths(level, port, telemetry)
+        return found
+
+    def lines(
+        self,
+        counts: Float32[np.ndarray, "rows products channels"],
+        frames: Float[np.ndarray, " rows"],
+        notched: Bool[np.ndarray, " rows"],
+    ) -> Bool[np.ndarray, "rows bins"]:
+        """Return the bins with known lines, or of the comb where it is on.
+
+        Parameters
+        ----------
+        counts : (rows, products, channels) array
+        frames : (rows,) array
+            Frames that each averages.
+        notched : (rows,) array of bool
+            Where the file says that the notch filter was on.
+        """
+        averaging, comb = AVERAGING[self.navgf], notched
+        if self.recipe.comb == "found":
+            autos = counts[:, :PORTS].astype(np.float64)
+            strength = comb_strength(autos, frames, averaging, channel_mhz(self.recipe.origin))
+            comb = comb | (np.abs(strength) > COMB_LIMIT)
+        return self.known | (comb[:, None] & comb_bins(averaging))
+
+
+def _slab(
+    line: Timeline, recipe: Recipe, states: dict[Any, State], start: int, counts: np.ndarray
+) -> Callable[[Reduced, int, int], None]:
+    """What puts the counts of some spectra, from a row on, into a band."""
+    session, first = line.sessions[int(line.session[start])], int(line.row[start])
+    here = slice(first, first + len(counts))
+    key = (int(session.navgf[first]), tuple(str(level) for level in session.level[first]))
+    if key not in states:
+        states[key] = State.of(recipe, *key)
+    state = states[key]
+    telemetry = {name: values[here] for name, values in session.telemetry.items()}
+    notched = np.zeros(len(counts), dtype=bool)
+    if session.notch is not None:
+        notched = _notched(session.notch[here])
+    try:
+        strengths = state.strengths(telemetry, len(counts))
+    except InputError as error:
+        raise InputError(f"{session.path}: {error}") from error
+    frames = session.frames[here]
+    lines = state.lines(counts, frames, notched)
+    return partial(_calibrate, state, counts, frames, strengths, lines, session.saturated[here])
+
+
+def _notched(notch: Int[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+    """Whether the mean of the comb's channels is subtracted: bit 4 says that it is not."""
+    return ((notch & 0b111) > 0) & ((notch & 0b10000) == 0)
+
+
+def _calibrate(
+    state: State,
+    counts: Float32[np.ndarray, "rows products channels"],
+    frames: Float[np.ndarray, " rows"],
+    strengths: Float[np.ndarray, "rows ports 3"],
+    lines: Bool[np.ndarray, "rows bins"],
+    saturated: Bool[np.ndarray, " rows"],
+    spectra: Reduced,
+    start: int,
+    number: int,
+) -> None:
+    """Calibrate, flag and average the channels of a band, into spectra from ``start`` on."""
+    recipe, band, averaging = state.recipe, state.bands[number], AVERAGING[state.navgf]
+    rows = slice(start, start + len(counts))
+    at = slice(band.first, band.last)
+    basis = state.basis[:, :, at]
+    gain = np.einsum("rpc,pck->rpk", strengths, basis)
+    with np.errstate(invalid="ignore"):
+        root = np.sqrt(np.where(gain > 0.0, gain, np.nan))
+    raw = counts[:, OF_FLIGHT, at].astype(np.float64)
+    factor = NANO2 * averaging.divisor / averaging.members
+    channels = raw * factor / (root[:, FIRST_PORT] * root[:, SECOND_PORT])
+    if recipe.sign < 0:
+        channels[:, IMAGINARY] *= -1.0
+    finite = np.isfinite(channels)
+    present = finite.any(axis=2)
+    # where a product is there, all of it has to be
+    whole = (finite | ~present[..., None]).all(axis=1) & present[:, AUTOS].any(axis=1)[:, None]
+    good = whole & ~lines[:, at] & ~saturated[:, None]
+    # products without an auto of their own do not tell lines
+    there = finite[:, AUTOS]
+    filled = np.where(there, channels[:, AUTOS], 0.0)
+    found, z = line_flags(band, filled, frames, good, threshold(recipe.false_alarm, PORTS))
+    kept = good & ~found
+    mean_auto = filled.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+    clean = np.where(finite, channels, 0.0)
+    values, variance, further = band.values(clean, mean_auto, kept)
+    before, _, _ = band.values(clean, mean_auto, whole)
+    reason = spectra.reason[number, rows]
+    reason[~np.isfinite(variance)] = TOO_MANY
+    reason[~good.any(axis=1)] = COMB
+    reason[~whole.any(axis=1)] = NO_DATA
+    reason[saturated] = SATURATED
+    spectra.values[number, :, rows] = np.where(present, values, np.nan).T
+    spectra.before[number, :, rows] = np.where(present, before, np.nan).T
+    spectra.n_averaged[number, rows] = frames / variance
+    noise = spectra.noise(number)[:, rows]
+    spectra.bend[number, :, rows] = _over(further[:, AUTOS].T, noise)
+    spectra.lines[number, rows] = 1.0 - kept.sum(axis=1) / len(band.basis)
+    spectra.slab_scatter[number, start // SLAB] = robust_scale(z[:, 0], kept)
+    middle = band.basis[:, 0] / len(band.basis)
+    centre = np.einsum("rpk,k->pr", gain, middle)
+    spectra.gain[number, :, rows] = centre
+    components = np.einsum("pck,k->pc", basis[:, 1:], middle)
+    spectra.slope[number, ..., rows] = components[..., None] / centre[:, None]
+
+
+def _over(values: Float[np.ndarray, "*n"], noise: Float[np.ndarray, "*n"]) -> np.ndarray:
+    """Values in standard deviations; NaN where there is no noise."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(np.isfinite(values) & (noise > 0.0), values / noise, np.nan)
+
+
+def _finish(
+    spectra: Reduced, whole: Reduced, rows: slice, false_alarm: float, number: int
+) -> Float[np.ndarray, " spans"]:
+    """Flag bursts in a band of a piece, and put the means of its bins into the whole.
+
+    Returns
+    -------
+    (spans,) array
+        Scatter over the noise.
+    """
+    scatter = _flag_bursts(spectra, false_alarm, number)
+    bin_of = whole.bin_of[rows] - whole.bin_of[rows.start]
+    n = int(bin_of[-1]) + 1
+    first = int(whole.bin_of[rows.start])
+    bins = slice(first, first + n)
+    live = spectra.observation.live_s
+    reason, values = spectra.reason[number], spectra.values[number]
+    good = reason == USED
+    kept, used = by_the_rule(np.isfinite(values) & good, bin_of, live)
+    reason[good & ~used] = PRODUCT
+    whole.reason[number, rows] = reason
+    whole.lines[number, rows] = spectra.lines[number]
+    # each spectrum has the weight of its live time, in what is not flagged and in all of it
+    weights = np.where(used, live, 0.0)
+    some = np.bincount(bin_of, weights, n) > 0.0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        squares = np.where(used, weights**2 / spectra.n_averaged[number], 0.0)
+        n_averaged = np.bincount(bin_of, weights, n) ** 2 / np.bincount(bin_of, squares, n)
+    whole.n_averaged[number, bins] = np.where(some, n_averaged, 0.0)
+    averaged = partial(_means, bin_of=bin_of, n=n)
+    whole.values[number][:, bins] = np.where(kept & some, averaged(values, weights), np.nan)
+    whole.before[number][:, bins] = averaged(spectra.before[number], live)
+    whole.gain[number][:, bins] = averaged(spectra.gain[number], live)
+    whole.slope[number][..., bins] = averaged(spectra.slope[number], live)
+    further = averaged(spectra.bend[number] * spectra.noise(number), weights)
+    whole.bend[number][:, bins] = _over(further, whole.noise(number)[:, bins])
+    return scatter
+
+
+def _flag_bursts(spectra: Reduced, false_alarm: float, number: int) -> Float[np.ndarray, " spans"]:
+    """Flag spectra that do not fit those before and after; the scatter over the noise, by span."""
+    with unannounced_leap_seconds():
+        times = spectra.observation.times
+        seconds = (times - times[0]).to_value(u.s)
+    autos, noise = spectra.values[number, AUTOS].T, spectra.noise(number).T
+    # what is absent neither stands out nor tells
+    there = np.isfinite(autos)
+    noise = np.where(there & (noise > 0.0), noise, np.inf)
+    reason = spectra.reason[number]
+    good = reason == USED
+    burst, scatter = burst_flags(seconds, np.where(there, autos, 0.0), noise, good, false_alarm)
+    reason[burst] = BURST
+    return scatter
+
+
+def _means(
+    values: Float[np.ndarray, "... rows"],
+    weights: Float[np.ndarray, " rows"],
+    bin_of: Int[np.ndarray, " rows"],
+    n: int,
+) -> Float[np.ndarray, "... bins"]:
+    """Weighted means of the finite values of each bin; NaN where it has none."""
+    rows = np.moveaxis(values, -1, 0)
+    weights = weights.reshape(-1, *(1,) * (rows.ndim - 1))
+    known = np.isfinite(rows) * weights
+    total, summed = (np.zeros((n, *rows.shape[1:])) for _ in range(2))
+    np.add.at(total, bin_of, known)
+    np.add.at(summed, bin_of, np.where(known > 0.0, rows, 0.0) * weights)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.moveaxis(summed / total, 0, -1)
+
+
+def _said_of(session: Session, recipe: Recipe) -> Mapping[str, Any]:
+    clock = recipe.clock or session.clock
+    return {
+        "file": str(session.path),
+        "kind": session.kind,
+        "layout": session.layout,
+        "spectra": session.n_rows,
+        "software": session.software,
+        "navgf": sorted({int(n) for n in session.navgf}),
+        "levels": sorted({"".join(row) for row in session.level}),
+        "window_s": float(session.window_s.max()),
+        "saturated": int(session.saturated.sum()),
+        "errors": int((session.errors != 0).sum()),
+        "clock": _whose(session, recipe),
+        "clock_file": None if recipe.clock is None else Path(recipe.clock.source).name,
+        "scale": None if clock is None else clock.scale,
+        "rate": 1.0 if clock is None else clock.rate,
+        "first_s": float(session.raw_s[0]),
+        "last_s": float(session.raw_s[-1]),
+    }
+
+
+def _whose(session: Session, recipe: Recipe) -> str:
+    """Who says which UTC a session's clock stands for."""
+    if session.clock is None:
+        return "clock file"
+    corrected = recipe.clock is not None and recipe.clock.stated is not None
+    return CORRECTED if corrected else "session"

@@ -1,0 +1,398 @@
+"""A session of the spectrometer: what is known of every spectrum; the spectra stay in the file.
+
+Facts of the spectrometer are from the flight software (lusee-night/coreloop: ``high_prec_avg.h``,
+``core_loop.h``) and from luseepy's ``lusee.ingest``. ADCs of 14 bits take 102.4 million samples a
+second, of which 4096 make a spectrum of 2048 channels, 25 kHz apart, every 40 microseconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Shaped
+
+from lusee_bayes.core.checks import Described, counted
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.layouts import Attribute, Content, Unread, Variable
+from lusee_bayes.core.reading import reading
+from lusee_bayes.flight.clock import Clock
+from lusee_bayes.instrument.products import all_products, auto_indices, labels
+
+N_CHANNELS = 2048
+CHANNEL_MHZ = 0.025
+FRAME_S = 4096 / 102.4e6
+# the ends of what an ADC of 14 bits gives
+ADC_LOW, ADC_HIGH = -8192, 8191
+# gain states of the flight software (gain_state of core_loop.h) that the gain table knows
+LEVELS = {0: "L", 1: "M", 2: "H"}
+NO_LEVEL = "-"
+PORTS = 4
+
+# autos of the four ports, then real and imaginary part of every pair
+FLIGHT_PRODUCTS = (
+    *(f"{i}{i}R" for i in range(PORTS)),
+    *(f"{i}{j}{part}" for i in range(PORTS) for j in range(i + 1, PORTS) for part in "RI"),
+)
+N_PRODUCTS = len(FLIGHT_PRODUCTS)
+# where the products of the package's order are in the spectrometer's, and what each of them is
+OF_FLIGHT = np.array([FLIGHT_PRODUCTS.index(label) for label in labels()])
+AUTOS = auto_indices()
+FIRST_PORT = np.array([p.i for p in all_products()])
+SECOND_PORT = np.array([p.j for p in all_products()])
+IMAGINARY = np.array([p.part == "I" for p in all_products()])
+
+BinOrigin = Literal["centre", "edge"]
+
+
+@dataclass(frozen=True)
+class Averaging:
+    """Which channels a bin of a spectrum holds, for a value of ``Navgf``.
+
+    Attributes
+    ----------
+    stride : int
+        Bin i begins at channel stride * i.
+    members : int
+        So many channels from there on are summed.
+    divisor : int
+        What the sum is divided by.
+    """
+
+    stride: int
+    members: int
+    divisor: int
+
+    @property
+    def n_bins(self) -> int:
+        """Number of bins."""
+        return N_CHANNELS // self.stride
+
+    def channels(self) -> Int[np.ndarray, "bins members"]:
+        """Return the channels of every bin."""
+        return self.stride * np.arange(self.n_bins)[:, None] + np.arange(self.members)
+
+
+# of Navgf = 3, which leaves out every fourth channel, the sum of three is divided by four
+AVERAGING = {
+    1: Averaging(1, 1, 1),
+    2: Averaging(2, 2, 2),
+    3: Averaging(4, 3, 4),
+    4: Averaging(4, 4, 4),
+}
+
+
+def channel_mhz(origin: BinOrigin) -> Float[np.ndarray, " channels"]:
+    """Return the middle of every channel in MHz.
+
+    Parameters
+    ----------
+    origin : {"centre", "edge"}
+        Whether channel k has its centre or its lower edge at k times 25 kHz.
+    """
+    return CHANNEL_MHZ * (np.arange(N_CHANNELS) + (0.5 if origin == "edge" else 0.0))
+
+
+# what the gain table asks of the telemetry
+TELEMETRY = (
+    "THERM_FPGA",
+    "SPE_ADC0_T",
+    "SPE_ADC1_T",
+    "SPE_1VAD8_V",
+    "VMON_1V2D",
+    "SPE_1VAD8_C",
+)
+# counts of spectra [first:last] of all products and channels
+Read = Callable[[int, int], Float32[np.ndarray, "rows products channels"]]
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Session(Described):
+    """A session; its spectra stay in the file.
+
+    Attributes
+    ----------
+    path : Path
+    layout : int
+        Version of luseepy's layout.
+    kind : str
+        HDF5 or FITS.
+    raw_s : (rows,) array
+        The mission clock, in seconds.
+    navgf : (rows,) array of int
+        Averaging over channels (:data:`.AVERAGING`).
+    navg_shift : (rows,) array of int
+        Logarithm of the number of frames that a spectrum averages, to base 2.
+    share : (rows,) array
+        The share of them that was not rejected; 1 where the file does not say.
+    level : (rows, ports) array of str
+        Of the gain: L, M, H, or "-" where the gain table has none.
+    adc_low, adc_high : (rows, ports) array of int
+        Extremes of the ADC.
+    adc_invalid : (rows, ports) array of int
+        How many of its samples were out of range.
+    errors : (rows,) array of int
+        What the flight software says of itself.
+    notch : (rows,) array of int or None
+        Whether the average of every fourth channel is subtracted; None where the file does not say.
+    telemetry : mapping of str to (rows,) array
+        At the times of the spectra; some of :data:`TELEMETRY`.
+    clock : Clock or None
+        None if the file does not say which UTC the clock stands for.
+    lon_deg, lat_deg : float
+        Of the site, as the file has it.
+    software : str
+        Version of the flight software, as 0x307.
+    opener : callable
+        Opens the file: a context manager that gives a :data:`Read`.
+    unused : mapping of str to int
+        Other families of data in the file, and how many rows they have.
+    """
+
+    path: Path
+    layout: int
+    kind: str
+    raw_s: Float[np.ndarray, " rows"]
+    navgf: Int[np.ndarray, " rows"]
+    navg_shift: Int[np.ndarray, " rows"]
+    share: Float[np.ndarray, " rows"]
+    level: Shaped[np.ndarray, "rows ports"]
+    adc_low: Int[np.ndarray, "rows ports"]
+    adc_high: Int[np.ndarray, "rows ports"]
+    adc_invalid: Int[np.ndarray, "rows ports"]
+    errors: Int[np.ndarray, " rows"]
+    notch: Int[np.ndarray, " rows"] | None
+    telemetry: Mapping[str, Float[np.ndarray, " rows"]]
+    clock: Clock | None
+    lon_deg: float
+    lat_deg: float
+    software: str
+    opener: Callable[[], AbstractContextManager[Read]]
+    unused: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self):
+        back = np.flatnonzero(~(np.diff(self.raw_s) > 0.0))
+        if back.size:
+            k = int(back[0])
+            raise InputError(
+                f"{self.path}: spectrum {k + 1} (clock {self.raw_s[k + 1]:.6f} s) does not come "
+                f"after spectrum {k} ({self.raw_s[k]:.6f} s); the spectra have to be in order"
+            )
+        for value in np.unique(self.navgf):
+            if int(value) not in AVERAGING:
+                known = ", ".join(map(str, AVERAGING))
+                raise InputError(f"{self.path}: Navgf is {value}; the flight software has {known}")
+
+    @property
+    def n_rows(self) -> int:
+        """Number of spectra."""
+        return len(self.raw_s)
+
+    @property
+    def frames(self) -> Float[np.ndarray, " rows"]:
+        """How many frames each spectrum averages."""
+        return self.share * 2.0**self.navg_shift
+
+    @property
+    def window_s(self) -> Float[np.ndarray, " rows"]:
+        """From the beginning to the end of each integration, in seconds."""
+        return FRAME_S * 2.0**self.navg_shift
+
+    @property
+    def saturated(self) -> Bool[np.ndarray, " rows"]:
+        """Whether an ADC was at the end of its range, or beyond."""
+        # the flight software counts from -8191 or to 8192 in some versions
+        ends = (self.adc_low <= ADC_LOW + 1) | (self.adc_high >= ADC_HIGH)
+        return (ends | (self.adc_invalid > 0)).any(axis=1)
+
+    @contextmanager
+    def spectra(self) -> Iterator[Read]:
+        """Open the file, for counts to be read piece by piece.
+
+        Raises
+        ------
+        InputError
+            For a file that is damaged, where it is.
+        """
+        with reading(self.path, "a session"), self.opener() as read:
+            yield read
+
+    def description(self) -> tuple[str, ...]:
+        states = ["".join(row) for row in np.unique(self.level, axis=0)]
+        clock = "its clock stands for a UTC that the file does not say"
+        if self.clock is not None:
+            ends = self.clock.utc(self.raw_s[[0, -1]])
+            clock = f"{ends[0].isot[:19]} to {ends[1].isot[:19]} UTC, clock in {self.clock.scale}"
+        averaged = ", ".join(map(str, np.unique(self.navgf)))
+        window = self.window_s
+        length = f"{window.min():.6g}" + (
+            "" if np.ptp(window) == 0.0 else f" to {window.max():.6g}"
+        )
+        notch = "not said" if self.notch is None else f"{int((self.notch > 0).sum())} with it"
+        lacking = [name for name in TELEMETRY if name not in self.telemetry]
+        unused = [f"{name} ({counted(n, 'row')})" for name, n in self.unused.items()]
+        return (
+            f"{self.n_rows} spectra of 16 products, {N_CHANNELS} channels, {self.kind} layout "
+            f"{self.layout}, flight software {self.software}",
+            clock,
+            f"each integrated for {length} s; Navgf {averaged}; gains of the ports "
+            f"{', '.join(states)}",
+            f"site: longitude {self.lon_deg:g}, latitude {self.lat_deg:g} degrees",
+            f"{int(self.saturated.sum())} spectra with a saturated ADC, "
+            f"{int((self.errors != 0).sum())} with errors of the flight software, "
+            f"{int((self.share < 1.0).sum())} partly averaged; notch: {notch}",
+            "telemetry of the gain table: " + ("lacks " + ", ".join(lacking) if lacking else "all"),
+            *(["not used: " + ", ".join(unused)] if unused else []),
+        )
+
+
+META = "spectra/metadata"
+
+
+def _counts(*more: int, low: float = -np.inf, high: float = np.inf, optional: bool = False):
+    return Variable(("row", *more), "integer", low=low, high=high, optional=optional)
+
+
+# what the layouts have in common, by the names of layout 3 in HDF5
+ROWS = {
+    "spectra/raw_times": Variable(("row",)),
+    # NaN where the clock is not known
+    "spectra/mjd_times": Variable(("row",), finite=False, optional=True),
+    f"{META}/Navgf": _counts(),
+    f"{META}/Navg1_shift": _counts(low=0.0, high=40.0),
+    f"{META}/Navg2_shift": _counts(low=0.0, high=40.0),
+    f"{META}/actual_bitslice": _counts(16, low=0.0, high=31.0),
+    f"{META}/adc_min": _counts(PORTS),
+    f"{META}/adc_max": _counts(PORTS),
+    f"{META}/adc_invalid_count_min": _counts(PORTS, low=0.0, optional=True),
+    f"{META}/adc_invalid_count_max": _counts(PORTS, low=0.0, optional=True),
+    f"{META}/errors": _counts(optional=True),
+    # layout 4 alone has these two
+    f"{META}/weight": _counts(low=0.0, optional=True),
+    f"{META}/notch": _counts(low=0.0, optional=True),
+    **{f"telemetry/{name}": Variable(("row",), optional=True) for name in TELEMETRY},
+}
+SAID = {
+    "constants.lun_lat_deg": Attribute(low=-90.0, high=90.0),
+    "constants.lun_long_deg": Attribute(low=-360.0, high=360.0),
+    "session_invariants.software_version": Attribute("word", optional=True),
+    "spectra/data.units": Attribute("text", choices=("SDU",)),
+    "spectra/data.representation": Attribute("text", choices=("gain_model_input_sdu",)),
+    "spectra/data.bitslice_restored": Attribute("boolean"),
+    "spectra/data.bitslice_reference": Attribute("integer", low=31.0, high=31.0),
+    "spectra/data.normalization_version": Attribute("integer", low=1.0, high=1.0),
+}
+
+
+def session_of(
+    path: Path,
+    version: int,
+    kind: str,
+    found: Content,
+    arrays: Mapping[str, Unread],
+    clock: Clock | None,
+    opener: Callable[[], AbstractContextManager[Read]],
+    unused: Mapping[str, int] | None = None,
+) -> Session:
+    """Make a session of what a file holds.
+
+    Parameters
+    ----------
+    path : Path
+    version : int
+        Of the layout.
+    kind : str
+        HDF5 or FITS.
+    found : Content
+        Of :data:`ROWS` and :data:`SAID`.
+    arrays : mapping of str to array
+        All that is there, by names as in :data:`ROWS`, not yet read.
+    clock : Clock or None
+    opener : callable
+        Opens the spectra.
+    unused : mapping of str to int, optional
+        Rows of other families of data.
+
+    Raises
+    ------
+    InputError
+        If counts or gains are not as they should be.
+    """
+    if not found.values["spectra/data.bitslice_restored"]:
+        raise InputError(
+            f"{path}: the bit slices of spectra/data are not restored; ingest the session again "
+            "with luseepy"
+        )
+    rows, cube = found.arrays, arrays["spectra/data"]
+    n = found.sizes["row"]
+    if tuple(cube.shape) != (n, 16, N_CHANNELS) or np.dtype(cube.dtype).kind != "f":
+        raise InputError(
+            f"{path}: spectra/data has shape {tuple(cube.shape)} and type {cube.dtype}, expected "
+            f"({n}, 16, {N_CHANNELS}) real numbers"
+        )
+    none = np.zeros((n, PORTS), dtype=np.int64)
+    shift2 = rows[f"{META}/Navg2_shift"]
+    share = np.ones(n)
+    if (weight := rows.get(f"{META}/weight")) is not None:
+        share = np.minimum(weight / 2.0**shift2, 1.0)
+    return Session(
+        path=path,
+        layout=version,
+        kind=kind,
+        raw_s=rows["spectra/raw_times"],
+        navgf=rows[f"{META}/Navgf"],
+        navg_shift=rows[f"{META}/Navg1_shift"] + shift2,
+        share=share,
+        level=_levels(path, arrays, n),
+        adc_low=rows[f"{META}/adc_min"],
+        adc_high=rows[f"{META}/adc_max"],
+        adc_invalid=rows.get(f"{META}/adc_invalid_count_min", none)
+        + rows.get(f"{META}/adc_invalid_count_max", none),
+        errors=rows.get(f"{META}/errors", none[:, 0]),
+        notch=rows.get(f"{META}/notch"),
+        telemetry={
+            name: rows[f"telemetry/{name}"] for name in TELEMETRY if f"telemetry/{name}" in rows
+        },
+        clock=clock,
+        lon_deg=found.values["constants.lun_long_deg"],
+        lat_deg=found.values["constants.lun_lat_deg"],
+        software=_version(found.values.get("session_invariants.software_version", "unknown")),
+        opener=opener,
+        unused=unused or {},
+    )
+
+
+def _version(text: str) -> str:
+    """A version of the flight software as it is written: 0x307 for the number 775."""
+    return f"{int(text):#x}" if text.isascii() and text.isdigit() else text
+
+
+def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> Shaped[np.ndarray, "rows ports"]:
+    """Gain levels, of the flight software's numbers or of letters."""
+    name = f"{META}/actual_gain"
+    if name not in arrays:
+        raise InputError(
+            f"{path} has no {name}, which says the gain of every spectrum; ingest the session "
+            "again with luseepy's present version"
+        )
+    codes = np.asarray(arrays[name])
+    if codes.dtype.kind == "S" and codes.shape == (n,):
+        # FITS joins the letters of a row
+        codes = np.array([list(row.decode().ljust(PORTS)) for row in codes], dtype="U1")
+    if codes.shape != (n, PORTS):
+        raise InputError(f"{path}: {name} has shape {codes.shape}, expected ({n}, {PORTS})")
+    levels = np.full((n, PORTS), NO_LEVEL, dtype="U1")
+    if codes.dtype.kind in "iu":
+        for code, level in LEVELS.items():
+            levels[codes == code] = level
+    elif codes.dtype.kind in "SU":
+        letters = codes.astype("U1")
+        known = np.isin(letters, list(LEVELS.values()))
+        levels[known] = letters[known]
+    else:
+        raise InputError(f"{path}: {name} holds {codes.dtype}, expected gain codes or letters")
+    return levels

@@ -1,0 +1,427 @@
+"""Files of sessions: read in every layout, written in layout 3, piece by piece.
+
+What is written is what :func:`read_session` and luseepy read; of what else a session of luseepy may
+hold, such as waveforms and housekeeping packets, there is nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from astropy.io import fits
+from jaxtyping import Float, Float32, Int, Shaped
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.files import replacing, user_path
+from lusee_bayes.core.formats import has_words, is_fits, opened, require_readable_hdf5
+from lusee_bayes.core.reading import reading, require_file
+from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
+from lusee_bayes.flight.layout_3 import (
+    INTERPOLATED,
+    UNKNOWN,
+    session_of_fits,
+    session_of_hdf5,
+)
+from lusee_bayes.flight.layout_4 import session_of_4
+from lusee_bayes.flight.session import (
+    LEVELS,
+    META,
+    N_CHANNELS,
+    N_PRODUCTS,
+    PORTS,
+    Read,
+    Session,
+)
+
+HDF5, FITS = (f"a session of lusee.ingest in {kind}" for kind in ("HDF5", "FITS"))
+NEWEST = 4
+
+
+def is_session(path: str | Path) -> bool:
+    """Return whether a file says that it is a session.
+
+    Raises
+    ------
+    InputError
+        If there is no file, or it is damaged.
+    """
+    path = require_file(path, "data")
+    if is_fits(path):
+        return has_words(path, ["LAYOUTV"])
+    with reading(path, HDF5):
+        if not h5py.is_hdf5(path):
+            return False
+        with h5py.File(path) as file:
+            return "layout_version" in file.attrs
+
+
+def read_session(path: str | Path) -> Session:
+    """Read everything of a session but its spectra, which stay in the file.
+
+    Parameters
+    ----------
+    path : str or Path
+        HDF5 of layout 3 or 4, or FITS of layout 3.
+
+    Raises
+    ------
+    InputError
+        For a file that is missing, damaged, of another kind or version, and for whatever it lacks.
+    """
+    path = require_file(path, "a session")
+    if is_fits(path):
+        with opened(path, FITS) as hdus:
+            if _version_of(path, hdus[0].header.get("LAYOUTV")) == 4:
+                raise InputError(
+                    f"{path} is of layout 4 in FITS; this version reads layout 4 in HDF5: ingest "
+                    "the session again with luseepy, as HDF5"
+                )
+            return session_of_fits(path, hdus, partial(_fits_spectra, path))
+    with reading(path, HDF5):
+        if not h5py.is_hdf5(path):
+            raise InputError(f"{path} is neither HDF5 nor FITS, and so no session of lusee.ingest")
+        require_readable_hdf5(path)
+        with h5py.File(path) as file:
+            version = _version_of(path, file.attrs.get("layout_version"))
+            made = session_of_4 if version == 4 else session_of_hdf5
+            return made(path, file, partial(_hdf5_spectra, path))
+
+
+def _version_of(path: Path, version: Any) -> int:
+    """The version of a layout. InputError if it is none that this package reads."""
+    number = None if version is None else int(version)
+    if number is None:
+        raise InputError(
+            f"{path} has no layout_version: it is no session of luseepy's lusee.ingest"
+        )
+    if number < 3:
+        raise InputError(
+            f"{path} is of layout {number}, in which bit slices are not restored; ingest the "
+            "session again with luseepy, which writes layout 3 or newer"
+        )
+    if number > NEWEST:
+        raise InputError(
+            f"{path} is of layout {number}; this version reads 3 and {NEWEST}; get a newer one"
+        )
+    return number
+
+
+@contextmanager
+def _fits_spectra(path: Path) -> Iterator[Read]:
+    with opened(path, FITS) as hdus:
+        cube = hdus["SPECTRA"].section
+        yield lambda first, last: np.asarray(cube[first:last], dtype=np.float32)
+
+
+@contextmanager
+def _hdf5_spectra(path: Path) -> Iterator[Read]:
+    with h5py.File(path) as file:
+        cache = cache_for(file["spectra/data"].chunks)
+    with h5py.File(path, **cache) as file:
+        cube = file["spectra/data"]
+        yield lambda first, last: np.asarray(cube[first:last], dtype=np.float32)
+
+
+# luseepy lets h5py choose its chunks, which for a long session hold a thousand spectra of few
+# channels. Unless all chunks of these spectra are kept, each is decompressed again for every slab
+LARGEST_CACHE = 1 << 29
+# two chunks must not compete for one place, which makes for many more places than chunks
+PLACES = 1_000_003
+
+
+def cache_for(chunks: tuple[int, ...] | None) -> dict[str, Any]:
+    """Return what :class:`h5py.File` has to be told, to read or write spectra piece by piece.
+
+    Parameters
+    ----------
+    chunks : (rows, products, channels) or None
+        None for a dataset without chunks.
+    """
+    if chunks is None:
+        return {}
+    spectra = chunks[0] * N_PRODUCTS * (N_CHANNELS + chunks[2]) * 4
+    size = min(int(1.25 * spectra), LARGEST_CACHE)
+    return {"rdcc_nbytes": max(size, 1 << 20), "rdcc_nslots": PLACES, "rdcc_w0": 1.0}
+
+
+def guessed_chunks(n_rows: int) -> tuple[int, ...]:
+    """Return the chunks that h5py chooses for the spectra of a session."""
+    with h5py.File("guess", "w", driver="core", backing_store=False) as file:
+        cube = file.create_dataset("data", (n_rows, N_PRODUCTS, N_CHANNELS), "f4", chunks=True)
+        return cube.chunks
+
+
+def whole_spectra(
+    path: Path, blocks: Iterable[Float32[np.ndarray, "_ products _"]], n_rows: int
+) -> Iterator[tuple[int, Float32[np.ndarray, "_ products channels"]]]:
+    """Yield the first row and the counts of every block, with all 2048 channels.
+
+    Raises
+    ------
+    InputError
+        If there are more or fewer rows than the session has, or other products.
+    """
+    first = 0
+    for block in blocks:
+        n, products, bins = block.shape
+        if products != N_PRODUCTS or bins > N_CHANNELS or first + n > n_rows:
+            raise InputError(
+                f"{path}: rows {first} to {first + n} have the shape {block.shape}, expected at "
+                f"most {n_rows - first} rows of {N_PRODUCTS} products and {N_CHANNELS} channels"
+            )
+        full = np.full((n, products, N_CHANNELS), np.nan, dtype=np.float32)
+        full[..., :bins] = block
+        yield first, full
+        first += n
+    if first != n_rows:
+        raise InputError(f"{path}: there are counts of {first} spectra for {n_rows} rows")
+
+
+# of the frames, so many are averaged by the hardware, as a power of two; software does the rest
+NAVG1_SHIFT = 14
+CODES = {level: code for code, level in LEVELS.items()}
+# the offset between two samples of an ADC that have no signal
+ADC_MEAN = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class SessionRows:
+    """A session without its spectra.
+
+    Attributes
+    ----------
+    raw_s : (rows,) array
+        The mission clock, in seconds.
+    navgf : (rows,) array of int
+        Averaging over channels (:data:`.AVERAGING`).
+    navg_shift : (rows,) array of int
+        Logarithm of the number of frames that a spectrum averages, to base 2.
+    level : (rows, ports) array of str
+        Of the gain: L, M, H.
+    bitslice : (rows, 16) array of int
+        Counts are multiples of 2^(bitslice - 31).
+    adc_low, adc_high, adc_invalid : (rows, ports) array of int
+        Extremes of the ADC, and how many of its samples were out of range.
+    adc_rms : (rows, ports) array
+    telemetry : mapping of str to (rows,) array
+        At the times of the spectra.
+    clock : Clock or None
+        None for a file that is not to say which UTC the clock stands for.
+    lon_deg, lat_deg : float
+        Of the site.
+    software : int
+        Version of the flight software.
+    """
+
+    raw_s: Float[np.ndarray, " rows"]
+    navgf: Int[np.ndarray, " rows"]
+    navg_shift: Int[np.ndarray, " rows"]
+    level: Shaped[np.ndarray, "rows ports"]
+    bitslice: Int[np.ndarray, "rows products"]
+    adc_low: Int[np.ndarray, "rows ports"]
+    adc_high: Int[np.ndarray, "rows ports"]
+    adc_invalid: Int[np.ndarray, "rows ports"]
+    adc_rms: Float[np.ndarray, "rows ports"]
+    telemetry: Mapping[str, Float[np.ndarray, " rows"]]
+    clock: Clock | None
+    lon_deg: float
+    lat_deg: float
+    software: int
+
+    @property
+    def n_rows(self) -> int:
+        """Number of spectra."""
+        return len(self.raw_s)
+
+    def metadata(self) -> dict[str, np.ndarray]:
+        """Return the fields of every spectrum, by the names of layout 3."""
+        first = np.minimum(self.navg_shift, NAVG1_SHIFT)
+        gain = np.vectorize(CODES.__getitem__, otypes=[np.int64])(self.level)
+        none = np.zeros(self.n_rows, dtype=np.int64)
+        return {
+            "Navg1_shift": first,
+            "Navg2_shift": self.navg_shift - first,
+            "Navgf": self.navgf,
+            "format": none,
+            "errors": none,
+            "actual_bitslice": self.bitslice,
+            "bitslice": self.bitslice,
+            "actual_gain": gain,
+            "gain": gain,
+            "adc_min": self.adc_low,
+            "adc_max": self.adc_high,
+            "adc_mean": np.full((self.n_rows, PORTS), ADC_MEAN),
+            "adc_rms": self.adc_rms,
+            "adc_invalid_count_min": self.adc_invalid,
+            "adc_invalid_count_max": np.zeros_like(self.adc_invalid),
+        }
+
+    def clock_words(self) -> tuple[float, float, str, str]:
+        """Return how layout 3 says the clock.
+
+        Returns
+        -------
+        raw_s, mjd : float
+            A reading, and the MJD that it stands for; zero where that is not known.
+        scale, source : str
+        """
+        if self.clock is None:
+            return 0.0, 0.0, UNKNOWN, UNKNOWN
+        mjd = (self.clock.jd1 - MJD_ZERO) + self.clock.jd2
+        return self.clock.raw_s, mjd, self.clock.scale, "mission_counter"
+
+    def mjd(self) -> Float[np.ndarray, " rows"]:
+        """Return the column of MJD that luseepy computes of the clock."""
+        raw_s, mjd, _, _ = self.clock_words()
+        return (self.raw_s - raw_s) / DAY_S + mjd
+
+
+def write_session(
+    path: str | Path,
+    rows: SessionRows,
+    blocks: Iterable[Float32[np.ndarray, "_ products _"]],
+    *,
+    kind: str = "hdf5",
+) -> Path:
+    """Write a session whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+    rows : SessionRows
+    blocks : iterable of (some rows, 16, bins) array
+        Counts, in the spectrometer's order of products; one after the other, so that they are never
+        in memory together. Fewer bins than 2048 are filled up with NaN.
+    kind : {"hdf5", "fits"}
+
+    Raises
+    ------
+    InputError
+        For another kind, blocks that do not make up the rows, and a file that cannot be
+        written.
+    """
+    write = {"hdf5": _write_session_hdf5, "fits": _write_session_fits}.get(kind)
+    if write is None:
+        raise InputError(f"sessions are written as hdf5 or fits, not as {kind}")
+    path = user_path(path)
+    with replacing(path) as unfinished:
+        write(unfinished, rows, blocks)
+    return path
+
+
+# files of FITS are made of records of this length
+RECORD = 2880
+# letters of FITS for types of columns
+FORMATS = {"i": "K", "f": "D"}
+
+
+def _write_session_fits(
+    path: Path, rows: SessionRows, blocks: Iterable[Float32[np.ndarray, "_ products _"]]
+) -> None:
+    _fits_header(rows).writeto(path)
+    with path.open("ab") as file:
+        file.write(_cube_header(rows.n_rows).tostring().encode("ascii"))
+        size = 0
+        for _, counts in whole_spectra(path, blocks, rows.n_rows):
+            size += file.write(counts.astype(">f4").tobytes())
+        file.write(b"\0" * (-size % RECORD))
+    with fits.open(path, mode="append") as hdus:
+        number = np.arange(rows.n_rows)
+        times = {"RAW_TIME": rows.raw_s, "MJD_TIME": rows.mjd()}
+        identity = {"UNIQUE_ID": number, **times, "ORIG_IDX": number}
+        hdus.append(_fits_table("SPECTRA_TIMES", identity))
+        hdus.append(_fits_table("SPECTRA_META", rows.metadata()))
+        hdus.append(_fits_table("SPEC_INTERP", {**times, **rows.telemetry}))
+
+
+def _fits_header(rows: SessionRows) -> fits.HDUList:
+    """All that comes before the spectra."""
+    primary = fits.PrimaryHDU()
+    primary.header.update({"LAYOUTV": 3, "ORIGIN": "lusee_bayes"})
+    invariants = fits.ImageHDU(name="SESSION_INV")
+    invariants.header["SW_VERS"] = rows.software
+    raw_s, mjd, scale, source = rows.clock_words()
+    constants = fits.ImageHDU(name="CONSTANTS")
+    site = {"LUN_LAT": rows.lat_deg, "LUN_LON": rows.lon_deg, "LUN_HGT": 0.0}
+    clock = {"RAWSHFT": raw_s, "MJDOFF": mjd, "TIMESYS": scale.upper(), "CLKSRC": source}
+    constants.header.update(site | clock)
+    return fits.HDUList([primary, invariants, constants])
+
+
+def _cube_header(n_rows: int) -> fits.Header:
+    header = fits.Header()
+    header.update({"XTENSION": "IMAGE", "BITPIX": -32, "NAXIS": 3})
+    header.update({"NAXIS1": N_CHANNELS, "NAXIS2": N_PRODUCTS, "NAXIS3": n_rows})
+    header.update({"PCOUNT": 0, "GCOUNT": 1, "EXTNAME": "SPECTRA"})
+    header.update({"NTIME": n_rows, "NPROD": N_PRODUCTS, "NCHAN": N_CHANNELS})
+    header.update({"BUNIT": "SDU", "BITSREST": True, "BITSREF": 31, "NORMVER": 1})
+    header["HIERARCH REPRESENTATION"] = "gain_model_input_sdu"
+    return header
+
+
+def _fits_table(name: str, columns: Mapping[str, np.ndarray]) -> fits.BinTableHDU:
+    units = {"RAW_TIME": "s", "MJD_TIME": "d"}
+    made = []
+    for key, values in columns.items():
+        form = f"{values[0].size}{FORMATS[values.dtype.kind]}"
+        made.append(fits.Column(key, form, unit=units.get(key), array=values))
+    return fits.BinTableHDU.from_columns(made, name=name)
+
+
+# as luseepy has it
+PACKED = {"compression": "gzip", "compression_opts": 1}
+
+# what the spectra say of themselves
+CUBE = {
+    "units": "SDU",
+    "representation": "gain_model_input_sdu",
+    "bitslice_restored": np.int64(1),
+    "bitslice_reference": np.int64(31),
+    "normalization_version": np.int64(1),
+}
+
+
+def _write_session_hdf5(
+    path: Path, rows: SessionRows, blocks: Iterable[Float32[np.ndarray, "_ products _"]]
+) -> None:
+    chunks = guessed_chunks(rows.n_rows)
+    with h5py.File(path, "w", **cache_for(chunks)) as file:
+        _write_all_but_spectra(file, rows)
+        shape = (rows.n_rows, N_PRODUCTS, N_CHANNELS)
+        cube = file.create_dataset("spectra/data", shape, "f4", chunks=chunks, **PACKED)
+        cube.attrs.update(CUBE)
+        for first, counts in whole_spectra(path, blocks, rows.n_rows):
+            cube[first : first + len(counts)] = counts
+
+
+def _write_all_but_spectra(file: h5py.File, rows: SessionRows) -> None:
+    file.attrs.update(layout_version=np.int64(3), cdi_directory="", n_items=np.int64(0))
+    file.create_group("session_invariants").attrs["software_version"] = np.int64(rows.software)
+    raw_s, mjd, scale, source = rows.clock_words()
+    constants = file.create_group("constants").attrs
+    constants.update(lun_lat_deg=rows.lat_deg, lun_long_deg=rows.lon_deg, lun_height_m=0.0)
+    constants.update(raw_time_subtract_seconds=raw_s, mjd_epoch_offset_days=mjd)
+    constants.update(time_scale=scale, clock_source=source)
+    if rows.clock is not None:
+        constants["clock_epoch_isot"] = rows.clock.isot
+    spectra = file.create_group("spectra")
+    spectra.attrs["count"] = np.int64(rows.n_rows)
+    number = np.arange(rows.n_rows)
+    times = {"mjd_times": rows.mjd(), "raw_times": rows.raw_s}
+    for name, values in {"unique_ids": number, "original_indices": number, **times}.items():
+        spectra.create_dataset(name, data=values, **PACKED)
+    metadata = file.create_group(META)
+    for name, values in rows.metadata().items():
+        metadata.create_dataset(name, data=values, **PACKED)
+    metadata["actual_bitslice"].attrs["applied_to_spectra"] = np.int64(1)
+    metadata["actual_bitslice"].attrs["reference_bit"] = np.int64(31)
+    telemetry = file.create_group(INTERPOLATED)
+    for name, values in {"time": rows.raw_s, "mjd_time": rows.mjd(), **rows.telemetry}.items():
+        telemetry.create_dataset(name, data=values, **PACKED)

@@ -1,0 +1,439 @@
+"""From V^2/Hz at a few frequencies to what the spectrometer sends, and what disturbs it.
+
+Spectra of all channels go through those that are known. Logarithms of autos are cubic splines of
+the logarithm of the frequency. So are the entries of the Cholesky factors of the matrices of
+correlation coefficients, the diagonal by its logarithm: then what lies between is a matrix of
+correlations, too. Beyond the known frequencies autos go on as power laws, and correlations become
+constant; a single known frequency makes power laws of index -2.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Float32, Int, Shaped
+from scipy.interpolate import CubicSpline
+
+from lusee_bayes.core.checks import require_positive
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.flight.flags import COMB_FIRST, COMB_SPACING
+from lusee_bayes.flight.gain_model import LETTERS, NANO2, GainModel
+from lusee_bayes.flight.session import (
+    AUTOS,
+    AVERAGING,
+    CHANNEL_MHZ,
+    FIRST_PORT,
+    FLIGHT_PRODUCTS,
+    IMAGINARY,
+    N_CHANNELS,
+    OF_FLIGHT,
+    PORTS,
+    SECOND_PORT,
+    BinOrigin,
+    channel_mhz,
+)
+from lusee_bayes.instrument.products import to_matrix, to_real
+
+INDEX = -2.5
+# below this share of the lowest known frequency spectra are held: what would rise further there
+# would be rounded coarsely elsewhere
+HELD_BELOW = 0.5
+# beyond the known frequencies splines go on for this much of the logarithm, longer than a band, and
+# are then held; the larger the power, the less bends before
+BEYOND, POWER = 0.2, 8
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelSpectra:
+    """Interpolates visibilities in frequency.
+
+    Attributes
+    ----------
+    autos : (channels, nodes) array
+        Takes logarithms of autos.
+    offset : (channels,) array
+        Added to what that makes.
+    correlations : (channels, nodes) array
+        Takes factors of correlations.
+    """
+
+    autos: Float[np.ndarray, "channels nodes"]
+    offset: Float[np.ndarray, " channels"]
+    correlations: Float[np.ndarray, "channels nodes"]
+
+    @classmethod
+    def of(
+        cls, nodes_mhz: Float[np.ndarray, " nodes"], channels_mhz: Float[np.ndarray, " channels"]
+    ) -> ChannelSpectra:
+        """Prepare the interpolation.
+
+        Parameters
+        ----------
+        nodes_mhz : (nodes,) array
+            Known frequencies, growing.
+        channels_mhz : (channels,) array
+        """
+        nodes = np.log(nodes_mhz)
+        at = np.log(np.maximum(channels_mhz, HELD_BELOW * nodes_mhz[0]))
+        if len(nodes) == 1:
+            ones = np.ones((len(at), 1))
+            return cls(ones, INDEX * (at - nodes[0]), ones)
+        spline = CubicSpline(nodes, np.eye(len(nodes)))
+        inside = np.clip(at, nodes[0], nodes[-1])
+        beyond = (at - inside) / BEYOND
+        held = inside + BEYOND * beyond / (1.0 + beyond**POWER) ** (1.0 / POWER)
+        values = spline(held)
+        autos = values + (at - held)[:, None] * spline(inside, 1)
+        return cls(autos, np.zeros(len(at)), values)
+
+    def __call__(
+        self, known: Float[np.ndarray, "nodes products rows"]
+    ) -> Float[np.ndarray, "products rows channels"]:
+        """Return visibilities in all channels.
+
+        Parameters
+        ----------
+        known : (nodes, products, rows) array
+            In the package's order.
+
+        Raises
+        ------
+        InputError
+            If an auto is not positive, or a matrix of visibilities not positive definite.
+        """
+        autos = known[:, AUTOS]
+        require_positive("the autos of the visibilities", autos)
+        scale = np.sqrt(autos[:, FIRST_PORT] * autos[:, SECOND_PORT])
+        matrices = np.moveaxis(to_matrix(np.moveaxis(known / scale, 1, 0)), (0, 1), (-2, -1))
+        try:
+            factors = np.linalg.cholesky(matrices)
+        except np.linalg.LinAlgError as error:
+            raise InputError(
+                "the visibilities of a time are not positive definite: voltages cannot be so "
+                "correlated; check beams and sky"
+            ) from error
+        low = _at_channels(self.correlations, factors)
+        ports = np.arange(len(AUTOS))
+        low[ports, ports] = np.exp(
+            _at_channels(self.correlations, np.log(factors[..., ports, ports].real))
+        )
+        # rows of length one make correlation coefficients
+        logs = _at_channels(self.autos, np.log(np.moveaxis(autos, 1, -1)))
+        length = np.sqrt((np.abs(low) ** 2).sum(axis=1))
+        low *= (np.exp((logs + self.offset) / 2.0) / length)[:, None]
+        full = np.empty_like(low)
+        for i in ports:
+            for j in ports[: i + 1]:
+                full[i, j] = sum(low[i, k] * low[j, k].conj() for k in ports[: j + 1])
+                full[j, i] = full[i, j].conj()
+        return to_real(full)
+
+
+def _at_channels(weights: Float[np.ndarray, "channels nodes"], values: np.ndarray) -> np.ndarray:
+    """Values (nodes, rows, ...) in all channels: (..., rows, channels)."""
+    found = np.tensordot(values, weights, axes=(0, 1))
+    return np.moveaxis(found, 0, -2)
+
+
+# of the 31 bits of a number, so many hold the largest of a spectrum. What is rounded then is far
+# below the noise, also where a spectrum has fallen to a thousandth
+BITS = 27
+REFERENCE = 31
+
+
+@dataclass(frozen=True, eq=False)
+class Counting:
+    """How spectra become counts, for one state of the spectrometer.
+
+    Attributes
+    ----------
+    table : GainModel
+        Channels beyond its frequencies have the gain at its ends.
+    levels : str
+        Of the gains of the ports, as MMMM.
+    navgf : int
+        Averaging over channels.
+    origin : {"centre", "edge"}
+        What of channel k lies at k times 25 kHz.
+    sign : {1, -1}
+        Of the imaginary parts of the spectrometer, in those of <s_i conj(s_j)>.
+    """
+
+    table: GainModel
+    levels: str
+    navgf: int
+    origin: BinOrigin
+    sign: int = 1
+
+    @cached_property
+    def _basis(self) -> Float[np.ndarray, "ports 3 channels"]:
+        found = []
+        for port, level in enumerate(self.levels):
+            anchors = self.table.anchor_mhz[LETTERS.index(level), port]
+            inside = np.clip(channel_mhz(self.origin), anchors[0], anchors[-1])
+            found.append(self.table.basis(level, port, inside))
+        return np.array(found)
+
+    def __call__(
+        self,
+        spectra: Float[np.ndarray, "products rows channels"],
+        telemetry: Mapping[str, Float[np.ndarray, " rows"]],
+    ) -> Float[np.ndarray, "rows products bins"]:
+        """Return counts before they are rounded.
+
+        Parameters
+        ----------
+        spectra : (products, rows, channels) array
+            In V^2/Hz, in the package's order.
+        telemetry : mapping of str to (rows,) array
+
+        Returns
+        -------
+        (rows, products, bins) array
+            In the spectrometer's order.
+        """
+        root = []
+        for port in range(PORTS):
+            q = self.table.strengths(self.levels[port], port, telemetry)
+            gain = self._basis[port, 0] + q @ self._basis[port, 1:]
+            # where a table has none, nothing is sent
+            root.append(np.sqrt(np.maximum(gain, 0.0)))
+        averaging = AVERAGING[self.navgf]
+        members = averaging.channels()
+        found = np.empty((spectra.shape[1], len(spectra), averaging.n_bins))
+        for k, product in enumerate(spectra):
+            counts = product * (root[FIRST_PORT[k]] * root[SECOND_PORT[k]]) / NANO2
+            counts = counts[:, members].sum(axis=2) / averaging.divisor
+            found[:, OF_FLIGHT[k]] = counts * (self.sign if IMAGINARY[k] else 1)
+        return found
+
+
+def bit_slices(counts: Float[np.ndarray, "rows products bins"]) -> Int[np.ndarray, " products"]:
+    """Return the slices for spectra like the first of some.
+
+    Parameters
+    ----------
+    counts : (rows, products, bins) array
+        In the spectrometer's order. Crosses have a slice by their autos, which bound them.
+    """
+    top = np.empty(counts.shape[1])
+    largest = np.abs(counts[0, OF_FLIGHT[AUTOS]]).max(axis=1)
+    top[OF_FLIGHT] = np.sqrt(largest[FIRST_PORT] * largest[SECOND_PORT])
+    bits = np.ceil(np.log2(top)) + REFERENCE - BITS
+    return np.clip(bits, 0, REFERENCE).astype(np.int64)
+
+
+def rounded(
+    counts: Float[np.ndarray, "rows products bins"], bitslice: Int[np.ndarray, "rows products"]
+) -> Float32[np.ndarray, "rows products bins"]:
+    """Return multiples of 2^(slice - 31).
+
+    Parameters
+    ----------
+    counts : (rows, products, bins) array
+    bitslice : (rows, products) array of int
+    """
+    step = 2.0 ** (bitslice - REFERENCE)[..., None]
+    return (np.rint(counts / step) * step).astype(np.float32)
+
+
+# disturbances come in stretches of so many spectra, but those of single ones
+STRETCH = 5
+# a saturated spectrum has so many times its counts
+SATURATED_FACTOR = 40.0
+# bursts are measured against the noise in so many channels
+BURST_CHANNELS = 1.0 / CHANNEL_MHZ
+
+
+@dataclass(frozen=True, eq=False)
+class Disturbances:
+    """What was put into each spectrum.
+
+    Attributes
+    ----------
+    level : (rows, ports) array of str
+        Of the gains.
+    absent : (rows, 16) array of bool
+        Products that are NaN, in the spectrometer's order.
+    saturated, tone, comb : (rows,) array of bool
+    tone_channel : (channels,) array of bool
+        Channels that have a tone in these spectra.
+    burst : (rows,) array of bool
+    phase : (rows, ports) array
+        Of bursts at the ports, in radians.
+    tone_factor, comb_factor, burst_factor : float
+        How strong they are (:meth:`drawn`).
+    """
+
+    level: Shaped[np.ndarray, "rows ports"]
+    absent: Bool[np.ndarray, "rows products"]
+    saturated: Bool[np.ndarray, " rows"]
+    tone: Bool[np.ndarray, " rows"]
+    tone_channel: Bool[np.ndarray, " channels"]
+    comb: Bool[np.ndarray, " rows"]
+    burst: Bool[np.ndarray, " rows"]
+    phase: Float[np.ndarray, "rows ports"]
+    tone_factor: float
+    comb_factor: float
+    burst_factor: float
+
+    @classmethod
+    def drawn(
+        cls,
+        hours: Float[np.ndarray, " rows"],
+        step_s: float,
+        origin: BinOrigin,
+        seed: int,
+        *,
+        navgf: int = 1,
+        levels: str = "MMMM",
+        switch_h: float | None = None,
+        switch_levels: str = "LLLL",
+        absent_share: float = 0.0,
+        saturated_share: float = 0.0,
+        tones_mhz: tuple[float, ...] = (),
+        tone_share: float = 0.1,
+        tone_factor: float = 30.0,
+        comb_share: float = 0.0,
+        comb_factor: float = 3.0,
+        burst_every_h: float | None = None,
+        burst_s: float = 600.0,
+        burst_factor: float = 30.0,
+    ) -> Disturbances:
+        """Draw them; by default there are none.
+
+        Parameters
+        ----------
+        hours : (rows,) array
+            Of the spectra, since the first.
+        step_s : float
+            From spectrum to spectrum.
+        origin : {"centre", "edge"}
+            What of channel k lies at k times 25 kHz.
+        seed : int
+        navgf : int
+            Averaging over channels.
+        levels, switch_levels : str
+            Gains of the four ports, and from ``switch_h`` on.
+        switch_h : float or None
+        absent_share, saturated_share, tone_share, comb_share : float
+            Shares of the spectra that lack a product, are saturated, have the tones and the comb.
+        tones_mhz : tuple of float
+            Each in one channel.
+        tone_factor, comb_factor : float
+            Powers of a line, in multiples of the radiometer noise of a channel.
+        burst_every_h : float or None
+            Mean time from burst to burst; None for none.
+        burst_s : float
+            Length of the longest; the shortest last for a spectrum.
+        burst_factor : float
+            Power of a burst, in multiples of the radiometer noise of a spectrum in 1 MHz.
+
+        Raises
+        ------
+        InputError
+            If a tone is in a channel that no bin holds.
+        """
+        n, generator = len(hours), np.random.default_rng([seed, 1])
+        level = np.array([list(levels)] * n, dtype="U1")
+        if switch_h is not None:
+            level[hours >= switch_h] = list(switch_levels)
+        absent = np.zeros((n, len(FLIGHT_PRODUCTS)), dtype=bool)
+        for row in np.flatnonzero(_drawn_stretches(generator, n, absent_share, 1)):
+            absent[row, generator.integers(len(FLIGHT_PRODUCTS))] = True
+        saturated = _drawn_stretches(generator, n, saturated_share, 1)
+        tones = _tone_channels(tones_mhz, navgf, origin)
+        tone = _drawn_stretches(generator, n, tone_share if tones_mhz else 0.0, STRETCH)
+        comb = _drawn_stretches(generator, n, comb_share, STRETCH)
+        burst, phase = np.zeros(n, dtype=bool), np.zeros((n, PORTS))
+        at = 0.0
+        while burst_every_h is not None:
+            at += generator.exponential(burst_every_h)
+            if at > hours[-1]:
+                break
+            length_s = step_s * max(burst_s / step_s, 1.0) ** generator.uniform()
+            # at least one spectrum, up to the end of the burst
+            first = int(np.searchsorted(hours, at))
+            here = slice(first, max(first + 1, np.searchsorted(hours, at + length_s / 3600.0)))
+            burst[here] = True
+            phase[here] = generator.uniform(0.0, 2.0 * np.pi, PORTS)
+        return cls(
+            level,
+            absent,
+            saturated,
+            tone,
+            tones,
+            comb,
+            burst,
+            phase,
+            tone_factor,
+            comb_factor,
+            burst_factor,
+        )
+
+    def add(
+        self,
+        t: Complex[np.ndarray, "antennas antennas rows channels"],
+        rows: slice,
+        frames: float,
+    ) -> None:
+        """Add tones, comb and bursts to the covariance of the voltages of some spectra, in place.
+
+        Parameters
+        ----------
+        t : (antennas, antennas, rows, channels) array
+        rows : slice
+            Which spectra.
+        frames : float
+            Frames that each averages.
+        """
+        level = np.einsum("iirc->rc", t).real / (PORTS * np.sqrt(frames))
+        comb = np.arange(N_CHANNELS) % COMB_SPACING == COMB_FIRST
+        lines = self.tone_factor * (self.tone[rows, None] & self.tone_channel)
+        lines = lines + self.comb_factor * (self.comb[rows, None] & comb)
+        t += level * lines
+        here = np.flatnonzero(self.burst[rows])
+        if here.size:
+            wave = np.exp(1j * self.phase[rows][here]).T
+            power = level[here] * self.burst_factor / np.sqrt(BURST_CHANNELS)
+            t[:, :, here] += wave[:, None, :, None] * wave.conj()[None, :, :, None] * power
+
+    def truth(self) -> dict[str, np.ndarray]:
+        """Return the table of what is where."""
+        names = ("level", "absent", "saturated", "tone", "tone_channel", "comb", "burst")
+        return {name: getattr(self, name) for name in names}
+
+
+def _tone_channels(
+    tones_mhz: tuple[float, ...], navgf: int, origin: BinOrigin
+) -> Bool[np.ndarray, " channels"]:
+    """The channels nearest to the tones. InputError if the averaging leaves one of them out."""
+    mhz, tones, kept = channel_mhz(origin), *(np.zeros(N_CHANNELS, dtype=bool) for _ in range(2))
+    kept[AVERAGING[navgf].channels()] = True
+    for tone_mhz in tones_mhz:
+        far = np.abs(mhz - tone_mhz)
+        channel = int(far.argmin())
+        if not kept[channel]:
+            there = mhz[np.where(kept, far, np.inf).argmin()]
+            raise InputError(
+                f"the tone at {tone_mhz:g} MHz is in channel {channel}, which Navgf "
+                f"{navgf} leaves out, so that no spectrum would have it; use {there:.6g} "
+                "MHz in flight.simulated.tones_mhz, or another flight.simulated.navgf"
+            )
+        tones[channel] = True
+    return tones
+
+
+def _drawn_stretches(
+    generator: np.random.Generator, n: int, share: float, length: int
+) -> Bool[np.ndarray, " rows"]:
+    """About this share of the spectra, in stretches."""
+    found = np.zeros(n, dtype=bool)
+    if share == 0.0:
+        return found
+    for start in np.flatnonzero(generator.uniform(size=n) < share / length):
+        found[start : start + length] = True
+    return found

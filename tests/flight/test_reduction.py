@@ -1,0 +1,257 @@
+"""Reduced spectra against the sums written out, one spectrum after the other."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.time import Time
+from naive_flight import FLIGHT_ORDER, naive_band
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.flight import reduction
+from lusee_bayes.flight.clock import read_clock
+from lusee_bayes.flight.flags import KnownLines
+from lusee_bayes.flight.gain_model import read_gain_table
+from lusee_bayes.flight.recipe import Recipe
+from lusee_bayes.flight.reduced import (
+    BURST,
+    COMB,
+    NO_DATA,
+    NO_FIT,
+    REASONS,
+    SATURATED,
+    USED,
+    read_reduced,
+    write_reduced,
+)
+from lusee_bayes.flight.reduction import reduce_sessions
+from lusee_bayes.flight.session_files import read_session
+from lusee_bayes.instrument.products import auto_indices, labels
+from lusee_bayes.testing import assert_refused
+
+F = (10.0, 25.0)
+
+
+@pytest.fixture(scope="module")
+def truth(flight):
+    """V^2/Hz at the receivers' inputs, receiver noise with it, in the package's order."""
+    found = dict(np.load(flight / "truth.npz"))
+    found["total"] = found["visibility_v2_hz"].copy()
+    found["total"][:, auto_indices()] += found["receiver_noise_v2_hz"]
+    return found
+
+
+@pytest.fixture(scope="module")
+def table(flight):
+    return read_gain_table(flight / "gain")
+
+
+def sessions(flight, names="abcd"):
+    return [read_session(flight / f"session_{name}.h5") for name in names]
+
+
+def recipe(table, **changes):
+    given = {"origin": "centre", "timestamp": "instant", "frequencies_mhz": F} | changes
+    return Recipe(table, **given)
+
+
+@pytest.fixture(scope="module")
+def reduced(flight, table):
+    return reduce_sessions(sessions(flight), recipe(table))
+
+
+@pytest.mark.parametrize(("name", "row"), [("a", 3), ("b", 30), ("c", 15)])
+def test_values_are_those_of_sums_written_out(flight, reduced, name, row):
+    at = {"a": 0, "b": 40, "c": 80}[name] + row
+    for band, f in enumerate(F):
+        expected, _ = naive_band(flight, name, row, f)
+        scale = np.sqrt(np.abs(expected[auto_indices()]).max())
+        np.testing.assert_allclose(
+            reduced.values[band, :, at], expected, rtol=1e-9, atol=1e-12 * scale**2
+        )
+
+
+def test_the_known_sky_comes_out_within_the_noise(reduced, truth):
+    """Every auto of every spectrum that is not flagged or disturbed, in standard deviations."""
+    disturbed = [f"{s}{r}" for s, r in truth["comb"] if s == "c"]
+    name = np.array([f"{s}{r}" for s, r in zip(truth["session"], truth["row"], strict=True)])
+    good = ~np.isin(name, disturbed)
+    for band in range(2):
+        values, total = reduced.values[band], truth["total"][band]
+        autos = auto_indices()
+        z = (values - total)[autos] / total[autos] * np.sqrt(reduced.n_averaged[band])
+        z = z[:, good & (reduced.reason[band] == USED)]
+        z = z[np.isfinite(z)]
+        assert len(z) > 480
+        # autos of four ports under one sky are correlated: fewer independent ones
+        assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=0.15)
+        assert np.abs(z).max() < 5.0
+
+
+def test_noise_is_that_of_independent_samples(reduced, truth):
+    """A parabola over n channels has 9/4 of the variance of their mean, for large n."""
+    n = 41
+    exact = (9.0 * n**2 - 21.0) / (4.0 * n**2 - 16.0)  # sum of squares of the smoothing weights
+    expected = float(truth["n_averages"]) * n / exact
+    # steep spectra and their noise change it by less than 1e-3
+    np.testing.assert_allclose(reduced.n_averaged[:, :40], expected, rtol=2e-3)
+
+
+def test_flags_are_those_of_what_was_injected(reduced, truth):
+    name = np.array([f"{s}{r}" for s, r in zip(truth["session"], truth["row"], strict=True)])
+    saturated = np.isin(name, [f"{s}{r}" for s, r in truth["saturated"]])
+    for band in range(2):
+        np.testing.assert_array_equal(reduced.reason[band] == SATURATED, saturated)
+        # of native channels, a comb costs every fourth
+        comb = np.isin(name, [f"{s}{r}" for s, r in truth["comb"] if s == "d"])
+        np.testing.assert_array_equal(reduced.lines[band] > 0.2, comb | saturated)
+    gone = truth["missing"]
+    expected = np.zeros(reduced.values.shape[1:], dtype=bool)
+    for session, row, product in gone:
+        at = int(np.flatnonzero(name == f"{session}{row}")[0])
+        expected[labels().index(FLIGHT_ORDER[int(product)]), at] = True
+    expected[:, saturated] = True
+    np.testing.assert_array_equal(np.isnan(reduced.values[0]), expected)
+
+
+def test_the_notch_and_the_comb_take_whole_spectra_where_they_are_known(flight, table):
+    found = reduce_sessions(sessions(flight, "c"), recipe(table, comb="always"))
+    assert (found.reason[0][[0, 1]] == COMB).all()
+    found = reduce_sessions(sessions(flight, "d"), recipe(table, comb="never"))
+    assert (found.reason == USED).all()
+
+
+def test_known_lines_are_left_out(flight, table):
+    lines = KnownLines(np.array([10.0]), ("made up",))
+    clean = reduce_sessions(sessions(flight, "a"), recipe(table))
+    found = reduce_sessions(sessions(flight, "a"), recipe(table, lines=lines))
+    np.testing.assert_allclose(found.lines[0], 3.0 / 41.0, rtol=1e-6)
+    assert not found.lines[1].any()
+    assert (found.n_averaged[0] < clean.n_averaged[0]).all()
+
+
+def test_pieces_make_no_difference(flight, table, monkeypatch):
+    given = {"timestamp": "middle", "average_s": 4 * 3600.0}
+    whole = reduce_sessions(sessions(flight), recipe(table, **given))
+    monkeypatch.setattr(reduction, "SLAB", 3)
+    monkeypatch.setattr(reduction, "PIECE", 1)
+    pieces = reduce_sessions(sessions(flight)[::-1], recipe(table, **given))
+    np.testing.assert_allclose(pieces.values, whole.values, rtol=1e-12)
+    np.testing.assert_array_equal(pieces.reason, whole.reason)
+    np.testing.assert_allclose(pieces.n_averaged, whole.n_averaged, rtol=1e-12)
+
+
+def test_averages_are_means_of_the_spectra(flight, table, reduced):
+    """Bins of 4 h end where gains change, and have the samples of all of their spectra."""
+    found = reduce_sessions(
+        sessions(flight), recipe(table, timestamp="middle", average_s=4 * 3600.0)
+    )
+    states = np.array(["".join(row) for row in found.level])
+    assert (states[found.bin_of[40:60]] == "MMMM").all()
+    assert (states[found.bin_of[60:80]] == "MMLL").all()
+    for bin_ in np.unique(found.bin_of[:40]):
+        rows = np.flatnonzero(found.bin_of == bin_)
+        assert len(rows) <= 8
+        expected = reduced.values[1][:, rows].mean(axis=1)
+        np.testing.assert_allclose(found.values[1][:, bin_], expected, rtol=1e-12)
+        assert found.n_averaged[1, bin_] == pytest.approx(
+            reduced.n_averaged[1, rows].sum(), rel=1e-6
+        )
+    data = found.at(25.0, np.ones(4))
+    # the windows of a bin are those of its spectra
+    np.testing.assert_allclose(
+        data.observation.live_s[0], (found.bin_of == 0).sum() * float(2.0**25 * 4e-5), rtol=1e-9
+    )
+
+
+def test_kelvin_are_what_an_enclosure_makes(reduced):
+    per_kelvin = np.array([1.0, 4.0, 9.0, 16.0]) * 1e-22
+    data = reduced.at(10.0, per_kelvin)
+    at = {label: k for k, label in enumerate(labels())}
+    grid = data.grid()
+    np.testing.assert_allclose(
+        grid[at["12I"], :40] * 6e-22, reduced.values[0, at["12I"], :40], rtol=1e-12
+    )
+    assert data.calibration.n_averaged.shape == (data.layout.n_times,)
+
+
+def test_gain_errors_are_those_of_the_levels(flight, table):
+    given = recipe(table, gain_std=0.02)
+    found = reduce_sessions(sessions(flight, "b"), given).at(10.0, np.ones(4) * 1e-22)
+    calibration = found.calibration
+    assert calibration.gain_names == ("L2", "L3", "M0", "M1", "M2", "M3")
+    assert calibration.gain_port.tolist() == [2, 3, 0, 1, 2, 3]
+    slope = calibration.gain_slope
+    np.testing.assert_array_equal(slope[0] > 0, np.arange(40) >= 20)
+    np.testing.assert_array_equal(slope[4] > 0, np.arange(40) < 20)
+    np.testing.assert_allclose(slope[2], 0.02)
+
+
+def test_shares_of_flags_are_those_of_the_values_that_there_were(reduced):
+    """Of 20 spectra 2 hold no data, 3 are bursts, 2 saturated; half of the rest does not fit."""
+    reason = np.full(reduced.reason.shape, NO_DATA, dtype=np.uint8)
+    reason[0, :20] = USED
+    reason[0, :7] = [NO_DATA, NO_DATA, BURST, BURST, BURST, SATURATED, SATURATED]
+    some = replace(reduced, reason=reason)
+    assert some.flagged(0) == pytest.approx({"saturated": 2 / 18, "burst": 3 / 18})
+    line = some.flag_line(0, 0.5)
+    assert line.startswith("flagged 63.89% of the values: ")
+    assert "does not fit the map 36.11%" in line and "burst 16.67%" in line
+    told = [text for text in some.doubts(0) if "more than a fifth" in text]
+    assert len(told) == 1 and "burst 16.67%" in told[0]
+    assert not any("fifth" in text for text in reduced.doubts(0))
+
+
+def test_files_of_reduced_spectra_hold_all(reduced, tmp_path):
+    path = write_reduced(tmp_path / "reduced.nc", reduced)
+    found = read_reduced(path)
+    for name in ("values", "n_averaged", "reason", "gain", "slope", "bin_of", "level", "lines"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(reduced, name))
+    a, b = (one.at(25.0, np.ones(4)) for one in (found, reduced))
+    assert a.digest() == b.digest()
+    assert_refused(lambda: found.at(11.0, np.ones(4)))
+
+
+def test_bins_that_do_not_fit_are_taken_out(reduced):
+    gone = np.zeros(reduced.values.shape[1:], dtype=bool)
+    gone[:, [3, 108]] = True
+    gone[5, 7] = True
+    less = reduced.without(0, gone)
+    assert np.isnan(less.values[0, 5, 7])
+    n_before, n_after = (one.at(10.0, np.ones(4)).layout.n_times for one in (reduced, less))
+    assert n_after == n_before - 2
+    assert (less.reason[0][[3, 108]] == NO_FIT).all()
+    assert less.shares(0)[REASONS[NO_FIT]] > 0
+    np.testing.assert_array_equal(less.values[1], reduced.values[1])
+
+
+def test_a_clock_file_corrects_the_utc_that_a_session_states(flight, table, tmp_path):
+    record = {"format_version": 1, "time_scale": "utc", "source": "tracking", "rate": 1.0 + 1e-6}
+    stated, true = "2027-01-25T00:00:00", "2027-01-25T00:00:46"
+    (tmp_path / "clock.json").write_text(
+        json.dumps(record | {"stated_utc_isot": stated, "clock_reference_isot": true})
+    )
+    clock = read_clock(tmp_path / "clock.json")
+    before, after = (
+        reduce_sessions(sessions(flight, "d"), recipe(table, clock=c)) for c in (None, clock)
+    )
+    elapsed = (before.observation.times - Time(stated)).sec
+    moved = (after.observation.times - before.observation.times).sec
+    np.testing.assert_allclose(moved, 46.0 + 1e-6 * elapsed, rtol=0, atol=1e-6)
+    assert after.sessions[0]["clock"] == "session, corrected by the clock file"
+    assert "clock.json" in after.notes()[0] and not before.notes()
+
+
+def test_what_contradicts_itself_is_refused(flight, table):
+    a, unknown = sessions(flight, "a")[0], read_session(flight / "session_a_unknown_time_scale.h5")
+    with pytest.raises(InputError, match="does not say which UTC"):
+        reduce_sessions([unknown], recipe(table))
+    with pytest.raises(InputError, match="overlap in time"):
+        reduce_sessions([a, a], recipe(table))
+    with pytest.raises(InputError, match="have no mean over a time"):
+        reduce_sessions([a], recipe(table, average_s=7200.0))
+    with pytest.raises(InputError, match="last for"):
+        reduce_sessions([a], recipe(table, timestamp="middle", average_s=60.0))
+    with pytest.raises(InputError, match="lacks"):
+        reduce_sessions([replace(a, telemetry={})], recipe(table))

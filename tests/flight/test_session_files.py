@@ -1,0 +1,403 @@
+"""Sessions of luseepy, of layout 4 made by hand, and our own; files that are damaged or foreign."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.time import Time
+from layout_4 import (
+    GAINS,
+    LANDING,
+    NAMES,
+    NOTCH,
+    RAW_S,
+    SPECTROMETER_S,
+    WEIGHT,
+    N,
+    counts,
+    metadata,
+    telemetry,
+    write_families,
+    write_layout_4,
+)
+
+from lusee_bayes.cli.main import main
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.flight.clock import Clock
+from lusee_bayes.flight.session import FLIGHT_PRODUCTS, OF_FLIGHT, TELEMETRY
+from lusee_bayes.flight.session_files import (
+    SessionRows,
+    cache_for,
+    guessed_chunks,
+    is_session,
+    read_session,
+    write_session,
+)
+from lusee_bayes.instrument.products import labels
+from lusee_bayes.testing import assert_refused
+
+
+@pytest.fixture
+def copy(flight, tmp_path):
+    """A session that a test may damage."""
+    path = tmp_path / "session.h5"
+    shutil.copy(flight / "session_d.h5", path)
+    path.chmod(0o644)
+    return path
+
+
+def test_products_are_in_the_spectrometers_order():
+    assert FLIGHT_PRODUCTS[:6] == ("00R", "11R", "22R", "33R", "01R", "01I")
+    assert [FLIGHT_PRODUCTS[k] for k in OF_FLIGHT] == list(labels())
+
+
+def test_what_a_session_says(flight):
+    session = read_session(flight / "session_b.h5")
+    truth = np.load(flight / "truth.npz")
+    mine = truth["session"] == "b"
+    assert (session.n_rows, session.layout, session.kind) == (40, 3, "HDF5")
+    utc = session.clock.utc(session.raw_s)
+    # MJD in one number is exact to a microsecond
+    np.testing.assert_allclose(utc.mjd, truth["mjd_utc"][mine], rtol=0, atol=1e-10)
+    assert ["".join(row) for row in session.level[[0, 19, 20, 39]]] == ["MMMM"] * 2 + ["MMLL"] * 2
+    np.testing.assert_array_equal(session.frames, float(truth["n_averages"]))
+    np.testing.assert_allclose(session.window_s, float(truth["integration_s"]), rtol=1e-12)
+    assert (session.lon_deg, session.lat_deg) == (float(truth["lon_deg"]), float(truth["lat_deg"]))
+
+
+def test_spectra_are_read_piece_by_piece(flight):
+    session = read_session(flight / "session_b.h5")
+    with session.spectra() as read, h5py.File(session.path) as file:
+        whole = file["spectra/data"][()]
+        np.testing.assert_array_equal(read(3, 9), whole[3:9])
+        np.testing.assert_array_equal(read(39, 40), whole[39:])
+    assert np.isnan(whole[5, 4]).all()
+
+
+def test_fits_and_hdf5_hold_the_same(flight):
+    a, b = (read_session(flight / f"session_a.{kind}") for kind in ("h5", "fits"))
+    assert b.kind == "FITS"
+    for name in ("raw_s", "navgf", "navg_shift", "level", "adc_low", "adc_high", "errors"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    assert a.telemetry.keys() == b.telemetry.keys()
+    for name, values in a.telemetry.items():
+        np.testing.assert_array_equal(values, b.telemetry[name])
+    np.testing.assert_array_equal(a.clock.utc(a.raw_s).jd, b.clock.utc(b.raw_s).jd)
+    with a.spectra() as one, b.spectra() as other:
+        np.testing.assert_array_equal(one(7, 12), other(7, 12))
+
+
+def test_saturated_spectra_are_those_that_were_made_so(flight):
+    truth = np.load(flight / "truth.npz")
+    rows = [int(row) for name, row in truth["saturated"] if name == "c"]
+    session = read_session(flight / "session_c.h5")
+    assert np.flatnonzero(session.saturated).tolist() == rows
+    assert not read_session(flight / "session_a.h5").saturated.any()
+
+
+def test_a_clock_that_nobody_has_established_is_none(flight):
+    assert read_session(flight / "session_a_unknown_time_scale.h5").clock is None
+
+
+def test_sessions_are_told_from_other_files(flight, tmp_path):
+    assert is_session(flight / "session_a.h5")
+    assert is_session(flight / "session_a.fits")
+    other = tmp_path / "other.h5"
+    with h5py.File(other, "w") as file:
+        file["data"] = np.zeros(3)
+    assert not is_session(other)
+    fits.PrimaryHDU(np.zeros(3)).writeto(tmp_path / "other.fits")
+    assert not is_session(tmp_path / "other.fits")
+    assert_refused(lambda: read_session(other))
+    (tmp_path / "text.h5").write_text("no")
+    assert_refused(lambda: read_session(tmp_path / "text.h5"))
+
+
+VERSIONS = [(2, "ingest the session again"), (5, "reads 3 and 4"), (None, "no layout_version")]
+
+
+@pytest.mark.parametrize(("version", "told"), VERSIONS)
+def test_older_and_newer_layouts_are_named(copy, version, told):
+    with h5py.File(copy, "a") as file:
+        if version is None:
+            del file.attrs["layout_version"]
+        else:
+            file.attrs["layout_version"] = version
+    with pytest.raises(InputError, match=told):
+        read_session(copy)
+
+
+def change(file, name, value):
+    shape = file[name][()]
+    del file[name]
+    file[name] = value(shape)
+
+
+WRONG = [
+    ("spectra/raw_times", lambda x: x[::-1]),
+    ("spectra/raw_times", lambda x: np.append(x[:-1], np.nan)),
+    ("spectra/raw_times", lambda x: x[:-1]),
+    ("spectra/mjd_times", lambda x: x + 1.0),
+    ("spectra/metadata/Navgf", lambda x: x + 6),
+    ("spectra/metadata/actual_gain", lambda x: x[:, :3]),
+    ("spectra/metadata/actual_gain", lambda x: x.astype(float)),
+    ("spectra/data", lambda x: x[:, :12]),
+    ("spectra_interpolated_telemetry/time", lambda x: x + 1.0),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), WRONG)
+def test_what_does_not_fit_is_refused(copy, name, value):
+    with h5py.File(copy, "a") as file:
+        change(file, name, value)
+    assert_refused(lambda: read_session(copy))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("bitslice_restored", 0), ("units", "counts"), ("normalization_version", 2)]
+)
+def test_counts_of_another_kind_are_refused(copy, name, value):
+    with h5py.File(copy, "a") as file:
+        file["spectra/data"].attrs[name] = value
+    assert_refused(lambda: read_session(copy))
+
+
+def test_files_that_are_cut_short_are_refused(flight, tmp_path):
+    for kind in ("h5", "fits"):
+        whole = (flight / f"session_a.{kind}").read_bytes()
+        for share in (0.1, 0.6, 0.95):
+            path = tmp_path / f"cut.{kind}"
+            path.write_bytes(whole[: int(share * len(whole))])
+
+            def use(path=path):
+                session = read_session(path)
+                with session.spectra() as read:
+                    read(0, session.n_rows)
+
+            assert_refused(use)
+
+
+def test_gains_in_letters_are_the_same(copy):
+    numbers = read_session(copy).level
+    with h5py.File(copy, "a") as file:
+        change(file, "spectra/metadata/actual_gain", lambda x: np.full(x.shape, b"M"))
+    np.testing.assert_array_equal(read_session(copy).level, numbers)
+
+
+@pytest.fixture
+def newer(tmp_path):
+    """A session of layout 4 that a test may change."""
+    return write_layout_4(tmp_path / "session_4.h5")
+
+
+def test_what_a_session_of_layout_4_says(newer):
+    session, rows = read_session(newer), metadata()
+    assert is_session(newer)
+    assert (session.n_rows, session.layout, session.kind) == (N, 4, "HDF5")
+    assert (session.lon_deg, session.lat_deg, session.software) == (182.258, -23.814, "0x307")
+    expected = {
+        "raw_s": RAW_S,
+        "navgf": 2,
+        "frames": 2.0**14 * WEIGHT,
+        "level": np.array(list("LMH"))[GAINS],
+        "adc_low": rows["adc_min"],
+        "adc_high": rows["adc_max"],
+        "adc_invalid": rows["adc_invalid_count_max"],
+        "errors": rows["errors"],
+        "notch": NOTCH,
+    }
+    for name, values in expected.items():
+        np.testing.assert_array_equal(getattr(session, name), values)
+    np.testing.assert_allclose(session.window_s, 2**20 * 40e-6, rtol=1e-12)
+    assert session.telemetry.keys() == set(NAMES[1:])
+    for name, values in session.telemetry.items():
+        np.testing.assert_allclose(values, telemetry(name, RAW_S), rtol=1e-9)
+    utc = session.clock.utc(RAW_S)
+    np.testing.assert_allclose((utc - Time(LANDING)).sec, RAW_S - SPECTROMETER_S, atol=1e-5)
+    with session.spectra() as read:
+        np.testing.assert_array_equal(read(1, 4), counts()[1:4])
+
+
+def test_families_that_are_not_used_are_named(newer, capsys):
+    def told():
+        assert main(["info", str(newer)]) == 0
+        return [line for line in capsys.readouterr().out.splitlines() if "not used" in line]
+
+    assert not told()
+    rows = {"calibrator__zoom_spectra": 12, "tr_spectra": 2, "calibrator__data": 3}
+    write_families(newer, **rows, grimm_spectra=1, housekeeping=4)
+    (line,) = told()
+    assert line.split("not used: ")[1] == (
+        "time-resolved spectra (2 rows), zoom spectra (12 rows), Grimm's spectra (1 row), "
+        "calibrator data (3 rows), housekeeping (4 rows)"
+    )
+
+
+FIELDS = "spectra/metadata/fields"
+CONTRADICTIONS = {
+    "spectra/raw_time_valid": (False, "raw_time_valid"),
+    f"{FIELDS}/adc_min/variant_000/row_indices": (10**6, "row_indices"),
+    f"{FIELDS}/navgf/variant_000/data": (1, "navgf"),
+    "telemetry/mission_seconds": (7, "does not cover the spectra"),
+}
+
+
+@pytest.mark.parametrize("name", CONTRADICTIONS)
+def test_layout_4_that_contradicts_itself_is_refused(newer, name):
+    value, told = CONTRADICTIONS[name]
+    with h5py.File(newer, "a") as file:
+        file[name][...] = value
+    with pytest.raises(InputError, match=told):
+        read_session(newer)
+
+
+LACKING = {
+    3: [
+        "spectra",
+        "spectra/data",
+        "spectra/raw_times",
+        "constants",
+        *(f"spectra/metadata/{name}" for name in ("Navgf", "Navg2_shift", "adc_min")),
+        *(f"spectra/metadata/{name}" for name in ("actual_gain", "actual_bitslice")),
+    ],
+    4: [
+        "spectra",
+        "spectra/raw_seconds",
+        "constants",
+        f"{FIELDS}/adc_min",
+        f"{FIELDS}/actual_gain",
+        "telemetry/values",
+    ],
+}
+
+
+@pytest.mark.parametrize(("layout", "name"), [(k, name) for k in LACKING for name in LACKING[k]])
+def test_what_is_missing_is_named(request, layout, name):
+    path = request.getfixturevalue({3: "copy", 4: "newer"}[layout])
+    with h5py.File(path, "a") as file:
+        del file[name]
+    with pytest.raises(InputError) as refused:
+        read_session(path)
+    told = {"raw_seconds": "raw_times"}.get(name.split("/")[-1], name.split("/")[-1])
+    assert told in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_without_a_clock_reference_the_telemetry_of_layout_4_is_not_known(newer):
+    with h5py.File(newer, "a") as file:
+        file["clock_reference"].attrs["available"] = np.bool_(False)
+    session = read_session(newer)
+    assert session.clock is None and not session.telemetry
+
+
+def test_layout_4_in_fits_is_refused(tmp_path):
+    primary = fits.PrimaryHDU()
+    primary.header["LAYOUTV"] = 4
+    primary.writeto(tmp_path / "s.fits")
+    with pytest.raises(InputError, match="as HDF5"):
+        read_session(tmp_path / "s.fits")
+
+
+ROWS = 7
+CLOCK = Clock("test", 2400000.5, 61192.0, "utc", 1000.0)
+KINDS = ["hdf5", "fits"]
+
+
+def some_rows(**changes):
+    rng = np.random.default_rng(5)
+    level = np.array([list("MMMM")] * 3 + [list("LMHL")] * 4)
+    rows = SessionRows(
+        raw_s=2.3e7 + 0.7 + 42.0 * np.arange(ROWS),
+        navgf=np.full(ROWS, 2),
+        navg_shift=np.full(ROWS, 20),
+        level=level,
+        bitslice=rng.integers(0, 31, (ROWS, 16)),
+        adc_low=-rng.integers(100, 8000, (ROWS, 4)),
+        adc_high=rng.integers(100, 8000, (ROWS, 4)),
+        adc_invalid=rng.integers(0, 3, (ROWS, 4)),
+        adc_rms=rng.uniform(50.0, 300.0, (ROWS, 4)),
+        telemetry={name: rng.uniform(1.0, 30.0, ROWS) for name in TELEMETRY},
+        clock=CLOCK,
+        lon_deg=182.258,
+        lat_deg=-23.814,
+        software=775,
+    )
+    return replace(rows, **changes)
+
+
+def written_counts(bins=2048):
+    return np.random.default_rng(6).normal(size=(ROWS, 16, bins)).astype(np.float32)
+
+
+def in_blocks(counts, *sizes):
+    start = 0
+    for size in sizes:
+        yield counts[start : start + size]
+        start += size
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_session_comes_back_from_its_file(tmp_path, kind):
+    rows, counts = some_rows(), written_counts()
+    counts[2, 3] = np.nan
+    path = write_session(tmp_path / "session", rows, in_blocks(counts, 4, 1, 2), kind=kind)
+    assert is_session(path)
+    found = read_session(path)
+    assert (found.layout, found.kind) == (3, kind.upper())
+    assert found.software == "0x307"
+    assert (found.lon_deg, found.lat_deg) == (rows.lon_deg, rows.lat_deg)
+    for name in ("raw_s", "navgf", "navg_shift", "level", "adc_low", "adc_high", "adc_invalid"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(rows, name))
+    np.testing.assert_array_equal(found.share, 1.0)
+    assert not found.errors.any()
+    for name in TELEMETRY:
+        np.testing.assert_array_equal(found.telemetry[name], rows.telemetry[name])
+    assert found.clock.differs_s(CLOCK, rows.raw_s) < 1e-6
+    with found.spectra() as read:
+        np.testing.assert_array_equal(read(0, ROWS), counts)
+        np.testing.assert_array_equal(read(3, 5), counts[3:5])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bins_that_are_not_there_are_nan_and_a_clock_may_be_unknown(tmp_path, kind):
+    path = write_session(tmp_path / "s", some_rows(clock=None), [written_counts(512)], kind=kind)
+    found = read_session(path)
+    assert found.clock is None
+    with found.spectra() as read:
+        counts = read(0, ROWS)
+    np.testing.assert_array_equal(counts[..., :512], written_counts(512))
+    assert np.isnan(counts[..., 512:]).all()
+
+
+@pytest.mark.parametrize(
+    "blocks, text",
+    [
+        ([written_counts()[:4]], "there are counts of 4 spectra for 7 rows"),
+        ([written_counts(), written_counts()[:1]], "expected at most 0 rows"),
+        ([written_counts()[:, :15]], "16 products"),
+    ],
+)
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_no_session_leaves_nothing_behind(tmp_path, kind, blocks, text):
+    with pytest.raises(InputError, match=text):
+        write_session(tmp_path / "s", some_rows(), blocks, kind=kind)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(InputError, match="not as netcdf"):
+        write_session(tmp_path / "s", some_rows(), [], kind="netcdf")
+
+
+def test_a_file_has_the_chunks_that_luseepy_makes_and_they_stay_in_memory(tmp_path):
+    path = write_session(tmp_path / "s", some_rows(), [written_counts()])
+    with h5py.File(path) as file:
+        cube = file["spectra/data"]
+        assert (cube.compression, cube.compression_opts) == ("gzip", 1)
+        assert cube.chunks == guessed_chunks(ROWS)
+    long = guessed_chunks(57_000)
+    assert long[0] > 256
+    needed = long[0] * 16 * 2048 * 4
+    assert needed <= cache_for(long)["rdcc_nbytes"] < 2 * needed
+    assert cache_for(None) == {}

@@ -1,0 +1,202 @@
+"""Coordinates of a log-normal sky's posterior, and its mode, against closed forms and searches."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import optimize
+
+from lusee_bayes.core.arrays import on_device
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.linear.information import Information
+from lusee_bayes.sampling.log_normal_prior import AMPLITUDE, STRUCTURE, TILT, LogNormalPrior
+from lusee_bayes.sampling.straight_log_normal import (
+    LogNormalMode,
+    coordinates_of,
+    find_mode,
+    learn_spectrum,
+    straight_coordinates,
+)
+from lusee_bayes.sky import BRIGHT_SOURCES
+from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
+from lusee_bayes.sky.priors import DensePrior
+from lusee_bayes.sky.template import EmbeddedTemplate
+
+MHZ, LMAX, TILTED = 25.0, 3, -2.0
+LEVEL = np.array([4.0 * np.pi])
+
+
+def log_normal(amplitude, lmax=LMAX, level=LEVEL, sources=()) -> LogNormalSky:
+    spectrum = deviation_spectrum(lmax, amplitude, TILTED, level)
+    return LogNormalSky.of(EmbeddedTemplate(MHZ), spectrum, MHZ, sources, band=16)
+
+
+def informed(truth: np.ndarray) -> Information:
+    """What data say that know combinations of 16 modes to 10 to 1e5 K; the template's is 1e5 K."""
+    rng = np.random.default_rng(1)
+    rotation = np.linalg.qr(rng.standard_normal((16, 16)))[0]
+    precision = np.geomspace(1e-2, 1e-10, 16)
+    return Information(
+        (rotation * precision) @ rotation.T,
+        rotation @ (np.sqrt(precision) * rng.standard_normal(16)),
+        truth,
+        np.asarray(96.0),
+        np.asarray(0.0),
+        np.asarray(96.0),
+    )
+
+
+@lru_cache
+def information(amplitude: float = 0.03) -> Information:
+    """Of a sky that departs from the template by 10 % on large scales."""
+    sky = log_normal(amplitude, sources=BRIGHT_SOURCES[:1])
+    return informed(sky.modes(np.random.default_rng(2).standard_normal(sky.size)))
+
+
+@lru_cache
+def mode() -> LogNormalMode:
+    return find_mode(log_normal(0.03, sources=BRIGHT_SOURCES[:1]), information())
+
+
+# --- the mode ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def two_unknowns():
+    """A datum of the mean temperature, half as large again as the template's, known to 5 %."""
+    sky = log_normal(0.1, lmax=0, sources=BRIGHT_SOURCES[:1])
+    value = 1.5 * sky.modes(np.zeros(2))
+    precision = float((0.05 * value[0]) ** -2)
+    given = Information(
+        np.array([[precision]]),
+        np.zeros(1),
+        value,
+        np.asarray(0.0),
+        np.asarray(-np.log(precision)),
+        np.asarray(1.0),
+    )
+    return sky, given
+
+
+def test_the_mode_is_where_a_search_without_derivatives_finds_it(two_unknowns):
+    sky, given = two_unknowns
+
+    def energy(u):
+        return float(given.chi2(sky.modes(u))) + u @ u
+
+    best = optimize.minimize(energy, np.zeros(2), method="Nelder-Mead", tol=1e-10)
+    np.testing.assert_allclose(find_mode(sky, given).white, best.x, atol=1e-4)
+
+
+def test_small_deviations_have_the_posterior_of_a_gaussian_sky():
+    """s of 1e-4: exp(s) - 1 - s is 1e-8, of skies that the data know to 1e-5."""
+    sky = log_normal(1e-4, level=np.array([1e-8]))
+    root = sky.jacobian(np.zeros(sky.size))
+    prior = DensePrior.of_covariance(root @ root.T, sky.modes(np.zeros(sky.size)))
+    given = informed(sky.modes(np.random.default_rng(0).standard_normal(sky.size)))
+    expected, found = given.posterior(prior), find_mode(sky, given)
+    std = np.asarray(expected.std())
+    assert np.abs((found.modes - np.asarray(expected.mean)) / std).max() < 0.02
+    half = np.linalg.solve(found.lower, found.jacobian.T)
+    np.testing.assert_allclose(np.sqrt((half**2).sum(0)), std, rtol=1e-3)
+
+
+def test_the_gradient_vanishes_at_the_mode():
+    found = mode()
+    sky, given = on_device((found.sky, found.information))
+
+    def energy(u):
+        return 0.5 * (given.chi2(sky.modes(u)) + u @ u)
+
+    slope = np.asarray(jax.jit(jax.grad(energy))(jnp.asarray(found.white)))
+    # H^-1 measures it in standard deviations
+    assert np.linalg.norm(np.linalg.solve(found.lower, slope)) < 1e-3
+
+
+# --- straight coordinates ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_straight_coordinates_are_one_to_one_with_the_determinant_they_say(learned):
+    power_law = np.array([np.log(0.03), TILTED]) if learned else None
+    covariance = np.array([[0.04, 0.01], [0.01, 0.09]]) if learned else None
+    coordinates = straight_coordinates(mode(), power_law, covariance)
+    n = coordinates.root.shape[0]
+    z = jax.random.normal(jax.random.key(3), (n,), dtype=jnp.float64)
+    x = coordinates.mean + coordinates.root @ z
+
+    @jax.jit
+    def flat(x):
+        values, log_det = coordinates.to_values(x)
+        return coordinates.join(values), log_det
+
+    values, log_det = flat(x)
+    assert float(jnp.abs(values - x).max()) > 1e-3
+    back = jax.jit(lambda values: coordinates.from_values(coordinates.split(values)))(values)
+    np.testing.assert_allclose(back, x, rtol=0, atol=1e-11)
+    derivative = jax.jit(jax.jacfwd(lambda x: flat(x)[0]))(x)
+    # rounding errors of 1e-16 times a condition of 1e5
+    assert float(log_det) == pytest.approx(np.linalg.slogdet(derivative)[1], abs=1e-8)
+    assert (float(log_det) != 0.0) == learned
+
+
+def test_energies_are_those_of_a_gaussian_in_straight_coordinates_only():
+    coordinates, found = straight_coordinates(mode()), mode()
+    z = jax.random.normal(jax.random.key(0), (60, found.sky.size), dtype=jnp.float64)
+    x = np.asarray(coordinates.mean)[None] + np.asarray(z @ coordinates.root.T)
+    values, _ = jax.jit(jax.vmap(coordinates.to_values))(jnp.asarray(x))
+    white = np.asarray(values[STRUCTURE])
+    chi2 = np.array([float(found.information.chi2(m)) for m in found.sky.modes(white)])
+    energy = 0.5 * (chi2 + (white**2).sum(1))
+    assert (energy - 0.5 * (np.asarray(z) ** 2).sum(1)).std() < 1.0
+    # what a Gaussian about the mode would draw contradicts the data: chi^2 of 96 scatters by 14
+    bent = np.array([float(found.information.chi2(m)) for m in found.sky.modes(x)])
+    assert np.median(bent - chi2) > 100.0
+
+
+# --- C_ell that is learned --------------------------------------------------------------------
+
+
+def test_the_learned_spectrum_has_the_highest_evidence_and_its_curvature():
+    prior = LogNormalPrior.of(log_normal(0.02), 0.02, TILTED, (0.7, 0.5))
+    found = learn_spectrum(prior, information())
+    best = found.power_law
+    centre, std = np.array([np.log(0.02), TILTED]), np.array([0.7, 0.5])
+
+    def log_posterior(theta):
+        sky = prior.sky.with_power_law(np.exp(theta[0]), theta[1])
+        there = find_mode(sky, information())
+        of_data = -0.5 * (float(there.information.misfit) + there.white @ there.white)
+        of_data -= np.log(np.diagonal(there.lower)).sum()
+        return of_data - 0.5 * (((theta - centre) / std) ** 2).sum()
+
+    top = log_posterior(best)
+    for direction in np.linalg.cholesky(found.covariance).T:
+        up, down = log_posterior(best + direction), log_posterior(best - direction)
+        # a parabola with this covariance falls by 1/2 on both sides
+        assert 0.5 * (up + down) - top == pytest.approx(-0.5, abs=0.1)
+        assert 0.5 * (up - down) == pytest.approx(0.0, abs=0.1)
+
+
+# --- refusals ---------------------------------------------------------------------------------
+
+
+def test_refusals():
+    with pytest.raises(InputError, match="the information has shape"):
+        find_mode(log_normal(0.1, lmax=2), information())
+    with pytest.raises(InputError, match="amplitude of the logarithm of the sky must be positive"):
+        LogNormalPrior.of(log_normal(0.1), 0.0, TILTED)
+    with pytest.raises(InputError, match="standard deviation of the tilt must be positive"):
+        LogNormalPrior.of(log_normal(0.1), 0.1, TILTED, (1.0, 0.0))
+
+
+@pytest.mark.parametrize("widths", [None, (0.7, 0.5)])
+def test_coordinates_are_those_of_the_sites_that_are_sampled(widths):
+    prior = LogNormalPrior.of(log_normal(0.02), 0.02, TILTED, widths)
+    coordinates = coordinates_of(prior, information())
+    assert coordinates.names == prior.sites
+    assert coordinates.chart.names == (STRUCTURE, AMPLITUDE, TILT)
