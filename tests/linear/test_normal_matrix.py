@@ -99,7 +99,7 @@ def test_equals_the_product_of_matrices(place, kind, order, missing):
         assert np.abs(other).max() > 1e-4 * np.abs(expected).max()  # the order does matter here
 
 
-@pytest.mark.parametrize("kind", ["diagonal", "templates"])
+@pytest.mark.parametrize("kind", [pytest.param("diagonal", marks=pytest.mark.long), "templates"])
 def test_inside_a_compiled_function_too(kind):
     """Where nothing is known of the angles and the weights: programs are compiled with A and N."""
     coupling = setting()

@@ -306,7 +306,7 @@ def test_the_two_parts_by_matrices(strength):
     assert found.instrument.degrees + found.prior.degrees == pytest.approx(model.n_data)
 
 
-def p_values(model, strength, n=120, truth=None):
+def p_values(model, strength, n=80, truth=None):
     rng = np.random.default_rng(5)
     parts = [split_of(model, drawn(truth or model, rng, strength))[0] for _ in range(n)]
     return np.array([[one.instrument.p, one.prior.p] for one in parts])

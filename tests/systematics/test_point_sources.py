@@ -233,6 +233,7 @@ def test_a_source_below_the_horizon_is_known_from_its_prior_only():
     assert result.lines()[2:] == [*lines, result.headline(), RULE]
 
 
+@pytest.mark.long
 def test_ignored_sources_have_no_fluxes():
     result = map_result(experiment("ignored"))
     assert result.fluxes is None
