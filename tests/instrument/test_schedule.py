@@ -8,11 +8,8 @@ from astropy.coordinates import ICRS, CartesianRepresentation, get_body_barycent
 from astropy.time import Time
 from lunarsky import MCMF, MoonLocation
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.instrument.moon import CYCLE_DAYS
-from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.schedule import Interval, Run
-from lusee_bayes.instrument.schedule_file import read_schedule
 
 # three lunar nights at half duty, the table turned in the middle of the first and of the last
 NIGHTS = """\
@@ -45,7 +42,7 @@ def schedule(seed, n=5, **options):
         at += timedelta(seconds=int(rng.choice([0, 1, 4000])))
         end = at + timedelta(seconds=int(rng.integers(2, 50000)))
         angle, duty = float(rng.choice([0.0, 30.0])), float(rng.choice([1.0, 0.5, 0.1]))
-        intervals.append(Interval(at.isoformat(), end.isoformat(), angle, duty, **options))
+        intervals.append(lb.Interval(at.isoformat(), end.isoformat(), angle, duty, **options))
         at = end
     return intervals
 
@@ -72,7 +69,7 @@ def seconds(observation, origin):
 @pytest.mark.parametrize("step_s", [600.0, 7200.0, 1234.5])
 def test_intervals_are_cut_as_by_a_loop(seed, step_s):
     intervals = schedule(seed)
-    o = Observation.from_schedule(intervals, step_s=step_s)
+    o = lb.Observation.from_schedule(intervals, step_s=step_s)
     expected = naive(intervals, step_s)
     origin = expected[0][0]
     start = np.array([(w[0] - origin).total_seconds() for w in expected])
@@ -93,7 +90,7 @@ def test_intervals_are_cut_as_by_a_loop(seed, step_s):
 @pytest.mark.parametrize("seed", range(6))
 def test_no_time_is_lost_or_found(seed):
     intervals = schedule(seed, n=8)
-    o = Observation.from_schedule(intervals, step_s=777.0)
+    o = lb.Observation.from_schedule(intervals, step_s=777.0)
     total = sum(one.duty_cycle * one.length_s for one in intervals)
     # rounding of a few hundred numbers of 1e3 seconds
     assert o.live_s.sum() == pytest.approx(total, abs=1e-8)
@@ -101,25 +98,27 @@ def test_no_time_is_lost_or_found(seed):
 
 def test_instants_begin_before_the_end():
     intervals = [
-        Interval("2027-01-15T00:00:00", "2027-01-15T04:00:00"),  # two steps: the end is no sample
-        Interval("2027-01-15T05:00:00", "2027-01-15T09:00:01"),  # a second more: it is
+        lb.Interval(
+            "2027-01-15T00:00:00", "2027-01-15T04:00:00"
+        ),  # two steps: the end is no sample
+        lb.Interval("2027-01-15T05:00:00", "2027-01-15T09:00:01"),  # a second more: it is
     ]
-    o = Observation.from_schedule(intervals, window="instant")
+    o = lb.Observation.from_schedule(intervals, window="instant")
     hours = np.array([0.0, 2.0, 5.0, 7.0, 9.0])
     np.testing.assert_allclose(seconds(o, "2027-01-15"), 3600.0 * hours, rtol=0, atol=1e-8)
     assert o.windows is None
     assert (o.live_s == 7200.0).all()
-    half = [Interval("2027-01-15", "2027-01-16", duty_cycle=0.5)]
+    half = [lb.Interval("2027-01-15", "2027-01-16", duty_cycle=0.5)]
     with pytest.raises(
-        InputError, match=r"no duty cycle; take windows \(observation.window=mean\)"
+        lb.InputError, match=r"no duty cycle; take windows \(observation.window=mean\)"
     ):
-        Observation.from_schedule(half, window="instant")
+        lb.Observation.from_schedule(half, window="instant")
 
 
 def test_runs_are_where_the_table_turns():
     days = [("15", 0.0), ("16", 0.0), ("17", 30.0), ("18", 0.0), ("21", 0.0)]
-    intervals = [Interval(f"2027-01-{d}", f"2027-01-{int(d) + 1}", angle) for d, angle in days]
-    o = Observation.from_schedule(intervals, step_s=43200.0)
+    intervals = [lb.Interval(f"2027-01-{d}", f"2027-01-{int(d) + 1}", angle) for d, angle in days]
+    o = lb.Observation.from_schedule(intervals, step_s=43200.0)
     assert o.turntable_deg == (0.0, 30.0, 0.0)
     np.testing.assert_array_equal(o.run, [0, 0, 0, 0, 1, 1, 2, 2, 2, 2])
 
@@ -130,17 +129,17 @@ def test_runs_are_a_schedule(window, step_s):
     """Runs of so many steps and a half: their samples fill the steps, the next begins later."""
     counts, angles = (10, 7, 12), (0.0, 30.0, -15.0)
     month = CYCLE_DAYS * 86400.0
-    runs = [Run((n + 0.5) * step_s / month, a) for n, a in zip(counts, angles, strict=True)]
+    runs = [lb.Run((n + 0.5) * step_s / month, a) for n, a in zip(counts, angles, strict=True)]
     site = {"lon_deg": 10.0, "lat_deg": 20.0}
-    expected = Observation.from_runs(
+    expected = lb.Observation.from_runs(
         runs, start="2027-02-01T00:00:00", step_s=step_s, window=window, **site
     )
     at, intervals = datetime(2027, 2, 1), []
     for n, angle in zip(counts, angles, strict=True):
         end = at + timedelta(seconds=n * step_s)
-        intervals.append(Interval(at.isoformat(), end.isoformat(), angle))
+        intervals.append(lb.Interval(at.isoformat(), end.isoformat(), angle))
         at = end + timedelta(seconds=0.5 * step_s)
-    got = Observation.from_schedule(intervals, step_s=step_s, window=window, **site)
+    got = lb.Observation.from_schedule(intervals, step_s=step_s, window=window, **site)
     # lengths in cycles are rounded, to 1e-16 of 1e5 seconds, and so are differences of dates
     apart = (got.times - expected.times).to_value(u.s)
     np.testing.assert_allclose(apart, 0.0, rtol=0, atol=1e-8)
@@ -165,8 +164,8 @@ def is_dark(times, lon_deg, lat_deg):
 def test_windows_at_night_are_dark_from_end_to_end():
     step_s, lon, lat = 40000.0, 182.258, -23.814
     dates = [("2027-01-14T00:00:00", "2027-01-31T00:00:00"), ("2027-02-01", "2027-02-16")]
-    intervals = [Interval(*pair, night_only=True) for pair in dates]
-    o = Observation.from_schedule(intervals, step_s=step_s, lon_deg=lon, lat_deg=lat)
+    intervals = [lb.Interval(*pair, night_only=True) for pair in dates]
+    o = lb.Observation.from_schedule(intervals, step_s=step_s, lon_deg=lon, lat_deg=lat)
     windows = naive(intervals, step_s)
     start, end = (Time([w[k] for w in windows]) for k in (0, 1))
     middle = start + (end - start) / 2.0
@@ -176,31 +175,31 @@ def test_windows_at_night_are_dark_from_end_to_end():
     assert (dark.any(axis=0) & ~expected).sum() == 3
     apart = (o.times - middle[expected]).to_value(u.s)
     np.testing.assert_allclose(apart, 0.0, rtol=0, atol=1e-8)
-    by_day = [Interval(*dates[0], night_only=True), Interval(*dates[1])]
-    mixed = Observation.from_schedule(by_day, step_s=step_s, lon_deg=lon, lat_deg=lat)
+    by_day = [lb.Interval(*dates[0], night_only=True), lb.Interval(*dates[1])]
+    mixed = lb.Observation.from_schedule(by_day, step_s=step_s, lon_deg=lon, lat_deg=lat)
     second = start >= Time("2027-02-01")
     assert mixed.n_times == (expected | second).sum()
-    instants = Observation.from_schedule(
+    instants = lb.Observation.from_schedule(
         intervals, step_s=step_s, lon_deg=lon, lat_deg=lat, window="instant"
     )
     assert instants.n_times == dark[0].sum()
 
 
 def test_a_table_in_csv(write):
-    intervals = read_schedule(write(NIGHTS))
+    intervals = lb.read_schedule(write(NIGHTS))
     assert intervals == (
-        Interval("2027-01-14T00:00:00Z", "2027-01-22T12:00:00Z", 0.0, 0.5, True),
-        Interval("2027-01-22T12:30:00", "2027-01-31T00:00:00", 30.0, 0.5, True),
-        Interval("2027-02-13T00:00:00", "2027-03-01T00:00:00", 30.0, 1.0, True),
-        Interval("2027-03-14T00:00:00", "2027-03-22T12:00:00", 30.0, 0.25, True),
-        Interval("2027-03-22T13:00:00", "2027-03-23", -60.5, 1.0, False),
+        lb.Interval("2027-01-14T00:00:00Z", "2027-01-22T12:00:00Z", 0.0, 0.5, True),
+        lb.Interval("2027-01-22T12:30:00", "2027-01-31T00:00:00", 30.0, 0.5, True),
+        lb.Interval("2027-02-13T00:00:00", "2027-03-01T00:00:00", 30.0, 1.0, True),
+        lb.Interval("2027-03-14T00:00:00", "2027-03-22T12:00:00", 30.0, 0.25, True),
+        lb.Interval("2027-03-22T13:00:00", "2027-03-23", -60.5, 1.0, False),
     )
     assert intervals[2].where.endswith("schedule.csv, row 3")
-    o = Observation.from_schedule(intervals, step_s=7200.0)
+    o = lb.Observation.from_schedule(intervals, step_s=7200.0)
     assert o.turntable_deg == (0.0, 30.0, -60.5)
     assert o.times[0].isot[:16] == "2027-01-15T03:00"  # sunset is late on the 14th
     columns = "turntable_deg,end,start\n7,2027-01-02,2027-01-01\n"
-    assert read_schedule(write(columns)) == (Interval("2027-01-01", "2027-01-02", 7.0),)
+    assert lb.read_schedule(write(columns)) == (lb.Interval("2027-01-01", "2027-01-02", 7.0),)
 
 
 HEADER = "start,end,turntable_deg,duty_cycle,night_only\n"
@@ -243,18 +242,20 @@ HEADER = "start,end,turntable_deg,duty_cycle,night_only\n"
     ],
 )
 def test_bad_tables_are_refused(write, text, message):
-    with pytest.raises(InputError, match=message):
-        read_schedule(write(text))
+    with pytest.raises(lb.InputError, match=message):
+        lb.read_schedule(write(text))
 
 
 def test_an_interval_without_a_night_is_refused(write):
     # the Sun is up for two weeks from 1 February 2027 at this site
     text = f"{HEADER}2027-01-16,2027-01-17,0,1,true\n2027-02-05,2027-02-07,0,1,true\n"
-    with pytest.raises(InputError, match=r"schedule.csv, row 2 holds no lunar night; lengthen it"):
-        Observation.from_schedule(read_schedule(write(text)))
-    unnamed = [Interval("2027-02-05", "2027-02-07", night_only=True)]
-    with pytest.raises(InputError, match="interval 0 holds no lunar night"):
-        Observation.from_schedule(unnamed)
+    with pytest.raises(
+        lb.InputError, match=r"schedule.csv, row 2 holds no lunar night; lengthen it"
+    ):
+        lb.Observation.from_schedule(lb.read_schedule(write(text)))
+    unnamed = [lb.Interval("2027-02-05", "2027-02-07", night_only=True)]
+    with pytest.raises(lb.InputError, match="interval 0 holds no lunar night"):
+        lb.Observation.from_schedule(unnamed)
 
 
 @pytest.mark.parametrize(
@@ -268,8 +269,8 @@ def test_an_interval_without_a_night_is_refused(write):
     ],
 )
 def test_bad_schedules_are_refused(intervals, options, message):
-    with pytest.raises(InputError, match=message):
-        Observation.from_schedule([Interval(*pair) for pair in intervals], **options)
+    with pytest.raises(lb.InputError, match=message):
+        lb.Observation.from_schedule([lb.Interval(*pair) for pair in intervals], **options)
 
 
 # a table as those of OpSim, with the states that its simulator adds
@@ -292,7 +293,7 @@ COMMANDS = """\
 
 
 def test_a_command_table_of_opsim(write):
-    intervals = read_schedule(write(COMMANDS, "comtable.yml"))
+    intervals = lb.read_schedule(write(COMMANDS, "comtable.yml"))
     mjd = [(61065.7, 61080.5), (61095.25, 61095.75), (61095.75, 61096.0)]
     assert len(intervals) == 3
     for one, (start, end) in zip(intervals, mjd, strict=True):
@@ -303,7 +304,7 @@ def test_a_command_table_of_opsim(write):
             assert abs(apart.total_seconds()) < 3e-6
         assert (one.turntable_deg, one.duty_cycle, one.night_only) == (0.0, 1.0, False)
     assert intervals[0].where.endswith("comtable.yml, entry 2")
-    assert Observation.from_schedule(intervals).n_runs == 1
+    assert lb.Observation.from_schedule(intervals).n_runs == 1
 
 
 @pytest.mark.parametrize(
@@ -333,12 +334,12 @@ def test_a_command_table_of_opsim(write):
     ],
 )
 def test_bad_command_tables_are_refused(write, text, message):
-    with pytest.raises(InputError, match=message):
-        read_schedule(write(text, "comtable.yml"))
+    with pytest.raises(lb.InputError, match=message):
+        lb.read_schedule(write(text, "comtable.yml"))
 
 
 def test_a_file_that_has_changed_is_read_again(write):
     path = write("start,end,turntable_deg\n2027-01-01,2027-01-02,0\n")
-    assert read_schedule(path)[0].turntable_deg == 0.0
+    assert lb.read_schedule(path)[0].turntable_deg == 0.0
     write("start,end,turntable_deg\n2027-01-01,2027-01-02,30\n")
-    assert read_schedule(path)[0].turntable_deg == 30.0
+    assert lb.read_schedule(path)[0].turntable_deg == 30.0

@@ -14,19 +14,13 @@ from astropy.io import fits
 from astropy.time import Time, TimeDelta
 from fits_files import write_images
 
+import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.cli.options import parse_frequencies
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import parse_yaml
-from lusee_bayes.experiment.data_files import read_data
-from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, Run
 from lusee_bayes.instrument.products import labels
-from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe
 
 PAIRS = [[i, j] for i in range(4) for j in range(i, 4)]
@@ -50,7 +44,7 @@ def write(path, data=None, pairs=PAIRS, header=HEADER, frequencies=(10.0, 20.0),
 
 
 def test_every_sample_is_in_its_place(tmp_path):
-    waterfall = read_waterfall(write(tmp_path / "w.fits"))
+    waterfall = lb.read_waterfall(write(tmp_path / "w.fits"))
     data = waterfall.at(20.0)
     assert data.frequency_mhz == 20.0 and data.n_missing == 0
     expected = 100.0 * np.arange(16)[:, None] + np.arange(12)[None] + 0.1
@@ -74,7 +68,7 @@ def test_every_sample_is_in_its_place(tmp_path):
 )
 def test_ranges_of_time(tmp_path, lunar_day, first):
     path = write(tmp_path / "w.fits", header=HEADER | {"LUNAR_DAY": lunar_day})
-    observation = read_waterfall(path).observation
+    observation = lb.read_waterfall(path).observation
     assert observation.times[0].isot == first
     np.testing.assert_allclose(observation.hours, 2.0 * np.arange(12), rtol=0, atol=1e-6)
 
@@ -87,7 +81,9 @@ def test_lunar_days_begin_at_noon_on_the_far_side(tmp_path):
     found = []
     for number, new_moon in zip((2500, "2501", 2502, 2503, 2504), new_moons, strict=True):
         path = tmp_path / f"{number}.fits"
-        found.append(read_waterfall(write(path, header=HEADER | {"LUNAR_DAY": number})).observation)
+        found.append(
+            lb.read_waterfall(write(path, header=HEADER | {"LUNAR_DAY": number})).observation
+        )
         off = (found[-1].times[0] - Time(f"2025-{new_moon}", scale="utc")).to_value(u.hour)
         assert abs(off) < 14.0
     days = np.diff([o.times[0].jd for o in found])
@@ -95,7 +91,7 @@ def test_lunar_days_begin_at_noon_on_the_far_side(tmp_path):
     # the Sun is highest there and then, by the package's other way to its altitude
     noon = found[2].times[0]
     around = noon + np.arange(-120.0, 121.0, 4.0) * u.s
-    middle = Observation(180.0, 0.0, around, np.zeros(61, int), (0.0,), 4.0)
+    middle = lb.Observation(180.0, 0.0, around, np.zeros(61, int), (0.0,), 4.0)
     highest = np.argmax(middle.sun_altitude_deg())
     # light needs 8 minutes, in which the Earth and the Moon move on by 20 arcseconds: 40 s
     assert abs(around[highest] - noon) < 50.0 * u.s
@@ -103,7 +99,7 @@ def test_lunar_days_begin_at_noon_on_the_far_side(tmp_path):
 
 def test_any_subset_and_order_of_products(tmp_path):
     """Columns follow the pairs; a pair the other way round is conjugated."""
-    data = read_waterfall(write(tmp_path / "w.fits", pairs=[[2, 2], [3, 1], [0, 0]])).at(10.0)
+    data = lb.read_waterfall(write(tmp_path / "w.fits", pairs=[[2, 2], [3, 1], [0, 0]])).at(10.0)
     place = {label: k for k, label in enumerate(labels())}
     grid, time = data.grid(), np.arange(12)
     assert data.n_missing == 12 * 12
@@ -117,15 +113,15 @@ def test_any_subset_and_order_of_products(tmp_path):
 def test_gaps_are_missing_samples_and_counted(tmp_path):
     data = 100.0 + np.zeros((12, 16, 2))
     data[3, :, 0], data[5:7, 7, 0] = np.nan, np.nan
-    waterfall = read_waterfall(write(tmp_path / "w.fits", data))
+    waterfall = lb.read_waterfall(write(tmp_path / "w.fits", data))
     assert (waterfall.at(10.0).n_missing, waterfall.at(20.0).n_missing) == (18, 0)
     assert "18 samples missing" in describe(tmp_path / "w.fits")
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mK", 1e-3), ("K", 1.0), ("kK", 1e3)])
 def test_temperatures_in_other_units_are_converted(tmp_path, unit, factor):
-    given = [read_waterfall(write(tmp_path / "k.fits"))]
-    given.append(read_waterfall(write(tmp_path / "u.fits", header=HEADER | {"BUNIT": unit})))
+    given = [lb.read_waterfall(write(tmp_path / "k.fits"))]
+    given.append(lb.read_waterfall(write(tmp_path / "u.fits", header=HEADER | {"BUNIT": unit})))
     np.testing.assert_allclose(given[1].grid, factor * given[0].grid, rtol=1e-15)
 
 
@@ -150,21 +146,21 @@ def test_temperatures_in_other_units_are_converted(tmp_path, unit, factor):
     ],
 )
 def test_files_that_cannot_be_used(tmp_path, options, message):
-    with pytest.raises(InputError, match=message):
-        read_waterfall(write(tmp_path / "w.fits", **options))
+    with pytest.raises(lb.InputError, match=message):
+        lb.read_waterfall(write(tmp_path / "w.fits", **options))
 
 
 def test_missing_channels_files_and_ends(tmp_path):
-    path, ten = write(tmp_path / "w.fits"), load_scenario("fiducial", ["frequency_mhz=10"])
-    with pytest.raises(InputError, match=r"no channel at 25 MHz \(it has 10, 20\)"):
-        read_data(path, load_scenario("fiducial"))
-    with pytest.raises(InputError, match="all 192 samples are flagged"):
-        read_data(write(tmp_path / "empty.fits", np.full((12, 16, 2), np.nan)), ten)
-    with pytest.raises(InputError, match="no data at"):
-        read_data(tmp_path / "none.fits", ten)
+    path, ten = write(tmp_path / "w.fits"), lb.load_scenario("fiducial", ["frequency_mhz=10"])
+    with pytest.raises(lb.InputError, match=r"no channel at 25 MHz \(it has 10, 20\)"):
+        lb.read_data(path, lb.load_scenario("fiducial"))
+    with pytest.raises(lb.InputError, match="all 192 samples are flagged"):
+        lb.read_data(write(tmp_path / "empty.fits", np.full((12, 16, 2), np.nan)), ten)
+    with pytest.raises(lb.InputError, match="no data at"):
+        lb.read_data(tmp_path / "none.fits", ten)
     path.write_bytes(path.read_bytes()[:4000])
-    with pytest.raises(InputError, match="cut short"):
-        read_data(path, ten)
+    with pytest.raises(lb.InputError, match="cut short"):
+        lb.read_data(path, ten)
 
 
 def test_what_info_says_of_luseepys_files(test_data):
@@ -228,20 +224,20 @@ def as_luseepy_reads(path):
 
 def random_channel(runs, frequency_mhz=25.0):
     """Visibilities of one frequency that are random numbers."""
-    observation = Observation.from_runs(runs)
+    observation = lb.Observation.from_runs(runs)
     layout = DataLayout(16, observation.n_times)
     values = np.random.default_rng(int(frequency_mhz)).normal(3e3, 1e3, layout.size)
-    return Visibilities(jnp.asarray(values), layout, observation, frequency_mhz)
+    return lb.Visibilities(jnp.asarray(values), layout, observation, frequency_mhz)
 
 
 def test_what_is_written_is_read_back_bit_by_bit(tmp_path):
-    one, two = (random_channel([Run(0.05)], frequency) for frequency in (25.0, 30.0))
+    one, two = (random_channel([lb.Run(0.05)], frequency) for frequency in (25.0, 30.0))
     flags = np.zeros((16, one.layout.n_times), dtype=bool)
     flags[3, 2], flags[:, 5] = True, True
     layout = DataLayout.from_flags(flags)
     two = replace(two, layout=layout, data=layout.gather(two.layout.scatter(two.data)))
-    path = write_waterfall(tmp_path / "w.fits", [one, two], np.array([3.0 - 40j, 4.0 - 30j]))
-    waterfall = read_waterfall(path)
+    path = lb.write_waterfall(tmp_path / "w.fits", [one, two], np.array([3.0 - 40j, 4.0 - 30j]))
+    waterfall = lb.read_waterfall(path)
     for given in (one, two):
         back = waterfall.at(given.frequency_mhz)
         np.testing.assert_array_equal(back.grid(), given.grid())
@@ -260,8 +256,8 @@ def test_what_is_written_is_read_back_bit_by_bit(tmp_path):
 
 def test_luseepys_own_file_is_written_back(tmp_path, test_data):
     original = test_data / "luseepy" / "waterfall_exact_engine.fits"
-    waterfall = read_waterfall(original)
-    path = write_waterfall(
+    waterfall = lb.read_waterfall(original)
+    path = lb.write_waterfall(
         tmp_path / "w.fits", [waterfall.at(f) for f in waterfall.frequencies_mhz]
     )
     ours, _, places = as_luseepy_reads(path)
@@ -273,14 +269,14 @@ def test_luseepys_own_file_is_written_back(tmp_path, test_data):
 @pytest.mark.parametrize(
     ("runs", "message"),
     [
-        ((Run(0.02, turntable_deg=30.0),), r"turntable angles, the data have \(30.0,\)"),
-        ((Run(0.02), Run(0.02)), "turntable angles"),
-        ((Run(2.0, night_only=True),), "without gaps; write netCDF"),
+        ((lb.Run(0.02, turntable_deg=30.0),), r"turntable angles, the data have \(30.0,\)"),
+        ((lb.Run(0.02), lb.Run(0.02)), "turntable angles"),
+        ((lb.Run(2.0, night_only=True),), "without gaps; write netCDF"),
     ],
 )
 def test_what_luseepys_layout_cannot_hold(tmp_path, runs, message):
-    with pytest.raises(InputError, match=message):
-        write_waterfall(tmp_path / "w.fits", 2 * [random_channel(runs)])
+    with pytest.raises(lb.InputError, match=message):
+        lb.write_waterfall(tmp_path / "w.fits", 2 * [random_channel(runs)])
     assert not list(tmp_path.iterdir())
 
 
@@ -294,7 +290,7 @@ def test_simulate_writes_it_and_map_reads_it(tmp_path):
     # each channel is what its own scenario gives, with a seed of its own
     for k, (f, seed) in enumerate(((20, 1), (25, 2))):
         alone = ["lmax=4", "observation.runs.0.cycles=0.1", f"frequency_mhz={f}", f"seed={seed}"]
-        expected = build(load_scenario("fiducial", alone)).data.grid()
+        expected = lb.build(lb.load_scenario("fiducial", alone)).data.grid()
         np.testing.assert_array_equal(data[:, :, k].T, expected)
     with fits.open(path) as hdus:
         kept = hdus["scenario"].data.tobytes().decode()
@@ -335,19 +331,23 @@ def test_ranges_of_frequencies():
 
 def test_another_site_and_other_ports(tmp_path):
     path = write(tmp_path / "w.fits", header=HEADER | {"LUN_LAT_DEG": -20.0, "LUN_LONG_DEG": 10.0})
-    scenario = load_scenario("fiducial", ["frequency_mhz=10", "lmax=4"])
-    with pytest.raises(InputError, match="--set observation.lon_deg=10 --set observation.lat_deg="):
-        set_up(scenario, read_data(path, scenario))
+    scenario = lb.load_scenario("fiducial", ["frequency_mhz=10", "lmax=4"])
+    with pytest.raises(
+        lb.InputError, match="--set observation.lon_deg=10 --set observation.lat_deg="
+    ):
+        set_up(scenario, lb.read_data(path, scenario))
     # 182.258 degrees East is 177.742 West
     path = write(tmp_path / "west.fits", header=HEADER | {"LUN_LONG_DEG": -177.742})
-    set_up(scenario, read_data(path, scenario))
+    set_up(scenario, lb.read_data(path, scenario))
 
 
 def test_products_that_the_beams_cannot_supply(tmp_path):
-    waterfall = read_waterfall(write(tmp_path / "w.fits"))
-    with pytest.raises(InputError, match="has the product 02R, but the beams are those of 2 ports"):
+    waterfall = lb.read_waterfall(write(tmp_path / "w.fits"))
+    with pytest.raises(
+        lb.InputError, match="has the product 02R, but the beams are those of 2 ports"
+    ):
         waterfall.at(10.0, n_ports=2)
-    few = read_waterfall(write(tmp_path / "few.fits", pairs=[[0, 0], [0, 1], [1, 1]]))
+    few = lb.read_waterfall(write(tmp_path / "few.fits", pairs=[[0, 0], [0, 1], [1, 1]]))
     data = few.at(10.0, n_ports=2)
     assert (data.layout.n_products, data.n_missing) == (4, 0)
     np.testing.assert_array_equal(data.grid()[:, 3], 100.0 * np.arange(4) + 3.0)
@@ -378,7 +378,7 @@ def four_port(path, **changes):
 
 
 def test_four_port_columns_are_where_the_table_says(tmp_path):
-    waterfall = read_waterfall(four_port(tmp_path / "w.fits"))
+    waterfall = lb.read_waterfall(four_port(tmp_path / "w.fits"))
     place = {label: k for k, label in enumerate(labels())}
     np.testing.assert_array_equal(waterfall.grid[place["13I"], :, 1], np.arange(1, 20, 4) / 4.0)
     np.testing.assert_array_equal(waterfall.grid[place["00R"], :, 0], np.arange(2, 20, 4) / 4.0)
@@ -407,5 +407,5 @@ twice = np.array([[2461000.0, 0.5], [2461000.0, 0.5], [2461000.0, 0.6]])
     ],
 )
 def test_four_port_files_that_cannot_be_used(tmp_path, changes, message):
-    with pytest.raises(InputError, match=message):
-        read_waterfall(four_port(tmp_path / "w.fits", **changes))
+    with pytest.raises(lb.InputError, match=message):
+        lb.read_waterfall(four_port(tmp_path / "w.fits", **changes))

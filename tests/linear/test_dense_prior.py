@@ -24,27 +24,15 @@ from reference_linear import (
 )
 from scipy.stats import multivariate_normal, ortho_group
 
+import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.instrument.coupling import DenseCoupling
-from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.left_out_dense import DenseLeftOut
 from lusee_bayes.linear.left_out_structured import StructuredLeftOut
-from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.pixel_variance import pixel_std, prior_pixel_std
-from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.linear.residuals import residuals
 from lusee_bayes.linear.resolution import resolution_rows
-from lusee_bayes.linear.updating import updated
-from lusee_bayes.noise import beam_error_noise
-from lusee_bayes.noise.covariance import DenseCovariance, DiagonalCovariance
 from lusee_bayes.runs.forecasting import informed_modes
-from lusee_bayes.sampling.distributions import Marginal, SkyPrior
-from lusee_bayes.sampling.whitening import Whitening
-from lusee_bayes.sky.priors import DensePrior, HarmonicPrior
 
 N = 25
 RNG = np.random.default_rng(3)
@@ -57,22 +45,22 @@ S = TURN * PER_MODE @ TURN.T
 CLOSE = 1e-10
 
 
-def problem(n_data: int, *, turned: bool) -> tuple[LinearGaussian, np.ndarray]:
+def problem(n_data: int, *, turned: bool) -> tuple[lb.LinearGaussian, np.ndarray]:
     """A model and its data, in the coordinates of independent modes or of correlated ones."""
     rng = np.random.default_rng(n_data)
     a, noise = rng.normal(size=(n_data, N)), random_covariance(rng, n_data)
     sky = MEAN + np.sqrt(PER_MODE) * rng.normal(size=N)
     data = a @ sky + np.linalg.cholesky(noise) @ rng.normal(size=n_data)
     if turned:
-        prior = DensePrior.of_covariance(jnp.asarray(S), jnp.asarray(TURN @ MEAN))
+        prior = lb.DensePrior.of_covariance(jnp.asarray(S), jnp.asarray(TURN @ MEAN))
         a = a @ TURN.T
     else:
-        prior = HarmonicPrior(jnp.asarray(SPECTRUM), mean=jnp.asarray(MEAN))
-    return LinearGaussian(jnp.asarray(a), prior, DenseCovariance(jnp.asarray(noise))), data
+        prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM), mean=jnp.asarray(MEAN))
+    return lb.LinearGaussian(jnp.asarray(a), prior, lb.DenseCovariance(jnp.asarray(noise))), data
 
 
 @lru_cache
-def solved(n_data: int, form: str, *, turned: bool) -> Posterior:
+def solved(n_data: int, form: str, *, turned: bool) -> lb.Posterior:
     model, data = problem(n_data, turned=turned)
     return model.condition(jnp.asarray(data), form)
 
@@ -127,64 +115,66 @@ def test_densities_and_coordinates():
     model, data = problem(40, turned=True)
     sky = RNG.normal(size=(3, N))
     expected = multivariate_normal.logpdf(sky, TURN @ MEAN, S)
-    site = SkyPrior(model.prior)
+    site = lb.SkyPrior(model.prior)
     np.testing.assert_allclose(site.log_prob(jnp.asarray(sky)), expected, rtol=CLOSE)
     np.testing.assert_allclose(
-        Marginal(model).log_prob(jnp.asarray(data)), model.log_prob(jnp.asarray(data)), rtol=1e-12
+        lb.Marginal(model).log_prob(jnp.asarray(data)),
+        model.log_prob(jnp.asarray(data)),
+        rtol=1e-12,
     )
     found = model.condition(jnp.asarray(data))
     sign, log_det = np.linalg.slogdet(np.asarray(found.covariance()))
     assert sign == 1.0
-    np.testing.assert_allclose(Whitening.of(found).log_det, 0.5 * log_det, rtol=CLOSE)
+    np.testing.assert_allclose(lb.Whitening.of(found).log_det, 0.5 * log_det, rtol=CLOSE)
 
 
 def test_a_beam_error_holds_the_correlated_sky():
     direction = RNG.normal(size=(12, N))
     prior = problem(40, turned=True)[0].prior
-    found = beam_error_noise(DenseCoupling(jnp.asarray(direction)), prior).dense()
+    found = lb.beam_error_noise(lb.DenseCoupling(jnp.asarray(direction)), prior).dense()
     moment = S + np.outer(TURN @ MEAN, TURN @ MEAN)
     np.testing.assert_allclose(found, direction @ moment @ direction.T, rtol=1e-10)
 
 
 def test_updates():
     model, data = problem(40, turned=True)
-    noise = DiagonalCovariance(jnp.linspace(0.5, 2.0, 40))
+    noise = lb.DiagonalCovariance(jnp.linspace(0.5, 2.0, 40))
     model = replace(model, noise=noise)
 
-    def part(rows: slice) -> LinearGaussian:
-        some = DiagonalCovariance(noise.variance[rows])
-        return LinearGaussian(model.coupling.dense()[rows], model.prior, some)
+    def part(rows: slice) -> lb.LinearGaussian:
+        some = lb.DiagonalCovariance(noise.variance[rows])
+        return lb.LinearGaussian(model.coupling.dense()[rows], model.prior, some)
 
     first, rest = slice(0, 30), slice(30, 40)
     earlier = part(first).condition(jnp.asarray(data[first]), "root")
-    found = updated(earlier, part(rest), jnp.asarray(data[rest]))
+    found = lb.updated(earlier, part(rest), jnp.asarray(data[rest]))
     whole = model.condition(jnp.asarray(data))
     np.testing.assert_allclose(found.mean, whole.mean, atol=CLOSE)
     np.testing.assert_allclose(found.covariance(), whole.covariance(), atol=CLOSE)
     np.testing.assert_allclose(found.log_evidence, whole.log_evidence, rtol=CLOSE)
     widths = np.sqrt(np.diag(S))
-    other = DensePrior.of_covariance(np.diag(widths**2), TURN @ MEAN)
+    other = lb.DensePrior.of_covariance(np.diag(widths**2), TURN @ MEAN)
     for prior, match in (
         (replace(model.prior, root=1.01 * model.prior.root), "has another prior: a variance of"),
         (other, "other correlations of the modes"),
         (replace(model.prior, mean=None), "another mean"),
     ):
-        with pytest.raises(InputError, match=match):
-            updated(earlier, replace(part(rest), prior=prior), jnp.asarray(data[rest]))
+        with pytest.raises(lb.InputError, match=match):
+            lb.updated(earlier, replace(part(rest), prior=prior), jnp.asarray(data[rest]))
 
 
 def test_pixels_of_the_prior():
-    prior = DensePrior.of_covariance(S)
+    prior = lb.DensePrior.of_covariance(S)
     np.testing.assert_array_equal(prior_pixel_std(prior, 4), pixel_std(prior.covariance(), 4))
     rest = S.copy()
     rest[0] = rest[:, 0] = 0.0
     np.testing.assert_allclose(
         prior_pixel_std(prior, 4, monopole=False), pixel_std(rest, 4), rtol=1e-12
     )
-    even = HarmonicPrior(SPECTRUM)
+    even = lb.HarmonicPrior(SPECTRUM)
     np.testing.assert_allclose(
         prior_pixel_std(even, 4, monopole=False),
-        prior_pixel_std(DensePrior.of_covariance(np.diag(PER_MODE)), 4, monopole=False),
+        prior_pixel_std(lb.DensePrior.of_covariance(np.diag(PER_MODE)), 4, monopole=False),
         rtol=1e-12,
     )
 
@@ -202,13 +192,13 @@ def observed(noise: str):
     # noise a thousand times larger than the telescope's, so that matrices by hand can be inverted
     runs = "observation.runs=[{cycles: 0.04}, {cycles: 0.03, turntable_deg: 40}]"
     given = ["lmax=5", runs, "noise.radiometer.factor=1e6", *NOISES[noise]]
-    experiment = build(load_scenario("fiducial", given))
+    experiment = lb.build(lb.load_scenario("fiducial", given))
     model = full_model(experiment.setup)
     width = np.sqrt(np.asarray(model.prior.variance()))
     rng = np.random.default_rng(6)
     correlated = random_covariance(rng, len(width)) * width * width[:, None]
     mean = jnp.asarray(0.3 * width * rng.normal(size=len(width)))
-    dense = DensePrior.of_covariance(jnp.asarray(correlated), mean)
+    dense = lb.DensePrior.of_covariance(jnp.asarray(correlated), mean)
     return experiment, model, replace(model, prior=dense)
 
 
@@ -251,7 +241,7 @@ def same(one, other):
 
 def test_a_diagonal_one_gives_the_isotropic_results():
     experiment, model, _ = observed("blocks")
-    diagonal = DensePrior.of_covariance(jnp.diag(model.prior.variance()))
+    diagonal = lb.DensePrior.of_covariance(jnp.diag(model.prior.variance()))
     data = experiment.data
     one, other = model.condition(data.data), replace(model, prior=diagonal).condition(data.data)
     sigma = np.asarray(one.std())
@@ -273,10 +263,10 @@ def test_a_mean_far_from_the_reference_sky_is_exact():
     rng = np.random.default_rng(1)
     a = rng.normal(size=(60, N)) * np.geomspace(1.0, 1e6, N) @ TURN.T
     other = ortho_group.rvs(N, random_state=3)
-    prior = DensePrior.of_covariance(other * np.geomspace(1.0, 1e-2, N) @ other.T)
+    prior = lb.DensePrior.of_covariance(other * np.geomspace(1.0, 1e-2, N) @ other.T)
     data = a @ (prior.root @ rng.normal(size=N)) + rng.normal(size=60)
     matrix, vector, zero = a.T @ a, a.T @ data, np.zeros(())
-    information = Information(
+    information = lb.Information(
         matrix, vector, np.zeros(N), np.asarray(data @ data), zero, np.asarray(60.0)
     )
     found = information.posterior(prior)

@@ -8,64 +8,51 @@ import numpy as np
 import pytest
 from assertions import close
 
+import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_device, on_host
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import pixel_matrix
-from lusee_bayes.instrument.beams import ProductBeams
-from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, Run
-from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.window_average import windowed
 from lusee_bayes.linear import information
-from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.normal_matrix import normal_matrix
 from lusee_bayes.linear.pixel_variance import pixel_std
 from lusee_bayes.linear.time_sums import CHUNK, time_sums
-from lusee_bayes.noise.covariance import (
-    DenseCovariance,
-    DiagonalCovariance,
-    LowRankCovariance,
-    TimeBandedCovariance,
-    TimeBlockCovariance,
-)
-from lusee_bayes.sky.priors import HarmonicPrior
 
 LMAX, N_PRODUCTS = 5, 4
 # the first and the last run see the sky through the same beams
-RUNS = [Run(0.5), Run(0.3, 35.0), Run(0.4)]
+RUNS = [lb.Run(0.5), lb.Run(0.3, 35.0), lb.Run(0.4)]
 
 
 def setting(order=2, missing=True, step_s=40000.0):
     """A coupling matrix of random beams; some samples, and all of one time, are missing."""
     rng = np.random.default_rng(3)
-    o = Observation.from_runs(RUNS, step_s=step_s)
+    o = lb.Observation.from_runs(RUNS, step_s=step_s)
     flags = np.zeros((N_PRODUCTS, o.n_times), dtype=bool)
     if missing:
         flags[1, 4], flags[:, 9], flags[0, -1] = True, True, True
     layout = DataLayout.from_flags(flags)
-    beams = ProductBeams(jnp.asarray(rng.standard_normal((N_PRODUCTS, (LMAX + 1) ** 2))), 25.0)
+    beams = lb.ProductBeams(jnp.asarray(rng.standard_normal((N_PRODUCTS, (LMAX + 1) ** 2))), 25.0)
     # a pole that wanders a hundred times further than the Moon's: the tilt is not to be missed
-    pointing = Pointing.of(o, LMAX, order)
+    pointing = lb.Pointing.of(o, LMAX, order)
     times, once = np.arange(o.n_times), np.ones(o.n_times)
     wandering = 0.05 * rng.standard_normal((o.n_times, 2))
     azimuth, *rest = windowed(times, once, np.asarray(pointing.azimuth), wandering, order, LMAX)
     functions, factors = map(jnp.asarray, rest)
     pointing = replace(pointing, azimuth=azimuth, functions=functions, factors=factors)
-    return CouplingMatrix.build(beams, pointing, layout)
+    return lb.CouplingMatrix.build(beams, pointing, layout)
 
 
 def noise_of(kind, layout):
     rng = np.random.default_rng(5)
     if kind == "diagonal":
-        return DiagonalCovariance(jnp.asarray(rng.uniform(0.5, 2.0, layout.size)))
+        return lb.DiagonalCovariance(jnp.asarray(rng.uniform(0.5, 2.0, layout.size)))
     roots = rng.standard_normal((layout.n_times, N_PRODUCTS, 2 * N_PRODUCTS))
     blocks = jnp.asarray(roots @ np.swapaxes(roots, 1, 2))
     if kind == "blocks":
-        return TimeBlockCovariance(blocks, layout)
+        return lb.TimeBlockCovariance(blocks, layout)
     if kind == "templates":
         root = jnp.asarray(rng.standard_normal((layout.size, 2)))
-        return TimeBlockCovariance(blocks, layout) + LowRankCovariance(root)
+        return lb.TimeBlockCovariance(blocks, layout) + lb.LowRankCovariance(root)
     # sums of what neighbouring times share: positive by construction
     shared = 0.3 * rng.standard_normal((layout.n_times + 2, N_PRODUCTS, N_PRODUCTS))
     band = np.zeros((layout.n_times, 3, N_PRODUCTS, N_PRODUCTS))
@@ -73,7 +60,7 @@ def noise_of(kind, layout):
         for t in range(w, layout.n_times):
             band[t, w] = sum(shared[t - w + k] @ shared[t - w + k].T for k in range(w, 3)) * 0.3
     band[:, 0] += np.asarray(blocks)
-    return TimeBandedCovariance(jnp.asarray(band), layout)
+    return lb.TimeBandedCovariance(jnp.asarray(band), layout)
 
 
 @pytest.mark.parametrize(
@@ -124,24 +111,24 @@ def test_what_has_no_structure_is_refused():
     coupling = setting()
     layout = coupling.layout
     diagonal = noise_of("diagonal", layout)
-    dense = DenseCovariance(diagonal.dense())
-    for noise in (dense, dense + LowRankCovariance(jnp.ones((layout.size, 1)))):
-        with pytest.raises(InputError, match="no structure in time"):
+    dense = lb.DenseCovariance(diagonal.dense())
+    for noise in (dense, dense + lb.LowRankCovariance(jnp.ones((layout.size, 1)))):
+        with pytest.raises(lb.InputError, match="no structure in time"):
             normal_matrix(coupling, noise)
-    with pytest.raises(InputError, match="response of its own"):
+    with pytest.raises(lb.InputError, match="response of its own"):
         normal_matrix(coupling.with_response(jnp.ones(layout.size)), diagonal)
-    with pytest.raises(InputError, match="N has shape"):
-        normal_matrix(coupling, DiagonalCovariance(jnp.ones(7)))
+    with pytest.raises(lb.InputError, match="N has shape"):
+        normal_matrix(coupling, lb.DiagonalCovariance(jnp.ones(7)))
 
 
 def model(kind="diagonal"):
     coupling = setting()
-    prior = HarmonicPrior(jnp.asarray(10.0 / (1.0 + np.arange(LMAX + 1.0)) ** 2))
+    prior = lb.HarmonicPrior(jnp.asarray(10.0 / (1.0 + np.arange(LMAX + 1.0)) ** 2))
     noise = noise_of("diagonal", coupling.layout)
     if kind == "low rank":
-        noise = noise + LowRankCovariance(jnp.ones((coupling.layout.size, 1)))
+        noise = noise + lb.LowRankCovariance(jnp.ones((coupling.layout.size, 1)))
     offset = jnp.asarray(np.linspace(0, 1, coupling.layout.size)) if kind == "offset" else None
-    return LinearGaussian(coupling, prior, noise, offset)
+    return lb.LinearGaussian(coupling, prior, noise, offset)
 
 
 @pytest.mark.parametrize(
@@ -169,8 +156,8 @@ def test_information_under_another_prior():
     found, _ = gaussian.inform(data)
     spectrum = np.asarray(gaussian.prior.spectrum) * 0.1
     spectrum[3] = 0.0  # an ell that is known to be zero
-    other = HarmonicPrior(jnp.asarray(spectrum))
-    expected = LinearGaussian(gaussian.coupling, other, gaussian.noise).condition(data, "map")
+    other = lb.HarmonicPrior(jnp.asarray(spectrum))
+    expected = lb.LinearGaussian(gaussian.coupling, other, gaussian.noise).condition(data, "map")
     got = found.posterior(other)
     np.testing.assert_allclose(got.mean, expected.mean, rtol=0, atol=1e-11)
     np.testing.assert_allclose(got.log_evidence, expected.log_evidence, rtol=1e-11)
@@ -181,7 +168,7 @@ def test_the_matrix_is_not_formed_where_there_is_structure(kind, monkeypatch):
     gaussian = model(kind)
     data = jnp.asarray(np.random.default_rng(2).standard_normal(gaussian.n_data))
     expected = np.asarray(gaussian.condition(data, "map").mean)
-    monkeypatch.setattr(CouplingMatrix, "dense", None)
+    monkeypatch.setattr(lb.CouplingMatrix, "dense", None)
     assert gaussian.is_structured
     np.testing.assert_allclose(gaussian.condition(data).mean, expected, rtol=0, atol=1e-11)
 
@@ -189,7 +176,7 @@ def test_the_matrix_is_not_formed_where_there_is_structure(kind, monkeypatch):
 def test_information_that_cannot_settle_says_so(monkeypatch):
     monkeypatch.setattr(information, "CONVERGENCE", 0.0)
     gaussian = model()
-    with pytest.raises(InputError, match="did not converge: its last step"):
+    with pytest.raises(lb.InputError, match="did not converge: its last step"):
         gaussian.inform(jnp.ones(gaussian.n_data))
 
 

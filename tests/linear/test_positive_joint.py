@@ -8,17 +8,13 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
-from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.joint_skies import paired
-from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.positive_channel import positive_sky
 from lusee_bayes.linear.positive_joint import ChannelsInMemory, find_joint_mode, linearised
-from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.sky.field_laws import FieldLaws
 from lusee_bayes.sky.positive_skies import PositiveSkies
-from lusee_bayes.sky.priors import HarmonicPrior
 from lusee_bayes.sky.template import Template
 
 LMAX = 3
@@ -76,8 +72,10 @@ def observed(skies, laws, seed=0, noise=0.05, n_data=40):
         a = rng.standard_normal((n_data + 2 * k, N))
         sigma = noise * np.sqrt((a @ sky) ** 2).mean() * rng.uniform(0.5, 2.0, len(a))
         d = a @ sky + sigma * rng.standard_normal(len(a))
-        wide = HarmonicPrior(jnp.asarray(np.full(LMAX + 1, (sky**2).max())))
-        model = LinearGaussian(jnp.asarray(a), wide, DiagonalCovariance(jnp.asarray(sigma**2)))
+        wide = lb.HarmonicPrior(jnp.asarray(np.full(LMAX + 1, (sky**2).max())))
+        model = lb.LinearGaussian(
+            jnp.asarray(a), wide, lb.DiagonalCovariance(jnp.asarray(sigma**2))
+        )
         found.append((a, sigma, d, model.inform(jnp.asarray(d))[0]))
     return found
 
@@ -192,8 +190,8 @@ def test_far_templates_are_reached_in_shorter_steps():
     skies = skies_of(FREQUENCIES[:1], ("level",))
     laws = rough(skies)
     a, sigma, d, _ = observed(skies, laws)[0]
-    wide = HarmonicPrior(jnp.asarray(np.full(LMAX + 1, 1e12)))
-    model = LinearGaussian(jnp.asarray(a), wide, DiagonalCovariance(jnp.asarray(sigma**2)))
+    wide = lb.HarmonicPrior(jnp.asarray(np.full(LMAX + 1, 1e12)))
+    model = lb.LinearGaussian(jnp.asarray(a), wide, lb.DiagonalCovariance(jnp.asarray(sigma**2)))
     information = model.inform(jnp.asarray(20.0 * d))[0]
     mode = find_joint_mode(skies, laws, ChannelsInMemory((information,)))
     assert np.exp(skies.grid.synthesise(mode.exponents[0])).mean() > 10.0
@@ -225,22 +223,22 @@ def test_learned_laws_maximise_the_evidence():
 
 
 def test_bad_input_is_refused_in_a_sentence():
-    with pytest.raises(InputError, match="unknown field 'indx'; did you mean 'index'"):
+    with pytest.raises(lb.InputError, match="unknown field 'indx'; did you mean 'index'"):
         skies_of(FREQUENCIES, ("level", "indx"))
-    with pytest.raises(InputError, match="2 fields of the logarithm need at least as many chan"):
+    with pytest.raises(lb.InputError, match="2 fields of the logarithm need at least as many chan"):
         skies_of(FREQUENCIES[:1], ("level", "index"))
-    with pytest.raises(InputError, match="there are 1 templates for 4 frequencies"):
+    with pytest.raises(lb.InputError, match="there are 1 templates for 4 frequencies"):
         PositiveSkies.of(FREQUENCIES, [Band(5.0)], LMAX)
-    with pytest.raises(InputError, match="the lmax of the fields is 2, that of the maps 3"):
+    with pytest.raises(lb.InputError, match="the lmax of the fields is 2, that of the maps 3"):
         PositiveSkies.of(FREQUENCIES, [Band(f) for f in FREQUENCIES], LMAX, lmax_fields=2)
 
     class Hole(Band):
         def at(self, theta, phi):
             return super().at(theta, phi) - 50.0
 
-    with pytest.raises(InputError, match="the template"):
+    with pytest.raises(lb.InputError, match="the template"):
         PositiveSkies.of(FREQUENCIES, [Hole(f) for f in FREQUENCIES], LMAX)
     skies = skies_of(FREQUENCIES[:1], ("level",))
-    other = Information(*(np.zeros(s) for s in ((4, 4), 4, 4, (), (), ())))
-    with pytest.raises(InputError, match="the patterns"):
+    other = lb.Information(*(np.zeros(s) for s in ((4, 4), 4, 4, (), (), ())))
+    with pytest.raises(lb.InputError, match="the patterns"):
         linearised(skies, 0, other, np.zeros(N))

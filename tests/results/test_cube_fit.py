@@ -9,9 +9,7 @@ import pytest
 from scipy import stats
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.linear.fit import FALSE_ALARM, ChiSquare
 from lusee_bayes.linear.split import WIDER
 from lusee_bayes.results.cube_fit import ChannelFits
@@ -100,7 +98,7 @@ def test_chi2_of_a_channel_is_that_of_its_data_under_the_model(small_cube):
     """d^T K^-1 d with K = A S A^T + N as a matrix."""
     run = small_cube.result
     for channel, scenario in zip(run.channels, run.scenario.channels(), strict=True):
-        experiment = build(scenario)
+        experiment = lb.build(scenario)
         model = full_model(experiment.setup)
         a, d = np.asarray(model.coupling.dense()), np.asarray(experiment.data.data)
         k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
@@ -126,11 +124,11 @@ def test_chi2_of_a_channel_is_that_of_its_data_under_the_model(small_cube):
 def test_a_joint_run_is_judged(tmp_path):
     """One posterior: its chi^2 counts, and is not the sum of the channels'."""
     sizes = ["lmax=3", "observation.runs.0.cycles=0.1", "frequencies_mhz=[20, 25, 30]"]
-    scenario = load_scenario("fiducial", [*sizes, "joint=true", "spectral.residual=0.1"])
+    scenario = lb.load_scenario("fiducial", [*sizes, "joint=true", "spectral.residual=0.1"])
     run = lb.run_map(scenario, tmp_path / "joint").result
     alone = sum(channel.instrument_chi2 for channel in run.channels)
     rest = run.fits().rest
     assert rest.chi2 + alone == pytest.approx(run.components.chi2)
     # the instrument is judged as in channels of their own
-    own = lb.run_map(load_scenario("fiducial", sizes), tmp_path / "own").result
+    own = lb.run_map(lb.load_scenario("fiducial", sizes), tmp_path / "own").result
     np.testing.assert_allclose(run.fits().chi2, own.fits().chi2, rtol=1e-6)

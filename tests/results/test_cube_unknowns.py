@@ -13,8 +13,6 @@ from reference_linear import white_posterior
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import per_mode
-from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.report.cube_page import FIGURES as CUBE_FIGURES
 from lusee_bayes.report.cube_page import cube_page
@@ -44,8 +42,8 @@ def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch
     assert list(written)[:3] == ["frequency_mhz", "unknown", "unit"]
     nulls = {}
     for channel in run.result.scenario.channels():
-        experiment = build(channel)
-        expected = unknowns_report(experiment, infer(experiment))
+        experiment = lb.build(channel)
+        expected = unknowns_report(experiment, lb.infer(experiment))
         nulls[channel.frequency_mhz] = expected.null
         here = written[written["frequency_mhz"] == channel.frequency_mhz].reset_index(drop=True)
         assert list(here["unknown"]) == list(expected.table["unknown"]) and len(here) == 9
@@ -107,8 +105,8 @@ def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(
     stds = np.concatenate([*stds, np.ones(3 * n_own)])
     rows, noise, rest, tables = [], [], [], []
     for number, channel in enumerate(scenario.channels()):
-        experiment = build(channel)
-        found = infer(experiment)
+        experiment = lb.build(channel)
+        found = lb.infer(experiment)
         a = np.asarray(experiment.setup.coupling.dense())
         t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
         row = np.zeros((len(a), len(stds)))

@@ -11,9 +11,7 @@ import pytest
 from experiments import four_ports
 from reference_linear import Answer, white_posterior
 
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.inference import infer
+import lusee_bayes as lb
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.experiment.simulate import true_values
@@ -55,9 +53,9 @@ class Dense:
     def of(cls, scenario) -> Dense:
         found = cls([], [], [], [], [])
         for channel in scenario.channels():
-            experiment = build(channel)
+            experiment = lb.build(channel)
             setup = experiment.setup
-            columns = [np.asarray(s.columns) for s in infer(experiment).systematics]
+            columns = [np.asarray(s.columns) for s in lb.infer(experiment).systematics]
             found.couplings.append(np.asarray(setup.coupling.dense()))
             found.templates.append(np.concatenate(columns, axis=1))
             found.noise.append(np.sqrt(np.asarray(radiometer(setup).diagonal())))
@@ -236,6 +234,6 @@ def test_seeds_of_simulated_receivers(response_file):
     ],
 )
 def test_refused_in_one_sentence(response_file, override, message):
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(lb.InputError, match=message) as caught:
         cube_of(response_file, "spectral={components: [power_law]}", RECEIVER, override)
     assert "\n" not in str(caught.value)

@@ -10,12 +10,6 @@ import equinox as eqx
 import pytest
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.inference import infer
-from lusee_bayes.sampling.hmc import Sampler, sample
-from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.validation import validate_draws
-from lusee_bayes.sampling.whitening import Whitening
 
 LMAX = int(os.environ.get("LUSEE_BAYES_TEST_LMAX", "31"))
 
@@ -28,26 +22,26 @@ LMAX = int(os.environ.get("LUSEE_BAYES_TEST_LMAX", "31"))
 )
 def test_nuts_agrees_with_every_mean_every_variance_and_the_covariance(scenario):
     name, *overrides = scenario
-    experiment = build(lb.load_scenario(name, [f"lmax={LMAX}", *overrides]))
-    inference, data = infer(experiment), experiment.data
+    experiment = lb.build(lb.load_scenario(name, [f"lmax={LMAX}", *overrides]))
+    inference, data = lb.infer(experiment), experiment.data
     model, posterior = inference.model, inference.posterior
-    program = load_program("sky")
-    chains = sample(
+    program = lb.load_program("sky")
+    chains = lb.sample(
         program.model,
         {**program.arguments(model), "data": data.data},
-        Sampler(chains=4, draws=500, seed=2),
-        Whitening.of(posterior),
+        lb.Sampler(chains=4, draws=500, seed=2),
+        lb.Whitening.of(posterior),
     )
     draws = chains.sites["sky"]
     assert draws.shape == (4, 500, (LMAX + 1) ** 2)
-    found = validate_draws(
+    found = lb.validate_draws(
         draws, posterior, chains.statistics["diverging"], chains.statistics["energy"]
     )
     assert found.passed, [check for check in found.checks if not check.passed]
     assert found.ess_bulk.min() > 1000
     # standard deviations 2 % off do not pass: total variance: 4 % off, 1 % allowed
     wrong = eqx.tree_at(lambda p: p.lower, posterior, 1.02 * posterior.lower)
-    again = validate_draws(
+    again = lb.validate_draws(
         draws, wrong, chains.statistics["diverging"], chains.statistics["energy"]
     )
     assert not again.passed

@@ -18,15 +18,8 @@ from jaxtyping import Array, Float
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers
-from lusee_bayes.experiment.experiment import Experiment, build
-from lusee_bayes.experiment.inference import infer
-from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling.chains import Chains
-from lusee_bayes.sampling.hmc import Sampler, sample
-from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.validation import Comparison, validate_draws
-from lusee_bayes.sampling.whitening import Whitening
 
 NOISES = {
     "paper": ("fiducial",),
@@ -44,36 +37,36 @@ LMAX, N_MODES, DRAWS, TIME = 6, 49, 2000, 2
 
 
 def drawn(
-    model: lb.LinearGaussian, data: Visibilities, coordinates: Posterior, **options
+    model: lb.LinearGaussian, data: lb.Visibilities, coordinates: lb.Posterior, **options
 ) -> Chains:
-    program = load_program("sky")
+    program = lb.load_program("sky")
     arguments = {**program.arguments(model), "data": data.data}
     # of the seeds 0 to 3, with gains, 0 is one of the false alarms that are stated
-    sampler = Sampler(draws=DRAWS, **{"seed": 2, **options})
-    return sample(program.model, arguments, sampler, Whitening.of(coordinates))
+    sampler = lb.Sampler(draws=DRAWS, **{"seed": 2, **options})
+    return lb.sample(program.model, arguments, sampler, lb.Whitening.of(coordinates))
 
 
 @dataclass(frozen=True)
 class Witness:
     """An experiment's posterior and four chains of draws of the same."""
 
-    experiment: Experiment
-    data: Visibilities
+    experiment: lb.Experiment
+    data: lb.Visibilities
     model: lb.LinearGaussian
-    posterior: Posterior
+    posterior: lb.Posterior
     chains: Chains
 
     @classmethod
     def of(cls, noise: str) -> Witness:
         scenario, *overrides = NOISES[noise]
         small = [f"lmax={LMAX}", "observation.runs.0.cycles=0.02", *overrides]
-        experiment = build(lb.load_scenario(scenario, small))
-        inference, data = infer(experiment), experiment.data
+        experiment = lb.build(lb.load_scenario(scenario, small))
+        inference, data = lb.infer(experiment), experiment.data
         model, posterior = inference.model, inference.posterior
         assert model.coupling.shape == (96, N_MODES)
         return cls(experiment, data, model, posterior, drawn(model, data, posterior))
 
-    def judge(self, posterior: Posterior, draws: int = DRAWS, first: int = 0) -> Comparison:
+    def judge(self, posterior: lb.Posterior, draws: int = DRAWS, first: int = 0) -> Comparison:
         some = slice(first, first + draws)
         skies = self.chains.sites["sky"][:, some]
         diverging, energy = (
@@ -81,7 +74,7 @@ class Witness:
         )
         return validate_draws(skies, posterior, diverging, energy)
 
-    def failed_of(self, wrong: Posterior, draws: int = DRAWS // 4, first: int = 0) -> set[str]:
+    def failed_of(self, wrong: lb.Posterior, draws: int = DRAWS // 4, first: int = 0) -> set[str]:
         """What fails of ``wrong`` about the true mean: only C can be to blame.
 
         A quarter of the draws is enough for most, and takes a quarter of the time.
@@ -96,7 +89,7 @@ class Witness:
         prior: lb.HarmonicPrior | None = None,
         noise: np.ndarray | None = None,
         keep: np.ndarray | slice = slice(None),
-    ) -> Posterior:
+    ) -> lb.Posterior:
         """The posterior with another prior, another N, or of the rows ``keep`` only."""
         noise = np.asarray(self.model.noise.dense()) if noise is None else noise
         model = lb.LinearGaussian(
