@@ -9,10 +9,8 @@ from astropy.time import Time
 from lunarsky import MCMF, MoonLocation
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.moon import CYCLE_DAYS
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.schedule import Interval, Run
-from lusee_bayes.instrument.schedule_file import read_schedule
+from lusee_bayes.instrument.schedule import CYCLE_DAYS, Interval, Run, read_schedule
 
 # three lunar nights at half duty, the table turned in the middle of the first and of the last
 NIGHTS = """\

@@ -22,9 +22,9 @@ from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, Run
-from lusee_bayes.instrument.products import labels
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.products import DataLayout, labels
+from lusee_bayes.instrument.schedule import Run
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe

@@ -30,21 +30,18 @@ from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.coupling import DenseCoupling
+from lusee_bayes.judge.left_out import DenseLeftOut, StructuredLeftOut
+from lusee_bayes.judge.measures import resolution_rows
+from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.left_out_dense import DenseLeftOut
-from lusee_bayes.linear.left_out_structured import StructuredLeftOut
-from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.linear.pixel_variance import pixel_std, prior_pixel_std
-from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.residuals import residuals
-from lusee_bayes.linear.resolution import resolution_rows
-from lusee_bayes.linear.updating import updated
-from lusee_bayes.noise import beam_error_noise
+from lusee_bayes.linear.model import LinearGaussian, updated
+from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
 from lusee_bayes.noise.covariance import DenseCovariance, DiagonalCovariance
+from lusee_bayes.noise.instrument_errors import beam_error_noise
 from lusee_bayes.runs.forecasting import informed_modes
 from lusee_bayes.sampling.distributions import Marginal, SkyPrior
-from lusee_bayes.sampling.whitening import Whitening
-from lusee_bayes.sky.priors import DensePrior, HarmonicPrior
+from lusee_bayes.sampling.hmc import Whitening
+from lusee_bayes.sky.prior import DensePrior, HarmonicPrior
 
 N = 25
 RNG = np.random.default_rng(3)

@@ -11,17 +11,17 @@ from assertions import close
 from lusee_bayes.core.arrays import on_device, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import pixel_matrix
-from lusee_bayes.instrument.beams import ProductBeams
+from lusee_bayes.instrument.averaging import windowed
+from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation, Run
+from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
-from lusee_bayes.instrument.window_average import windowed
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.instrument.schedule import Run
 from lusee_bayes.linear import information
 from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.linear.normal_matrix import normal_matrix
-from lusee_bayes.linear.pixel_variance import pixel_std
-from lusee_bayes.linear.time_sums import CHUNK, time_sums
+from lusee_bayes.linear.normal_matrix import CHUNK, normal_matrix, time_sums
+from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.noise.covariance import (
     DenseCovariance,
     DiagonalCovariance,
@@ -29,7 +29,7 @@ from lusee_bayes.noise.covariance import (
     TimeBandedCovariance,
     TimeBlockCovariance,
 )
-from lusee_bayes.sky.priors import HarmonicPrior
+from lusee_bayes.sky.prior import HarmonicPrior
 
 LMAX, N_PRODUCTS = 5, 4
 # the first and the last run see the sky through the same beams

@@ -11,14 +11,17 @@ from scipy import optimize, stats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.joint_skies import paired
+from lusee_bayes.linear.joint import paired
 from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.linear.positive_channel import positive_sky
-from lusee_bayes.linear.positive_joint import ChannelsInMemory, find_joint_mode, linearised
+from lusee_bayes.linear.positive_joint import (
+    ChannelsInMemory,
+    find_joint_mode,
+    linearised,
+    positive_sky,
+)
 from lusee_bayes.noise.covariance import DiagonalCovariance
-from lusee_bayes.sky.field_laws import FieldLaws
-from lusee_bayes.sky.positive_skies import PositiveSkies
-from lusee_bayes.sky.priors import HarmonicPrior
+from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
+from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.sky.template import Template
 
 LMAX = 3

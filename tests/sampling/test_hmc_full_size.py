@@ -10,12 +10,10 @@ import equinox as eqx
 import pytest
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.inference import infer
-from lusee_bayes.sampling.hmc import Sampler, sample
+from lusee_bayes.experiment.experiment import build, infer
+from lusee_bayes.sampling.hmc import Sampler, Whitening, sample
 from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.validation import validate_draws
-from lusee_bayes.sampling.whitening import Whitening
 
 LMAX = int(os.environ.get("LUSEE_BAYES_TEST_LMAX", "31"))
 

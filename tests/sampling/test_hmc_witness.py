@@ -18,15 +18,12 @@ from jaxtyping import Array, Float
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers
-from lusee_bayes.experiment.experiment import Experiment, build
-from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.experiment import Experiment, build, infer
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.sampling.chains import Chains
-from lusee_bayes.sampling.hmc import Sampler, sample
+from lusee_bayes.sampling.hmc import Chains, Sampler, Whitening, sample
 from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.validation import Comparison, validate_draws
-from lusee_bayes.sampling.whitening import Whitening
 
 NOISES = {
     "paper": ("fiducial",),
