@@ -14,10 +14,9 @@ from scipy.linalg import blas, lapack
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.diagnosis import diagnose
-from lusee_bayes.experiment.experiment import observed, simulated
-from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.experiment import infer, observed, simulated
 from lusee_bayes.instrument.products import all_products
-from lusee_bayes.linear.residuals import residuals
+from lusee_bayes.judge.residuals import residuals
 
 
 def unit() -> float:

@@ -22,7 +22,7 @@ from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.flight.reduction import reduce_sessions
 from lusee_bayes.flight.session_files import read_session, write_session
-from lusee_bayes.runs.flight_run import run_simulate_flight
+from lusee_bayes.runs.data_run import run_simulate_flight
 
 STEP_S, SPECTRA, BANDS = 42.0, 57_000, 46
 # spectra that are simulated, and then repeated

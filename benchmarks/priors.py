@@ -18,7 +18,7 @@ from rich.table import Table
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.sky.local_scales import embedded_local_scales
+from lusee_bayes.priors.local_scales import embedded_local_scales
 
 
 def steady(work: Callable[[], object], repeats: int) -> float:

@@ -19,9 +19,8 @@ from rich.console import Console
 from rich.table import Table
 
 import lusee_bayes as lb
-from lusee_bayes.sampling.hmc import ALGORITHMS, Sampler, sample
+from lusee_bayes.sampling.hmc import ALGORITHMS, Sampler, Whitening, sample
 from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.whitening import Whitening
 
 CHAINS = 4
 

@@ -28,15 +28,13 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import under_sky
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.linear.levels import LEVELS
-from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, ORANGE, colour_bar
-from lusee_bayes.report.figures.mollweide import mollweide
+from lusee_bayes.judge.coverage import LEVELS, Counts
+from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, ORANGE, colour_bar, mollweide
 from lusee_bayes.results.channel import ChannelResult
-from lusee_bayes.results.coverage import Counts
 from lusee_bayes.results.draws import deviations
 from lusee_bayes.results.map_result import map_result
-from lusee_bayes.sky import FileSource, GalaxySource, SkySource
-from lusee_bayes.testing.skies import SmoothSky, SpottySky
+from lusee_bayes.sky.sky_source import FileSource, GalaxySource, SkySource
+from lusee_bayes.testing.cases import SmoothSky, SpottySky
 
 # each takes a seed
 NAMED: dict[str, Callable[[int], SkySource]] = {

@@ -20,19 +20,15 @@ from matplotlib.figure import Figure
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import base_model
+from lusee_bayes.experiment.model import base_model, true_values
 from lusee_bayes.experiment.rounds import Inference
-from lusee_bayes.experiment.simulate import true_values
-from lusee_bayes.linear.metrics import ell_cross, signal_to_noise
-from lusee_bayes.report.figures.channel import maps
-from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar
-from lusee_bayes.report.figures.mollweide import mollweide
-from lusee_bayes.report.figures.taper import shown
+from lusee_bayes.judge.chi2 import ell_cross, signal_to_noise
+from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar, mollweide, shown
+from lusee_bayes.report.figures.maps import sky_maps
 from lusee_bayes.results.map_result import map_result
 from lusee_bayes.sampling.datatree import read_datatree
-from lusee_bayes.sampling.uncertainty import summary
-from lusee_bayes.sky import BRIGHT_SOURCES
-from lusee_bayes.sky.galaxy import galaxy_map
+from lusee_bayes.sampling.mode import summary
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galaxy_map
 
 HERE = Path(__file__).parent / "figures"
 GREEN = "#009E73"  # of the same palette as BLUE and ORANGE
@@ -41,7 +37,7 @@ GREEN = "#009E73"  # of the same palette as BLUE and ORANGE
 def first_map() -> None:
     """Draw the maps of `lusee-bayes map fiducial`."""
     channel = map_result(lb.build(lb.load_scenario("fiducial"))).channel
-    maps(channel).savefig(HERE / "maps.png", dpi=110)
+    sky_maps(channel).savefig(HERE / "maps.png", dpi=110)
 
 
 def fixed_axis() -> None:

@@ -10,15 +10,12 @@ from typing import Any
 import jax.numpy as jnp
 from numpyro.infer.util import log_density
 
-from lusee_bayes.experiment.experiment import Experiment, build
-from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.pieces import program_pieces
+from lusee_bayes.experiment.experiment import Experiment, build, program_pieces
+from lusee_bayes.experiment.model import full_model, simulate
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.experiment.simulate import simulate
-from lusee_bayes.experiment.terms import Around
-from lusee_bayes.sampling.programs import Program
-from lusee_bayes.sampling.promotion import numpyro_promotion
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.experiment.term import Around
+from lusee_bayes.sampling.programs import Program, numpyro_promotion
+from lusee_bayes.testing.cases import small_scenario
 
 # nothing of these enters a setup (test_experiment.py checks it), only the data and N; the mean of
 # noise.receiver does

@@ -1,4 +1,9 @@
-"""What commands have in common: options that mean the same everywhere."""
+"""Options that commands share, and the tables that they print.
+
+What commands have in common: options that mean the same everywhere.
+
+The tables that commands print.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +22,7 @@ from lusee_bayes.core.errors import InputError
 
 if TYPE_CHECKING:
     from lusee_bayes.experiment.scenario import Scenario
+
 
 Overrides = Annotated[list[str], Parameter(name="--set", negative="")]
 Quiet = Annotated[

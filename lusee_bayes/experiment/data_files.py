@@ -19,12 +19,10 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.flight.reduced import Reduced, read_reduced
 from lusee_bayes.flight.session_files import is_session
 from lusee_bayes.instrument.averaging import averaged
-from lusee_bayes.instrument.beams.gridded import SAME_FREQUENCY_MHZ
-from lusee_bayes.instrument.timestamps import Timestamp
-from lusee_bayes.instrument.visibilities import HINT, Visibilities
-from lusee_bayes.instrument.visibilities_file import read_visibilities
-from lusee_bayes.instrument.waterfalls import Waterfall, read_waterfall
-from lusee_bayes.instrument.waterfalls.four_port import INTERPOLATIONS
+from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
+from lusee_bayes.instrument.times import Timestamp
+from lusee_bayes.instrument.visibilities import HINT, Visibilities, read_visibilities
+from lusee_bayes.instrument.waterfalls import INTERPOLATIONS, Waterfall, read_waterfall
 
 ACCEPTED = (
     "visibilities (lusee-bayes simulate), a waterfall of luseepy, sessions of its lusee.ingest, or "

@@ -1,9 +1,27 @@
-"""Did you mean, for data: the usual mistakes, tried where no sky explains the data.
+"""Usual mistakes in data and model: which of them would make the data fit.
+
+The usual mistakes in data and models, each as what would undo it.
+
+A mistake in the data is undone by mixing the products of every time. One in the model is undone by
+other beams, or by another observation: other times, angles or another site.
+
+The residual chi^2 of data, what no sky absorbs, with the data or the model changed.
+
+Changes of data that mix the products of each time, and their residual chi^2, all at once.
+
+d' = sum_jk W_jk x_jk, where x_jk has product k in the place of product j. With K the covariance of
+the data under a prior that allows any sky, and b the model without a sky, ::
+
+    chi^2(W) = (X w - b)^T K^-1 (X w - b) = (w, -1)^T Q (w, -1),    Q = (X, b)^T K^-1 (X, b).
+
+With Q at hand exchanges, signs and reversals cost nothing; factors and constants are solved for.
+
+Did you mean, for data: the usual mistakes, tried where no sky explains the data.
 
 Each is undone, and its residual chi^2, what a prior wide enough for any sky leaves
-(:mod:`lusee_bayes.linear.split`), tells whether the data would fit.
+(:mod:`lusee_bayes.judge.chi2`), tells whether the data would fit.
 
-Changes of the data cost one matrix together (:mod:`.mixed_products`). A change of the model needs a
+Changes of the data cost one matrix together (:mod:`.diagnosis`). A change of the model needs a
 normal matrix of its own; these are compared up to ``SCREENED_LMAX`` first. The best of both are
 computed as the scenario has it, with N for the changed data.
 """
@@ -12,24 +30,470 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
+from jaxtyping import Float
 
+from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.any_sky import UnderAnySky
+from lusee_bayes.core.harmonics import lmax_of, mean_over_m, mode_numbers, n_modes, turn_about_z
+from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.mistakes import (
-    ModelMistake,
-    model_mistakes,
-)
-from lusee_bayes.experiment.mixed_products import MixedProducts
+from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.experiment.term import Around
+from lusee_bayes.instrument.beams.fields import ProductBeams
+from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.pointing import Pointing
-from lusee_bayes.instrument.pointing_offsets import kind_of, offset_names, with_offsets
+from lusee_bayes.instrument.pointing import Pointing, kind_of, offset_names, with_offsets
+from lusee_bayes.instrument.products import all_products, auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.linear.fit import ChiSquare, stands_out, two_sided
-from lusee_bayes.linear.residuals import Residuals
+from lusee_bayes.judge.chi2 import WIDER, ChiSquare, expected_chi2, stands_out, two_sided, with_sky
+from lusee_bayes.judge.residuals import Residuals
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.sky.prior import HarmonicPrior
+
+Mixing = Float[np.ndarray, "products products"]
+
+# seconds to be added to times that are not what they are taken for
+CLOCKS = {
+    "the times are TT or TDB, not UTC": -69.184,
+    "the times are TAI, not UTC": -37.0,
+    "the times are an hour early": 3600.0,
+    "the times are an hour late": -3600.0,
+    "the times are a day early": 86400.0,
+    "the times are a day late": -86400.0,
+}
+
+
+@dataclass(frozen=True)
+class DataMistake:
+    """A mistake in the data.
+
+    Attributes
+    ----------
+    words, remedy : str
+        What is wrong, and what to do.
+    mixing : (products, products) array
+        What makes the right products of each time's wrong ones.
+    constant : (products,) array or None
+        What is then taken away, in K.
+    time : int or None
+        The only time that is wrong; None for all.
+    reverses : bool
+        Whether the order of times is reversed.
+    """
+
+    words: str
+    remedy: str
+    mixing: Mixing
+    constant: Float[np.ndarray, " products"] | None = None
+    time: int | None = None
+    reverses: bool = False
+
+    def undone(
+        self, grid: Float[np.ndarray, "products times"]
+    ) -> Float[np.ndarray, "products times"]:
+        """The visibilities without the mistake, in K."""
+        grid = grid[:, ::-1] if self.reverses else grid
+        mixed = self.mixing @ grid
+        if self.constant is not None:
+            mixed = mixed - self.constant[:, None]
+        if self.time is None:
+            return mixed
+        return np.where(np.arange(grid.shape[1]) == self.time, mixed, grid)
+
+
+@dataclass(frozen=True)
+class ModelMistake:
+    """A mistake in the model.
+
+    Attributes
+    ----------
+    words, remedy : str
+        What is wrong, and what to do.
+    beams : ProductBeams
+        Those without the mistake.
+    observation : Observation
+        That without the mistake.
+    """
+
+    words: str
+    remedy: str
+    beams: ProductBeams
+    observation: Observation
+
+
+def port_mixing(ports: tuple[int, ...], signs: tuple[float, ...] | None = None) -> Mixing:
+    """What makes the products of ports 0, 1, ... of data that have them as ``ports``.
+
+    Parameters
+    ----------
+    ports : tuple of int
+        Of each port, under which number the data have it.
+    signs : tuple of float, optional
+        Of each port, the sign of its voltage.
+    """
+    products, signs = all_products(len(ports)), signs or (1.0,) * len(ports)
+    place = {tuple(product): k for k, product in enumerate(products)}
+    mixing = np.zeros((len(products), len(products)))
+    for row, (a, b, part) in enumerate(products):
+        i, j = ports[a], ports[b]
+        conjugated = -1.0 if part == "I" and i > j else 1.0
+        mixing[row, place[min(i, j), max(i, j), part]] = conjugated * signs[a] * signs[b]
+    return mixing
+
+
+def data_mistakes(n_ports: int) -> Iterator[DataMistake]:
+    """Conjugation, signs, exchanges, and reversed times."""
+    products, ports = all_products(n_ports), tuple(range(n_ports))
+    same = np.eye(len(products))
+    imaginary = np.array([p.part == "I" for p in products])
+    crosses = np.array([p.i != p.j for p in products])
+    yield DataMistake(
+        "the data are conjugated: the imaginary parts have the other sign",
+        "change their sign (from_arrays: convention='conj(s_i) s_j')",
+        np.diag(np.where(imaginary, -1.0, 1.0)),
+    )
+    yield DataMistake(
+        "all crosses have the other sign",
+        "change their sign",
+        np.diag(np.where(crosses, -1.0, 1.0)),
+    )
+    for size in range(1, n_ports // 2 + 1):
+        for flipped in combinations(ports, size):
+            if 2 * size == n_ports and 0 not in flipped:  # as if the others were flipped
+                continue
+            named = " and ".join(map(str, flipped))
+            yield DataMistake(
+                f"the voltages of port {named} have the other sign",
+                f"change the sign of all crosses of port {named} with others",
+                port_mixing(ports, tuple(-1.0 if p in flipped else 1.0 for p in ports)),
+            )
+    for i, j in combinations(ports, 2):
+        yield DataMistake(
+            f"ports {i} and {j} are exchanged",
+            f"exchange ports {i} and {j} of the data",
+            port_mixing(tuple({i: j, j: i}.get(port, port) for port in ports)),
+        )
+    for turn in range(1, n_ports):
+        yield DataMistake(
+            f"the ports are turned by {turn}: the model's port 0 is the data's port {turn}",
+            "number the data's ports as the beams'",
+            port_mixing(tuple((port + turn) % n_ports for port in ports)),
+        )
+    for i, j in combinations(range(len(products)), 2):
+        order = np.arange(len(products))
+        order[[i, j]] = j, i
+        named = f"{products[i].label} and {products[j].label}"
+        yield DataMistake(
+            f"products {named} are exchanged", f"exchange {named} of the data", same[order]
+        )
+    yield DataMistake("the times are reversed", "sort the data by time", same, reverses=True)
+
+
+def model_mistakes(setup: Setup) -> Iterator[ModelMistake]:
+    """Angles, azimuths, clocks, the site's signs, and neighbouring channels."""
+    observation, beams = setup.observation, setup.beams
+    angles = observation.turntable_deg
+
+    def seen(words: str, remedy: str, other: Observation) -> ModelMistake:
+        return ModelMistake(words, remedy, beams, other)
+
+    for turn in (90.0, 180.0, 270.0):
+        yield seen(
+            f"the array is turned by {turn:g} degrees from East towards North",
+            f"use --set beam.turntable_offset_deg={turn:g}",
+            replace(observation, turntable_deg=tuple(angle + turn for angle in angles)),
+        )
+    if any(angles):
+        yield seen(
+            "the turntable's angles have the other sign",
+            "count them from East towards North",
+            replace(observation, turntable_deg=tuple(-angle for angle in angles)),
+        )
+    _, m = mode_numbers(beams.lmax)
+    mirrored = np.asarray(beams.modes) * np.where(m < 0, -1.0, 1.0)
+    for words, modes in (
+        ("the azimuth of the beams is mirrored", mirrored),
+        (
+            "the azimuth of the beams is counted from North towards East",
+            np.asarray(turn_about_z(mirrored, np.pi / 2.0)),
+        ),
+    ):
+        remedy = "count it from East towards North"
+        yield ModelMistake(words, remedy, replace(beams, modes=modes), observation)
+    half = observation.step_s / 2.0
+    starts = {"the times are starts of samples": half, "the times are ends of samples": -half}
+    for words, seconds in (CLOCKS | starts).items():
+        shifted = with_offsets(observation, {"clock_s": seconds})
+        yield seen(words, f"add {seconds:g} s to the times", shifted)
+    for name, key in (("latitude", "lat_deg"), ("longitude", "lon_deg")):
+        value = getattr(observation, key)
+        yield seen(
+            f"the site's {name} has the other sign",
+            f"use --set observation.{key}={-value:g}",
+            with_offsets(observation, {key: -2.0 * value}),
+        )
+    width = setup.scenario.noise.radiometer.bandwidth_hz / 1e6
+    for frequency in (beams.frequency_mhz - width, beams.frequency_mhz + width):
+        try:
+            other = setup.beam_source.beams(frequency, beams.lmax)
+        except InputError:  # the source has none there
+            continue
+        yield ModelMistake(
+            f"the frequency is that of the neighbouring channel, {frequency:g} MHz",
+            f"use --set frequency_mhz={frequency:g}",
+            other,
+            observation,
+        )
+
+
+@dataclass(frozen=True)
+class UnderAnySky:
+    """Data, and the model that their residual chi^2 is computed in, under a wide prior.
+
+    Attributes
+    ----------
+    setup : Setup
+    data : Visibilities
+    model : LinearGaussian
+        Of these data.
+    spectrum : (ells,) array
+        C_ell of the wide prior, in K^2.
+    """
+
+    setup: Setup
+    data: Visibilities
+    model: LinearGaussian
+    spectrum: Float[np.ndarray, " ells"]
+
+    @classmethod
+    def of(cls, setup: Setup, data: Visibilities, model: LinearGaussian) -> UnderAnySky:
+        """Under a prior that allows any sky, as bright as the data ask for."""
+        return cls(setup, data, on_host(model), _any_sky(setup, data))
+
+    def wide(self, coupling: Coupling) -> tuple[ChiSquare, Posterior]:
+        """Residual chi^2, and the posterior under the wide prior."""
+        n_ells = lmax_of(coupling.shape[1]) + 1
+        more = max(0, n_ells - len(self.spectrum))
+        spectrum = np.pad(self.spectrum, (0, more), mode="edge")[:n_ells]
+        information, posterior = Information.of(
+            coupling,
+            HarmonicPrior(spectrum),
+            self.model.noise,
+            self.model.offset,
+            np.asarray(self.data.data),
+        )
+        posterior, n = on_host(posterior), self.model.n_data
+        chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
+        degrees = n - with_sky(n - expected_chi2(posterior, n))
+        return ChiSquare(chi2, float(degrees)), posterior
+
+    def under(self, beams: ProductBeams, observation: Observation, pointing: Pointing) -> ChiSquare:
+        """Residual chi^2 with other beams or another observation.
+
+        ``pointing`` is that of the data's own observation, up to the ell that counts.
+        """
+        lmax = len(pointing.pole_from_galactic.blocks) - 1
+        if (observation.times == self.setup.observation.times).all():
+            pointing = pointing.placed(observation)
+        else:
+            pointing = Pointing.of(observation, lmax)
+        modes = np.asarray(beams.modes)[:, : n_modes(lmax)]
+        beams = ProductBeams(modes, beams.frequency_mhz)
+        return self.wide(CouplingMatrix.build(beams, pointing, self.data.layout))[0]
+
+    def without(self, mistake: DataMistake) -> ChiSquare:
+        """Residual chi^2 of the data without a mistake, with N for them."""
+        layout = self.data.layout
+        right = np.asarray(layout.gather(mistake.undone(filled(self.data))))
+        data = replace(self.data, data=right)
+        try:
+            model = on_host(full_model(self.setup, Around(data)))
+        except InputError:  # without it, some auto is not positive
+            return ChiSquare(np.inf, float(layout.size))
+        return replace(self, data=data, model=model).wide(model.coupling)[0]
+
+
+def _any_sky(setup: Setup, data: Visibilities) -> Float[np.ndarray, " ells"]:
+    """C_ell of a prior that allows any sky, as bright as the data ask for, in K^2."""
+    prior = on_host(setup.prior if setup.family is None else setup.family.expected())
+    power = np.asarray(prior.variance())
+    if prior.white_mean is not None:
+        power = power + np.asarray(prior.colour(prior.white_mean)) ** 2
+    autos = auto_indices(setup.beam_source.n_ports)
+    modelled = float(np.median(np.asarray(setup.signal)[autos]))
+    brighter = np.nanmedian(np.asarray(data.grid())[autos]) / modelled
+    return mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2
+
+
+def filled(data: Visibilities) -> Float[np.ndarray, "products times"]:
+    """The data on the full grid, absent samples interpolated in time."""
+    grid = np.array(data.grid())
+    times = np.arange(grid.shape[1])
+    for row in grid:
+        there = np.isfinite(row)
+        row[~there] = np.interp(times[~there], times[there], row[there]) if there.any() else 0.0
+    return grid
+
+
+# times that are tried one by one, the worst first
+TIMES = 32
+
+
+@dataclass(frozen=True)
+class MixedProducts:
+    """Q of the module's equations, of some data.
+
+    here : UnderAnySky; posterior : under the wide prior; grid : (products, times) array, in K; q :
+    (columns, columns) array, of every x_jk, ones in every product, the times reversed, and b
+    """
+
+    here: UnderAnySky
+    posterior: Posterior
+    grid: Float[np.ndarray, "products times"]
+    q: Float[np.ndarray, "columns columns"]
+
+    @classmethod
+    def of(cls, here: UnderAnySky, posterior: Posterior) -> MixedProducts:
+        """Of data and their posterior under the wide prior."""
+        grid, layout, offset = filled(here.data), here.data.layout, here.model.offset
+        n, product, time = len(grid), layout.product, layout.time
+        mixed = np.zeros((layout.size, n, n))
+        mixed[np.arange(layout.size), product] = grid[:, time].T
+        steady = np.zeros(layout.size) if offset is None else np.asarray(offset)
+        columns = [mixed.reshape(layout.size, -1), np.eye(n)[product]]
+        columns += [np.stack([grid[:, ::-1][product, time], steady], axis=1)]
+        return cls(here, posterior, grid, _gram(here, posterior, np.concatenate(columns, axis=1)))
+
+    def chi2(self, vector: Float[np.ndarray, " columns"]) -> float:
+        """chi^2 of (w, -1)."""
+        return float(vector @ self.q @ vector)
+
+    def vector(self, mixing: Float[np.ndarray, "products products"], b: float = -1.0) -> np.ndarray:
+        """(w, -1) of a mixing, or w of one that is added."""
+        return np.concatenate([mixing.ravel(), np.zeros(len(mixing) + 1), [b]])
+
+    def tried(self) -> Iterator[tuple[float, DataMistake]]:
+        """Every mistake with its chi^2."""
+        n_ports = self.here.setup.beam_source.n_ports
+        for mistake in data_mistakes(n_ports):
+            w = self.vector(mistake.mixing)
+            if mistake.reverses:
+                w = np.zeros(len(w))
+                w[-2:] = 1.0, -1.0
+            yield self.chi2(w), mistake
+        products = all_products(n_ports)
+        autos = np.array([p.i == p.j for p in products], dtype=np.float64)
+        for product, which in zip(products, np.eye(len(products)), strict=True):
+            yield self._factor(f"product {product.label}", which)
+        yield self._factor("every auto", autos)
+        for port in range(n_ports):
+            powers = np.array([float(p.i == port) + float(p.j == port) for p in products])
+            yield self._gain(port, powers)
+        yield self._constant(np.flatnonzero(autos))
+        yield from self._times()
+
+    def _factor(
+        self, name: str, which: Float[np.ndarray, " products"]
+    ) -> tuple[float, DataMistake]:
+        """A factor of some products: chi^2 is a parabola in what is missing."""
+        whole = self.vector(np.eye(len(which)))
+        step = self.vector(np.diag(which), 0.0)
+        curvature = float(step @ self.q @ step)
+        missing = -float(step @ self.q @ whole) / curvature
+        return self.chi2(whole + missing * step), DataMistake(
+            f"{name} is {_number(1.0 / (1.0 + missing), curvature**-0.5)} times what the others "
+            "predict",
+            f"look at the calibration of {name}",
+            np.diag(1.0 + missing * which),
+        )
+
+    def _gain(self, port: int, powers: Float[np.ndarray, " products"]) -> tuple[float, DataMistake]:
+        """A gain of a port's voltage, squared in its auto: chi^2 is of fourth order in it."""
+        parts = [self.vector(np.diag((powers == k) * 1.0), -1.0 * (k == 0)) for k in range(3)]
+        gram = np.array([[u @ self.q @ v for v in parts] for u in parts])
+        chi2 = np.polynomial.Polynomial(
+            [np.trace(gram[:, ::-1], offset=2 - order) for order in range(5)]
+        )
+        roots = chi2.deriv().roots()
+        real = roots.real[np.abs(roots.imag) <= 1e-6 * np.abs(roots.real)]
+        gain = real[np.argmin(chi2(real))]
+        return float(chi2(gain)), DataMistake(
+            f"the voltage of port {port} is {1.0 / gain:.5g} times what the others predict",
+            f"look at the calibration of port {port}",
+            np.diag(gain**powers),
+        )
+
+    def _constant(self, autos: np.ndarray) -> tuple[float, DataMistake]:
+        """A constant in every auto."""
+        n = len(self.grid)
+        whole = self.vector(np.eye(n))
+        places = n * n + autos
+        level = np.linalg.solve(self.q[np.ix_(places, places)], self.q[places] @ whole)
+        whole[places] -= level
+        constant = np.zeros(n)
+        constant[autos] = level
+        named = ", ".join(f"{x:.4g}" for x in level)
+        return self.chi2(whole), DataMistake(
+            f"the autos have a constant of {named} K besides the sky",
+            "give noise.receiver, or subtract it",
+            np.eye(n),
+            constant,
+        )
+
+    def _times(self) -> Iterator[tuple[float, DataMistake]]:
+        """A factor of all products of one time."""
+        here, layout, values = self.here, self.here.data.layout, np.asarray(self.here.data.data)
+        factor = here.model.noise.factor()
+        # K^-1 (d - b)
+        left = np.asarray(
+            factor.solve(values - np.asarray(here.model.predict(self.posterior.mean)))
+        )
+        pull = np.bincount(layout.time, values * left, layout.n_times)
+        most = np.bincount(layout.time, values * np.asarray(factor.solve(values)), layout.n_times)
+        worst = np.argsort(-(pull**2) / np.where(most > 0.0, most, np.inf))[:TIMES]
+        worst = worst[most[worst] > 0.0]
+        columns = np.where(layout.time[:, None] == worst, values[:, None], 0.0)
+        curvature = np.diagonal(_gram(here, self.posterior, columns))
+        whole = self.chi2(self.vector(np.eye(len(self.grid))))
+        for time, bend in zip(worst.tolist(), curvature.tolist(), strict=True):
+            if not bend > 0.0:  # the others predict nothing
+                continue
+            missing = -pull[time] / bend
+            when = here.data.observation.times[time].isot[:19]
+            yield (
+                whole - pull[time] ** 2 / bend,
+                DataMistake(
+                    f"all products at {when} are {_number(1.0 / (1.0 + missing), bend**-0.5)} "
+                    "times what the other times predict",
+                    "leave this time out",
+                    (1.0 + missing) * np.eye(len(self.grid)),
+                    time=time,
+                ),
+            )
+
+
+def _number(factor: float, std: float) -> str:
+    """A factor with the error of its inverse."""
+    return f"{factor:.5g} +- {std * factor**2:.1g}"
+
+
+def _gram(
+    here: UnderAnySky, posterior: Posterior, columns: Float[np.ndarray, "data n"]
+) -> Float[np.ndarray, "n n"]:
+    """X^T K^-1 X, K^-1 = N^-1 - N^-1 A C A^T N^-1."""
+    solved = np.asarray(here.model.noise.factor().solve(columns))
+    seen = np.stack([np.asarray(here.model.coupling.transpose_mv(x)) for x in solved.T])
+    white = np.asarray(posterior.prior.colour_columns(seen)).T
+    half = solve_lower(posterior.lower, white, transpose=False)
+    return columns.T @ solved - half.T @ half
+
 
 # changes of the model are compared up to this ell
 SCREENED_LMAX = 12

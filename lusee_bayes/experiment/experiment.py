@@ -1,27 +1,47 @@
-"""An experiment: a setup and the data that were taken with it."""
+"""A scenario with its data, ready to be mapped or sampled.
+
+An experiment: a setup and the data that were taken with it.
+
+From an experiment to the posterior over its sky.
+
+What programs can ask an experiment for.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 
+from lusee_bayes.core.arrays import on_device
 from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.learned_prior import with_learned_prior
+from lusee_bayes.experiment.instrument_terms import gain_drifts
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
-from lusee_bayes.experiment.model import radiometer
-from lusee_bayes.experiment.plausibility import require_plausible
+from lusee_bayes.experiment.model import model_to_sample, radiometer, simulate
+from lusee_bayes.experiment.rounds import (
+    Inference,
+    model_about,
+    rebuilds,
+    settled,
+    with_learned_prior,
+)
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.simulate import simulate
-from lusee_bayes.experiment.terms import Around
+from lusee_bayes.experiment.sky_terms import point_sources
+from lusee_bayes.experiment.term import Around
+from lusee_bayes.experiment.terms import TERMS
+from lusee_bayes.instrument.instrument import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.linear.learning import Learned
-from lusee_bayes.sky import SkySource
+from lusee_bayes.judge.plausibility import require_plausible
+from lusee_bayes.linear.information import Information
+from lusee_bayes.priors.learning import Learned
+from lusee_bayes.sky.sky_source import SkySource
 
 
 @dataclass(frozen=True, repr=False)
@@ -203,3 +223,88 @@ def under_sky(
     sky = source.at(scenario.frequency_mhz, scenario.lmax)
     seen = replace(setup.under(sky), scenario=scenario)
     return _learned(Experiment(seen, simulate(seen)), stages or Stages())
+
+
+def infer(experiment: Experiment) -> Inference:
+    """Condition the experiment's model on its data (:func:`.settled`).
+
+    Parameters
+    ----------
+    experiment : Experiment
+
+    Raises
+    ------
+    InputError
+        As :func:`.settled`.
+    """
+    return settled(experiment.setup, experiment.data, experiment.around)
+
+
+def inform(experiment: Experiment) -> tuple[Information, Inference]:
+    """What the data say of the sky as a quadratic form, and the posterior that it gives.
+
+    Parameters
+    ----------
+    experiment : Experiment
+
+    Raises
+    ------
+    InputError
+        As :func:`infer`.
+    """
+    if rebuilds(experiment.setup):
+        found = infer(experiment)
+    else:
+        around = Around(experiment.data)
+        found = Inference(*model_about(experiment.setup, around), None, 1, around)
+    information, posterior = found.model.inform(experiment.data.data)
+    return information, replace(found, posterior=posterior)
+
+
+def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
+    """What makes the pieces of an experiment that programs can ask for, by name.
+
+    A piece raises InputError, once made, for a systematic that the scenario marginalises as well.
+    """
+    setup, data, log_normal = experiment.setup, experiment.data, experiment.scenario.log_normal
+
+    def free(key: str, made: Callable[[], Any]) -> Callable[[], Any]:
+        def make():
+            piece = made()
+            term = next(term for term in TERMS if term.key == key)
+            if any(t == "marginalised" for t, _ in term.build(setup, Around())):
+                raise InputError(
+                    "the program samples what the scenario marginalises, so that it would count "
+                    f"twice; set {key}.treatment=sampled"
+                )
+            return piece
+
+        return make
+
+    @cache
+    def around() -> Around:
+        # about none, large offsets are not described, and gains are those of other antennas
+        if not rebuilds(setup):
+            return Around(data)
+        return settled(setup, data, experiment.around).around
+
+    to_sample = cache(lambda: model_to_sample(setup, around()))
+    return {
+        "gaussian": lambda: to_sample()[0],
+        "systematics": lambda: to_sample()[1],
+        "gain_drifts": free("noise.gain", lambda: gain_drifts(setup, around())),
+        "instrument": free("noise.beam", lambda: embedded_instrument(setup)),
+        "sources": free("sources", lambda: point_sources(setup)),
+        "log_normal": lambda: on_device(log_normal.prior(setup.sky.frequency_mhz, setup.sky.lmax)),
+        "layout": lambda: data.layout,
+    }
+
+
+def embedded_instrument(setup: Setup) -> Instrument:
+    """The embedded antennas, prepared. InputError where the beams are those of a file."""
+    if setup.scenario.beam.is_file:
+        raise InputError(
+            "the program asks for the embedded antennas, which beam.file replaces; leave out "
+            "beam.file"
+        )
+    return setup.prepared

@@ -13,8 +13,8 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.formats import format_of
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.instrument_sections import FlightSection
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.schema import FlightSection
 from lusee_bayes.flight.bands import shared_noise
 from lusee_bayes.flight.clock import read_clock
 from lusee_bayes.flight.flags import NO_LINES, read_lines
@@ -23,7 +23,7 @@ from lusee_bayes.flight.recipe import Recipe
 from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.flight.reduction import reduce_sessions
 from lusee_bayes.flight.session_files import read_session
-from lusee_bayes.instrument.correlations import CONVENTIONS
+from lusee_bayes.instrument.products import CONVENTIONS
 from lusee_bayes.instrument.visibilities import Visibilities
 
 

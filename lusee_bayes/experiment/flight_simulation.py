@@ -18,10 +18,10 @@ from lusee_bayes.core.engine import in_threads, processors
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.flight_data import gain_table_of, per_kelvin_of
+from lusee_bayes.experiment.instrument_sections import FlightSection, FlightSimulatedSection
+from lusee_bayes.experiment.model import true_signal, true_values
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.schema import FlightSection, FlightSimulatedSection
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.experiment.simulate import true_signal, true_values
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
 from lusee_bayes.flight.gain_model import GainModel, draw_gains, synthetic_gains
 from lusee_bayes.flight.session import (
@@ -41,13 +41,17 @@ from lusee_bayes.flight.synthesis import (
     bit_slices,
     rounded,
 )
-from lusee_bayes.instrument.correlations import CONVENTIONS
-from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import all_products, to_matrix, to_real
+from lusee_bayes.instrument.products import (
+    CONVENTIONS,
+    DataLayout,
+    all_products,
+    to_matrix,
+    to_real,
+)
+from lusee_bayes.instrument.times import Windows
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.instrument.windows import Windows
-from lusee_bayes.noise.sample_covariances import sample_covariances
+from lusee_bayes.noise.radiometer import sample_covariances
 
 # spectra whose A is in memory at once
 PIECE = 2048

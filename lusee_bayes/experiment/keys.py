@@ -18,7 +18,7 @@ from pydantic_core import PydanticUndefined
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.reading import as_yaml
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.schema import Section
+from lusee_bayes.experiment.section import Section
 
 UNITS = {
     "mhz": "MHz",

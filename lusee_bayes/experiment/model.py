@@ -1,26 +1,36 @@
-"""d = A m + n of a setup: with radiometer noise alone, or with every systematic."""
+"""The model of a setup, and data simulated from it.
+
+d = A m + n of a setup: with radiometer noise alone, or with every systematic.
+
+Simulated data: the true instrument, its drifts and fluxes, drawn with the scenario's seed.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
 
-from lusee_bayes.core.arrays import on_device
-from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.terms import (
-    TERMS,
-    Around,
+import jax
+from jaxtyping import Float
+
+from lusee_bayes.core.arrays import Array, on_device
+from lusee_bayes.experiment.instrument_terms import (
     PointingTerm,
-    noise_visibilities,
     pointed,
-    radiometer_about,
     table_factors,
+    true_beams,
+    true_instrument,
+    true_setup,
 )
-from lusee_bayes.instrument.coupling import DenseCoupling
+from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.experiment.term import Around, Truth, noise_visibilities, radiometer_about
+from lusee_bayes.experiment.terms import TERMS
+from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling
+from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.noise import radiometer_noise
 from lusee_bayes.noise.covariance import Covariance
-from lusee_bayes.systematics import Marginalised, Systematic
+from lusee_bayes.noise.radiometer import radiometer_noise
+from lusee_bayes.systematics.systematic import Marginalised, Systematic
 
 
 def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
@@ -109,3 +119,35 @@ def model_to_sample(setup: Setup, around: Around) -> tuple[LinearGaussian, tuple
     if later and not any(systematic.changes_coupling for systematic in later):
         model = replace(model, coupling=DenseCoupling(model.coupling.dense()))
     return model, tuple(later)
+
+
+def true_values(setup: Setup) -> Truth:
+    """True values of what simulated data hold, by the names of their sites."""
+    key = jax.random.key(setup.scenario.seed)
+    return {name: value for term in TERMS for name, value in term.truth(setup, key).items()}
+
+
+def true_signal(setup: Setup, truth: Truth) -> Float[Array, "products times"]:
+    """Visibilities of sky, ground and systematics with the true instrument and values, in K."""
+    key = jax.random.key(setup.scenario.seed)
+    setup = true_setup(setup, truth)
+    true = CouplingMatrix.build(true_beams(setup), setup.pointing)
+    visibilities = true.layout.scatter(true @ setup.sky.modes)
+    visibilities = visibilities + true_instrument(setup).background()[:, None]
+    for term in TERMS:
+        visibilities = term.distort(visibilities, setup, truth, key)
+    return visibilities
+
+
+def simulate(setup: Setup) -> Visibilities:
+    """Visibilities of the scenario's sky, with every draw from its seed."""
+    truth = true_values(setup)
+    visibilities = true_signal(setup, truth)
+    noise = radiometer(setup).scaled(truth.get("noise_level", 1.0))
+    return Visibilities(
+        setup.layout.gather(visibilities) + noise.sample(jax.random.key(setup.scenario.seed)),
+        setup.layout,
+        setup.observation,
+        setup.scenario.frequency_mhz,
+        setup.sky.modes,
+    )

@@ -1,37 +1,53 @@
-"""N that is built around what the data tell, in rounds, and the posterior of each."""
+"""Inference in rounds: the prior, and N about the map, until neither moves.
+
+N that is built around what the data tell, in rounds, and the posterior of each.
+
+A prior whose parameters the data of an experiment tell.
+
+Priors by name, for a comparison under which of them data are most probable.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, on_host
-from lusee_bayes.experiment.model import base_model, marginalised, radiometer, systematics
-from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.terms import (
-    TERMS,
-    Around,
-    Term,
-    gains_about,
-    pointed,
-    radiometer_about,
+from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.experiment.instrument_terms import pointed
+from lusee_bayes.experiment.model import (
+    base_model,
+    full_model,
+    marginalised,
+    radiometer,
+    systematics,
 )
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.experiment.sky_sections import (
+    IsotropicPriorSection,
+    LocalScalesPriorSection,
+    PriorSection,
+)
+from lusee_bayes.experiment.term import Around, Term, gains_about, radiometer_about
+from lusee_bayes.experiment.terms import TERMS
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.linear.freedom import data_freedom
+from lusee_bayes.judge.measures import data_freedom
+from lusee_bayes.linear.amplitudes import template_amplitudes, weighted_residual
+from lusee_bayes.linear.information import Information, integrated_out
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.templates import template_amplitudes, weighted_residual
-from lusee_bayes.systematics import (
-    Expanded,
-    GainTable,
-    PointingOffsets,
-    PointSources,
-    Systematic,
-    Templated,
-)
+from lusee_bayes.priors.families import PriorFamily
+from lusee_bayes.priors.learning import Learned, learn_whatever_fits
+from lusee_bayes.systematics.gain_table import GainTable
+from lusee_bayes.systematics.instrument_unknowns import PointingOffsets
+from lusee_bayes.systematics.sky_unknowns import PointSources
+from lusee_bayes.systematics.systematic import Expanded, Systematic, Templated
 
 # N is rebuilt until the map moves by less than this (rms, in standard deviations)
 SETTLED, MAX_ROUNDS = 1e-2, 30
@@ -283,3 +299,149 @@ def prediction(
             besides = besides + columns @ (columns.T @ solved)
     grid = complete.layout.scatter(complete @ difference_of_skies)
     return setup.signal + grid + setup.layout.scatter(besides)
+
+
+# the map and its prior are found together when the map moves by less than this, rms; a step of
+# learning that is not taken moves it by a hundredth
+PRIOR_SETTLED, MAX_PRIOR_ROUNDS = 0.05, 8
+# parameters are learned up to this ell first, in a tenth of the time, where there are more
+COARSE_LMAX = 24
+
+
+def with_learned_prior(
+    setup: Setup, data: Visibilities
+) -> tuple[Setup, Learned | None, Around | None]:
+    """Learn the prior from data; a prior that is given stays as it is.
+
+    Systematics are in N as far as they are marginalised. Where N is built around what the data
+    tell, learning takes part in the rounds: N under the prior so far, the prior under this N, and
+    so on, until the map moves by less than 0.05 standard deviations (rms).
+
+    Parameters
+    ----------
+    setup : Setup
+    data : Visibilities
+
+    Returns
+    -------
+    Setup
+        With the prior.
+    Learned or None
+        How it was learned.
+    Around or None
+        What N was built around in the last round; None where that is the data alone.
+    """
+    if setup.family is None:
+        return setup, None, None
+    if not rebuilds(setup):
+        learned = learned_prior(setup, setup.family, about_sky(setup, data))
+        return replace(setup, prior=learned.prior), learned, None
+    learned, before, found = None, None, settled(setup, data)
+    for _ in range(MAX_PRIOR_ROUNDS):
+        information = full_model(setup, found.around).inform(data.data)[0]
+        start = None if learned is None or not learned.settled else learned.parameters
+        learned = learned_prior(setup, setup.family, information, start)
+        setup = replace(setup, prior=learned.prior)
+        before, found = found, settled(setup, data, found.around)
+        moved = float(found.posterior.rms_shift_from(before.posterior))
+        if moved < PRIOR_SETTLED:
+            return setup, learned, found.around
+    return setup, replace(learned, still_moves=moved), found.around
+
+
+def about_sky(setup: Setup, data: Visibilities) -> Information:
+    """What data say of the sky; only its reference sky depends on the setup's prior.
+
+    Where N is built around what data tell, it is about that of the prior before them.
+    """
+    around = settled(setup, data).around if rebuilds(setup) else Around(data)
+    return full_model(setup, around).inform(data.data)[0]
+
+
+def learned_prior(
+    setup: Setup,
+    family: PriorFamily,
+    information: Information,
+    start: Float[np.ndarray, " parameters"] | None = None,
+) -> Learned:
+    """Learn the prior of a family, up to a lower ell first where there are many.
+
+    Parameters
+    ----------
+    setup : Setup
+        Of the scenario that the family is of.
+    family : PriorFamily
+    information : Information
+        What the data say of the sky (:func:`about_sky`).
+    start : (parameters,) array, optional
+        Where to begin.
+    """
+    scenario, seed = setup.scenario, setup.scenario.seed
+    if start is not None or scenario.lmax <= COARSE_LMAX:
+        return learn_whatever_fits(family, information, start, seed)
+    coarse = scenario.prior.family(scenario.frequency_mhz, COARSE_LMAX)
+    n = n_modes(COARSE_LMAX)
+    variance = np.asarray(setup.prior.variance())[n:]
+    first = learn_whatever_fits(coarse, integrated_out(information, n, variance), seed=seed)
+    start = family.start_from(coarse, first.parameters) if first.settled else None
+    return learn_whatever_fits(family, information, start=start, seed=seed)
+
+
+# takes C_ell of the scenario's sky, which only simulations know
+OF_TRUE_SKY = "isotropic-sky"
+NAMED: dict[str, PriorSection] = {
+    "isotropic": IsotropicPriorSection(),
+    OF_TRUE_SKY: IsotropicPriorSection(spectrum="sky"),
+    "local_scales": LocalScalesPriorSection(),
+}
+
+
+def named_priors(
+    names: Sequence[str] | None, scenario: Scenario, *, known_sky: bool
+) -> dict[str, PriorSection]:
+    """Find the sections of priors.
+
+    The scenario's own section is taken where it is of the kind that is named, so that a template
+    or an amplitude of its own counts.
+
+    Parameters
+    ----------
+    names : sequence of str or None
+        Two or more of ``isotropic`` (C_ell learned), ``isotropic-sky`` (that of the scenario's
+        sky) and ``local_scales``; None for all that can be.
+    scenario : Scenario
+    known_sky : bool
+        Whether the data are of the scenario's sky.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, one that is given twice, fewer than two, and ``isotropic-sky`` where
+        the sky is not known.
+    """
+    if names is None:
+        names = [name for name in NAMED if known_sky or name != OF_TRUE_SKY]
+    for name in names:
+        if name not in NAMED:
+            raise InputError(f"--priors: no prior '{name}'; {nearest(name, NAMED)}")
+    if len(set(names)) < len(names):
+        raise InputError(f"--priors {','.join(names)}: give each prior once")
+    if len(names) < 2:
+        raise InputError(
+            f"--priors: {len(names)} given, and a comparison needs two or more of "
+            f"{', '.join(NAMED)}"
+        )
+    if OF_TRUE_SKY in names and not known_sky:
+        raise InputError(
+            f"--priors: {OF_TRUE_SKY} takes C_ell of the scenario's sky, which nobody knows of "
+            "measured data; leave it out, or give --truth if the data are of that sky"
+        )
+    return {name: _section(NAMED[name], scenario.prior) for name in names}
+
+
+def _section(named: PriorSection, own: PriorSection) -> PriorSection:
+    """The scenario's own section if it is of the kind of a named one."""
+    if own.model != named.model:
+        return named
+    # isotropic priors differ in where C_ell comes from
+    return own if own.model != "isotropic" or own.origin == named.origin else named

@@ -1,4 +1,10 @@
-"""A scenario: everything that determines a run, as YAML, validated before anything is computed.
+"""Scenarios: read, overridden, validated.
+
+``--set key.path=value``: changing one entry of a tree of keys and values.
+
+What is wrong with a scenario, in one sentence.
+
+A scenario: everything that determines a run, as YAML, validated before anything is computed.
 
 Unknown keys are errors that name the nearest known one. ``to_yaml`` writes the resolved scenario,
 defaults included; running that file again gives the same numbers.
@@ -10,34 +16,137 @@ import os
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
-from lusee_bayes.experiment.overrides import apply_override
-from lusee_bayes.experiment.scenario_errors import one_sentence
-from lusee_bayes.experiment.schema import (
+from lusee_bayes.experiment.instrument_sections import (
     BeamSection,
     FlightSection,
-    Frequency,
+    MonopoleBeamSection,
+    ObservationSection,
+)
+from lusee_bayes.experiment.noise_sections import NoiseSection
+from lusee_bayes.experiment.section import Frequency, OutputSection, Section, Seed
+from lusee_bayes.experiment.sky_sections import (
     GalaxySection,
     IsotropicPriorSection,
     LocalScalesPriorSection,
     LogNormalSection,
-    MonopoleBeamSection,
-    NoiseSection,
-    ObservationSection,
-    OutputSection,
     PriorSection,
-    Section,
-    Seed,
     SkySection,
     SourcesSection,
     SpectralSection,
 )
+
+
+def apply_override(tree: dict[str, Any], override: str) -> None:
+    """Set one entry of ``tree``; list entries by number, as in observation.runs.0.cycles=2.
+
+    InputError, naming the override, if it is not of the form key.path=value or leads nowhere.
+    """
+    key, separator, text = override.partition("=")
+    if not separator or not key:
+        raise InputError(f"--set takes key.path=value, got '{override}'")
+    *parents, last = key.split(".")
+    node: Any = tree
+    for parent in parents:
+        node = _step(node, parent, override)
+    value = parse_yaml(text, f"--set {override}: the value")
+    if isinstance(node, list):
+        node[_position(node, last, override)] = value
+    else:
+        node[last] = value
+
+
+def _step(node: Any, key: str, override: str) -> Any:
+    if isinstance(node, list):
+        return node[_position(node, key, override)]
+    if node.get(key) is None:
+        node[key] = {}
+    if not isinstance(node[key], dict | list):
+        raise InputError(f"--set {override}: '{key}' holds a value, not a section")
+    return node[key]
+
+
+def _position(node: list[Any], key: str, override: str) -> int:
+    if not (key.isascii() and key.isdigit() and len(key) < 10) or int(key) >= len(node):
+        raise InputError(f"--set {override}: '{key}' is not one of the entries 0..{len(node) - 1}")
+    return int(key)
+
+
+def one_sentence(error: ValidationError, source: str, model: type[BaseModel]) -> str:
+    """What was found, what was expected and where, for the first thing that is wrong.
+
+    Parameters
+    ----------
+    error : ValidationError
+        Of pydantic.
+    source : str
+        Where the scenario comes from.
+    model : type
+        The model that it was validated against.
+    """
+    first = error.errors()[0]
+    path, sections = _resolved(first["loc"], model)
+    where = ".".join(path)
+    if first["type"] == "extra_forbidden":
+        known = {name for section in sections for name in section.model_fields}
+        return f"{source}: unknown key '{where}'; {nearest(path[-1], known)}"
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    if first["type"] == "union_tag_invalid":
+        models = first["ctx"]["expected_tags"].replace("'", "").split(", ")
+        got = first["ctx"]["tag"]
+        return f"{source}: {where}.model is '{got}', which is unknown; {nearest(got, models)}{more}"
+    if first["type"] == "missing":
+        return f"{source}: {where} is missing{more}"
+    expected = first["msg"].removeprefix("Value error, ")
+    expected = expected[0].lower() + expected[1:]
+    if first["type"] == "value_error" and isinstance(first["input"], (dict, BaseModel)):
+        return f"{source}: {where}: {expected}{more}" if where else f"{source}: {expected}{more}"
+    if first["type"] in ("model_type", "model_attributes_type", "dict_type"):
+        # pydantic names the class
+        expected = "it should be a section with keys; lusee-bayes keys lists them"
+    # YAML has lists where sections have tuples
+    got = list(first["input"]) if isinstance(first["input"], tuple) else first["input"]
+    return f"{source}: {where} is {got!r}, but {expected}{more}"
+
+
+def _resolved(
+    location: tuple[int | str, ...], model: type[BaseModel]
+) -> tuple[list[str], list[type[BaseModel]]]:
+    """The path as a user writes it, and the section that its last key belongs to, of every kind.
+
+    pydantic puts the ``model`` of a section that comes in several kinds into the path. A key may be
+    meant for another kind than the one that was found: ``sky.fil=X`` is taken for a galaxy's.
+    """
+    path: list[str] = []
+    section: type[BaseModel] | None = model
+    sections = [model]
+    kinds: dict[str, type[BaseModel]] = {}
+    for number, key in enumerate(location):
+        if key in kinds:
+            section, kinds = kinds[str(key)], {}
+            continue
+        path.append(str(key))
+        if isinstance(key, int) or section is None or number == len(location) - 1:
+            continue
+        field = section.model_fields.get(key)
+        found = [] if field is None else _models_in(field.annotation)
+        kinds = {str(m.model_fields["model"].default): m for m in found if len(found) > 1}
+        section, sections = (found[0] if len(found) == 1 else None), found
+    return path, sections
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    """Every section that a field's type names."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models_in(part)]
+
 
 # the scenarios that ship with the package
 FOLDER = resources.files("lusee_bayes.experiment") / "scenarios"

@@ -1,4 +1,9 @@
-"""A scenario's instrument pointed at its sky: all that is fixed before there are data."""
+"""A, S, the sky and what is known of the instrument, from a scenario.
+
+What a scenario's antennas and receivers add to every visibility, whatever the sky.
+
+A scenario's instrument pointed at its sky: all that is fixed before there are data.
+"""
 
 from __future__ import annotations
 
@@ -11,23 +16,85 @@ from jaxtyping import Float, Int
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.emission import background_of
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.schema import PriorSection, SourceSection
-from lusee_bayes.instrument.beams import BeamSource, Monopoles, ProductBeams, Receiver
-from lusee_bayes.instrument.beams.gridded import SAME_FREQUENCY_MHZ
-from lusee_bayes.instrument.calibration import Calibration
+from lusee_bayes.experiment.sky_sections import PriorSection, SourceSection
+from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ, ProductBeams
+from lusee_bayes.instrument.beams.monopoles import Monopoles, Receiver
+from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.ephemeris import BODIES, body_direction
 from lusee_bayes.instrument.instrument import Instrument
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.observation import BODIES, Observation, body_direction
 from lusee_bayes.instrument.pointing import Pointing
+from lusee_bayes.instrument.products import DataLayout, auto_indices
 from lusee_bayes.instrument.source_response import source_response
-from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.sky import BRIGHT_SOURCES, Sky, galactic_unit_vector, kelvin_steradian
-from lusee_bayes.sky.prior_family import PriorFamily
-from lusee_bayes.sky.priors import Prior
+from lusee_bayes.instrument.visibilities import Calibration, Visibilities
+from lusee_bayes.priors.families import PriorFamily
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galactic_unit_vector, kelvin_steradian
+from lusee_bayes.sky.prior import Prior
+from lusee_bayes.sky.sky_source import Sky
+
+
+def background_of(scenario: Scenario, source: BeamSource) -> Float[Array, " products"]:
+    """Visibilities without any sky: ground, antennas, and receivers with their mean noise; in K.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    source : BeamSource
+        Its beams, behind the receivers of the data.
+
+    Raises
+    ------
+    InputError
+        If the scenario's receivers or ground need to know of the beams what these do not say.
+    """
+    background = np.array(source.background(scenario.frequency_mhz))
+    if scenario.noise.regolith is not None:
+        ground_per_kelvin(source, scenario.frequency_mhz)  # refuses what has no ground
+    background[auto_indices(source.n_ports)] += receiver_powers(scenario, source)
+    return background
+
+
+def receiver_powers(scenario: Scenario, source: BeamSource) -> Float[np.ndarray, " ports"]:
+    """Mean noise of every port's receiver in K; zeros where the scenario has none.
+
+    Raises
+    ------
+    InputError
+        If it is given in V^2/Hz, and the beams know no volts.
+    """
+    section, frequency = scenario.noise.receiver, scenario.frequency_mhz
+    if section is None:
+        return np.zeros(source.n_ports)
+    rise = (frequency / section.reference_mhz) ** section.slope
+    if section.power_k is not None:
+        return np.full(source.n_ports, section.power_k * rise)
+    circuit = source.circuit(frequency)
+    if circuit is None:
+        raise InputError(
+            "noise.receiver.power_v2_hz needs antennas that know volts, which are those of a "
+            "response file; give that as beam.file, or use noise.receiver.power_k"
+        )
+    return section.power_v2_hz * rise / circuit.per_kelvin.diagonal().real
+
+
+def ground_per_kelvin(source: BeamSource, frequency_mhz: float) -> Float[Array, " products"]:
+    """Visibilities that each kelvin of the ground's temperature adds, in K per K.
+
+    Raises
+    ------
+    InputError
+        If the beams do not say what the ground emits.
+    """
+    if not hasattr(source, "moon_k"):
+        raise InputError(
+            "noise.regolith needs antennas that receive from the ground, which are those of a "
+            "response file or of a scalar beam file; give one as beam.file, or leave out "
+            "noise.regolith"
+        )
+    warm, cold = (replace(source, moon_k=kelvin) for kelvin in (1.0, 0.0))
+    return np.asarray(warm.background(frequency_mhz)) - np.asarray(cold.background(frequency_mhz))
+
 
 # instants in each piece of a window for the response to a source: antennas see nothing smaller
 # than some degrees, and nothing at the horizon, where a source appears within a window

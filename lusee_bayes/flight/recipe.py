@@ -21,9 +21,7 @@ from lusee_bayes.flight.gain_model import GainModel
 from lusee_bayes.flight.session import BinOrigin, Session
 from lusee_bayes.instrument.averaging import bins_of
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.times import unannounced_leap_seconds
-from lusee_bayes.instrument.timestamps import TO_MIDDLE, Timestamp
-from lusee_bayes.instrument.windows import Windows
+from lusee_bayes.instrument.times import TO_MIDDLE, Timestamp, Windows, unannounced_leap_seconds
 
 
 @dataclass(frozen=True, eq=False)

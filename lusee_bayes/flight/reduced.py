@@ -24,14 +24,11 @@ from lusee_bayes.core.version import __version__
 from lusee_bayes.flight.gain_model import LETTERS, N_COMPONENTS, Curves
 from lusee_bayes.flight.session import AUTOS, N_PRODUCTS, NO_LEVEL, PORTS
 from lusee_bayes.instrument.averaging import binned
-from lusee_bayes.instrument.beams.gridded import SAME_FREQUENCY_MHZ
-from lusee_bayes.instrument.calibration import Calibration
-from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import all_products, labels
-from lusee_bayes.instrument.times import JD_SCALES, utc_of_jd
-from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.instrument.windows import Windows
+from lusee_bayes.instrument.products import DataLayout, all_products, labels
+from lusee_bayes.instrument.times import JD_SCALES, Windows, utc_of_jd
+from lusee_bayes.instrument.visibilities import Calibration, Visibilities
 
 # why a spectrum is not used in a band; the first is that it is
 REASONS = (

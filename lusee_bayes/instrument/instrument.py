@@ -10,11 +10,11 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.beam_operator import BeamOperator
-from lusee_bayes.instrument.beams import Monopoles, ProductBeams, monopole_beams, parameter, placed
-from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.beams.fields import ProductBeams
+from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, placed
+from lusee_bayes.instrument.coupling import BeamOperator, CouplingMatrix
 from lusee_bayes.instrument.pointing import Pointing
+from lusee_bayes.instrument.products import DataLayout
 
 
 class Instrument(eqx.Module):

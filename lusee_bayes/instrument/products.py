@@ -1,19 +1,35 @@
-"""The correlation products of n antennas: their order and their labels.
+"""Products of pairs of antennas, their correlations, and the layout of data.
+
+The correlation products of n antennas: their order and their labels.
 
 Voltages s_i give V_ij = <s_i conj(s_j)>: one real number for each antenna (auto), two for
 each pair (Re, Im). They are ordered and labelled as in luseepy:
 ``00R, 01R, 01I, 02R, 02I, 03R, 03I, 11R, 12R, ... 33R``, n^2 real products in all.
+
+Arrays of measured correlations, as instruments and their software have them.
+
+Names of products, signs of imaginary parts, sites and angles are said in many ways;
+:meth:`.Visibilities.from_arrays` takes them through the functions of this module.
+
+Where each entry of the data vector d belongs: which product, which time.
+
+d is stacked product by product with time running fastest. Samples that are flagged or were
+never taken are not in d at all, so the positions are explicit.
 """
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float, Int, Shaped
 
 from lusee_bayes.core.arrays import Array, as_complex, namespace
+from lusee_bayes.core.checks import Described, is_traced
+from lusee_bayes.core.errors import InputError, nearest
 
 N_ANTENNAS = 4
 
@@ -77,3 +93,352 @@ def to_matrix(
                 imag = products[position[Product(min(i, j), max(i, j), "I")]]
             rows.append(as_complex(real, imag if i < j else -imag))
     return xp.stack(rows).reshape(n, n, *products.shape[1:])
+
+
+# what an imaginary part can be that of, and the sign that turns it into <s_i conj(s_j)>
+CONVENTIONS = {"s_i conj(s_j)": 1.0, "conj(s_i) s_j": -1.0}
+# sites by name: selenographic longitude and latitude in degrees
+SITES = {"LuSEE-Night": (182.258, -23.814)}
+# an auto is real; rounding of 32-bit numbers is below this share of it
+AUTO_TOLERANCE = 1e-5
+NAME = re.compile(r"\s*(\d)\s*[-_x, ]?\s*(\d)\s*([RI]?)\s*", re.IGNORECASE)
+
+
+def real_products(
+    data: Any,
+    products: Any,
+    flags: Any,
+    convention: str,
+    n_antennas: int,
+) -> tuple[Float[np.ndarray, "products times"], Bool[np.ndarray, "products times"]]:
+    """Return the real products of arrays of correlations in the package's order.
+
+    Parameters
+    ----------
+    data : (times, names) array
+        Complex correlations, or real products; NaN, or masked, where a sample is absent.
+    products : sequence of str or None
+        The name of each column; see :meth:`.Visibilities.from_arrays`.
+    flags : (times, names) or (times,) array of bool, optional
+        True where a sample is not to be used.
+    convention : str
+        A key of ``CONVENTIONS``.
+    n_antennas : int
+
+    Returns
+    -------
+    (products, times) array
+        In the unit of the data, 0 where absent.
+    (products, times) array of bool
+        Whether each is absent.
+
+    Raises
+    ------
+    InputError
+        For names that are unknown or given twice, shapes that do not fit, autos that are not real,
+        infinities, and another convention.
+    """
+    masked = np.ma.getmaskarray(data) if isinstance(data, np.ma.MaskedArray) else False
+    data = _numbers(data)
+    if convention not in CONVENTIONS:
+        raise InputError(f"unknown convention '{convention}'; {nearest(convention, CONVENTIONS)}")
+    columns = _columns(products, np.iscomplexobj(data), n_antennas)
+    if data.shape[1] != len(columns):
+        turned = "; transpose them" if data.shape[0] == len(columns) else ""
+        raise InputError(
+            f"the data have shape {data.shape}, expected (times, products) with "
+            f"{len(columns)} products{turned}"
+        )
+    absent = np.isnan(data) | masked | _flags(flags, data.shape)
+    if np.isinf(data[~absent]).any():
+        first = np.argwhere(np.isinf(data) & ~absent)[0]
+        raise InputError(
+            f"the data hold infinity at time {first[0]}, product {first[1]}; flag such samples, or "
+            "put NaN there"
+        )
+    known = {label: number for number, label in enumerate(labels(n_antennas))}
+    values = np.zeros((len(known), len(data)))
+    missing = np.ones(values.shape, dtype=bool)
+    for column, (i, j, part) in enumerate(columns):
+        gone, one = absent[:, column], np.where(absent[:, column], 0.0, data[:, column])
+        sign = CONVENTIONS[convention] * (1.0 if i <= j else -1.0)
+        pair = f"{min(i, j)}{max(i, j)}"
+        parts = {part: one} if part else {"R": one.real, "I": one.imag}
+        if i == j and np.iscomplexobj(data):
+            _require_real(pair, one)
+        for name, numbers in parts.items():
+            label = f"{pair}{name}"
+            if label not in known:
+                continue
+            row = known[label]
+            if not missing[row].all():
+                raise InputError(f"the product {label} is given more than once; name each once")
+            values[row] = numbers if name == "R" else sign * numbers
+            missing[row] = gone
+    return values, missing
+
+
+def _numbers(data: Any) -> np.ndarray:
+    try:
+        data = np.asarray(data)
+        data = data.astype(np.complex128 if np.iscomplexobj(data) else np.float64)
+    except (ValueError, TypeError) as error:
+        raise InputError(
+            f"the data are not an array of numbers: {error}; give (times, products), in K"
+        ) from error
+    if data.ndim != 2 or not data.size:
+        raise InputError(f"the data have shape {data.shape}, expected (times, products)")
+    return data
+
+
+def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int, int, str]]:
+    """Ports and part of each column; the part is empty for complex numbers."""
+    if products is None:
+        ordered = all_products(n_antennas)
+        if is_complex:
+            return [(p.i, p.j, "") for p in ordered if p.part == "R"]
+        return [(p.i, p.j, p.part) for p in ordered]
+    if isinstance(products, str):
+        raise InputError(f"products is '{products}'; give a list with the name of each column")
+    columns: list[tuple[int, int, str]] = []
+    for name in products:
+        found = NAME.fullmatch(name if isinstance(name, str) else "".join(map(str, name)))
+        if not found:
+            raise InputError(
+                f"unknown product '{name}'; name the two ports, such as "
+                + ("'01'" if is_complex else "'01R' and '01I'")
+            )
+        i, j, part = int(found[1]), int(found[2]), found[3].upper()
+        if max(i, j) >= n_antennas:
+            raise InputError(
+                f"the product '{name}' has port {max(i, j)}, but there are {n_antennas} ports "
+                f"(0 to {n_antennas - 1}); give n_antennas if there are more"
+            )
+        if is_complex and part:
+            raise InputError(
+                f"the data are complex and the product is named '{name}'; name the ports alone "
+                f"('{i}{j}'), or give real and imaginary parts as two real columns"
+            )
+        if not is_complex and not part and i != j:
+            raise InputError(
+                f"the data are real and the product is named '{name}'; name the part, '{name}R' "
+                f"or '{name}I'"
+            )
+        if i == j and part == "I":
+            raise InputError(f"there is no product '{name}': an auto is real")
+        columns.append((i, j, part if is_complex else part or "R"))
+        if columns[-1] in columns[:-1]:
+            raise InputError(f"the product '{name}' is given more than once; name each once")
+    return columns
+
+
+def _flags(flags: Any, shape: tuple[int, ...]) -> np.ndarray:
+    if flags is None:
+        return np.zeros(shape, dtype=bool)
+    flags = np.asarray(flags)
+    if flags.dtype.kind not in "biu" or not np.isin(flags, (0, 1)).all():
+        raise InputError(
+            "flags hold other values than true and false; give true where a sample is not to be "
+            "used"
+        )
+    if flags.shape == shape[:1]:
+        flags = flags[:, None]
+    elif flags.shape != shape:
+        raise InputError(
+            f"flags have shape {flags.shape}, expected {shape} as the data, or {shape[:1]}"
+        )
+    return np.broadcast_to(flags.astype(bool), shape)
+
+
+def _require_real(pair: str, auto: np.ndarray) -> None:
+    bad = np.flatnonzero(np.abs(auto.imag) > AUTO_TOLERANCE * np.abs(auto.real))
+    if bad.size:
+        raise InputError(
+            f"the auto {pair} is {auto[bad[0]]:.6g} at time {bad[0]}, but an auto is real; check "
+            "the names and the order of the products"
+        )
+
+
+def site_of(site: Any) -> tuple[float, float]:
+    """Return longitude and latitude in degrees of a pair, or of a site of ``SITES`` by name.
+
+    Raises
+    ------
+    InputError
+        If it is neither.
+    """
+    if isinstance(site, str):
+        known = {name.lower(): place for name, place in SITES.items()}
+        if site.lower() not in known:
+            raise InputError(
+                f"unknown site '{site}'; {nearest(site, SITES)} (or give longitude and latitude in "
+                "degrees)"
+            )
+        return known[site.lower()]
+    try:
+        lon, lat = (float(x) for x in site)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"the site is {site!r}; give selenographic longitude and latitude in degrees, or a "
+            f"name: {', '.join(SITES)}"
+        ) from error
+    return lon, lat
+
+
+def numbers_of_times(name: str, values: Any, n_times: int) -> Float[np.ndarray, " times"]:
+    """Return a finite number for each time. InputError, with the name, if there are others."""
+    try:
+        numbers = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is {values!r}; give a number for each time") from error
+    if numbers.shape != (n_times,) or not np.isfinite(numbers).all():
+        raise InputError(
+            f"{name} has shape {numbers.shape}; give a finite number for each of {n_times} times"
+        )
+    return numbers
+
+
+def runs_of(turntable_deg: Any, n_times: int) -> tuple[np.ndarray, tuple[float, ...]]:
+    """Return the run of each sample, and the turntable angle of each run.
+
+    Parameters
+    ----------
+    turntable_deg : float or (times,) array
+        A new run begins where the angle changes.
+    n_times : int
+
+    Raises
+    ------
+    InputError
+        If there are neither one angle nor as many as times, or they are not finite.
+    """
+    try:
+        angles = np.asarray(turntable_deg, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"turntable_deg is {turntable_deg!r}; give angles in degrees") from error
+    if angles.shape not in ((), (n_times,)) or not np.isfinite(angles).all():
+        raise InputError(
+            f"turntable_deg has shape {angles.shape}; give one finite angle in degrees, or one "
+            f"for each of {n_times} times"
+        )
+    angles = np.broadcast_to(angles, (n_times,))
+    run = np.concatenate([[0], np.cumsum(np.diff(angles) != 0.0)]).astype(np.int64)
+    return run, tuple(angles[np.searchsorted(run, np.arange(run[-1] + 1))].tolist())
+
+
+class DataLayout(Described, eqx.Module):
+    """The product and the time of every entry of d.
+
+    Attributes
+    ----------
+    n_products, n_times : int
+        Size of the full grid.
+    index : (data,) array of int or None
+        Position ``product * n_times + time`` of every entry in the full grid; None if no sample is
+        missing.
+    """
+
+    n_products: int = eqx.field(static=True)
+    n_times: int = eqx.field(static=True)
+    index: Int[Array, " data"] | None = None
+
+    def description(self) -> tuple[str, ...]:
+        grid = self.n_products * self.n_times
+        absent = f", {grid - self.size} absent" if self.index is not None else ""
+        return (f"{self.n_products} products x {self.n_times} times, {self.size} data{absent}",)
+
+    @classmethod
+    def from_flags(cls, flags: Bool[np.ndarray, "products times"]) -> DataLayout:
+        """Return the layout that leaves out every sample whose flag is True.
+
+        Raises
+        ------
+        InputError
+            If all samples are flagged.
+        """
+        flags = np.asarray(flags, dtype=bool)
+        if flags.all():
+            raise InputError(
+                f"all {flags.size} samples are flagged or missing; there is nothing to map"
+            )
+        index = None if not flags.any() else np.flatnonzero(~flags.ravel())
+        return cls(*flags.shape, index)
+
+    @property
+    def size(self) -> int:
+        """Number of entries of d."""
+        return self.n_products * self.n_times if self.index is None else self.index.shape[0]
+
+    @property
+    def product(self) -> np.ndarray:
+        """Number of the product of every entry, shape (data,)."""
+        return self._positions() // self.n_times
+
+    @property
+    def time(self) -> np.ndarray:
+        """Number of the time of every entry, shape (data,)."""
+        return self._positions() % self.n_times
+
+    @property
+    def present(self) -> Bool[Array, "products times"]:
+        """Whether each sample of the grid is in d."""
+        if self.index is None:
+            return np.ones((self.n_products, self.n_times), dtype=bool)
+        return self.scatter(namespace(self.index).ones(self.size, dtype=bool))
+
+    def _positions(self) -> np.ndarray:
+        if self.index is None:
+            return np.arange(self.size)
+        return np.asarray(self.index)
+
+    def require_same(self, other: DataLayout) -> None:
+        """Check that another layout holds the same samples, where both are known.
+
+        Raises
+        ------
+        InputError
+            If it does not.
+        """
+        same = (self.n_products, self.n_times, self.size) == (
+            other.n_products,
+            other.n_times,
+            other.size,
+        )
+        if same and self.index is not None and other.index is not None:
+            same = is_traced(self.index, other.index) or np.array_equal(self.index, other.index)
+        if not same:
+            raise InputError(
+                f"two layouts of {self.size} and {other.size} data hold different samples; build "
+                "both terms for the same observation and flags"
+            )
+
+    def gather(self, grid: Float[Array, "products times *rest"]) -> Float[Array, "data *rest"]:
+        """Return the entries of d, with any trailing axes, of a full grid."""
+        flat = grid.reshape(self.n_products * self.n_times, *grid.shape[2:])
+        return flat if self.index is None else flat[self.index]
+
+    def scatter(self, data: Shaped[Array, "data *rest"]) -> Shaped[Array, "products times *rest"]:
+        """Put the entries of d onto the full grid; missing samples are zero."""
+        rest = data.shape[1:]
+        if self.index is None:
+            return data.reshape(self.n_products, self.n_times, *rest)
+        xp = namespace(data, self.index)
+        flat = xp.zeros((self.n_products * self.n_times, *rest), dtype=data.dtype)
+        if xp is np:
+            flat[self.index] = data
+        else:
+            flat = flat.at[self.index].set(data)
+        return flat.reshape(self.n_products, self.n_times, *rest)
+
+    def by_time(
+        self, data: Float[Array, "data *columns"]
+    ) -> Float[Array, "times products all_columns"]:
+        """Return d with the products of one time together; missing samples are zero."""
+        grid = self.scatter(data)
+        return grid.reshape(*grid.shape[:2], -1).swapaxes(0, 1)
+
+    def from_times(
+        self, grid: Float[Array, "times products all_columns"], shape: tuple[int, ...]
+    ) -> Float[Array, "data *columns"]:
+        """Return the array of this shape that :meth:`by_time` has made ``grid`` of."""
+        return self.gather(grid.swapaxes(0, 1)).reshape(shape)

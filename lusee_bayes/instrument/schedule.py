@@ -1,30 +1,117 @@
-"""Stretches of observing and the samples that they are cut into.
+"""When is observed: runs, cuts, gaps and schedules in files.
+
+Orientations of the Moon, from lunarsky's own coordinate transformation, and on it; the Sun.
+
+Stretches of observing and the samples that they are cut into.
 
 Runs follow one another and are told by their length; the intervals of a schedule have dates, and
 time may pass between them.
+
+Schedules in files: tables of intervals in CSV, and command tables of LuSEE-Night's OpSim.
+
+OpSim (https://github.com/lusee-night/opsim) has its schedules in YAML: ``config/comtable-*.yml``,
+and the same with the states of battery and storage in the logs of its simulator. An entry holds a
+``start`` (MJD, UTC) and a ``mode`` of the spacecraft, which lasts until the start of the next
+entry. In one mode alone, ``science``, the spectrometer takes data (``config/modes.yml`` and
+``devices.yml`` there). Such a table knows of no turntable.
+
+Visibilities on the full grid, where some samples are absent and noise levels are needed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
+from io import StringIO
+from itertools import pairwise
+from pathlib import Path
 from typing import Literal
 
 import astropy.units as u
 import numpy as np
+from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_body_barycentric
 from astropy.time import Time
 from jaxtyping import Bool, Float, Int
+from lunarsky import MCMF
+from scipy.spatial.transform import Rotation as SpatialRotation
 
-from lusee_bayes.core.checks import require_positive
+from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.checks import is_traced, require_positive
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.moon import CYCLE_DAYS
+from lusee_bayes.core.lazy import pandas
+from lusee_bayes.core.reading import naming, parse_yaml, read_text, reading
+from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.instrument.times import (
+    ROUNDING_S,
+    Windows,
     require_ephemeris,
     unannounced_leap_seconds,
     utc_from_text,
 )
-from lusee_bayes.instrument.windows import ROUNDING_S, Windows
+
+# a sidereal month
+CYCLE_DAYS = 27.321661
+# period after which the sky repeats itself in luseepy's engine croissant
+LUSEEPY_MONTH_HOURS = 655.72
+
+
+def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:
+    """Return the rotations that take Galactic unit vectors to MCMF ones.
+
+    The three Galactic axes go through lunarsky's ICRS -> MCMF transformation in one call.
+    """
+    axes = Galactic(CartesianRepresentation(np.eye(3)[:, :, None])).transform_to(ICRS())
+    icrs = ICRS(CartesianRepresentation(axes.cartesian.xyz.value))
+    with unannounced_leap_seconds():
+        turned = icrs.transform_to(MCMF(obstime=times))
+    return np.moveaxis(turned.cartesian.xyz.value, 2, 0)
+
+
+def about_fixed_axis(
+    times: Time, hours: Float[np.ndarray, " times"]
+) -> Float[np.ndarray, "times 3 3"]:
+    """Return the same of a Moon that turns evenly about the axis of the first time.
+
+    Parameters
+    ----------
+    times : (times,) Time
+    hours : (times,) array
+        Since the first one.
+    """
+    angle = 2.0 * np.pi * hours / LUSEEPY_MONTH_HOURS
+    about_z = SpatialRotation.from_rotvec(np.outer(-angle, [0.0, 0.0, 1.0])).as_matrix()
+    return about_z @ mcmf_from_galactic(times[:1])[0]
+
+
+def topocentric_from_mcmf(lon_deg: float, lat_deg: float) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation from MCMF to the East, North and up of a site, its rows."""
+    lon, lat = np.radians(lon_deg), np.radians(lat_deg)
+    up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    east = np.array([-np.sin(lon), np.cos(lon), 0.0])
+    return np.array([east, np.cross(up, east), up])
+
+
+def lean(tilt_deg: tuple[float, float]) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation from East, North and up to the axes of a lander.
+
+    It leans first towards North, about East, then towards East, about North.
+    """
+    east, north = np.radians(tilt_deg)
+    turned = SpatialRotation.from_rotvec([0.0, east, 0.0])
+    turned *= SpatialRotation.from_rotvec([-north, 0.0, 0.0])
+    return turned.inv().as_matrix()
+
+
+def sun_direction(times: Time) -> Float[np.ndarray, "times 3"]:
+    """Return Galactic unit vectors from the Moon's centre to where the Sun's is at the time."""
+    with unannounced_leap_seconds():
+        sun = get_body_barycentric("sun", times, ephemeris="builtin")
+        moon = get_body_barycentric("moon", times, ephemeris="builtin")
+    direction = (sun - moon).xyz.to_value(u.km)
+    galactic = ICRS(CartesianRepresentation(direction)).transform_to(Galactic())
+    vector = galactic.cartesian.xyz.value
+    return (vector / np.linalg.norm(vector, axis=0)).T
 
 
 @dataclass(frozen=True)
@@ -315,3 +402,188 @@ def require_sequence(intervals: Sequence[Interval]) -> None:
 def _seconds_between(first: Time, second: Time) -> float:
     with unannounced_leap_seconds():
         return float((second - first).to_value(u.s))
+
+
+WHAT = "a schedule, a table in CSV or OpSim's in YAML"
+REQUIRED = {"start", "end", "turntable_deg"}
+OPTIONAL = {"duty_cycle", "night_only"}
+# of OpSim, in which data are taken
+OBSERVING = "science"
+
+
+def read_schedule(path: str | Path) -> tuple[Interval, ...]:
+    """Read the intervals of a schedule.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV with the columns ``start``, ``end`` (UTC, ISO) and ``turntable_deg``, and, if they are
+        wanted, ``duty_cycle`` and ``night_only`` (true or false); what follows a # is a comment.
+        Or, if the name ends in .yaml or .yml, a command table of OpSim, whose intervals in the
+        mode ``science`` are taken, with the turntable at zero.
+
+    Returns
+    -------
+    tuple of Interval
+        In order.
+
+    Raises
+    ------
+    InputError
+        With file and row, for a missing column, a bad value, intervals that overlap or are not in
+        order, and a schedule without any.
+    """
+    return _parsed(str(path), read_text(path, WHAT))
+
+
+@lru_cache(maxsize=4)
+def _parsed(path: str, text: str) -> tuple[Interval, ...]:
+    """Channels of several frequencies and estimates of their cost read the same file again."""
+    is_yaml = Path(path).suffix in (".yaml", ".yml")
+    intervals = _of_commands(path, text) if is_yaml else _of_table(path, text)
+    with naming(path):
+        require_sequence(intervals)
+    return intervals
+
+
+def _of_table(path: str, text: str) -> tuple[Interval, ...]:
+    with reading(path, WHAT):
+        table = pandas.read_csv(StringIO(text), dtype=str, comment="#", skipinitialspace=True)
+        if not isinstance(table.index, pandas.RangeIndex):
+            raise ValueError("rows have more entries than the header")
+    table = table.fillna("")
+    if not REQUIRED <= set(table.columns) <= REQUIRED | OPTIONAL:
+        raise InputError(
+            f"{path} has the columns {', '.join(table.columns)}; a schedule has "
+            f"{', '.join(sorted(REQUIRED))}, and may have {' and '.join(sorted(OPTIONAL))}"
+        )
+    return tuple(
+        _interval(f"{path}, row {number}", row)
+        for number, row in enumerate(table.to_dict("records"), start=1)
+    )
+
+
+def _interval(place: str, row: dict[str, str]) -> Interval:
+    numbers = {}
+    for name, default in (("turntable_deg", ""), ("duty_cycle", "1")):
+        try:
+            numbers[name] = float(row.get(name) or default)
+        except ValueError as error:
+            raise InputError(f"{place}: {name} is '{row[name]}', not a number") from error
+    night_only = (row.get("night_only", "").strip() or "false").lower()
+    if night_only not in ("true", "false"):
+        raise InputError(f"{place}: night_only is '{night_only}'; write true or false")
+    return Interval(
+        row["start"], row["end"], **numbers, night_only=night_only == "true", where=place
+    )
+
+
+def _of_commands(path: str, text: str) -> tuple[Interval, ...]:
+    """Every stretch in the mode science."""
+    root = parse_yaml(text, path)
+    if not isinstance(root, dict):
+        raise InputError(
+            f"{path} is no command table of OpSim: expected numbered entries with start and mode; "
+            "a table of intervals is a CSV file, whose name ends otherwise"
+        )
+    entries = [_command(f"{path}, entry {name}", entry) for name, entry in root.items()]
+    for (_, before, _), (place, after, _) in pairwise(entries):
+        if not after > before:
+            raise InputError(
+                f"{place}: start {after} does not come after that of the entry before, {before}; "
+                "sort the entries by their start"
+            )
+    if entries and entries[-1][2] == OBSERVING:
+        raise InputError(
+            f"{entries[-1][0]}: the last entry is in the mode {OBSERVING}, and nothing says when "
+            "it ends; add an entry of another mode"
+        )
+    return tuple(
+        Interval(_date(start), _date(end), where=place)
+        for (place, start, mode), (_, end, _) in pairwise(entries)
+        if mode == OBSERVING
+    )
+
+
+def _command(place: str, entry: object) -> tuple[str, float, str]:
+    """Where an entry is, its start as MJD and its mode."""
+    try:
+        start, mode = float(entry["start"]), str(entry["mode"])  # type: ignore[index]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{place}: a command table of OpSim has a start (a modified Julian date, UTC, as "
+            "61050.8) and a mode in each entry"
+        ) from error
+    with naming(place):
+        require_ephemeris(np.array([start + 2400000.5]))
+    return place, start, mode
+
+
+def _date(mjd: float) -> str:
+    """To the microsecond, which is all that a double holds of it."""
+    with unannounced_leap_seconds():
+        return str(Time(mjd, format="mjd", scale="utc", precision=6).isot)
+
+
+def without_gaps(
+    visibilities: Float[Array, "products times"], layout: DataLayout
+) -> Float[Array, "products times"]:
+    """Return visibilities with a value at every sample, for the noise around them.
+
+    The noise of a sample depends on the antenna temperatures of its ports, and in the exact form
+    on all products of its time. Where one of these is absent, it is interpolated linearly between
+    the samples of the same product before and after it (at the ends the nearest one is taken). A
+    cross that was never measured is zero: its ports are taken to be uncorrelated. The auto of a
+    port that was never used is the mean of the others, and no sample depends on it.
+
+    Parameters
+    ----------
+    visibilities : (products, times) array
+        In K. A sample is absent where it is not in the layout, and its value is 0 (as
+        :meth:`DataLayout.scatter` leaves it) or NaN; a model's values at absent samples are kept.
+    layout : DataLayout
+
+    Returns
+    -------
+    (products, times) array
+
+    Raises
+    ------
+    InputError
+        If an auto is absent at all times, but a product of its port is not.
+    """
+    if layout.index is None or is_traced(visibilities, layout.index):
+        return visibilities
+    values, present = np.array(visibilities), np.asarray(layout.present)
+    absent = ~present & (np.isnan(values) | (values == 0.0))
+    if not absent.any():
+        return visibilities
+    products = all_products(round(np.sqrt(layout.n_products)))
+    times = np.arange(layout.n_times)
+    unused = []
+    for number, product in enumerate(products):
+        gaps = absent[number]
+        if not gaps.any():
+            continue
+        if not gaps.all():
+            values[number, gaps] = np.interp(times[gaps], times[~gaps], values[number, ~gaps])
+        elif product.i != product.j:
+            values[number] = 0.0
+        else:
+            _require_unused(product.i, present)
+            unused.append(number)
+    if unused:
+        autos = [k for k, p in enumerate(products) if p.i == p.j and k not in unused]
+        values[unused] = values[autos].mean(0)
+    return namespace(visibilities).asarray(values)
+
+
+def _require_unused(port: int, present: np.ndarray) -> None:
+    products = all_products(round(np.sqrt(len(present))))
+    for product, there in zip(products, present.any(1), strict=True):
+        if there and port in (product.i, product.j):
+            raise InputError(
+                f"the auto {port}{port}R is absent at all times, and the noise of "
+                f"{product.label} depends on it; give modelled visibilities of all samples, such "
+                "as the signal of a CouplingMatrix without flags"
+            )

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.beams import Monopoles, beams_towards
+from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
 from lusee_bayes.instrument.observation import Observation
 
 

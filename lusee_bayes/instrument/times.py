@@ -1,20 +1,38 @@
-"""Times in UTC, of whatever kind files and users give them."""
+"""Times of data: leap seconds, the ephemeris' reach, windows and what a stamp stands for.
+
+Times in UTC, of whatever kind files and users give them.
+
+The windows over which samples were integrated: what a visibility is the mean of.
+
+A sample has one or more pieces, within each of which its live time is spread evenly: one piece
+where the spectrometer integrated without a gap, or with a duty cycle far faster than the sky turns;
+several where something was left out. The mean over a window is that over its pieces, each with the
+weight of its live time.
+
+What the times of samples are: starts, middles or ends of their windows, or instants.
+
+Times and bounds that were rounded, such as single-precision seconds or Julian dates in one number,
+make windows overlap by as much. Such overlaps are halved between the two samples, and a live time
+that is longer than its window by as little is that of the window.
+"""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import astropy.units as u
 import erfa
 import numpy as np
 from astropy.time import Time
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
+from lusee_bayes.core.checks import Described, require_finite
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.layouts import Attribute, Content
 
@@ -189,3 +207,338 @@ def step_of(times: Time, step_s: float | None) -> float:
         raise InputError("the integration time of a single sample is not known; give step_s")
     with unannounced_leap_seconds():
         return float(np.median(np.abs((times[1:] - times[:-1]).to_value(u.s))))
+
+
+# times of a Julian date in two parts are exact to less than a nanosecond, others to a few of them
+ROUNDING_S = 1e-6
+
+
+@dataclass(frozen=True, repr=False)
+class Windows(Described):
+    """Start, end and live time of every piece of every sample.
+
+    Attributes
+    ----------
+    sample : (pieces,) array of int
+        The sample that each piece belongs to: 0, 1, ... without going back.
+    start_s, end_s : (pieces,) array
+        In seconds from the sample's time.
+    live_s : (pieces,) array
+        What was integrated between them, in seconds.
+
+    Raises
+    ------
+    InputError
+        For a piece that ends before it begins, overlaps the one before it, or was live for longer
+        than it lasts or not at all, and for a sample without a piece.
+    """
+
+    sample: Int[np.ndarray, " pieces"]
+    start_s: Float[np.ndarray, " pieces"]
+    end_s: Float[np.ndarray, " pieces"]
+    live_s: Float[np.ndarray, " pieces"]
+
+    def __post_init__(self):
+        lengths = {x.shape for x in (self.sample, self.start_s, self.end_s, self.live_s)}
+        if len(lengths) > 1 or self.sample.ndim != 1 or not self.sample.size:
+            raise InputError(
+                "sample, start_s, end_s and live_s of windows must be lists of the same length, "
+                f"with at least one piece; got the shapes {sorted(lengths)}"
+            )
+        steps = np.diff(self.sample)
+        if self.sample[0] != 0 or not ((steps == 0) | (steps == 1)).all():
+            raise InputError(
+                "pieces of windows must count the samples 0, 1, ... without going back, with at "
+                "least one piece for each"
+            )
+        for name in ("start_s", "end_s", "live_s"):
+            require_finite(f"{name} of the windows", getattr(self, name))
+        length = self.end_s - self.start_s
+        self._refuse(
+            ~(length > 0.0),
+            "ends {0:g} s from its time, not after its start at {1:g} s; windows need a start and "
+            "then an end",
+            self.end_s,
+            self.start_s,
+        )
+        self._refuse(
+            self.live_s > length + ROUNDING_S,
+            "was live for {0:g} s of a window of {1:g} s; live time cannot be longer than the "
+            "window",
+            self.live_s,
+            length,
+        )
+        self._refuse(
+            ~(self.live_s > 0.0),
+            "has a live time of {0:g} s; leave out samples in which nothing was integrated",
+            self.live_s,
+        )
+        same = np.zeros(len(length), dtype=bool)
+        same[1:] = (steps == 0) & (self.start_s[1:] < self.end_s[:-1] - ROUNDING_S)
+        self._refuse(
+            same,
+            "has a piece that begins at {0:g} s, before the one before it has ended; pieces of a "
+            "window must not overlap",
+            self.start_s,
+        )
+
+    def _refuse(self, wrong: Bool[np.ndarray, " pieces"], text: str, *values: np.ndarray) -> None:
+        if wrong.any():
+            first = int(np.argmax(wrong))
+            what = text.format(*(float(value[first]) for value in values))
+            raise InputError(f"sample {self.sample[first]} {what}")
+
+    @classmethod
+    def whole(
+        cls,
+        start_s: Float[np.ndarray, " samples"],
+        end_s: Float[np.ndarray, " samples"],
+        live_s: Float[np.ndarray, " samples"] | None = None,
+    ) -> Windows:
+        """Return windows of one piece each, live all of the time unless ``live_s`` says less."""
+        live_s = end_s - start_s if live_s is None else live_s
+        return cls(np.arange(len(start_s)), start_s, end_s, live_s)
+
+    def description(self) -> tuple[str, ...]:
+        live, bounds = self.live_per_sample_s, self.bounds_s
+        share = live.sum() / (bounds[:, 1] - bounds[:, 0]).sum()
+        return (
+            f"{self.n_samples} windows in {len(self.sample)} pieces, live for {live.min():g} to "
+            f"{live.max():g} s, {share:.1%} of the time",
+        )
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples."""
+        return int(self.sample[-1]) + 1
+
+    @property
+    def live_per_sample_s(self) -> Float[np.ndarray, " samples"]:
+        """Live time of every sample, in seconds."""
+        return np.add.reduceat(self.live_s, self._first)
+
+    @property
+    def bounds_s(self) -> Float[np.ndarray, "samples 2"]:
+        """Start and end of every sample, in seconds from its time."""
+        last = np.append(self._first[1:], len(self.sample)) - 1
+        return np.stack([self.start_s[self._first], self.end_s[last]], axis=1)
+
+    @property
+    def _first(self) -> Int[np.ndarray, " samples"]:
+        return np.searchsorted(self.sample, np.arange(self.n_samples))
+
+    def require_fitting(self, times: Time, step_s: float) -> None:
+        """Check that windows are those of samples at these times, a step apart.
+
+        Raises
+        ------
+        InputError
+            If there are more or fewer of them, and if one is longer than a step or overlaps the
+            next.
+        """
+        if self.n_samples != len(times):
+            raise InputError(
+                f"there are windows of {self.n_samples} samples for {len(times)} times"
+            )
+        bounds = self.bounds_s
+        length = bounds[:, 1] - bounds[:, 0]
+        if (length > step_s * (1.0 + 1e-9) + ROUNDING_S).any():
+            longest = int(np.argmax(length))
+            raise InputError(
+                f"the window of sample {longest} lasts {length[longest]:g} s, longer than the step "
+                f"of {step_s:g} s from sample to sample; check the bounds, or give the step"
+            )
+        with unannounced_leap_seconds():
+            seconds = (times - times[0]).to_value(u.s)
+        gaps = np.diff(seconds) + bounds[1:, 0] - bounds[:-1, 1]
+        if (gaps < -ROUNDING_S).any():
+            first = int(np.argmax(gaps < -ROUNDING_S))
+            raise InputError(
+                f"the windows of samples {first} and {first + 1} ({times[first].isot[:19]}) "
+                f"overlap by {-gaps[first]:g} s; give each stretch of time to one sample"
+            )
+
+    def select(self, keep: Bool[np.ndarray, " samples"]) -> Windows:
+        """Return the windows of the samples where ``keep`` is True."""
+        here = keep[self.sample]
+        _, sample = np.unique(self.sample[here], return_inverse=True)
+        return Windows(sample, self.start_s[here], self.end_s[here], self.live_s[here])
+
+    def nodes(
+        self, n: int
+    ) -> tuple[Int[np.ndarray, " nodes"], Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
+        """Return instants whose weighted means are those over the windows (Gauss-Legendre).
+
+        Parameters
+        ----------
+        n : int
+            Instants in each piece: exact for polynomials in time up to degree 2 n - 1.
+
+        Returns
+        -------
+        sample : (nodes,) array of int
+            The sample of every instant, growing.
+        offset_s : (nodes,) array
+            Seconds from the sample's time, growing within each sample.
+        weight : (nodes,) array
+            One in total for each sample.
+        """
+        x, w = np.polynomial.legendre.leggauss(n)
+        middle, half = (self.start_s + self.end_s) / 2.0, (self.end_s - self.start_s) / 2.0
+        offset = middle[:, None] + half[:, None] * x
+        share = self.live_s / self.live_per_sample_s[self.sample]
+        weight = share[:, None] * (w / 2.0)
+        return np.repeat(self.sample, n), offset.ravel(), weight.ravel()
+
+
+Timestamp = Literal["start", "middle", "end", "instant"]
+# from the time of a sample to the middle of its window, in lengths of the window
+TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}
+# overlaps up to these are rounding of times: in seconds, and as a share of the step
+ROUNDED_S, ROUNDED_SHARE = 1e-3, 1e-4
+
+
+def stamped(
+    times: Time,
+    timestamp: str,
+    step_s: float,
+    live_s: Float[np.ndarray, " times"] | None = None,
+) -> tuple[Time, Windows | None]:
+    """Return the middles and the windows of samples that last for a step each.
+
+    Parameters
+    ----------
+    times : (times,) Time
+    timestamp : {"start", "middle", "end", "instant"}
+        What they are.
+    step_s : float
+        Length of the windows, in seconds.
+    live_s : (times,) array, optional
+        What was integrated in them, in seconds; all of the time by default.
+
+    Returns
+    -------
+    Time
+        The middles; for instants the times as they are.
+    Windows or None
+        None for instants.
+
+    Raises
+    ------
+    InputError
+        For another timestamp, for instants with live times, and as :class:`.Windows`.
+    """
+    if timestamp == "instant":
+        if live_s is not None:
+            raise InputError(
+                "instants have no live time; say whether the times are the start, middle or end "
+                "of the samples, or leave out the live time"
+            )
+        return times, None
+    if timestamp not in TO_MIDDLE:
+        raise InputError(
+            f"unknown timestamp '{timestamp}'; {nearest(timestamp, [*TO_MIDDLE, 'instant'])}"
+        )
+    with unannounced_leap_seconds():
+        middles = times + TO_MIDDLE[timestamp] * step_s * u.s
+        seconds = (times - times[0]).to_value(u.s)
+    half = np.full(len(seconds), step_s / 2.0)
+    return middles, _windows(seconds, -half, half, step_s, live_s)
+
+
+def bounded(
+    times: Time,
+    bounds: Time,
+    step_s: float | None = None,
+    live_s: Float[np.ndarray, " times"] | None = None,
+) -> tuple[Time, float, Windows]:
+    """Return the middles, the step and the windows of samples whose start and end are known.
+
+    Parameters
+    ----------
+    times : (times,) Time
+        Anywhere within the samples.
+    bounds : (times, 2) Time
+        Start and end of each.
+    step_s : float, optional
+        In seconds; by default the median step from sample to sample.
+    live_s : (times,) array, optional
+        What was integrated, in seconds; all of the time by default.
+
+    Raises
+    ------
+    InputError
+        For a time outside its bounds, without a step for a single sample, and as
+        :class:`.Windows`.
+    """
+    with unannounced_leap_seconds():
+        start = (bounds[:, 0] - times).to_value(u.s)
+        end = (bounds[:, 1] - times).to_value(u.s)
+        middles = times + (start + end) / 2.0 * u.s
+        seconds = (middles - middles[0]).to_value(u.s)
+    length = end - start
+    step = step_of(times, float(length[0]) if step_s is None and len(times) == 1 else step_s)
+    rounding = _rounding(step)
+    outside = (start > rounding) | (end < -rounding)
+    backward = ~(length > 0.0)
+    if (outside & ~backward).any():
+        first = int(np.argmax(outside & ~backward))
+        raise InputError(
+            f"the time of sample {first} ({times[first].isot[:19]}) is not within its bounds, "
+            f"which begin {start[first]:g} s and end {end[first]:g} s from it; give bounds in the "
+            "order of the times"
+        )
+    if step_s is None and step < length.max() <= step + rounding:
+        step = float(length.max())
+    return middles, step, _windows(seconds, -length / 2.0, length / 2.0, step, live_s)
+
+
+def utc_bounds(bounds: Any, n_times: int) -> Time:
+    """Return bounds of any kind of times in UTC.
+
+    Parameters
+    ----------
+    bounds : (times, 2) Time, or array of datetime, datetime64 or str
+
+    Returns
+    -------
+    (times, 2) Time
+
+    Raises
+    ------
+    InputError
+        For another shape, and as :func:`.utc_times`.
+    """
+    bounds = bounds if isinstance(bounds, Time) else np.asarray(bounds)
+    if bounds.shape != (n_times, 2):
+        raise InputError(
+            f"bounds have shape {bounds.shape}, expected ({n_times}, 2): start and end of every "
+            "sample"
+        )
+    try:
+        return utc_times(bounds).reshape(n_times, 2)
+    except InputError as error:
+        raise InputError(f"bounds, taken row by row: {error}") from error
+
+
+def _rounding(step_s: float) -> float:
+    return max(ROUNDED_S, ROUNDED_SHARE * step_s)
+
+
+def _windows(
+    seconds: Float[np.ndarray, " times"],
+    start_s: Float[np.ndarray, " times"],
+    end_s: Float[np.ndarray, " times"],
+    step_s: float,
+    live_s: Float[np.ndarray, " times"] | None,
+) -> Windows:
+    """Windows of one piece each, about ``seconds``, with overlaps by rounding cut off."""
+    overlap = end_s[:-1] - start_s[1:] - np.diff(seconds)
+    cut = np.where((overlap > 0.0) & (overlap <= _rounding(step_s)), overlap / 2.0, 0.0)
+    start_s = start_s + np.append(0.0, cut)
+    end_s = end_s - np.append(cut, 0.0)
+    if live_s is not None:
+        length = end_s - start_s
+        rounded = (live_s > length) & (live_s <= length + _rounding(step_s))
+        live_s = np.where(rounded, length, live_s)
+    return Windows.whole(start_s, end_s, live_s)

@@ -1,4 +1,21 @@
-"""The data set d: visibilities of one frequency with their times, products and flags."""
+"""Visibilities: data of all products and times, calibration, and their file.
+
+Windows of samples in netCDF files, and what files without them say of their times.
+
+``time_bounds`` is that of the CF conventions, for people and other software, and ``live_time`` goes
+with it. The pieces are exact: seconds from the time of their sample. Instants are declared by the
+attribute ``window``. A file with none of these does not say what its times are.
+
+What is left of a spectrometer's spectra in their averages: how many samples, and which gains.
+
+An average over channels and spectra has the radiometer noise of the independent samples of the
+voltages that it is the mean of; its gain is off by the errors of the gain table, which all spectra
+of one level of one port share.
+
+The data set d: visibilities of one frequency with their times, products and flags.
+
+Read the package's own files of visibilities.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +24,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import astropy.units as u
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
+from astropy.time import Time
+from jaxtyping import Bool, Float, Int
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import Array
@@ -24,18 +43,197 @@ from lusee_bayes.core.checks import (
 )
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
+from lusee_bayes.core.formats import read_netcdf
 from lusee_bayes.core.harmonics import lmax_of, n_modes
-from lusee_bayes.core.layouts import require_mhz
+from lusee_bayes.core.layouts import Attribute, Content, Layout, Variable, require_mhz
+from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
-from lusee_bayes.instrument import window_variables
-from lusee_bayes.instrument.beams.receiver import MeasuredReceiver
-from lusee_bayes.instrument.calibration import Calibration
-from lusee_bayes.instrument.correlations import numbers_of_times, real_products, runs_of, site_of
-from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.beams.monopoles import MeasuredReceiver
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import N_ANTENNAS, labels
-from lusee_bayes.instrument.times import step_of, utc_times
-from lusee_bayes.instrument.timestamps import bounded, stamped, utc_bounds
+from lusee_bayes.instrument.products import (
+    N_ANTENNAS,
+    DataLayout,
+    labels,
+    numbers_of_times,
+    real_products,
+    runs_of,
+    site_of,
+)
+from lusee_bayes.instrument.times import (
+    JD_SCALES,
+    Windows,
+    bounded,
+    stamped,
+    step_of,
+    unannounced_leap_seconds,
+    utc_bounds,
+    utc_of_datetimes,
+    utc_of_jd,
+    utc_times,
+)
+
+PIECES = ("piece_sample", "piece_start_s", "piece_end_s", "piece_live_s")
+VARIABLES = {
+    "time_bounds": Variable(("time", 2), "time", optional=True),
+    "live_time": Variable(("time",), optional=True),
+    "piece_sample": Variable(("piece",), "integer", low=0.0, optional=True),
+    **{name: Variable(("piece",), optional=True) for name in PIECES[1:]},
+}
+ATTRIBUTES = {"window": Attribute("text", choices=("mean", "instant"), optional=True)}
+# times for people are written to the millisecond
+EYE = {"units": "milliseconds since 1970-01-01", "calendar": "proleptic_gregorian"}
+ENCODING = EYE | {"dtype": "int64"}
+EYE_S = 0.01
+
+
+def coordinate(observation: Observation) -> tuple[Any, ...]:
+    """Return the coordinate ``time`` of a Dataset, for the reader's eye."""
+    attrs = {} if observation.windows is None else {"bounds": "time_bounds"}
+    return ("time",), _datetimes(observation.times), attrs, ENCODING
+
+
+def window_variables(observation: Observation) -> dict[str, tuple[Any, ...]]:
+    """Return the variables of a Dataset that hold the windows of an observation, if it has any."""
+    windows = observation.windows
+    if windows is None:
+        return {}
+    with unannounced_leap_seconds():
+        bounds = observation.times[:, None] + windows.bounds_s * u.s
+    values = (windows.sample, windows.start_s, windows.end_s, windows.live_s)
+    return {
+        "time_bounds": (("time", "bounds"), _datetimes(bounds), {}, ENCODING),
+        "live_time": (("time",), windows.live_per_sample_s, {"units": "s"}),
+        "piece_sample": (("piece",), values[0]),
+        **{
+            name: (("piece",), value, {"units": "s"})
+            for name, value in zip(PIECES[1:], values[1:], strict=True)
+        },
+    }
+
+
+def _datetimes(times: Time) -> np.ndarray:
+    return times.isot.astype("datetime64[ms]")
+
+
+def attributes(observation: Observation) -> dict[str, str]:
+    """Return the attribute of a file that says whether its samples are means or instants."""
+    return {"window": "instant" if observation.windows is None else "mean"}
+
+
+def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, bool]:
+    """Return what a file says of the windows of its samples.
+
+    Parameters
+    ----------
+    found : Content
+        Of a layout with ``VARIABLES`` and ``ATTRIBUTES``, and an attribute ``step_s``.
+    times : (times,) Time
+        Of its samples.
+
+    Returns
+    -------
+    Time
+        The middles of the windows; the times as they are where there are none.
+    Windows or None
+    bool
+        Whether the file says what its times are.
+
+    Raises
+    ------
+    InputError
+        For variables that belong together and are not all there, or contradict each other, and
+        as :class:`.Windows`.
+    """
+    here, said = found.arrays, found.values.get("window")
+    pieces = [name for name in PIECES if name in here]
+    given = [*pieces, *(name for name in ("time_bounds", "live_time") if name in here)]
+    if said == "instant" and given:
+        raise InputError(
+            f"the attribute window says that the samples are instants, and {given[0]} gives "
+            "them windows; leave out one of them"
+        )
+    if pieces and len(pieces) < len(PIECES):
+        lost = next(name for name in PIECES if name not in here)
+        raise InputError(f"there is {pieces[0]}, but no {lost}; pieces of windows need both")
+    if pieces:
+        windows = Windows(*(here[name] for name in PIECES))
+        if "time_bounds" in here:
+            _require_same(windows, times, here["time_bounds"])
+        return times, windows, True
+    if "time_bounds" in here:
+        bounds = utc_of_datetimes(here["time_bounds"])
+        live_s = here.get("live_time")
+        middles, _, windows = bounded(times, bounds, found.values["step_s"], live_s)
+        return middles, windows, True
+    if given or said == "mean":
+        what = "live_time" if given else "the attribute window = 'mean'"
+        raise InputError(
+            f"there is {what}, but no time_bounds; add the start and the end of every sample"
+        )
+    return times, None, said == "instant"
+
+
+def _require_same(windows: Windows, times: Time, there: np.ndarray) -> None:
+    bounds = utc_of_datetimes(there)
+    with unannounced_leap_seconds():
+        seconds = (bounds - times[:, None]).to_value(u.s)
+    if windows.n_samples != len(times):
+        return  # an Observation says so
+    off = np.abs(seconds - windows.bounds_s).max(axis=1)
+    if (off > EYE_S).any():
+        first = int(np.argmax(off > EYE_S))
+        raise InputError(
+            f"time_bounds and the pieces of sample {first} differ by {off[first]:g} s; change "
+            "both, or leave out the variables of the pieces"
+        )
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Samples behind every time, and what is not known about its gains.
+
+    Attributes
+    ----------
+    n_averaged : (times,) array
+        Independent samples of complex voltages behind every time: bandwidth times live time, less
+        what unequal weights and overlapping channels cost.
+    gain_names : tuple of str
+        Errors of the gain table, such as "M0 PC1": level, port and component.
+    gain_port : (errors,) array of int
+        The port of each.
+    gain_slope : (errors, times) array
+        By how much a port's power gain is above the table's, relative to it, where the error is
+        one prior standard deviation; 0 at times when the port has another level.
+    lost : float
+        Share of the spectra that rules of the reduction flagged.
+
+    Raises
+    ------
+    InputError
+        If lengths do not fit, or something is not finite or positive.
+    """
+
+    n_averaged: Float[np.ndarray, " times"]
+    gain_names: tuple[str, ...] = ()
+    gain_port: Int[np.ndarray, " errors"] | None = None
+    gain_slope: Float[np.ndarray, "errors times"] | None = None
+    lost: float = 0.0
+
+    def __post_init__(self):
+        require_positive("the number of samples averaged", self.n_averaged)
+        n, times = len(self.gain_names), len(self.n_averaged)
+        if (self.gain_port is None) != (n == 0) or (self.gain_slope is None) != (n == 0):
+            raise InputError("errors of the gain table need names, ports and slopes")
+        if n:
+            require_shape("gain_port", self.gain_port, (n,))
+            require_shape("gain_slope", self.gain_slope, (n, times))
+            require_finite("gain_slope", self.gain_slope)
+
+    def select(self, keep: Bool[np.ndarray, " times"]) -> Calibration:
+        """Return that of the times where ``keep`` is True."""
+        slope = None if self.gain_slope is None else self.gain_slope[:, keep]
+        return Calibration(self.n_averaged[keep], self.gain_names, self.gain_port, slope, self.lost)
+
 
 LOADS = ("load_ohm_real", "load_ohm_imag")
 # what to do where there is no file of them
@@ -257,7 +455,7 @@ class Visibilities(Described):
             "flag": (("product", "time"), ~np.asarray(self.layout.present)),
             "run": (("time",), observation.run),
             "turntable_deg": (("run_number",), np.array(observation.turntable_deg)),
-            **window_variables.variables(observation),
+            **window_variables(observation),
         }
         if self.truth is not None:
             variables["truth"] = (("mode",), np.asarray(self.truth), {"units": "K"})
@@ -272,7 +470,7 @@ class Visibilities(Described):
             variables,
             coords={
                 "product": list(self.labels),
-                "time": window_variables.coordinate(observation),
+                "time": coordinate(observation),
             },
             attrs={
                 "format": formats.VISIBILITIES,
@@ -280,7 +478,7 @@ class Visibilities(Described):
                 "lon_deg": observation.lon_deg,
                 "lat_deg": observation.lat_deg,
                 "step_s": observation.step_s,
-                **(window_variables.attributes(observation) if self.says_window else {}),
+                **(attributes(observation) if self.says_window else {}),
                 "lusee_bayes_version": __version__,
             },
         )
@@ -301,3 +499,98 @@ class Visibilities(Described):
         with replacing(path) as partial:
             self.to_dataset().assign_attrs(attrs or {}).to_netcdf(partial, engine="h5netcdf")
         return user_path(path)
+
+
+# what a file of visibilities holds
+LAYOUT = Layout(
+    "visibilities",
+    {
+        "product": Variable(("product",), "text"),
+        "visibility": Variable(("product", "time"), finite=False, unit="K"),
+        "flag": Variable(("product", "time"), "boolean"),
+        "jd1": Variable(("time",)),
+        "jd2": Variable(("time",)),
+        "run": Variable(("time",), "integer", low=0.0),
+        "turntable_deg": Variable(("run_number",)),
+        **VARIABLES,
+        "truth": Variable(("mode",), optional=True, unit="K"),
+        # the receivers' loads ZL, where they are known
+        "load_frequency_mhz": Variable(
+            ("load_frequency",), low=0.0, grows=True, optional=True, unit="MHz"
+        ),
+        **{name: Variable(("load_frequency", "port", "port_2"), optional=True) for name in LOADS},
+    },
+    {
+        "frequency_mhz": Attribute(low=0.0, unit="MHz"),
+        "lon_deg": Attribute(low=-360.0, high=360.0),
+        "lat_deg": Attribute(low=-90.0, high=90.0),
+        "step_s": Attribute(low=0.0),
+        **ATTRIBUTES,
+        **JD_SCALES,
+    },
+)
+
+
+def read_visibilities(path: str | Path) -> Visibilities:
+    """Read a file that :meth:`Visibilities.write` has written.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    Visibilities
+
+    Raises
+    ------
+    InputError
+        If the file is missing or of another kind, holds NaN that is not flagged, or has nothing
+        but flagged samples.
+    """
+    require_file(path, "data", HINT)
+    found = read_netcdf(path, formats.VISIBILITIES, LAYOUT, HINT)
+    here = found.arrays
+    n, products = round(np.sqrt(found.sizes["product"])), tuple(map(str, here["product"]))
+    if products != labels(n):
+        raise InputError(
+            f"{path} has products {', '.join(products)}; expected {', '.join(labels(n))}"
+        )
+    flags = here["flag"]
+    values = np.where(flags, 0.0, here["visibility"])
+    require_finite(f"{path}: visibility (where not flagged)", values)
+    if here["run"].max() >= found.sizes["run_number"]:
+        raise InputError(
+            f"{path}: run numbers go up to {here['run'].max()}, and turntable_deg has "
+            f"{found.sizes['run_number']} runs"
+        )
+    with naming(path):
+        layout = DataLayout.from_flags(flags)
+        utc = utc_of_jd(found)
+        times, windows, says_window = read_windows(found, utc)
+        observation = Observation(
+            found.values["lon_deg"],
+            found.values["lat_deg"],
+            times,
+            here["run"],
+            tuple(here["turntable_deg"].tolist()),
+            found.values["step_s"],
+            windows=windows,
+        )
+        return Visibilities(
+            layout.gather(values),
+            layout,
+            observation,
+            found.values["frequency_mhz"],
+            here.get("truth"),
+            _receiver(path, here),
+            says_window,
+        )
+
+
+def _receiver(path: str | Path, here: dict[str, np.ndarray]) -> MeasuredReceiver | None:
+    names = ("load_frequency_mhz", *LOADS)
+    if not set(names) <= set(here):
+        return None
+    frequencies, real, imaginary = (here[name] for name in names)
+    return MeasuredReceiver(str(path), frequencies, real + 1j * imaginary)

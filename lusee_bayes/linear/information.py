@@ -1,4 +1,6 @@
-"""The log-likelihood of data as a quadratic form in the sky.
+"""What data say of the sky, as a quadratic form.
+
+The log-likelihood of data as a quadratic form in the sky.
 
 ::
 
@@ -8,6 +10,8 @@
 for any reference sky m0. It has the size of the sky, however many data there are. With a prior it
 gives the posterior, with those of other frequencies a joint one. m0 is chosen near the posterior
 mean: for m0 = 0 the terms are 1e10 times larger than their sum.
+
+The information of data about some of the unknowns, the others integrated out.
 """
 
 from __future__ import annotations
@@ -39,6 +43,7 @@ from lusee_bayes.core.linalg import (
     cholesky,
     gram_matrix,
     precise_residual,
+    scaled,
     solve_lower,
 )
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
@@ -46,7 +51,7 @@ from lusee_bayes.linear.normal_matrix import has_structure, is_within_times, nor
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.linear.solver import CONVERGENCE, MAX_REFINEMENTS
 from lusee_bayes.noise.covariance import Covariance, Factor
-from lusee_bayes.sky.priors import Prior
+from lusee_bayes.sky.prior import Prior
 
 
 class Information(Described, eqx.Module):
@@ -329,3 +334,49 @@ def _condition(
         + here.n_data * np.log(2.0 * np.pi)
     )
     return u, xp.asarray(log_evidence), moved
+
+
+def integrated_out(
+    information: Information, n: int, variance: Float[Array, " others"]
+) -> Information:
+    """Write ln p(d) as a function of the first unknowns, the others integrated out.
+
+    With b ~ N(0, D) for the others, and K = M_bb + D^-1, ::
+
+        M' = M_aa - M_ab K^-1 M_ba,    v' = v_a - M_ab K^-1 v_b
+
+    Parameters
+    ----------
+    information : Information
+        Of all unknowns.
+    n : int
+        How many unknowns are kept.
+    variance : (others,) array
+        D of the others, in K^2, positive.
+
+    Returns
+    -------
+    Information
+        Of n unknowns.
+
+    Raises
+    ------
+    InputError
+        If ``variance`` has another length.
+    """
+    others = information.n_modes - n
+    require_shape("the variance", variance, (others,))
+    xp = namespace(information)
+    here = information.recentred(xp.concatenate([information.reference[:n], xp.zeros(others)]))
+    scale = xp.sqrt(variance)
+    lower = cholesky(scaled(here.matrix[n:, n:], scale) + xp.eye(others))
+    across = solve_lower(lower, scale[:, None] * here.matrix[n:, :n], transpose=False)
+    pull = solve_lower(lower, (scale * here.vector[n:])[:, None], transpose=False)
+    return Information(
+        here.matrix[:n, :n] - across.T @ across,
+        here.vector[:n] - (across.T @ pull)[:, 0],
+        here.reference[:n],
+        xp.asarray(here.misfit - (pull**2).sum()),
+        xp.asarray(here.log_det + 2.0 * xp.log(xp.diagonal(lower)).sum()),
+        here.n_data,
+    )

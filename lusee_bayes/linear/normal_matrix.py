@@ -1,41 +1,237 @@
 """A^T N^-1 A without A: from the beams and Fourier sums over time.
 
+Sums over times of weights, pairs of functions and exp(i q phi): all of time in A^T N^-1 A.
+
+::
+
+    F_c,jk(q) = sum_t w_c(t) u_j(t) u_k(t) exp(i q phi(t)),    q = -2 lmax .. 2 lmax
+
+They are the only part of a normal matrix whose cost grows with the number of samples, and a small
+part of its cost.
+
+A^T W A of the samples at one turntable angle, from beams and Fourier sums over time.
+
+The equations are those of :mod:`.normal_matrix`; here is the arithmetic that takes the time.
+
+A^T N^-1 A without A: from the beams and Fourier sums over time.
+
 With c_lm(t) = sum_j u_j(t) beta_j,lm exp(i m phi(t)), beta_lm = W_lm + i W_l,-m (coupling.py), a
 visibility is Re sum_m conj(c_lm) (a_lm + i a_l,-m), and for noise that does not couple times ::
 
     sum_t w(t) c_lm conj(c'_l'm') = sum_jk beta_j,lm conj(beta'_k,l'm') F_jk(m - m') = P,
     sum_t w(t) c_lm c'_l'm'       = sum_jk beta_j,lm beta'_k,l'm' F_jk(m + m')       = Q,
 
-with F the sums of :mod:`time_sums`. The four parts of the matrix follow from P + Q and P - Q.
+with F the sums of :mod:`.normal_matrix`. The four parts of the matrix follow from P + Q and P - Q.
 Noise that couples different times is whitened in order of time, a few rows of A at once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
+from itertools import pairwise
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 
-from lusee_bayes.core.arrays import Array, compiled, namespace
+from lusee_bayes.core.arrays import Array, as_complex, compiled, namespace, placed, scan
 from lusee_bayes.core.checks import is_traced, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import Rotation
+from lusee_bayes.core.harmonics import Rotation, mode_numbers
 from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, mirrored, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_about_pole
-from lusee_bayes.linear.one_angle import of_one_angle, places
-from lusee_bayes.linear.time_sums import CHUNK
 from lusee_bayes.noise.covariance import (
     Covariance,
     DiagonalCovariance,
     LowRankUpdate,
     TimeBandedCovariance,
+    TimeBandedFactor,
     TimeBlockCovariance,
 )
-from lusee_bayes.noise.covariance.time_banded import TimeBandedFactor
+
+# times that are summed at once: it bounds the memory
+CHUNK = 512
+
+
+def time_sums(
+    weights: Float[Array, "weights times"],
+    azimuth: Float[Array, " times"],
+    functions: Float[Array, "times functions"],
+    lmax: int,
+) -> Complex[Array, "weights functions functions q"]:
+    """Compute F for every pair of functions of time.
+
+    Parameters
+    ----------
+    weights : (weights, times) array
+        w_c(t), in 1/K^2 where they are inverse variances.
+    azimuth : (times,) array
+        phi(t), in radians.
+    functions : (times, functions) array
+        u_j(t).
+    lmax : int
+        Highest order m of either beam.
+
+    Returns
+    -------
+    (weights, functions, functions, 4 lmax + 1) complex array
+        The last axis counts q from -2 lmax to 2 lmax. In the unit of ``weights``.
+    """
+    n = functions.shape[1]
+    left, right = np.triu_indices(n)
+    n_chunks = -(-azimuth.shape[0] // CHUNK)
+    missing = n_chunks * CHUNK - azimuth.shape[0]
+
+    xp = namespace(weights, azimuth, functions)
+
+    def chunked(x: Array) -> Array:
+        padded = xp.pad(x, ((0, missing), *((0, 0),) * (x.ndim - 1)))
+        return padded.reshape(n_chunks, CHUNK, *x.shape[1:])
+
+    def add(total, part):
+        w, phi, u = part
+        pairs = u[:, left] * u[:, right]
+        angle = phi[:, None] * np.arange(2.0 * lmax + 1.0)[None]
+        phases = xp.concatenate([xp.cos(angle), xp.sin(angle)], axis=1)
+        weighted = (w.T[:, None] * pairs.T[None]).reshape(-1, CHUNK)
+        return total + weighted @ phases, None
+
+    start = xp.zeros((weights.shape[0] * len(left), 2 * (2 * lmax + 1)))
+    parts = (chunked(weights.T), chunked(azimuth), chunked(functions))
+    sums, _ = scan(xp, add, start, parts)
+    cosine, sine = xp.split(sums.reshape(weights.shape[0], len(left), -1), 2, axis=-1)
+    positive = as_complex(cosine, sine)
+    full = xp.concatenate([positive[..., :0:-1].conj(), positive], axis=-1)
+    place = np.zeros((n, n), dtype=int)
+    place[left, right] = place[right, left] = np.arange(len(left))
+    return xp.take(full, place, axis=1)
+
+
+# strips of orders where they are compiled: more save products with zeros
+N_STRIPS = 6
+
+
+@compiled
+def of_one_angle(
+    by_order: Float[Array, "orders beams degrees"],
+    weights: Float[Array, "..."],
+    azimuth: Float[Array, " times"],
+    functions: Float[Array, "functions times"],
+    n_products: int,
+) -> Float[Array, "modes modes"]:
+    """The lower triangle of their part in the mean-pole frame; modes as :func:`places` has them."""
+    n = by_order.shape[0]
+    beams = by_order.reshape(n, n_products, -1, 2, n).swapaxes(2, 3)
+    f = time_sums(weights.reshape(-1, azimuth.shape[0]), azimuth, functions.T, n - 1)
+    return _from_sums(beams, f.reshape(*weights.shape[:-1], *f.shape[1:]))
+
+
+def _from_sums(
+    beams: Float[Array, "orders products 2 functions degrees"], f: Complex[Array, "..."]
+) -> Float[Array, "modes modes"]:
+    """The matrix of beams (W_lm, W_l,-m) and Fourier sums, one strip of orders after the other.
+
+    Only columns of orders up to the strip's own last one, and rows of degrees from its first one,
+    are computed; the others are mirror images, or zero. Modes come in the order of
+    :func:`places`, so that a strip is one block on and below the diagonal.
+    """
+    xp, n = namespace(beams, f), beams.shape[0]
+    # of every mode: degree, order, and whether it is a_l,-m
+    ell, m = (x[_by_order(n - 1)] for x in mode_numbers(n - 1))
+    m, s = np.abs(m), (m < 0).astype(int)
+    whole = xp.zeros((len(m),) * 2)
+    n_strips = n if xp is np else min(N_STRIPS, n)
+    strips = list(pairwise(np.linspace(0, n, n_strips + 1).astype(int).tolist()))
+
+    def put(strip: tuple[int, int], whole: Array) -> Array:
+        first, end = strip
+
+        def add(_, number):
+            return None, _rows_of_order(number, beams, f, first, end)
+
+        _, rows = scan(xp, add, None, np.arange(first, end))
+        start, stop = np.searchsorted(m, (first, end))
+        row = ((m - first) * 2 + s) * (n - first) + ell - first
+        column = (s * end + m) * n + ell
+        rows = rows.reshape(-1, rows.shape[-1])[row[start:stop][:, None], column[:stop][None]]
+        return placed(whole, (slice(start, stop), slice(stop)), rows)
+
+    for strip in strips:
+        whole = put(strip, whole)
+    return whole
+
+
+def places(lmax: int) -> Int[np.ndarray, " modes"]:
+    """Rows of the packed modes: by growing ``|m|``, for each first the a_lm, then the a_l,-m."""
+    return np.argsort(_by_order(lmax))
+
+
+@lru_cache(maxsize=4)
+def _by_order(lmax: int) -> Int[np.ndarray, " modes"]:
+    ell, m = mode_numbers(lmax)
+    return np.lexsort((ell, m < 0, np.abs(m)))
+
+
+def _rows_of_order(
+    m: Array,
+    beams: Float[Array, "orders products 2 functions degrees"],
+    f: Complex[Array, "..."],
+    first: int,
+    end: int,
+) -> Float[Array, "rows columns"]:
+    """Rows a_lm, then a_l,-m, of one order; columns a_l'm', then a_l',-m', of orders below end.
+
+    Rows of degrees from ``first``; columns of all degrees, with zeros where there is no mode.
+    """
+    xp, n, others = namespace(beams, f), beams.shape[0], np.arange(end)
+    difference = xp.take(f, m - others + 2 * (n - 1), axis=-1)
+    total = xp.take(f, m + others + 2 * (n - 1), axis=-1)
+    plus, minus = _weighted((total + difference) / 2.0, (total - difference) / 2.0, beams[:end])
+    real, imaginary = own = beams[m][..., first:].swapaxes(0, 1)
+    # real and imaginary parts of complex products by products of real matrices
+    both = xp.concatenate([xp.stack([real, -imaginary], 1), xp.stack([imaginary, real], 1)], -1)
+    both = both.reshape(-1, 2 * own.shape[-1]).T
+    # (rows, orders, degrees) of either
+    u, v = ((both @ x).swapaxes(0, 1) for x in (plus, minus))
+    r = n - first
+    u, v = u.reshape(2 * r, -1), v.reshape(2 * r, -1)
+    return xp.concatenate([xp.concatenate([u[:r], -v[r:]], 1), xp.concatenate([u[r:], v[:r]], 1)])
+
+
+def _weighted(
+    even: Complex[Array, "..."],
+    odd: Complex[Array, "..."],
+    beams: Float[Array, "orders products 2 functions degrees"],
+) -> list[Float[Array, "orders parts degrees"]]:
+    """(P + Q) / 2 and (P - Q) / 2 without the row's own beam, real and imaginary parts.
+
+    With the other beam W + i W', and F(m + m') + F(m - m') = 2 even, their difference 2 odd::
+
+        (P + Q) / 2 = even W + i odd W',    (P - Q) / 2 = -odd W - i even W'.
+    """
+    xp, (n_orders, n_products, _, n_functions, n) = namespace(even, beams), beams.shape
+    factors = [
+        xp.stack([xp.stack([even.real, -odd.imag]), xp.stack([even.imag, odd.real])]),
+        xp.stack([xp.stack([-odd.real, even.imag]), xp.stack([-odd.imag, -even.real])]),
+    ]
+    if even.ndim == 5:
+        # part, other part, product, other product, function, other function, order
+        factors = [x.transpose(6, 2, 0, 4, 3, 1, 5) for x in factors]
+        factors = [x.reshape(n_orders, n_products * 2 * n_functions, -1) for x in factors]
+        return [x @ beams.reshape(n_orders, -1, n) for x in factors]
+    beams = beams.reshape(n_orders, n_products, -1, n)
+    factors = [x.transpose(5, 2, 0, 3, 1, 4).reshape(*beams.shape[:3], -1) for x in factors]
+    if xp is np:
+        products = [x @ beams for x in factors]
+    else:  # XLA multiplies many small matrices a sixth as fast as it adds these terms
+        products = [
+            sum(x[..., q, None] * beams[:, :, None, q] for q in range(beams.shape[2]))
+            for x in factors
+        ]
+    return [x.reshape(n_orders, -1, n) for x in products]
 
 
 def normal_matrix(coupling: Coupling, noise: Covariance) -> Float[Array, "modes modes"]:

@@ -1,4 +1,6 @@
-"""One posterior for positive skies of several frequencies, by Gauss and Newton.
+"""One posterior for positive skies of several frequencies.
+
+One posterior for positive skies of several frequencies, by Gauss and Newton.
 
 With the exponents phi_f = sum_c s_fc a_c + r_f of :mod:`.positive_skies`, ::
 
@@ -7,8 +9,16 @@ With the exponents phi_f = sum_c s_fc a_c + r_f of :mod:`.positive_skies`, ::
 About given exponents m_f is linear, m_f + W_f (phi - phi_f), and what the data of a channel say of
 phi is a quadratic form: W^T M W, W^T v. So a round is a joint posterior as :mod:`.joint` finds it,
 of maps without unit. The step to its mean is halved until E falls, and rounds are repeated until a
-step would gain nothing. Meanwhile A and tilt of the fields may be learned (:mod:`.field_laws`). The
-last posterior is the Gaussian about the mode, its evidence Laplace's.
+step would gain nothing. Meanwhile A and tilt of the fields may be learned.
+The last posterior is the Gaussian about the mode, its evidence Laplace's.
+
+The positive sky of one channel, from the joint posterior of the fields.
+
+Laws of the fields of positive skies, learned from the large scales of all channels.
+
+Learning takes twenty rounds of :mod:`.positive_joint`. A and tilt are those of a power law, of
+which modes up to a low ell tell nearly all: those above are integrated out, with the power of the
+template.
 """
 
 from __future__ import annotations
@@ -18,25 +28,27 @@ from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import sum_over_m
+from lusee_bayes.core.harmonics import n_modes, per_mode, power_spectrum, sum_over_m
 from lusee_bayes.core.linalg import inverse_from_cholesky, symmetric_product
-from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.amplitudes import Patterns
+from lusee_bayes.linear.information import Information, integrated_out
 from lusee_bayes.linear.joint import (
+    ChannelSky,
     ComponentSums,
+    channel_sky,
     component_posterior,
+    paired,
     residual_lower,
     summed,
 )
-from lusee_bayes.linear.joint_skies import channel_sky, paired
-from lusee_bayes.linear.patterns import Patterns
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.sky.field_laws import FieldLaws
-from lusee_bayes.sky.positive_skies import PositiveSkies
+from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 # found when a round moves all unknowns together by less than this, in standard deviations, and no
@@ -338,3 +350,118 @@ def _descended(
             return trial
         part /= 2.0
     return here
+
+
+# draws whose fields are on the grid at once
+CHUNK = 32
+
+
+def positive_sky(
+    mode: PositiveMode,
+    channel: int,
+    information: Information,
+    spread: Float[np.ndarray, "pairs modes modes"],
+    draws: Float[np.ndarray, "n fields modes"],
+    key: PRNGKeyArray,
+) -> ChannelSky:
+    """Compute the sky of one channel.
+
+    Its mean is the sky of the mean exponent, and draws are those of exponents' draws: all are
+    positive on the grid, but for the point sources. The covariance is W C W^T of the exponent's C.
+
+    Parameters
+    ----------
+    mode : PositiveMode
+    channel : int
+        Number of the channel.
+    information : Information
+        Of the channel's data, in K.
+    spread : (pairs, modes, modes) array
+        Covariance of the fields as packed by :func:`.paired`.
+    draws : (n, fields, modes) array
+        Draws of the fields.
+    key : PRNGKeyArray
+        For draws of residuals and fluxes. Give the same key for all channels of a run.
+
+    Returns
+    -------
+    ChannelSky
+        In K.
+    """
+    skies, exponent = mode.skies, mode.exponents[channel]
+    relative = linearised(skies, channel, information, exponent)
+    found = on_host(channel_sky(mode.prior, channel, relative, mode.fields, spread, draws, key))
+    beside = diffuse_part(skies, channel, information)
+    slope = skies.jacobian(channel, exponent)
+    covariance = beside.whole_covariance(symmetric_product(slope @ found.covariance, slope.T))
+    mean = beside.whole_sky(skies.modes(channel, found.mean))
+    shape = len(draws), len(beside.patterns)
+    flux_key = jax.random.fold_in(jax.random.fold_in(key, channel), 1)
+    z = np.asarray(jax.random.normal(flux_key, shape, dtype=jnp.float64))
+    drawn = np.empty((len(draws), len(mean)))
+    for first in range(0, len(draws), CHUNK):
+        here = slice(first, first + CHUNK)
+        drawn[here] = skies.modes(channel, np.asarray(found.draws[here]))
+    whole = on_host(information)
+    return ChannelSky(mean, covariance, beside.whole_skies(drawn, z), whole.chi2(mean))
+
+
+# highest ell of the maps that laws are learned from
+COARSE_LMAX = 16
+
+
+def learn_laws(
+    skies: PositiveSkies,
+    channels: Channels,
+    *,
+    lmax_fields: int,
+    report: Callable[[int, str], None] | None = None,
+) -> FieldLaws:
+    """Learn C_ell of all fields and residuals, by the maximum of the evidence.
+
+    Parameters
+    ----------
+    skies : PositiveSkies
+    channels : Channels
+        Their data.
+    lmax_fields : int
+        Highest ell of the exponents while laws are learned, at least that of the maps then.
+    report : callable, optional
+        Told the number of every round, and how far it moved.
+
+    Raises
+    ------
+    InputError
+        As :func:`.find_joint_mode`.
+    """
+    lmax = min(skies.lmax, COARSE_LMAX)
+    coarse = skies.coarser(lmax, lmax_fields)
+    parts = _large_scales(skies, channels, n_modes(lmax))
+    mode = find_joint_mode(coarse, FieldLaws.of(coarse), parts, learn=True, report=report)
+    return mode.laws
+
+
+def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsInMemory:
+    """What all channels say of the first modes."""
+    names = ("matrix", "vector", "reference", "misfit", "log_det", "n_data")
+
+    def large(channel: int, information: Information) -> dict[str, np.ndarray]:
+        found = on_host(information)
+        if found.n_modes > n:
+            found = integrated_out(found, n, _small_scales(skies, channel)[n:])
+        return {name: np.asarray(getattr(found, name)) for name in names}
+
+    shapes = dict(zip(names, ((n, n), (n,), (n,), (), (), ()), strict=True))
+    found = channels.each(large, shapes)
+    return ChannelsInMemory(
+        tuple(
+            Information(*(np.asarray(found[name][k]) for name in names))
+            for k in range(len(skies.levels))
+        )
+    )
+
+
+def _small_scales(skies: PositiveSkies, channel: int) -> Float[np.ndarray, " modes"]:
+    """The template's power in every mode, with its sources'."""
+    template = skies.modes(channel, np.zeros(skies.n_fields))
+    return per_mode(power_spectrum(template) + power_spectrum(skies.sources[channel]).sum(0))

@@ -32,7 +32,7 @@ from lusee_bayes.core.linalg import gram_matrix, solve_lower
 from lusee_bayes.instrument.coupling import Coupling
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import Covariance, Factor
-from lusee_bayes.sky.priors import Prior
+from lusee_bayes.sky.prior import Prior
 
 FORMS = ("map", "data", "root")
 

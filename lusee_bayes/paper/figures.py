@@ -12,11 +12,17 @@ from matplotlib.figure import Figure
 
 from lusee_bayes.core.harmonics import lmax_of
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.instrument.beams import HemisphereGrid
+from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.paper.claims import FREQUENCIES, SHOWN_FREQUENCIES, Cases, frequency_case
-from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, orthographic
-from lusee_bayes.report.figures.mollweide import mollweide
-from lusee_bayes.report.figures.taper import shown, taper_fwhm_deg
+from lusee_bayes.report.figures.drawing import (
+    BLUE,
+    DIVERGING,
+    GREY,
+    mollweide,
+    orthographic,
+    shown,
+    taper_fwhm_deg,
+)
 
 # the paper's colours by group, of lightness different enough for colour-blind readers; the lines
 # within a group differ in style

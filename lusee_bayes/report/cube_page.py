@@ -7,13 +7,12 @@ from pathlib import Path
 from lusee_bayes.core.checks import counted
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_json
-from lusee_bayes.linear.fit import stands_out
-from lusee_bayes.report import head, html
-from lusee_bayes.report.cube_explorer import cube_explorer
-from lusee_bayes.report.flight_section import SECTION, flight_section, is_flight
-from lusee_bayes.report.run_details import details
-from lusee_bayes.report.unknowns_section import cube_unknowns
-from lusee_bayes.results.cube_fit import N_TESTS
+from lusee_bayes.judge.chi2 import stands_out
+from lusee_bayes.judge.cube_fit import N_TESTS
+from lusee_bayes.report import html
+from lusee_bayes.report.explorer import cube_explorer
+from lusee_bayes.report.html import details
+from lusee_bayes.report.sections import SECTION, cube_unknowns, flight_section, is_flight
 from lusee_bayes.results.saved import (
     CHANNEL_SUMMARY,
     COVERAGE,
@@ -99,13 +98,13 @@ def cube_page(folder: Path, name: str) -> str:
         title,
         [
             html.contents(sections),
-            head.verdict(summary["level"], summary["verdict"]),
-            head.doubts(folder / "summary.json", summary),
-            head.unmapped(folder / "summary.json", summary),
-            head.about(folder, channel_words),
+            html.verdict(summary["level"], summary["verdict"]),
+            html.doubts(folder / "summary.json", summary),
+            html.unmapped(folder / "summary.json", summary),
+            html.about(folder, channel_words),
             *(html.section(*anchors[name], *inside) for name, inside in parts.items()),
             *([flight_section(folder)] if is_flight(folder) else []),
-            html.section(*SECTIONS[-2], head.downloads(folder), head.citation(folder)),
+            html.section(*SECTIONS[-2], html.downloads(folder), html.citation(folder)),
             html.section(*SECTIONS[-1], *details(folder, summary)),
         ],
     )

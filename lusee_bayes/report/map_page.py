@@ -9,13 +9,12 @@ import xarray as xr
 
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_table
-from lusee_bayes.linear.fit import probability
-from lusee_bayes.linear.levels import LEVELS, NAMES
-from lusee_bayes.report import head, html
+from lusee_bayes.judge.chi2 import probability
+from lusee_bayes.judge.coverage import LEVELS, NAMES
+from lusee_bayes.report import html
 from lusee_bayes.report.explorer import explorer
-from lusee_bayes.report.flight_section import SECTION, flight_section, is_flight
-from lusee_bayes.report.run_details import details
-from lusee_bayes.report.unknowns_section import map_unknowns
+from lusee_bayes.report.html import details
+from lusee_bayes.report.sections import SECTION, flight_section, is_flight, map_unknowns
 from lusee_bayes.results.finished_runs import FinishedRun
 from lusee_bayes.results.saved import COVERAGE, DIAGNOSIS, POINTING, SOURCES
 
@@ -58,16 +57,16 @@ def map_page(folder: Path, name: str) -> str:
         title,
         [
             html.contents(sections),
-            head.verdict(found.attrs["level"], found.attrs["verdict"]),
+            html.verdict(found.attrs["level"], found.attrs["verdict"]),
             *_mistakes(folder, summary),
-            head.doubts(folder / "summary.json", summary),
-            head.about(folder, f"{summary['frequency_mhz']:g} MHz"),
+            html.doubts(folder / "summary.json", summary),
+            html.about(folder, f"{summary['frequency_mhz']:g} MHz"),
             html.section(*SECTIONS[0], *_map(folder, summary, found)),
             html.section(*SECTIONS[1], *_scales(folder, run)),
             *([flight_section(folder)] if flight else []),
             html.section(*SECTIONS[2], *_data(folder, summary, found)),
             html.section(*SECTIONS[3], *_numbers(folder, summary)),
-            html.section(*SECTIONS[4], head.downloads(folder), head.citation(folder)),
+            html.section(*SECTIONS[4], html.downloads(folder), html.citation(folder)),
             html.section(*SECTIONS[5], *details(folder, summary)),
         ],
     )

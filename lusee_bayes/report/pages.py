@@ -10,9 +10,9 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import read_manifest, recover, replacing
 from lusee_bayes.core.layouts import Layout
 from lusee_bayes.core.reading import read_json
+from lusee_bayes.report.comparison_page import priors_page
 from lusee_bayes.report.cube_page import cube_page
 from lusee_bayes.report.map_page import map_page
-from lusee_bayes.report.priors_page import priors_page
 from lusee_bayes.report.sample_page import sample_page
 
 REPORT = "report.html"

@@ -8,9 +8,9 @@ import numpy as np
 
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_json, read_table
-from lusee_bayes.report import head, html
-from lusee_bayes.report.run_details import details
-from lusee_bayes.results.convergence import CRITERIA, FAR, FEW, warnings_of
+from lusee_bayes.report import html
+from lusee_bayes.report.html import details
+from lusee_bayes.results.draws import CRITERIA, FAR, FEW, warnings_of
 from lusee_bayes.results.saved import CHECK, SAMPLING, SUMMARY_TABLE, VALIDATION
 
 # name, text for those who do not see it, caption
@@ -80,9 +80,9 @@ def sample_page(folder: Path, name: str) -> str:
         f"{sampling['mean_acceptance']:.2f}."
     )
     reasons = warnings_of(table, sampling)
-    kind = head.TENSE if reasons else head.GOOD
+    kind = html.TENSE if reasons else html.GOOD
     if worst > FAR or sampling["divergences"] > FEW * sampling["chains"] * sampling["draws"]:
-        kind = head.BAD
+        kind = html.BAD
     sections = [("summary", "Summary"), ("pictures", "Pictures")]
     sections += [("files", "Files and citation"), ("run", "The run")]
     parts = [html.section("summary", "Summary", html.table(header, map(_short, rows)))]
@@ -102,12 +102,12 @@ def sample_page(folder: Path, name: str) -> str:
             html.contents(sections),
             html.paragraph(" ".join([*reasons[:1], verdict, *reasons[1:]]), kind),
             html.paragraph(CRITERIA, "threshold"),
-            head.doubts(folder / "sampling.json", sampling),
-            head.about(folder, f"draws of the program {sampling['program']}"),
+            html.doubts(folder / "sampling.json", sampling),
+            html.about(folder, f"draws of the program {sampling['program']}"),
             *parts,
             html.section("pictures", "Pictures", *present),
             html.section(
-                "files", "Files and citation", head.downloads(folder), head.citation(folder)
+                "files", "Files and citation", html.downloads(folder), html.citation(folder)
             ),
             html.section("run", "The run", *details(folder, sampling)),
         ],

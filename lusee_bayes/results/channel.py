@@ -1,7 +1,15 @@
-"""The posterior over the sky at one frequency: what every kind of run has in common.
+"""The posterior over the sky at one frequency, and what is known of it.
+
+What is known of a channel besides its posterior.
+
+The posterior over the sky at one frequency: what every kind of run has in common.
 
 A map is one channel, a cube several; samples and the paper's cases stand beside one. It is made of
-an information with its covariance here, or of a posterior with its model (:mod:`.map_channel`).
+an information with its covariance here, or of a posterior with its model (:mod:`.claims`).
+
+The channel of a posterior with its model at hand: that of a map of one frequency.
+
+How far a map is from a known truth, by latitude and at some multipoles.
 """
 
 from __future__ import annotations
@@ -16,17 +24,75 @@ from jaxtyping import Float, Shaped
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import Described, extent
 from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, power_spectrum
-from lusee_bayes.experiment.plausibility import about_information
-from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.metrics import (
+from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.judge.chi2 import (
+    ChiSquare,
     correlation,
     ell_cross,
+    expected_chi2,
+    highest_altitude,
     signal_to_noise,
 )
-from lusee_bayes.linear.pixel_variance import pixel_std
-from lusee_bayes.results.coverage import Counts, Coverage
-from lusee_bayes.results.observed import Observed
-from lusee_bayes.results.unknowns import UnknownsReport
+from lusee_bayes.judge.coverage import Counts, Coverage, latitudes
+from lusee_bayes.judge.plausibility import about_information
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.posterior import pixel_std
+from lusee_bayes.results.draws import deviations, doubts, posterior_draws
+from lusee_bayes.results.unknowns import Unknowns, UnknownsReport
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What is known of a channel besides its posterior: for :func:`channel_of_information`.
+
+    Attributes
+    ----------
+    frequency_mhz : float
+    prior_std : (modes,) array
+        Of the channel's own prior, in K.
+    truth : (modes,) array or None
+    highest_altitude : (pixels,) array
+    n_missing, rounds : int
+    instrument : ChiSquare
+        What no sky explains of the channel's own data.
+    doubts : tuple of str
+    unknowns : Unknowns or None
+        Receivers, ground and gain table, where the model has them.
+    """
+
+    frequency_mhz: float
+    prior_std: Float[np.ndarray, " modes"]
+    truth: Float[np.ndarray, " modes"] | None
+    highest_altitude: Float[np.ndarray, " pixels"]
+    n_missing: int
+    rounds: int
+    instrument: ChiSquare
+    doubts: tuple[str, ...] = ()
+    unknowns: Unknowns | None = None
+
+    @classmethod
+    def of(
+        cls,
+        experiment: Experiment,
+        inference: Inference,
+        instrument: ChiSquare,
+        unknowns: Unknowns | None = None,
+    ) -> Observed:
+        """Of an experiment, and what no sky explains of its data."""
+        data, nside = experiment.data, experiment.scenario.map_nside
+        return cls(
+            experiment.scenario.frequency_mhz,
+            np.sqrt(np.asarray(experiment.setup.prior.variance())),
+            None if data.truth is None else np.asarray(data.truth),
+            highest_altitude(data.observation, nside),
+            data.n_missing,
+            inference.rounds,
+            instrument,
+            doubts(experiment, inference),
+            unknowns,
+        )
+
 
 # numbers of a channel that a file keeps as attributes
 NUMBERS = (
@@ -74,7 +140,7 @@ class ChannelResult(Described):
         Of the data under the model, sky included: a chi^2 distribution of ``n_data`` degrees of
         freedom. NaN for a channel of a joint posterior, which has no model of its own.
     instrument_chi2, instrument_chi2_expected : float
-        Of the channel's own data, what no sky explains (:mod:`.split`). NaN for a map of its own,
+        Of the channel's own data, what no sky explains (:mod:`.chi2`). NaN for a map of its own,
         whose diagnostics have it.
     refinement : float
         Last correction of the mean, in standard deviations.
@@ -292,3 +358,98 @@ def channel_of_information(
 
 def _array(values: Float[Array, " modes"] | None) -> Float[np.ndarray, " modes"] | None:
     return None if values is None else np.asarray(values)
+
+
+def channel_of_posterior(
+    experiment: Experiment,
+    inference: Inference,
+    covariance: Float[np.ndarray, "modes modes"],
+    *,
+    n_draws: int = 0,
+    judged: Inference | None = None,
+) -> ChannelResult:
+    """The channel of a posterior over harmonic coefficients.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    inference : Inference
+        The posterior, and the model of the data.
+    covariance : (modes, modes) array
+        In K^2.
+    n_draws : int
+        How many draws of the posterior to keep.
+    judged : Inference, optional
+        The model that predicts the data and its posterior, where earlier data were there.
+    """
+    scenario, data, posterior = experiment.scenario, experiment.data, inference.posterior
+    judged, found = inference if judged is None else judged, ()
+    prior_variance = np.asarray(inference.model.prior.variance())
+    std, width = np.sqrt(np.diagonal(covariance)), pixel_std(covariance, scenario.map_nside)
+    fraction = np.divide(std**2, prior_variance, out=np.zeros(len(std)), where=prior_variance > 0)
+    mean = np.asarray(posterior.mean)
+    truth = None if data.truth is None else np.asarray(data.truth)
+    if truth is not None:
+        found = Counts.of_pixels(width, truth - mean, deviations(experiment, posterior)).coverage()
+    return ChannelResult(
+        frequency_mhz=scenario.frequency_mhz,
+        mean=mean,
+        std=std,
+        prior_std=np.sqrt(prior_variance),
+        prior_fraction=mean_over_m(fraction),
+        pixel_std=width,
+        highest_altitude=highest_altitude(data.observation, scenario.map_nside),
+        draws=posterior_draws(experiment, posterior, n_draws),
+        truth=truth,
+        independent=None,
+        log_evidence=float(posterior.log_evidence),
+        information_bits=float(posterior.information_bits()),
+        chi2=float(inference.model.chi2(posterior.mean, data.data)),
+        chi2_expected=expected_chi2(judged.posterior, inference.model.n_data),
+        chi2_model=float(judged.model.chi2(judged.posterior.mean, data.data))
+        + float(judged.posterior.prior_chi2()),
+        refinement=float(posterior.refinement),
+        n_data=inference.model.n_data,
+        n_missing=data.n_missing,
+        rounds=inference.rounds,
+        doubts=(
+            *doubts(experiment, inference),
+            *about_information(float(posterior.information_bits())),
+        ),
+        coverage=found,
+    )
+
+
+# at which SNR is told
+ELLS = (5, 10, 20, 30)
+
+
+def errors_by_latitude(channel: ChannelResult) -> list[dict[str, float | str]]:
+    """By latitude: rms error in K, and the width of error bars over the sky's brightness.
+
+    Parameters
+    ----------
+    channel : ChannelResult
+        With its truth.
+    """
+    truth, mean = (modes_to_map(m, channel.nside) for m in (channel.truth, channel.mean))
+    return [
+        {
+            "name": name,
+            "rms_error_k": float(np.sqrt(((mean - truth)[inside] ** 2).mean())),
+            "std_over_sky": float(channel.pixel_std[inside].mean() / truth[inside].mean()),
+        }
+        for name, inside in latitudes(channel.nside).items()
+    ]
+
+
+def snr_at_some_ell(channel: ChannelResult) -> dict[int, float]:
+    """SNR_ell at 5, 10, 20 and 30, as far as the map goes.
+
+    Parameters
+    ----------
+    channel : ChannelResult
+        With its truth.
+    """
+    snr = channel.snr()
+    return {ell: float(snr[ell]) for ell in ELLS if ell < len(snr)}

@@ -1,6 +1,14 @@
-"""Draws of a posterior, which of them a scenario's seed stands for, and what is doubtful."""
+"""Draws of a posterior, and whether draws can be trusted.
+
+Draws of a posterior, which of them a scenario's seed stands for, and what is doubtful.
+
+Whether draws can be trusted: what is wanted of chains, and what they fall short of.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -10,9 +18,9 @@ from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.linear.parameter_draws import draws_with_parameters
+from lusee_bayes.judge.coverage import N_DRAWS
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.results.coverage import N_DRAWS
+from lusee_bayes.priors.learning import draws_with_parameters
 
 # what the seed is folded with for posterior draws, and for those that coverage is compared with
 DRAWS, COMPARED = 1, 8
@@ -28,7 +36,7 @@ def posterior_draws(
 ) -> Float[np.ndarray, "draws modes"]:
     """Draw the sky.
 
-    Where the prior was learned, its parameters are drawn, too (:mod:`.parameter_draws`); not for
+    Where the prior was learned, its parameters are drawn, too (:mod:`.learning`); not for
     data that do not fit, which would not let them be uncertain.
 
     Parameters
@@ -80,3 +88,52 @@ def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
     if inference.unsettled:
         found.append(inference.unsettled)
     return tuple(found)
+
+
+# R-hat and effective sizes a chain that are enough (Vehtari et al. 2021); an R-hat far from it, and
+# the share of diverged draws that is
+AGREE, PER_CHAIN, FAR, FEW = 1.01, 100, 1.05, 0.01
+CRITERIA = (
+    f"Wanted: R-hat of at most {AGREE:g}, effective sizes of {PER_CHAIN} for each chain, no "
+    f"divergences. Bad: R-hat above {FAR:g}, or more than {FEW:.0%} of the draws diverged."
+)
+
+
+def warnings_of(table: Mapping[str, np.ndarray], sampling: Mapping[str, Any]) -> list[str]:
+    """Why draws are not to be trusted yet, and what to do; empty if there is no reason.
+
+    Parameters
+    ----------
+    table : mapping
+        Columns of summary.csv: quantity, r_hat, ess_bulk, ess_tail.
+    sampling : mapping
+        sampling.json.
+    """
+    found = []
+    names, r_hat = table["quantity"], np.nan_to_num(table["r_hat"], nan=-np.inf, posinf=np.inf)
+    above = int((r_hat > AGREE).sum())
+    if above:
+        furthest = int(np.argmax(r_hat))
+        found.append(
+            f"Not converged: R-hat is above {AGREE:g} for {above} of {len(names)} quantities, most "
+            f"for {names[furthest]} ({r_hat[furthest]:.3f}). Raise --draws."
+        )
+    least = PER_CHAIN * sampling["chains"]
+    for column, what in (("ess_bulk", "bulk"), ("ess_tail", "tail")):
+        if column not in table:
+            continue
+        size = np.nan_to_num(table[column], nan=np.inf)
+        few = int((size < least).sum())
+        if few:
+            worst = int(np.argmin(size))
+            found.append(
+                f"The {what} effective size is below {least} for {few} of {len(names)} quantities, "
+                f"least for {names[worst]} ({size[worst]:.0f}): raise --draws."
+            )
+    if sampling["divergences"]:
+        found.append(
+            f"{sampling['divergences']} trajectories diverged: the steps are too long where the "
+            "posterior is narrow. Raise --warmup; if that does not help, write the program in "
+            "coordinates in which its posterior is wide."
+        )
+    return found

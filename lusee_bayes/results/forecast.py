@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.linear.metrics import ell_cross
+from lusee_bayes.judge.chi2 import ell_cross
 
 AS_GIVEN = "as given"
 

@@ -1,4 +1,11 @@
-"""A posterior map at one frequency, with what is needed to judge it."""
+"""A posterior map at one frequency, with what is needed to judge it.
+
+Fluxes of the point sources beside a map.
+
+Where a map's prior comes from, in words and numbers.
+
+A posterior map at one frequency, with what is needed to judge it.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +14,7 @@ from pathlib import Path
 from textwrap import wrap
 
 import jax
+import numpy as np
 import pandas as pd
 import xarray as xr
 
@@ -16,25 +24,133 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages, peak_memory_gb
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.diagnosis import Diagnosis, diagnose
-from lusee_bayes.experiment.experiment import Experiment, explained
-from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.experiment import Experiment, explained, infer
+from lusee_bayes.experiment.instrument_terms import beam_rms_difference
+from lusee_bayes.experiment.model import true_values
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.terms import beam_rms_difference
 from lusee_bayes.flight.reduced import Reduced
-from lusee_bayes.linear.fit import LEVELS, RULE
-from lusee_bayes.linear.metrics import effective_resolution_deg
-from lusee_bayes.linear.residuals import residuals
-from lusee_bayes.linear.updating import composed, deviation_model
-from lusee_bayes.results.channel import ChannelResult
+from lusee_bayes.judge.chi2 import LEVELS, RULE, effective_resolution_deg
+from lusee_bayes.judge.residuals import residuals
+from lusee_bayes.linear.amplitudes import template_amplitudes
+from lusee_bayes.linear.model import composed, deviation_model
+from lusee_bayes.results.channel import ChannelResult, channel_of_posterior
 from lusee_bayes.results.diagnostics import diagnostics
-from lusee_bayes.results.fluxes import flux_lines, flux_table
-from lusee_bayes.results.map_channel import channel_of_posterior
-from lusee_bayes.results.pointing import PointingReport, pointing_report
-from lusee_bayes.results.prior_words import prior_sentence, prior_summary
 from lusee_bayes.results.saved import JUDGED
-from lusee_bayes.results.unknowns import UnknownsReport, unknowns_report
+from lusee_bayes.results.unknowns import (
+    PointingReport,
+    UnknownsReport,
+    pointing_report,
+    unknowns_report,
+)
 from lusee_bayes.results.updatable import Updatable, read_updatable
+from lusee_bayes.sky.galaxy import kelvin_steradian
+from lusee_bayes.systematics.sky_unknowns import PointSources
+
+
+def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
+    """Posterior of every source's flux in Jy and in K sr, with its prior and, if known, its truth.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        With sources that are not ignored.
+    inference : Inference
+        Of these data alone.
+
+    Returns
+    -------
+    DataFrame
+        A row for each source, or block of it. ``above_horizon``: whether it is ever up; if not,
+        its flux is known from the prior only.
+    """
+    setup, data = experiment.setup, experiment.data
+    sources = next(s for s in inference.systematics if isinstance(s, PointSources))
+    amplitudes = template_amplitudes(
+        inference.model, inference.posterior, data.data, sources.templates()
+    )
+    prior_std = np.asarray(sources.std())
+    mean = np.asarray(sources.mean()) + prior_std * amplitudes.mean
+    std = prior_std * amplitudes.std
+    jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
+    truth = true_values(setup) if data.truth is not None else {}
+    rows, at = [], 0
+    for source in sources.sources:
+        true = np.broadcast_to(truth.get(source.site, np.nan), source.n_blocks)
+        for block, up in enumerate(source.seen()):
+            row = {
+                "source": source.name,
+                "block": block,
+                "above_horizon": bool(up),
+                "flux_jy": mean[at] * jansky,
+                "std_jy": std[at] * jansky,
+                "flux_k_sr": mean[at],
+                "std_k_sr": std[at],
+                "prior_jy": float(source.mean) * jansky,
+                "prior_std_jy": float(source.std) * jansky,
+            }
+            rows.append(row if data.truth is None else row | {"true_jy": true[block] * jansky})
+            at += 1
+    return pd.DataFrame(rows)
+
+
+def flux_lines(fluxes: pd.DataFrame) -> list[str]:
+    """One line for every source, or block of it."""
+    lines = []
+    for row in fluxes.to_dict("records"):
+        name = row["source"] if row["block"] == 0 else f"{row['source']} ({row['block']})"
+        text = f"{name}: {row['flux_jy']:.4g} +- {row['std_jy']:.2g} Jy"
+        if not row["above_horizon"]:
+            text += ", the prior's: it is never above the horizon"
+        lines.append(text)
+    return lines
+
+
+def prior_sentence(experiment: Experiment) -> str:
+    """The prior's model, where its C_ell comes from and, if it was learned, its parameters.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    """
+    section, learned = experiment.scenario.prior, experiment.learned
+    rows = [] if learned is None else learned.as_rows()
+    found = ", ".join(f"{r['name']} {r['value']:.2f} +- {r['std']:.2f}" for r in rows)
+    return f"Prior {section.model}, C_ell {section.origin}{': ' if found else ''}{found}."
+
+
+def prior_summary(experiment: Experiment) -> dict[str, object]:
+    """What summary.json says of the prior.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    """
+    learned = experiment.learned
+    return {
+        "prior": prior_sentence(experiment),
+        "prior_parameters": [] if learned is None else learned.as_rows(),
+        # the parameters integrated out, too
+        "log_evidence_learned": None if learned is None else learned.log_evidence,
+    }
+
+
+def joint_prior_sentence(scenario: Scenario) -> str:
+    """Which prior the skies of a joint posterior have.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of joint channels.
+    """
+    section, kept = scenario.spectral, f"prior.model={scenario.prior.model} is not used"
+    if section.model == "positive":
+        return (
+            f"Prior spectral.model=positive: the embedded template times the exponential of "
+            f"{', '.join(section.fields)}, their C_ell learned from these data; {kept}."
+        )
+    return f"Prior spectral.model={section.model}, C_ell of the scenario's own skies; {kept}."
+
 
 DOES_NOT_FIT = LEVELS[-1]
 

@@ -13,15 +13,17 @@ from typing import Any
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.progress import peak_memory_gb
 from lusee_bayes.core.version import versions
-from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.experiment import Experiment, infer
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.linear.held_out import HeldOut, held_out
-from lusee_bayes.linear.split import Split
-from lusee_bayes.results.channel import ChannelResult
-from lusee_bayes.results.errors import errors_by_latitude, snr_at_some_ell
-from lusee_bayes.results.map_channel import channel_of_posterior
-from lusee_bayes.results.prior_words import prior_sentence
+from lusee_bayes.judge.chi2 import Split
+from lusee_bayes.judge.residuals import HeldOut, held_out
+from lusee_bayes.results.channel import (
+    ChannelResult,
+    channel_of_posterior,
+    errors_by_latitude,
+    snr_at_some_ell,
+)
+from lusee_bayes.results.map_result import prior_sentence
 
 # a difference of two evidences of which each is good to one or two
 CLEAR = 3.0

@@ -13,8 +13,8 @@ from lusee_bayes.core.progress import peak_memory_gb
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
-from lusee_bayes.results.convergence import warnings_of
-from lusee_bayes.sampling.uncertainty import (
+from lusee_bayes.results.draws import warnings_of
+from lusee_bayes.sampling.mode import (
     INTERVAL,
     pixel_interval_of_draws,
     pixel_mean_of_draws,
@@ -22,8 +22,8 @@ from lusee_bayes.sampling.uncertainty import (
     sky_quantities,
     summary,
 )
-from lusee_bayes.sky.landmarks import LANDMARKS
-from lusee_bayes.systematics.base import SKY
+from lusee_bayes.sky.galaxy import LANDMARKS
+from lusee_bayes.systematics.systematic import SKY
 
 SAMPLES, CHAINS = "samples.nc", "chains"
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
-from lusee_bayes.linear.fit import LEVELS
-from lusee_bayes.linear.levels import NAMES
+from lusee_bayes.judge.chi2 import LEVELS
+from lusee_bayes.judge.coverage import NAMES
 
 MODES = Variable(("mode",))
 WIDTHS = Variable(("mode",), low=0.0)

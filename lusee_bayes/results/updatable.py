@@ -20,7 +20,7 @@ from lusee_bayes.core.reading import reading
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.saved import HINT, UPDATABLE
-from lusee_bayes.sky.priors import DensePrior, HarmonicPrior, Prior
+from lusee_bayes.sky.prior import DensePrior, HarmonicPrior, Prior
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lusee_bayes.linear.levels import LEVELS
+from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.results.sample_result import SampleResult
-from lusee_bayes.sampling.calibration import Ranks
-from lusee_bayes.sampling.validation import Check, Comparison
+from lusee_bayes.sampling.validation import Check, Comparison, Ranks
 
 
 @dataclass(frozen=True)

@@ -1,17 +1,44 @@
-"""A comparison: finished map runs side by side."""
+"""Runs, or priors, side by side.
+
+A comparison: finished map runs side by side.
+
+One data set mapped under several priors, and which of them it prefers.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import write_csv
+from lusee_bayes.experiment.data_files import Data, read_data
+from lusee_bayes.experiment.experiment import Experiment, observed, with_truth
+from lusee_bayes.experiment.rounds import about_sky, learned_prior, named_priors
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
+from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.linear.information import Information
 from lusee_bayes.report.comparison_page import comparison_page
-from lusee_bayes.report.figures import comparison as comparison_figures
-from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, read_runs
-from lusee_bayes.runs.folder import FIGURES, Output, Run, RunKind, run_folder, write_run
-from lusee_bayes.runs.origins import origin_of
+from lusee_bayes.report.figures.maps import curves_of_runs, maps_of_runs
+from lusee_bayes.report.figures.plans import priors
+from lusee_bayes.results.finished_runs import FinishedRun, Provenance, comparison_rows, read_runs
+from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
+from lusee_bayes.runs.cost import require_resources
+from lusee_bayes.runs.folder import (
+    FIGURES,
+    Output,
+    Run,
+    RunKind,
+    inputs_of,
+    origin_of,
+    require_marginal,
+    require_single_frequency,
+    run_folder,
+    write_run,
+)
 
 
 def run_compare(
@@ -58,6 +85,110 @@ COMPARISON = RunKind(
         Output(_write_page),
         Output(lambda runs, folder: write_csv(folder / "comparison.csv", comparison_rows(runs))),
     ),
-    figures={"maps": comparison_figures.maps, "curves": comparison_figures.curves},
+    figures={"maps": maps_of_runs, "curves": curves_of_runs},
     dpi=100,
+)
+
+
+def run_compare_priors(
+    scenario: Scenario | str | Path,
+    folder: str | Path,
+    priors: Sequence[str] | None = None,
+    *,
+    data: Data | None = None,
+    truth: bool = False,
+    name: str = "the scenario",
+    engine: Engine | None = None,
+    replace: bool = False,
+    stages: Stages | None = None,
+) -> Run[PriorComparison]:
+    """Map one data set under several priors, and say which of them it prefers.
+
+    A, N and the data are the same for all; what :func:`run_map` would find is found for each. The
+    folder is written in one transaction.
+
+    Parameters
+    ----------
+    scenario : Scenario, or its file or name
+        Of one frequency.
+    folder : path
+        Of the results.
+    priors : sequence of str, optional
+        Names (:func:`.named_priors`), two or more; by default all that can be.
+    data : Visibilities, path, or sequence of them, optional
+        Visibilities to map; without them the scenario's own are simulated.
+    truth : bool
+        The given data are of the scenario's own sky.
+    name : str
+        Of the scenario, for the title.
+    engine : Engine, optional
+        What maps the data under each prior; by default this process, one after the other.
+    replace : bool
+        Replace results of another run in the folder.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        As :func:`.named_priors`, for a scenario of several frequencies or one that samples
+        something, and as :func:`run_map`.
+    """
+    scenario = load_scenario(scenario)
+    engine, stages = engine or ThisProcess(side_by_side=1), stages or Stages()
+    require_single_frequency("compare-priors", bool(scenario.frequencies_mhz))
+    require_marginal("compare-priors", "set treatment=marginalised", scenario.samples)
+    sections = named_priors(priors, scenario, known_sky=data is None or truth)
+    sections = {name: section.anchored() for name, section in sections.items()}
+    names = ",".join(sections)
+    origin = origin_of(scenario, data, truth=truth or None, priors=names)
+    with run_folder(
+        folder, COMPARE_PRIORS, origin, replace=replace, inputs=inputs_of(scenario, data)
+    ) as place:
+        measured = None if data is None else read_data(data, scenario)
+        require_resources(scenario, measured, stages)
+        experiment = observed(scenario, measured, stages)
+        if truth:
+            experiment = with_truth(experiment)
+        with stages("data"):
+            information = about_sky(experiment.setup, experiment.data)
+
+        def under(prior: str) -> UnderPrior:
+            setup = experiment.setup.with_prior(sections[prior])
+            return _under(prior, setup, experiment, information)
+
+        engine.work_in(place)
+        found = engine.each(Tasks(under, list(sections), list(sections)), stages, "priors")
+        result = PriorComparison(name, scenario, tuple(found), stages.seconds)
+        provenance = Provenance.of_experiment(experiment, data)
+        return write_run(place, result, COMPARE_PRIORS, origin, stages, provenance)
+
+
+def _under(name: str, setup: Setup, experiment: Experiment, information: Information) -> UnderPrior:
+    """What the data say under one prior, or a family of them."""
+    if setup.family is None:
+        evidence = float(information.posterior(setup.prior).log_evidence)
+        return UnderPrior.of(name, replace(experiment, setup=setup), evidence)
+    learned = learned_prior(setup, setup.family, information)
+    setup = replace(setup, prior=learned.prior)
+    mapped = replace(experiment, setup=setup, learned=learned)
+    return UnderPrior.of(name, mapped, learned.log_evidence)
+
+
+def _write_texts(result: PriorComparison, folder: Path) -> None:
+    (folder / "priors.json").write_text(
+        json.dumps(result.as_json(), indent=2) + "\n", encoding="utf-8"
+    )
+    (folder / "priors.md").write_text(result.as_markdown(), encoding="utf-8")
+    (folder / "scenario.yaml").write_text(result.scenario.to_yaml(), encoding="utf-8")
+
+
+# what the folder of a comparison of priors holds; a new file is one line here
+COMPARE_PRIORS = RunKind(
+    "compare-priors",
+    outputs=(
+        Output(_write_texts),
+        Output(lambda result, folder: write_csv(folder / "priors.csv", result.rows())),
+    ),
+    figures={"priors": priors},
 )

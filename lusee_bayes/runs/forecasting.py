@@ -1,27 +1,49 @@
-"""The information in an observation, from the posterior covariance alone: no data are needed."""
+"""Forecasts of observations, one by one, each kept as soon as it is made.
+
+The information in an observation, from the posterior covariance alone: no data are needed.
+
+The variations of a scenario that a plan looks at by itself.
+
+Turned in the same time and repeated at the same angles, so that a turn is compared with standing
+still for as long.
+
+Forecasts of many variations, each kept in a file as soon as it is made.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import namespace
+from lusee_bayes.core.engine import Engine, Tasks
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.files import replacing
 from lusee_bayes.core.harmonics import sum_over_m
 from lusee_bayes.core.linalg import solve_lower
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.version import __version__
+from lusee_bayes.experiment.instrument_sections import RunSection
+from lusee_bayes.experiment.instrument_terms import pointing_offsets
 from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.terms import Around, pointing_offsets
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.products import all_products
-from lusee_bayes.linear.metrics import effective_resolution_deg, prior_fraction_per_ell
+from lusee_bayes.experiment.term import Around
+from lusee_bayes.instrument.products import DataLayout, all_products
+from lusee_bayes.judge.chi2 import effective_resolution_deg, prior_fraction_per_ell
+from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.templates import template_amplitudes
-from lusee_bayes.results.forecast import Forecast, Variation
+from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation
+from lusee_bayes.runs.cost import duration
 
 
 def expected_snr_squared(posterior: Posterior) -> Float[np.ndarray, " ells"]:
@@ -120,3 +142,197 @@ def forecast(variation: Variation) -> Forecast:
         )
     except InputError as error:
         raise InputError(f"{variation.source}, {variation.name}: {error}") from error
+
+
+# one turn of the table
+TURN_DEG = 30.0
+# each run in so many parts, or all of them repeated so often
+PARTS = (1, 2, 3)
+CYCLES = (0.25, 0.5, 1.0, 2.0, 3.0)
+DUTY_CYCLES = (0.25, 0.5, 1.0)
+
+
+def default_variations(source: str, scenario: Scenario) -> list[Variation]:
+    """The scenario as it is, then turntable, duration, nights, duty cycle and lost antennas.
+
+    A schedule keeps its dates and angles.
+    """
+    families = {AS_GIVEN: {AS_GIVEN: scenario}}
+    if scenario.observation.schedule is None:
+        families |= families_of_runs(scenario)
+    families["duty cycle"] = {f"{duty:g}": with_duty_cycle(scenario, duty) for duty in DUTY_CYCLES}
+    found = [
+        Variation(source, family, name, varied)
+        for family, members in families.items()
+        for name, varied in members.items()
+    ]
+    n_ports = scenario.beam.n_ports
+    if n_ports > 1:
+        found += [
+            Variation(source, "antenna lost", f"port {port}", scenario, (port,))
+            for port in range(n_ports)
+        ]
+    return found
+
+
+def families_of_runs(scenario: Scenario) -> dict[str, dict[str, Scenario]]:
+    """The scenario with its runs turned, longer or shorter, or by night."""
+    runs = scenario.observation.runs
+    return {
+        "turned, same time": {
+            angles(turned): with_runs(scenario, turned)
+            for turned in (parted(runs, n) for n in PARTS)
+        },
+        "turned, more time": {
+            f"{length(turned)}: {angles(turned)}": with_runs(scenario, turned)
+            for turned in (repeated(runs, n, TURN_DEG) for n in PARTS[1:])
+        },
+        "duration": {
+            length(longer): with_runs(scenario, longer)
+            for longer in (lasting(runs, cycles) for cycles in CYCLES)
+        },
+        "nights only": {
+            length(longer): with_runs(scenario, at_night(longer))
+            for longer in (repeated(runs, n, 0.0) for n in PARTS[:2])
+        },
+    }
+
+
+Runs = tuple[RunSection, ...]
+
+
+def changed(run: RunSection, **values: Any) -> RunSection:
+    """A run with other values, checked again."""
+    return RunSection(**{**run.model_dump(), **values})
+
+
+def parted(runs: Sequence[RunSection], parts: int) -> Runs:
+    """Every run in equal parts, each turned by 30 degrees more than the one before."""
+    return tuple(
+        changed(run, cycles=run.cycles / parts, turntable_deg=run.turntable_deg + part * TURN_DEG)
+        for run in runs
+        for part in range(parts)
+    )
+
+
+def repeated(runs: Sequence[RunSection], times: int, turn_deg: float) -> Runs:
+    """All runs so many times, each time turned by ``turn_deg`` more."""
+    return tuple(
+        changed(run, turntable_deg=run.turntable_deg + number * turn_deg)
+        for number in range(times)
+        for run in runs
+    )
+
+
+def lasting(runs: Sequence[RunSection], cycles: float) -> Runs:
+    """The runs, longer or shorter by one factor, so that they last ``cycles`` together."""
+    factor = cycles / sum(run.cycles for run in runs)
+    return tuple(changed(run, cycles=run.cycles * factor) for run in runs)
+
+
+def at_night(runs: Sequence[RunSection]) -> Runs:
+    """The runs with samples taken at night only."""
+    return tuple(changed(run, night_only=True) for run in runs)
+
+
+def angles(runs: Sequence[RunSection]) -> str:
+    """Their turntable angles, in words."""
+    return ", ".join(f"{run.turntable_deg:g}°" for run in runs)
+
+
+def length(runs: Sequence[RunSection]) -> str:
+    """How long they last, in words."""
+    cycles = sum(run.cycles for run in runs)
+    return f"{cycles:g} cycle{'' if cycles == 1.0 else 's'}"
+
+
+def with_runs(scenario: Scenario, runs: Runs) -> Scenario:
+    """The scenario with other runs."""
+    observation = scenario.observation.model_copy(update={"runs": runs})
+    return scenario.model_copy(update={"observation": observation})
+
+
+def with_duty_cycle(scenario: Scenario, duty_cycle: float) -> Scenario:
+    """The scenario with another duty cycle of the receivers."""
+    radiometer = scenario.noise.radiometer.model_copy(update={"duty_cycle": duty_cycle})
+    noise = scenario.noise.model_copy(update={"radiometer": radiometer})
+    return scenario.model_copy(update={"noise": noise})
+
+
+@dataclass(frozen=True)
+class ForecastFiles:
+    """Unfinished work of a plan: a JSON file for each forecast that is made.
+
+    Attributes
+    ----------
+    folder : Path
+    """
+
+    folder: Path
+
+    def forecast(self, variation: Variation) -> Forecast:
+        """Read the forecast of a variation, or make it and write it, whole or not at all."""
+        path = self.folder / f"{_digest(variation)}.json"
+        if path.is_file():
+            kept = json.loads(path.read_text(encoding="utf-8"))
+            kept["snr_squared"] = np.array(kept["snr_squared"], dtype=np.float64)
+            return Forecast(variation=variation, **kept)
+        made = forecast(variation)
+        names = (field.name for field in fields(Forecast) if field.name != "variation")
+        kept = {name: getattr(made, name) for name in names}
+        kept["snr_squared"] = np.asarray(made.snr_squared).tolist()
+        with replacing(path) as partial:
+            partial.write_text(json.dumps(kept), encoding="utf-8")
+        return made
+
+
+def _digest(variation: Variation) -> str:
+    """Of all that a forecast depends on."""
+    parts = [variation.scenario.to_yaml(), list(variation.lost), __version__]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
+
+
+def forecasts_of(
+    variations: Sequence[Variation], files: ForecastFiles, engine: Engine, stages: Stages
+) -> list[Forecast]:
+    """Make a forecast of every variation; what is there twice is computed once.
+
+    Parameters
+    ----------
+    variations : sequence of Variation
+    files : ForecastFiles
+        What an interrupted plan has made is taken from them.
+    engine : Engine
+    stages : Stages
+        Told how many there are, and after the first about how long the others take.
+
+    Returns
+    -------
+    list of Forecast
+        In the order of the variations.
+
+    Raises
+    ------
+    InputError
+        As :func:`.forecast`.
+    """
+    # workers may have other folders of their own
+    anchored = [replace(v, scenario=v.scenario.anchored()) for v in variations]
+    different: dict[str, Variation] = {}
+    for variation in anchored:
+        different.setdefault(_digest(variation), variation)
+    stages.say(f"  {len(variations)} variations, {len(different)} of them different")
+    first, *others = different.values()
+    start = time.perf_counter()
+    with stages("first forecast"):
+        found = [files.forecast(first)]
+    if others:
+        longest = len(others) * (time.perf_counter() - start)
+        stages.say(f"  the other {len(others)} take about {duration(longest)}, or less")
+        names = [f"{other.source}, {other.name}" for other in others]
+        found += engine.each(Tasks(files.forecast, others, names), stages, "planning")
+    known = {_digest(one.variation): one for one in found}
+    return [
+        replace(known[_digest(there)], variation=here)
+        for here, there in zip(variations, anchored, strict=True)
+    ]

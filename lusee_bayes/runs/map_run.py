@@ -21,33 +21,47 @@ from lusee_bayes.experiment.experiment import Experiment, build, with_truth
 from lusee_bayes.experiment.flight_data import visibilities_of
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.flight.reduced import Reduced, write_reduced
-from lusee_bayes.report.figures import channel as channel_figures
-from lusee_bayes.report.figures import cube as cube_figures
-from lusee_bayes.report.figures import diagnostics as diagnostic_figures
-from lusee_bayes.report.figures import flight as flight_figures
-from lusee_bayes.report.figures.pointing import pointing_by_day
-from lusee_bayes.report.figures.unknowns import unknowns_by_frequency
-from lusee_bayes.results.channel_files import CHANNELS
-from lusee_bayes.results.cost import posterior_cost, require_fits, require_resources
+from lusee_bayes.report.figures.checks import (
+    calibration,
+    draws_of_posterior,
+    pointing_by_day,
+    residuals_by_product,
+    time_line,
+    unknowns_by_frequency,
+    waterfall,
+)
+from lusee_bayes.report.figures.maps import (
+    beams,
+    channel_fidelity,
+    channel_maps,
+    channel_spectra,
+    chi2,
+    data_vector,
+    map_fidelity,
+    sky_maps,
+    sky_spectra,
+)
 from lusee_bayes.results.cube import CubeResult
-from lusee_bayes.results.cube_channels import cube_result
-from lusee_bayes.results.diagnostics_file import write_diagnostics
-from lusee_bayes.results.map_files import cards, write_cube, write_map
+from lusee_bayes.results.diagnostics import write_diagnostics
+from lusee_bayes.results.finished_runs import Provenance
+from lusee_bayes.results.map_files import cards, write_cube, write_map, write_posterior
 from lusee_bayes.results.map_result import MapResult, map_result
-from lusee_bayes.results.posterior_file import write_posterior
-from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.results.saved import REDUCED
+from lusee_bayes.runs.channel_files import CHANNELS
+from lusee_bayes.runs.cost import posterior_cost, require_fits, require_resources
+from lusee_bayes.runs.cube import cube_result
 from lusee_bayes.runs.folder import (
     Output,
     Run,
     RunKind,
+    inputs_of,
+    origin_of,
     require_marginal,
     require_single_frequency,
     run_folder,
     write_run,
 )
-from lusee_bayes.runs.origins import inputs_of, origin_of
-from lusee_bayes.sky import write_alms
+from lusee_bayes.sky.sky_files import write_alms
 
 
 def run_map(
@@ -254,17 +268,17 @@ MAP = RunKind(
         Output(_write_summary),
     ),
     figures={
-        "maps": lambda result: channel_figures.maps(result.channel),
-        "data_vector": lambda result: channel_figures.data_vector(result.experiment.data),
-        "beams": lambda result: channel_figures.beams(result.experiment.setup),
-        "fidelity": lambda result: channel_figures.fidelity(result.channel),
-        "spectra": lambda result: channel_figures.spectra(result.channel),
-        "draws": lambda result: diagnostic_figures.draws(result.diagnostics),
-        "residuals": lambda result: diagnostic_figures.residuals(result.diagnostics),
+        "maps": lambda result: sky_maps(result.channel),
+        "data_vector": lambda result: data_vector(result.experiment.data),
+        "beams": lambda result: beams(result.experiment.setup),
+        "fidelity": lambda result: map_fidelity(result.channel),
+        "spectra": lambda result: sky_spectra(result.channel),
+        "draws": lambda result: draws_of_posterior(result.diagnostics),
+        "residuals": lambda result: residuals_by_product(result.diagnostics),
         "pointing": lambda result: result.pointing and pointing_by_day(result.pointing.preferred),
-        "flight_time_line": lambda r: r.reduced and flight_figures.time_line(r.reduced),
-        "flight_waterfall": lambda r: r.reduced and flight_figures.waterfall(r.reduced, r.band),
-        "flight_calibration": lambda r: r.reduced and flight_figures.calibration(r.reduced),
+        "flight_time_line": lambda r: r.reduced and time_line(r.reduced),
+        "flight_waterfall": lambda r: r.reduced and waterfall(r.reduced, r.band),
+        "flight_calibration": lambda r: r.reduced and calibration(r.reduced),
     },
 )
 
@@ -284,13 +298,13 @@ CUBE = RunKind(
         Output(_write_summary),
     ),
     figures={
-        "maps": cube_figures.maps,
-        "spectra": cube_figures.spectra,
-        "fidelity": cube_figures.fidelity,
-        "chi2": cube_figures.chi2,
+        "maps": channel_maps,
+        "spectra": channel_spectra,
+        "fidelity": channel_fidelity,
+        "chi2": chi2,
         "unknowns": lambda r: r.unknowns and unknowns_by_frequency(r.unknowns),
-        "flight_time_line": lambda r: r.reduced and flight_figures.time_line(r.reduced),
-        "flight_calibration": lambda r: r.reduced and flight_figures.calibration(r.reduced),
+        "flight_time_line": lambda r: r.reduced and time_line(r.reduced),
+        "flight_calibration": lambda r: r.reduced and calibration(r.reduced),
     },
     unfinished=CHANNELS,
     dpi=100,

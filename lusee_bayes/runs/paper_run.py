@@ -13,11 +13,9 @@ from lusee_bayes.core.files import replacing
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import write_csv
 from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios, read_case
-from lusee_bayes.paper.claim_table import claim_table, claims_as_markdown
-from lusee_bayes.paper.claims import Cases
+from lusee_bayes.paper.claims import Cases, claim_table, claims_as_markdown
 from lusee_bayes.paper.figures import FIGURES
-from lusee_bayes.runs.folder import Output, Run, RunKind, run_folder, write_run
-from lusee_bayes.runs.origins import origin_of
+from lusee_bayes.runs.folder import Output, Run, RunKind, origin_of, run_folder, write_run
 
 CASES, UNFINISHED = "cases", "unfinished-cases"
 RESUME = "the same command continues from the finished cases"

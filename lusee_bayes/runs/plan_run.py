@@ -9,12 +9,19 @@ from pathlib import Path
 from lusee_bayes.core.engine import Engine, ThisProcess
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, write_csv
-from lusee_bayes.report.figures import plan as plan_figures
-from lusee_bayes.results.cost import posterior_cost, require_fits
+from lusee_bayes.report.figures.plans import forecasts
 from lusee_bayes.results.forecast import Forecast, Variation, forecast_rows
-from lusee_bayes.results.forecasts import ForecastFiles, forecasts_of
-from lusee_bayes.runs.folder import Output, Run, RunKind, run_folder, write_run
-from lusee_bayes.runs.origins import inputs_of, origin_of
+from lusee_bayes.runs.cost import posterior_cost, require_fits
+from lusee_bayes.runs.folder import (
+    Output,
+    Run,
+    RunKind,
+    inputs_of,
+    origin_of,
+    run_folder,
+    write_run,
+)
+from lusee_bayes.runs.forecasting import ForecastFiles, forecasts_of
 
 UNFINISHED = "unfinished-forecasts"
 RESUME = "the same command continues from the finished forecasts"
@@ -72,6 +79,6 @@ PLAN = RunKind(
     outputs=(
         Output(lambda forecasts, folder: write_csv(folder / "plan.csv", forecast_rows(forecasts))),
     ),
-    figures={"plan": plan_figures.forecasts},
+    figures={"plan": forecasts},
     unfinished=UNFINISHED,
 )

@@ -13,14 +13,27 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.report.figures import chains as chain_figures
-from lusee_bayes.report.figures import samples as sample_figures
-from lusee_bayes.results.cost import require_resources
+from lusee_bayes.report.figures.sampling import (
+    against_analytic,
+    energy,
+    pairs,
+    ranks,
+    traces,
+    uncertainty,
+)
+from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.map_files import write_cube, write_map
-from lusee_bayes.results.provenance import Provenance
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult
-from lusee_bayes.runs.folder import Output, Run, RunKind, run_folder, write_run
-from lusee_bayes.runs.origins import inputs_of, origin_of
+from lusee_bayes.runs.cost import require_resources
+from lusee_bayes.runs.folder import (
+    Output,
+    Run,
+    RunKind,
+    inputs_of,
+    origin_of,
+    run_folder,
+    write_run,
+)
 from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling.datatree import write_datatree
 from lusee_bayes.sampling.hmc import Sampler
@@ -160,12 +173,12 @@ SAMPLE = RunKind(
     "sample",
     outputs=SAMPLE_OUTPUTS,
     figures={
-        "uncertainty": sample_figures.uncertainty,
-        "traces": sample_figures.traces,
-        "ranks": lambda result: chain_figures.ranks(result.quantities()),
-        "energy": lambda result: chain_figures.energy(result.tree["sample_stats"].dataset),
-        "pairs": lambda result: chain_figures.pairs(result.quantities()),
-        "against_analytic": lambda result: chain_figures.against_analytic(result.tree),
+        "uncertainty": uncertainty,
+        "traces": traces,
+        "ranks": lambda result: ranks(result.quantities()),
+        "energy": lambda result: energy(result.tree["sample_stats"].dataset),
+        "pairs": lambda result: pairs(result.quantities()),
+        "against_analytic": lambda result: against_analytic(result.tree),
     },
     unfinished=CHAINS,
 )

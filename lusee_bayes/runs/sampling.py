@@ -14,27 +14,20 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, reading
 from lusee_bayes.core.version import versions
-from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.inference import infer
-from lusee_bayes.experiment.pieces import program_pieces
+from lusee_bayes.experiment.experiment import Experiment, infer, program_pieces
+from lusee_bayes.experiment.model import true_values
 from lusee_bayes.experiment.rounds import Inference
-from lusee_bayes.experiment.simulate import true_values
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult
-from lusee_bayes.sampling.chains import Chains
-from lusee_bayes.sampling.checkpoints import Checkpoints
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree
 from lusee_bayes.sampling.distributions import TimesStudentT
-from lusee_bayes.sampling.hmc import Sampler, sample
+from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sample
+from lusee_bayes.sampling.log_normal import coordinates_of
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.program_checks import require_sampleable
-from lusee_bayes.sampling.program_sites import predicts
-from lusee_bayes.sampling.programs import Program
-from lusee_bayes.sampling.straight_log_normal import coordinates_of
-from lusee_bayes.sampling.whitening import Whitening
-from lusee_bayes.systematics import SCALES, Systematic
-from lusee_bayes.systematics.base import SKY
-from lusee_bayes.systematics.chart import Chart
+from lusee_bayes.sampling.programs import Program, predicts
+from lusee_bayes.systematics.gain_drifts import SCALES
+from lusee_bayes.systematics.systematic import SKY, Chart, Systematic
 
 # where the mode of a collapsed program is looked for
 STARTS = 4

@@ -10,20 +10,17 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.report.figures import samples as sample_figures
-from lusee_bayes.results.cost import require_resources
-from lusee_bayes.results.provenance import Provenance
+from lusee_bayes.report.figures.sampling import comparison, rank_statistics
+from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.sample_result import CHAINS
 from lusee_bayes.results.validation_result import ValidationResult
-from lusee_bayes.runs.folder import Output, Run, RunKind, run_folder, write_run
-from lusee_bayes.runs.origins import inputs_of
+from lusee_bayes.runs.cost import require_resources
+from lusee_bayes.runs.folder import Output, Run, RunKind, inputs_of, run_folder, write_run
 from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_origin
 from lusee_bayes.runs.sampling import sample_result
-from lusee_bayes.sampling.calibration import calibrate_sky
-from lusee_bayes.sampling.hmc import Sampler
-from lusee_bayes.sampling.least import require_draws, require_simulations
+from lusee_bayes.sampling.hmc import Sampler, require_draws, require_simulations
 from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.validation import validate_draws
+from lusee_bayes.sampling.validation import calibrate_sky, validate_draws
 
 
 def run_validate(
@@ -120,8 +117,8 @@ VALIDATION = RunKind(
     "validate",
     outputs=(*map(_of_sampled, SAMPLE_OUTPUTS), Output(_write_verdict)),
     figures={
-        "comparison": lambda result: sample_figures.comparison(result.comparison),
-        "calibration": lambda result: sample_figures.calibration(result.ranks),
+        "comparison": lambda result: comparison(result.comparison),
+        "calibration": lambda result: rank_statistics(result.ranks),
     },
     unfinished=CHAINS,
     after=("sample",),

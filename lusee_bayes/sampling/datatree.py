@@ -19,10 +19,15 @@ from lusee_bayes.core.reading import reading, require_file
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.sampling.chains import Chains
-from lusee_bayes.sampling.programs import Program, collapsed_skies, is_collapsed, replicated_data
-from lusee_bayes.sampling.promotion import numpyro_promotion
-from lusee_bayes.systematics.base import SKY
+from lusee_bayes.sampling.hmc import Chains
+from lusee_bayes.sampling.programs import (
+    Program,
+    collapsed_skies,
+    is_collapsed,
+    numpyro_promotion,
+    replicated_data,
+)
+from lusee_bayes.systematics.systematic import SKY
 
 DATA = "data"
 # what a file of samples holds at least

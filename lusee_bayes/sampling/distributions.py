@@ -23,10 +23,10 @@ from numpyro import distributions as dist
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, Factor
-from lusee_bayes.sky.priors import Prior
+from lusee_bayes.sky.prior import Prior
 
 HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
 

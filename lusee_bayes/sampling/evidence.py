@@ -28,8 +28,7 @@ from numpyro.infer.util import potential_energy
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling.mode import LaplaceApproximation, laplace_approximation
-from lusee_bayes.sampling.programs import Program
-from lusee_bayes.sampling.promotion import numpyro_promotion
+from lusee_bayes.sampling.programs import Program, numpyro_promotion
 
 # degrees of freedom of the proposal, whose tails are heavier than a Gaussian's
 TAILS = 7.0

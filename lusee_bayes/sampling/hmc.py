@@ -1,14 +1,33 @@
-"""Hamiltonian Monte Carlo of any NumPyro program: chains side by side, draws kept as they come.
+"""Hamiltonian Monte Carlo: chains that survive a kill.
+
+Draws of chains side by side, and statistics of every draw.
+
+Coordinates in which posteriors are round: they change the speed of sampling, not its density.
+
+whitened(program, whitening)    samples m through z, m = mean + R z
+
+Draws on disk as they come: a run that is killed at any moment goes on where it stopped.
+
+One file a chunk: the draws of that chunk and the state of the chains behind it, written whole or
+not at all. The last file is the place to go on from; nothing else needs to be consistent with it.
+
+Hamiltonian Monte Carlo of any NumPyro program: chains side by side, draws kept as they come.
 
 Programs are sampled in coordinates in which their posterior is nearly round, if such are known
-(:mod:`lusee_bayes.sampling.whitening`: those of the sky's analytic posterior, or of
+(:mod:`lusee_bayes.sampling.hmc`: those of the sky's analytic posterior, or of
 :mod:`lusee_bayes.sampling.mode`); the density is the program's own.
+
+The least numbers of draws and simulations that checks need; asked before any work begins.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -16,17 +35,381 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 from numpyro.infer import HMC, NUTS
 from numpyro.infer.hmc import HMCState
 
 from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.sampling.chains import STATISTICS, Chains
-from lusee_bayes.sampling.checkpoints import Checkpoints
-from lusee_bayes.sampling.program_sites import latent_sites, predicts
-from lusee_bayes.sampling.promotion import numpyro_promotion
-from lusee_bayes.sampling.whitening import WHITE_SUFFIX, Whitening, whitened
+from lusee_bayes.core.layouts import Layout
+from lusee_bayes.core.lazy import dist, numpyro
+from lusee_bayes.core.reading import read_json, reading
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.sampling.programs import latent_sites, numpyro_promotion, predicts
+from lusee_bayes.systematics.systematic import Chart
+
+# statistics of every draw, by their ArviZ names
+STATISTICS: dict[str, Callable[[HMCState], Array]] = {
+    "lp": lambda s: -s.potential_energy,
+    "energy": lambda s: s.energy,
+    "diverging": lambda s: s.diverging,
+    "acceptance_rate": lambda s: s.accept_prob,
+    "step_size": lambda s: s.adapt_state.step_size,
+    "n_steps": lambda s: s.num_steps,
+}
+
+
+@dataclass(frozen=True)
+class Chains:
+    """Draws, and statistics of every draw.
+
+    Attributes
+    ----------
+    sites : dict of (chains, draws, ...) arrays
+        Draws by site.
+    statistics : dict of (chains, draws) arrays
+        By the names of ``STATISTICS``.
+    """
+
+    sites: dict[str, np.ndarray]
+    statistics: dict[str, np.ndarray]
+
+    @property
+    def gradients(self) -> int:
+        """Gradient evaluations behind the draws, all chains together, warmup left out."""
+        return int(self.statistics["n_steps"].sum())
+
+
+# the site of z is that of m with this appended
+WHITE_SUFFIX = "_white"
+
+
+class Whitening(eqx.Module):
+    """Coordinates z of one or more sites, x = mean + R z, in which a posterior is round.
+
+    x are the sites' values, unconstrained (numpyro's ``biject_to``), one site after the other;
+    with a chart, its coordinates of them.
+
+    Attributes
+    ----------
+    mean : (unknowns,) array
+        x at z = 0.
+    root : (unknowns, white) array
+        R, where R R^T is the covariance of x.
+    log_det : () array
+        ln|det R|.
+    sites : tuple of (str, tuple of int)
+        Name and unconstrained shape of each site.
+    chart : Chart, optional
+        Coordinates in which ridges are straight.
+
+    Raises
+    ------
+    InputError
+        If the sites have another number of values than the mean.
+    """
+
+    mean: Float[Array, " unknowns"]
+    root: Float[Array, "unknowns white"]
+    log_det: Float[Array, ""]
+    sites: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
+    chart: Chart | None = None
+
+    def __check_init__(self):
+        n = sum(int(np.prod(shape)) for _, shape in self.sites)
+        if not is_traced(self.mean) and self.mean.shape != (n,):
+            raise InputError(f"the sites have {n} values, the mean {self.mean.shape[0]}")
+
+    @classmethod
+    def of(cls, posterior: Posterior, site: str = "sky") -> Whitening:
+        """Return the coordinates in which a posterior of the sky is N(0, 1).
+
+        Parameters
+        ----------
+        posterior : Posterior
+            The analytic posterior.
+        site : str
+            Name of the sky's site.
+
+        Raises
+        ------
+        InputError
+            If the sky's prior has no density.
+        """
+        log_det = posterior.prior.log_det() - jnp.log(jnp.diagonal(posterior.lower)).sum()
+        root = posterior.root()
+        return cls(posterior.mean, root, log_det, ((site, (root.shape[0],)),))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sites."""
+        return tuple(name for name, _ in self.sites)
+
+    def split(self, x: Float[Array, " unknowns"]) -> dict[str, Float[Array, "..."]]:
+        """Split x by site, each in its shape."""
+        values, start = {}, 0
+        for name, shape in self.sites:
+            size = int(np.prod(shape))
+            values[name] = x[start : start + size].reshape(shape)
+            start += size
+        return values
+
+    def join(self, values: Mapping[str, Float[Array, "..."]]) -> Float[Array, " unknowns"]:
+        """Join values by site to x."""
+        return jnp.concatenate([values[name].reshape(-1) for name in self.names])
+
+    def to_values(
+        self, x: Float[Array, " unknowns"]
+    ) -> tuple[dict[str, Float[Array, "..."]], Float[Array, ""]]:
+        """Compute the sites' unconstrained values at x, and ln|det| of their derivative by x."""
+        if self.chart is None:
+            return self.split(x), jnp.zeros(())
+        return self.chart.to_values(self.split(x))
+
+    def from_values(self, values: Mapping[str, Float[Array, "..."]]) -> Float[Array, " unknowns"]:
+        """Compute x of the sites' unconstrained values."""
+        return self.join(values if self.chart is None else self.chart.from_values(values))
+
+
+def whitened(program: Callable, whitening: Whitening) -> Callable:
+    """Return a program that samples sites through z, x = mean + R z.
+
+    The density stays the program's own: its prior at x, times ``|det R|``. Only the coordinates are
+    those of some Gaussian; where it is not the posterior, sampling is slower and not wrong.
+
+    Parameters
+    ----------
+    program : callable
+        A NumPyro model.
+    whitening : Whitening
+        Coordinates of some of its latent sites.
+
+    Returns
+    -------
+    callable
+        The model with an improper site z, NAME_white of the first site. It cannot be drawn from
+        without a value for z; draw from ``program`` itself.
+
+    Raises
+    ------
+    InputError
+        When it runs, if one of the sites is observed.
+    """
+
+    def model(*args, **kwargs):
+        first = whitening.names[0]
+        free = dist.ImproperUniform(dist.constraints.real_vector, (), (whitening.root.shape[1],))
+        z = numpyro.sample(f"{first}{WHITE_SUFFIX}", free)
+        values, log_det = whitening.to_values(whitening.mean + whitening.root @ z)
+        # the determinant of all coordinates is counted once, with the first site
+        log_dets = dict.fromkeys(whitening.names, 0.0) | {first: whitening.log_det + log_det}
+        config = {name: _Given(values[name], log_dets[name]) for name in whitening.names}
+        with numpyro.handlers.reparam(config=config):
+            return program(*args, **kwargs)
+
+    return model
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What makes a site with a given unconstrained value a deterministic one and its density.
+
+    ``log_det``: of coordinates that the value was made of, added to the density.
+    """
+
+    value: Float[Array, "..."]
+    log_det: float | Float[Array, ""]
+
+    def __call__(self, name, fn, obs):
+        if obs is not None:
+            raise InputError(f"the site '{name}' is observed; only latent sites can be whitened")
+        transform = dist.biject_to(fn.support)
+        value = transform(self.value)
+        density = self.log_det + transform.log_abs_det_jacobian(self.value, value).sum()
+        numpyro.factor(f"{name}_density", fn.log_prob(value).sum() + density)
+        return None, value
+
+
+IDENTITY_LAYOUT = Layout("the description of an unfinished run")
+IDENTITY = "run.json"
+CHUNK_GLOB = "chunk-*.npz"
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """The content of one file.
+
+    Attributes
+    ----------
+    iteration : int
+        Iterations done at its end, warmup included.
+    state : list of array
+        Leaves of the sampler's state.
+    draws : dict of (draws, chains, ...) array
+        Draws of the chunk by name.
+    start : int
+        Iterations done before it.
+    """
+
+    iteration: int
+    state: list[np.ndarray]
+    draws: dict[str, np.ndarray]
+    start: int = 0
+
+    def write(self, folder: Path) -> None:
+        """Write the chunk's file whole or not at all."""
+        arrays = {f"state:{i:03d}": leaf for i, leaf in enumerate(self.state)}
+        arrays |= {f"draws:{name}": values for name, values in self.draws.items()}
+        arrays["start:"] = np.array(self.start)
+        target = folder / f"chunk-{self.iteration:08d}.npz"
+        scratch = folder / f".partial-{target.name}"
+        with scratch.open("wb") as file:
+            np.savez(file, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(scratch, target)
+
+    @classmethod
+    def read(cls, path: Path) -> Chunk:
+        """Read a chunk's file. InputError if it cannot be read."""
+        kinds: dict[str, dict[str, np.ndarray]] = {"start": {}, "state": {}, "draws": {}}
+        try:
+            with reading(path, "a checkpoint"), path.open("rb") as file, np.load(file) as arrays:
+                for key in arrays.files:
+                    kind, name = key.split(":", 1)
+                    kinds[kind][name] = arrays[key]
+                start = int(kinds["start"][""])
+        except InputError as error:
+            raise InputError(f"{error}; delete it to go on from the one before") from error
+        state = [kinds["state"][name] for name in sorted(kinds["state"])]
+        return cls(_iteration(path), state, kinds["draws"], start)
+
+
+class Checkpoints:
+    """The chunks of one run in one folder.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The folder.
+    identity : dict
+        JSON values that tell the run from others.
+    resume : bool
+        Whether to go on with an unfinished run.
+
+    Raises
+    ------
+    InputError
+        If the folder holds an unfinished run and ``resume`` is False, or another run, or draws of
+        an unknown one.
+    """
+
+    def __init__(self, folder: str | Path, identity: dict[str, object], *, resume: bool):
+        self.folder = Path(folder)
+        described = json.loads(json.dumps(identity))
+        marker = self.folder / IDENTITY
+        if marker.exists():
+            self._require_same(_read_marker(marker), described, resume)
+        elif self._paths():
+            raise InputError(
+                f"'{self.folder}' holds draws, but no {IDENTITY} that says of which run; delete "
+                "the folder"
+            )
+        else:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            scratch = self.folder / f".partial-{IDENTITY}"
+            scratch.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
+            os.replace(scratch, marker)
+
+    def _require_same(self, found: dict, described: dict, resume: bool) -> None:
+        if not resume:
+            chunks = self._paths()
+            done = _iteration(chunks[-1]) if chunks else "no"
+            raise InputError(
+                f"'{self.folder}' holds an unfinished run ({done} iterations done); go on with "
+                "--resume, or delete the folder"
+            )
+        for name in sorted({*found, *described}):
+            if found.get(name) != described.get(name):
+                raise InputError(
+                    f"the unfinished run in '{self.folder}' has another {name}: "
+                    f"{_short(found.get(name))}, now {_short(described.get(name))}; resume it with "
+                    "the same, or delete the folder"
+                )
+
+    def _paths(self) -> list[Path]:
+        return sorted(self.folder.glob(CHUNK_GLOB))
+
+    def last(self) -> Chunk | None:
+        """Return the last chunk; None if nothing is done yet."""
+        paths = self._paths()
+        return Chunk.read(paths[-1]) if paths else None
+
+    def append(self, iteration: int, state: list[Array], draws: dict[str, Array]) -> None:
+        """Keep what was sampled since the last call.
+
+        Parameters
+        ----------
+        iteration : int
+            Iterations done by now, warmup included.
+        state : list of array
+            Leaves of the sampler's state.
+        draws : dict of (draws, chains, ...) array
+            Draws since the last call by name.
+        """
+        paths = self._paths()
+        start = _iteration(paths[-1]) if paths else 0
+        arrays = {name: np.asarray(values) for name, values in draws.items()}
+        Chunk(iteration, [np.asarray(leaf) for leaf in state], arrays, start).write(self.folder)
+
+    def draws(self) -> dict[str, np.ndarray]:
+        """Return all draws so far, (chains, draws, ...) by name.
+
+        Raises
+        ------
+        InputError
+            If a chunk is missing.
+        """
+        chunks = [Chunk.read(path) for path in self._paths()]
+        done = 0
+        for chunk in chunks:
+            if chunk.start != done:
+                raise InputError(
+                    f"'{self.folder}' lacks the draws of iterations {done} to {chunk.start}; "
+                    "delete the chunks behind them to go on from there"
+                )
+            done = chunk.iteration
+        kept = [chunk.draws for chunk in chunks if chunk.draws]
+        return {
+            name: np.concatenate([c[name] for c in kept]).swapaxes(0, 1)
+            for name in (kept[0] if kept else {})
+        }
+
+    def remove(self) -> None:
+        """Delete the folder. If that is interrupted, no half of it is left under its name."""
+        doomed = self.folder.with_name(f".{self.folder.name}-removed")
+        shutil.rmtree(doomed, ignore_errors=True)
+        if self.folder.exists():
+            os.replace(self.folder, doomed)
+            shutil.rmtree(doomed)
+
+
+def _iteration(path: Path) -> int:
+    return int(path.stem.removeprefix("chunk-"))
+
+
+def _read_marker(marker: Path) -> dict[str, object]:
+    try:
+        return read_json(marker, IDENTITY_LAYOUT)
+    except InputError as error:
+        raise InputError(f"{error}; delete its folder") from error
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."
+
 
 ALGORITHMS = ("nuts", "hmc")
 
@@ -348,3 +731,25 @@ class _Run:
             return state
         mesh = Mesh(np.asarray(devices), ("chain",))
         return jax.device_put(state, NamedSharding(mesh, PartitionSpec("chain")))
+
+
+# bins of a rank histogram, and the simulations that each should expect
+N_BINS, PER_BIN = 20, 5
+LEAST_DRAWS = 100
+
+
+def require_simulations(n: int) -> None:
+    """Raise InputError for too few data sets: each bin of the histogram should expect five."""
+    if n < PER_BIN * N_BINS:
+        raise InputError(
+            f"calibration needs at least {PER_BIN * N_BINS} simulations, {PER_BIN} for each of "
+            f"the {N_BINS} bins of a rank histogram, got {n}; raise --simulations"
+        )
+
+
+def require_draws(n: int) -> None:
+    """Raise InputError for fewer draws of a chain than a comparison needs."""
+    if n < LEAST_DRAWS:
+        raise InputError(
+            f"a comparison needs {LEAST_DRAWS} draws of each chain, got {n}; raise --draws"
+        )

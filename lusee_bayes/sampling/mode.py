@@ -1,10 +1,19 @@
-"""The mode of a program's posterior and its curvature there: where to begin, in which coordinates.
+"""The mode of a program, the curvature there, and how uncertain quantities are.
+
+Minus the log posterior of a program, its gradient and its curvature.
+
+The mode of a program's posterior and its curvature there: where to begin, in which coordinates.
 
 The curvature is the Hessian where few sites are sampled (the sky integrated out). Where a
 program predicts the data at a site CorrelatedNormal, as d ~ N(f(x), N), it is that of Gauss and
 Newton, J^T N^-1 J plus that of the prior, J the derivative of f: for the sky and thousands of
 other unknowns at once. At a site TimesStudentT every time has its weight in N^-1. Both only serve
 as coordinates; the density sampled is the program's own.
+
+Maps of draws of the sky: standard deviations, intervals, which region is brighter.
+
+Skies are draws (chains, draws, modes) of Galactic harmonic coefficients in K, by HMC or
+:meth:`Posterior.sample`; maps are HEALPix RING, Galactic, in K.
 """
 
 from __future__ import annotations
@@ -12,24 +21,185 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import arviz_base
+import arviz_stats
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
+from arviz_stats.base import array_stats
 from jaxtyping import Bool, Float, Int
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer import init_to_median
+from numpyro.infer.util import potential_energy
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import is_traced
+from lusee_bayes.core.checks import is_traced, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.sampling.curvature import Potential, root_of_inverse, without_held
+from lusee_bayes.core.harmonics import lmax_of, pixel_matrix, power_spectrum, synthesis_matrix
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.sampling.distributions import HALF_LOG_2PI, Prediction
-from lusee_bayes.sampling.promotion import numpyro_promotion
-from lusee_bayes.sampling.whitening import Whitening
-from lusee_bayes.systematics.base import MOST_COLLAPSED
-from lusee_bayes.systematics.chart import Chart
+from lusee_bayes.sampling.hmc import Whitening
+from lusee_bayes.sampling.programs import numpyro_promotion
+from lusee_bayes.systematics.systematic import MOST_COLLAPSED, Chart
+
+# step of the differences that give the Hessian, in standard deviations
+DIFFERENCE = 0.1
+# columns of the Jacobian at once: more would take more memory than time they save
+COLUMNS = 64
+
+
+class Potential(eqx.Module):
+    """Minus the log posterior of a program's unconstrained coordinates x.
+
+    Attributes
+    ----------
+    program : callable
+        A NumPyro model.
+    arguments : dict
+        Its arguments, with the data.
+    shapes : Whitening
+        Names and shapes of the sites in x, and the chart of their coordinates.
+    predicts : bool
+        Whether the program predicts the data, at sites CorrelatedNormal or TimesStudentT.
+    hold : tuple of str
+        Sites that are held where they are.
+    """
+
+    program: Callable = eqx.field(static=True)
+    arguments: dict[str, Any]
+    shapes: Whitening
+    predicts: bool = eqx.field(static=True)
+    hold: tuple[str, ...] = eqx.field(static=True)
+
+    def held(self) -> np.ndarray:
+        """Return the positions in x of what is held."""
+        sites = self.shapes.sites
+        parts = [np.full(int(np.prod(shape)), name in self.hold) for name, shape in sites]
+        return np.flatnonzero(np.concatenate(parts))
+
+    def values(self, x: Float[Array, " n"], still: bool) -> tuple[dict[str, Array], Array]:
+        """Return the sites' values at x, and ln|det| of their Jacobian; ``still`` as in value."""
+        parts = self.shapes.split(x)
+        for name in self.hold if still else ():
+            if name in parts:
+                parts[name] = jax.lax.stop_gradient(parts[name])
+        return (
+            (parts, jnp.zeros(()))
+            if self.shapes.chart is None
+            else self.shapes.chart.to_values(parts)
+        )
+
+    def value(self, x: Float[Array, " n"], still: bool = False) -> Float[Array, ""]:
+        """Return it at x; ``still``: without derivatives by what is held."""
+        values, log_det = self.values(x, still)
+        return potential_energy(self.program, (), self.arguments, values) - log_det
+
+    def residual(self, x: Float[Array, " n"], still: bool = False) -> Float[Array, " data"]:
+        """Return the residuals of all sites that predict, such as L^-1 (d - f(x)), N = L L^T."""
+        found = self._predictions(x, still)
+        return jnp.concatenate([fn.residual(value) for fn, value in found])
+
+    def misfit(self, x: Float[Array, " n"], still: bool = False) -> Float[Array, ""]:
+        """Return the misfit of all sites that predict, such as chi^2 / 2."""
+        return sum((fn.misfit(value) for fn, value in self._predictions(x, still)), jnp.zeros(()))
+
+    def _predictions(self, x: Float[Array, " n"], still: bool) -> list[tuple[Prediction, Array]]:
+        values, _ = self.values(x, still)
+
+        def place(site):
+            if site["name"] in values:
+                return dist.biject_to(site["fn"].support)(values[site["name"]])
+            return None
+
+        model = handlers.substitute(handlers.seed(self.program, 0), substitute_fn=place)
+        return [
+            (site["fn"], site["value"])
+            for site in handlers.trace(model).get_trace(**self.arguments).values()
+            if site["type"] == "sample" and isinstance(site["fn"], Prediction)
+        ]
+
+    def slope(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the gradient at x."""
+        return jax.grad(self.value)(x)
+
+    def gradient_and_curvature(
+        self, x: Float[Array, " n"], scale: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+        """Return both at x; ``scale``: lengths over which the potential is a parabola.
+
+        The curvature is that of Gauss and Newton where the program predicts the data, else the
+        Hessian by differences of gradients.
+        """
+        if not self.predicts:
+            # all in one map: second derivatives of banded factors take minutes to compile
+            steps = DIFFERENCE * jnp.diag(scale)
+            places = jnp.concatenate([x[None], x[None] + steps, x[None] - steps])
+            gradients = jax.lax.map(self.slope, places)
+            up, down = jnp.split(gradients[1:], 2)
+            slopes = (up - down) / (2.0 * DIFFERENCE * scale[:, None])
+            return gradients[0], 0.5 * (slopes + slopes.T)
+
+        def prior(x, still=False):
+            return self.value(x, still) - self.misfit(x, still)
+
+        columns = self._derivatives(self.residual, x)
+        if self.shapes.chart is None:
+            # every site's prior is a product over its values
+            _, diagonal = jax.jvp(jax.grad(prior), (x,), (jnp.ones_like(x),))
+            return self.slope(x), columns @ columns.T + jnp.diag(jnp.abs(diagonal))
+        of_prior = self._derivatives(jax.grad(prior), x)
+        return self.slope(x), columns @ columns.T + 0.5 * (of_prior + of_prior.T)
+
+    def _derivatives(
+        self, f: Callable[..., Float[Array, " m"]], x: Float[Array, " n"]
+    ) -> Float[Array, "n m"]:
+        """The transposed Jacobian of f(x, still).
+
+        Apart for what is held: charts need matrices that only scales change, and products of
+        those with every other direction would take longer than all the rest.
+        """
+        held = self.held()
+        unit = jnp.eye(x.shape[0])
+        _, derivative = jax.linearize(lambda x: f(x, True), x)
+        rows = jax.lax.map(derivative, unit, batch_size=COLUMNS)
+        if not len(held):
+            return rows
+        return rows.at[held].set(
+            jax.lax.map(lambda e: jax.jvp(lambda x: f(x, False), (x,), (e,))[1], unit[held])
+        )
+
+
+def without_held(curvature: Float[Array, "n n"], free: Float[Array, " n"]) -> Float[Array, "n n"]:
+    """Keep only the diagonal, made positive, of what is held: its block may not be positive."""
+    held = (1.0 - free) * jnp.abs(jnp.diagonal(curvature))
+    return curvature * free[:, None] * free[None] + jnp.diag(held)
+
+
+def root_of_inverse(curvature: Float[Array, "n n"], problem: Potential) -> tuple[Array, Array]:
+    """Return R and whether all curvature is positive; R R^T inverts its absolute value."""
+    if not problem.predicts:
+        return _root_of_any_sign(curvature)
+    lower = jnp.linalg.cholesky(curvature)
+    unit = jnp.eye(curvature.shape[0])
+    root = jax.scipy.linalg.solve_triangular(lower, unit, lower=True).T
+    if problem.shapes.chart is None:
+        return root, jnp.asarray(True)
+    # a prior in curved coordinates need not curve upwards everywhere
+    positive = jnp.isfinite(root).all()
+    return jax.lax.cond(positive, lambda: (root, positive), lambda: _root_of_any_sign(curvature))
+
+
+def _root_of_any_sign(curvature: Float[Array, "n n"]) -> tuple[Array, Array]:
+    # in units of its own diagonal, since parameters come in any
+    scale = 1.0 / jnp.sqrt(jnp.abs(jnp.diagonal(curvature)))
+    values, vectors = jnp.linalg.eigh(curvature * scale[:, None] * scale[None])
+    least = np.finfo(np.float64).eps * jnp.abs(values).max()
+    strength = jnp.maximum(jnp.abs(values), least)
+    return scale[:, None] * vectors / jnp.sqrt(strength)[None], (values > 0).all()
+
 
 # the mode is found when a step is shorter than this, rms in standard deviations: near enough for
 # coordinates, and longer than what rounding of a log evidence makes (1e-7, or 5e-4 of one)
@@ -260,3 +430,195 @@ def _climb(
     whitening = Whitening(x, root, log_det, problem.shapes.sites, problem.shapes.chart)
     log_evidence = -value + log_det + x.shape[0] * HALF_LOG_2PI
     return LaplaceApproximation(whitening, log_evidence, length_of(white, positive), n)
+
+
+# pixels of which all draws are held at once
+CHUNK = 1024
+
+# columns of summaries: the same with ArviZ 0.8 and 1.x
+INTERVAL = 0.9
+
+
+def _per_pixel(
+    skies: Float[np.ndarray, "chains draws modes"],
+    nside: int,
+    reduce: Callable[[Float[np.ndarray, "draws some"]], np.ndarray],
+) -> np.ndarray:
+    """``reduce`` of all draws of every pixel, chunk by chunk."""
+    flat = skies.reshape(-1, skies.shape[-1])
+    matrix = pixel_matrix(nside, lmax_of(flat.shape[-1]))
+    parts = [reduce(flat @ matrix[i : i + CHUNK].T) for i in range(0, len(matrix), CHUNK)]
+    return np.concatenate(parts, axis=-1)
+
+
+def pixel_mean_of_draws(
+    skies: Float[np.ndarray, "chains draws modes"], nside: int
+) -> Float[np.ndarray, " pixels"]:
+    """Compute the mean of every pixel over the draws, in K."""
+    return _per_pixel(skies, nside, lambda values: values.mean(0))
+
+
+def pixel_std_of_draws(
+    skies: Float[np.ndarray, "chains draws modes"], nside: int
+) -> Float[np.ndarray, " pixels"]:
+    """Compute the standard deviation of every pixel over the draws, in K."""
+    return _per_pixel(skies, nside, lambda values: values.std(0, ddof=1))
+
+
+def pixel_interval_of_draws(
+    skies: Float[np.ndarray, "chains draws modes"], nside: int, probability: float = INTERVAL
+) -> Float[np.ndarray, "2 pixels"]:
+    """Compute the lower and upper end of each pixel's central credible interval.
+
+    Parameters
+    ----------
+    skies : (chains, draws, modes) array
+        Draws, in K.
+    nside : int
+        NSIDE of the pixels.
+    probability : float
+        Of the interval, between 0 and 1.
+
+    Returns
+    -------
+    (2, pixels) array
+        In K.
+
+    Raises
+    ------
+    InputError
+        If the probability is not between 0 and 1.
+    """
+    if not 0 < probability < 1:
+        raise InputError(f"the probability of an interval must lie in 0..1, got {probability}")
+    tails = [(1 - probability) / 2, (1 + probability) / 2]
+    return _per_pixel(skies, nside, lambda values: np.quantile(values, tails, axis=0))
+
+
+def disc(nside: int, l_deg: float, b_deg: float, radius_deg: float) -> Bool[np.ndarray, " pixels"]:
+    """Select the pixels within a radius of a Galactic direction.
+
+    Parameters
+    ----------
+    nside : int
+        NSIDE of the pixels.
+    l_deg, b_deg : float
+        Galactic longitude and latitude in degrees.
+    radius_deg : float
+        The radius in degrees.
+
+    Raises
+    ------
+    InputError
+        If no pixel lies within it.
+    """
+    inside = np.zeros(healpy.nside2npix(nside), dtype=bool)
+    centre = healpy.ang2vec(l_deg, b_deg, lonlat=True)
+    inside[healpy.query_disc(nside, centre, np.radians(radius_deg))] = True
+    if not inside.any():
+        raise InputError(
+            f"no pixel of NSIDE {nside} lies within {radius_deg:g} degrees of l = {l_deg:g}, b = "
+            f"{b_deg:g}; pixels are {healpy.nside2resol(nside, arcmin=True) / 60:.1f} degrees wide"
+        )
+    return inside
+
+
+def region_brightness(
+    skies: Float[np.ndarray, "chains draws modes"], region: Bool[np.ndarray, " pixels"]
+) -> Float[np.ndarray, "chains draws"]:
+    """Compute the mean brightness of a region for every draw, in K."""
+    nside = healpy.npix2nside(len(region))
+    row = pixel_matrix(nside, lmax_of(skies.shape[-1]))[region].mean(0)
+    return skies @ row
+
+
+def probability_brighter(
+    skies: Float[np.ndarray, "chains draws modes"],
+    first: Bool[np.ndarray, " pixels"],
+    second: Bool[np.ndarray, " others"],
+) -> tuple[float, float]:
+    """Compute the probability that one region is brighter on average than another.
+
+    Parameters
+    ----------
+    skies : (chains, draws, modes) array
+        Draws, in K.
+    first, second : (pixels,) array of bool
+        The regions, of one NSIDE.
+
+    Returns
+    -------
+    probability, error : float
+        That the first is brighter, and its Monte Carlo error.
+
+    Raises
+    ------
+    InputError
+        For regions of different NSIDE.
+    """
+    require_shape("the second region", second, first.shape)
+    brighter = region_brightness(skies, first) > region_brightness(skies, second)
+    share = float(brighter.mean())
+    if share in (0.0, 1.0):
+        # no draw says otherwise: the rule of three bounds what n independent ones could miss
+        return share, 3.0 / brighter.size
+    error = array_stats.mcse(brighter.astype(float), chain_axis=0, draw_axis=1, method="mean")
+    return share, float(error)
+
+
+def sky_quantities(
+    skies: Float[np.ndarray, "chains draws modes"],
+    *,
+    modes: Sequence[tuple[int, int]] = (),
+    ells: Sequence[int] = (),
+    pixels: Mapping[str, tuple[float, float]] | None = None,
+) -> dict[str, Float[np.ndarray, "chains draws"]]:
+    """Compute chosen quantities of every draw, by name.
+
+    Parameters
+    ----------
+    skies : (chains, draws, modes) array
+        Draws, in K.
+    modes : sequence of (int, int)
+        Modes (ell, m).
+    ells : sequence of int
+        Of powers C_ell.
+    pixels : mapping of (float, float), optional
+        Galactic longitude and latitude in degrees of brightnesses, by name.
+
+    Raises
+    ------
+    InputError
+        For modes and ells beyond lmax.
+    """
+    lmax = lmax_of(skies.shape[-1])
+    columns = {}
+    for name, (l_deg, b_deg) in (pixels or {}).items():
+        theta, phi = np.radians([90.0 - b_deg]), np.radians([l_deg])
+        columns[f"T({name}) [K]"] = skies @ synthesis_matrix(theta, phi, lmax)[0]
+    spectra = power_spectrum(skies) if len(ells) else None
+    for ell in ells:
+        if not 0 <= ell <= lmax:
+            raise InputError(f"there is no ell = {ell} up to lmax = {lmax}")
+        columns[f"C_{ell} [K2]"] = spectra[..., ell]
+    for ell, m in modes:
+        if not (0 <= ell <= lmax and abs(m) <= ell):
+            raise InputError(f"there is no mode (ell, m) = ({ell}, {m}) up to lmax = {lmax}")
+        columns[f"sky({ell}, {m}) [K]"] = skies[..., ell**2 + ell + m]
+    return columns
+
+
+def summary(quantities: Mapping[str, Float[np.ndarray, "chains draws"]]) -> pd.DataFrame:
+    """Make ArviZ's summary, a row for each quantity.
+
+    It has mean, standard deviation, 90 % interval, bulk and tail ESS, R-hat and Monte Carlo
+    errors.
+
+    Parameters
+    ----------
+    quantities : mapping of (chains, draws) array
+        Draws by name.
+    """
+    tree = arviz_base.from_dict({"posterior": dict(quantities)}, check_conventions=False)
+    with np.errstate(all="ignore"):  # of chains that have not moved; NaN then says so
+        return arviz_stats.summary(tree, ci_prob=INTERVAL, ci_kind="eti", round_to="none")

@@ -19,10 +19,9 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.sampling.datatree import DATA
-from lusee_bayes.sampling.programs import Program
-from lusee_bayes.sampling.promotion import numpyro_promotion
-from lusee_bayes.sampling.whitening import WHITE_SUFFIX
-from lusee_bayes.systematics.base import SKY
+from lusee_bayes.sampling.hmc import WHITE_SUFFIX
+from lusee_bayes.sampling.programs import Program, numpyro_promotion
+from lusee_bayes.systematics.systematic import SKY
 
 # names that samples.nc uses for something else
 TAKEN = ("chain", "draw", "mode", "datum", "ell", "m", "product", "time")

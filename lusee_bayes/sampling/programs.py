@@ -1,11 +1,19 @@
-"""Probabilistic programs: files with a NumPyro ``model``, and what they can ask for."""
+"""NumPyro programs: what a program is given, and what it says.
+
+NumPyro under strict rules of JAX.
+
+Probabilistic programs: files with a NumPyro ``model``, and what they can ask for.
+
+The sites of a NumPyro program: which are sampled, which observed, which predict.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import inspect
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -24,7 +32,19 @@ from lusee_bayes.core.files import user_path
 from lusee_bayes.core.reading import read_text, require_file
 from lusee_bayes.core.version import printable
 from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.sampling.promotion import numpyro_promotion
+from lusee_bayes.sampling.distributions import Prediction
+
+
+@contextmanager
+def numpyro_promotion() -> Iterator[None]:
+    """Allow JAX's standard promotion of types and ranks.
+
+    NumPyro's own code mixes types and ranks, whatever rules are set for ours. Use it around calls
+    of NumPyro, or as the decorator ``@numpyro_promotion()`` of functions that make them.
+    """
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
 
 # the programs that come along: beside the package in a checkout, inside it once installed
 PACKAGE = Path(__file__).parents[1]
@@ -87,7 +107,7 @@ class Program:
             With all systematics in N; its pieces are ``PIECES``.
         more : mapping of callable, optional
             What makes the pieces of an experiment, by name
-            (:func:`lusee_bayes.experiment.pieces.program_pieces`).
+            (:func:`lusee_bayes.experiment.experiment.program_pieces`).
 
         Raises
         ------
@@ -295,3 +315,38 @@ def _draw(
         return gaussian.predict(sky) + gaussian.noise.sample(key)
 
     return jax.lax.map(one, (sites, skies, keys))
+
+
+def predicts(program: Callable, arguments: dict, kind: type[Prediction] = Prediction) -> bool:
+    """Tell whether a program has a site CorrelatedNormal or TimesStudentT, or of one ``kind``.
+
+    It then samples everything that they depend on, and its density needs matrix products only.
+    """
+    return any(isinstance(site["fn"], kind) for site in _sites(program, arguments))
+
+
+def latent_sites(program: Callable, arguments: dict) -> list[str]:
+    """Return the names of the sites that a program samples and does not observe."""
+    return site_names(program, arguments)[0]
+
+
+def site_names(program: Callable, arguments: dict) -> tuple[list[str], list[str]]:
+    """Return the names of a program's latent and of its observed sites."""
+    latent, observed = [], []
+    for site in _sites(program, arguments):
+        (observed if site["is_observed"] else latent).append(site["name"])
+    return latent, observed
+
+
+def _sites(program: Callable, arguments: dict) -> list[dict]:
+    """The sample sites of a program, without running it."""
+    found = []
+
+    def run(dynamic):
+        trace = handlers.trace(handlers.seed(program, 0)).get_trace(**eqx.combine(dynamic, static))
+        found.extend(site for site in trace.values() if site["type"] == "sample")
+
+    dynamic, static = eqx.partition(arguments, eqx.is_array)
+    with numpyro_promotion():
+        jax.eval_shape(run, dynamic)
+    return found

@@ -1,4 +1,28 @@
-"""The embedded diffuse sky: an ULSA-like model of the Galaxy between 1 and 50 MHz.
+"""The embedded Galaxy: synchrotron, absorption, bright sources.
+
+Free-free absorption and emission of the warm ionised gas of the Galaxy.
+
+The absorption coefficient at frequency nu is k(nu) <n_e^2>. <n_e^2> follows NE2001 (Cordes &
+Lazio 2002, astro-ph/0207156), reduced to what a degree-scale sky below 50 MHz shows: the thick
+disc, the annular thin disc, the low-density regions around the Sun, and the one nearby HII shell
+that is opaque at 10 MHz. Its spiral arms are left out: the sky agrees with ULSA without them.
+
+Positions are in kpc, Galactocentric, NE2001's axes: x towards l = 90 degrees, y from the centre
+towards the Sun, z towards the north Galactic pole; the Sun is at (0, 8.5, 0).
+
+Directions whose brightness summaries and spectra show.
+
+The brightest discrete sources of the low-frequency sky: positions and spectra.
+
+Spectra are log-polynomials where they were measured. Below, no flux scale exists: the power law
+of the last two octaves is carried on, through a turnover exp(-(nu/nu_t)^-2.1) by free-free
+absorption on the way, ::
+
+    S(nu) = S(nu_0) (nu/nu_0)^alpha exp(-(nu/nu_t)^-2.1 + (nu_0/nu_t)^-2.1),   nu < nu_0.
+
+Expect 10 % at 50 MHz, 20 % at 20 MHz and no more than the order of magnitude below 10 MHz.
+
+The embedded diffuse sky: an ULSA-like model of the Galaxy between 1 and 50 MHz.
 
 Cong et al. 2021 (arXiv:2104.03170): synchrotron emissivity of an axisymmetric Galaxy, integrated
 along every line of sight through ionised gas, in front of an isotropic background, ::
@@ -6,23 +30,312 @@ along every line of sight through ionised gas, in front of an isotropic backgrou
     T(l, b) = int [j(s) + kappa(s) T_e] exp(-tau(s)) ds + T_bg exp(-tau(inf)),
     tau(s) = int_0^s kappa ds'.
 
-The emissivity and the background are theirs. The electrons are in :mod:`.free_free`; their thermal
+The emissivity and the background are theirs. The electrons are in :mod:`.galaxy`; their thermal
 emission kappa T_e, which ULSA leaves out, and the random component are ours. No file is read: the
 map is computed.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from jaxtyping import Float
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import require_nside
-from lusee_bayes.core.lazy import healpy
-from lusee_bayes.sky import free_free
-from lusee_bayes.sky.free_free import SUN_RADIUS_KPC
+from lusee_bayes.core.harmonics import require_nside, synthesis_matrix
+from lusee_bayes.core.lazy import coordinates, healpy
+
+ELECTRON_TEMPERATURE_K = 8000.0
+SUN_RADIUS_KPC = 8.5
+
+# Densities, heights and radii are NE2001's (n1h1/h1, h1, A1; n2, h2, A2). The clumping factor
+# <n^2>/<n>^2 of the thick disc is tuned by hand against ULSA's mean at 1 MHz; it is that of gas
+# filling 30 % of the volume (Gaensler et al. 2008, PASA 25, 184, find 4 to 30 %). That of the thin
+# disc is NE2001's F2; F1 = 0.18, made for scattering, would leave 1 MHz four times too bright.
+THICK_DENSITY_CM3 = 0.034
+THICK_HEIGHT_KPC = 0.97
+THICK_EDGE_KPC = 17.5
+THICK_CLUMPING = 3.5
+THIN_DENSITY_CM3 = 0.08
+THIN_HEIGHT_KPC = 0.15
+THIN_RADIUS_KPC = 3.8
+THIN_WIDTH_KPC = 1.8
+THIN_CLUMPING = 120.0
+
+
+def absorption_per_emission_measure(frequency_mhz: float) -> float:
+    """Compute the optical depth of one unit of emission measure, int <n_e^2> ds = 1 pc cm^-6.
+
+    tau = 3.014e-2 T^-1.5 nu^-2 EM g with g = ln(4.955e-2 / nu) + 1.5 ln T, nu in GHz, T in K.
+    g carries the Gaunt factor; the usual nu^-2.1 law is its slope near 1 GHz, and 20 % too high
+    at 1 MHz.
+
+    Parameters
+    ----------
+    frequency_mhz : float
+        Frequency in MHz.
+
+    References
+    ----------
+    Oster 1961, Rev. Mod. Phys. 33, 525; Wilson, Rohlfs & Huettemeister, Tools of Radio
+    Astronomy, eq. 10.35.
+    """
+    nu_ghz = frequency_mhz / 1e3
+    gaunt = np.log(4.955e-2 / nu_ghz) + 1.5 * np.log(ELECTRON_TEMPERATURE_K)
+    return float(3.014e-2 * ELECTRON_TEMPERATURE_K**-1.5 * nu_ghz**-2 * gaunt)
+
+
+def thermal_emission(depth: np.ndarray) -> np.ndarray:
+    """Compute the brightness temperature of the gas itself, T_e (1 - exp(-tau)), in K.
+
+    The gas has one temperature. So the emission of all its parts, each absorbed by the gas in
+    front of it, int T_e exp(-tau) dtau, depends on the whole optical depth only: what is
+    transparent adds T_e tau, what is opaque is a black body of T_e.
+
+    Parameters
+    ----------
+    depth : array
+        Optical depth of the whole line of sight.
+
+    References
+    ----------
+    Rybicki & Lightman, Radiative Processes in Astrophysics, eq. 1.30 (Rayleigh-Jeans).
+    """
+    return -ELECTRON_TEMPERATURE_K * np.expm1(-depth)
+
+
+def thick_disc(radius_kpc: np.ndarray) -> np.ndarray:
+    """Compute the thick disc's mid-plane <n_e^2> in cm^-6 at Galactocentric radii in kpc."""
+    edge = 0.5 * np.pi / THICK_EDGE_KPC
+    shape = np.cos(edge * np.minimum(radius_kpc, THICK_EDGE_KPC)) / np.cos(edge * SUN_RADIUS_KPC)
+    return THICK_CLUMPING * (THICK_DENSITY_CM3 * shape) ** 2
+
+
+def thin_disc(radius_kpc: np.ndarray) -> np.ndarray:
+    """Compute the annular thin disc's mid-plane <n_e^2> in cm^-6 at cylindrical radii in kpc."""
+    shape = np.exp(-2.0 * ((radius_kpc - THIN_RADIUS_KPC) / THIN_WIDTH_KPC) ** 2)
+    return THIN_CLUMPING * THIN_DENSITY_CM3**2 * shape
+
+
+def height_profile(z_kpc: np.ndarray, height_kpc: float) -> np.ndarray:
+    """Compute <n_e^2> at heights in kpc over its mid-plane value: NE2001's sech^2, squared."""
+    return np.cosh(np.minimum(np.abs(z_kpc) / height_kpc, 100.0)) ** -4.0
+
+
+@dataclass(frozen=True)
+class Region:
+    """An ellipsoid of uniform <n_e^2> that replaces the discs inside it.
+
+    Attributes
+    ----------
+    name : str
+        The region's name.
+    centre_kpc : tuple of float
+        Its centre, Galactocentric.
+    semi_axes_kpc : tuple of float
+        Along the major axis, across it in the plane, and vertical.
+    angle_deg : float
+        Of the major axis from +x towards +y.
+    n_squared_cm6 : float
+        <n_e^2> in cm^-6.
+    """
+
+    name: str
+    centre_kpc: tuple[float, float, float]
+    semi_axes_kpc: tuple[float, float, float]
+    angle_deg: float
+    n_squared_cm6: float
+
+    def chord(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Find where lines of sight enter and leave the ellipsoid.
+
+        Parameters
+        ----------
+        direction : (..., 3) array
+            Unit vectors.
+
+        Returns
+        -------
+        enter, leave : (...) arrays
+            Distances from the Sun in kpc; both are equal where the line misses the ellipsoid.
+        """
+        c, s = np.cos(np.radians(self.angle_deg)), np.sin(np.radians(self.angle_deg))
+        to_ball = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        to_ball = to_ball / np.array(self.semi_axes_kpc)[:, None]
+        u = direction @ to_ball.T
+        w = to_ball @ (np.array([0.0, SUN_RADIUS_KPC, 0.0]) - np.array(self.centre_kpc))
+        uu = np.sum(u * u, axis=-1)
+        middle = -(u @ w) / uu
+        half = np.sqrt(np.maximum(middle**2 - (w @ w - 1.0) / uu, 0.0))
+        return np.maximum(middle - half, 0.0), np.maximum(middle + half, 0.0)
+
+
+# NE2001's local interstellar medium and one of its clumps, <n^2> = F n^2 with its n and F. Where
+# two overlap the first one listed counts, as in NE2001; its local hot bubble, a slanted cylinder,
+# and its Loop I, a half sphere, are upright ellipsoids here. The Vela shell lies at l = 263.25,
+# b = -9, 0.25 kpc away, and is opaque at 10 MHz: it makes much of ULSA's odd multipoles there.
+REGIONS = (
+    Region("IRAS Vela shell", (-0.2452, 8.5290, -0.0391), (0.038,) * 3, 0.0, 4.0**2 * 3.0),
+    Region("local hot bubble", (0.01, 8.45, 0.17), (0.085, 0.10, 0.33), 0.0, 0.005**2 * 0.01),
+    Region("Loop I", (-0.045, 8.40, 0.07), (0.18, 0.18, 0.18), 0.0, 0.0125**2 * 0.2),
+    Region("local superbubble", (-0.75, 9.0, -0.05), (1.05, 0.425, 0.325), 139.0, 0.016**2 * 0.01),
+    Region("low-density region", (1.36, 8.06, 0.0), (1.50, 0.75, 0.50), -24.2, 0.012**2 * 0.10),
+)
+
+
+# Galactic longitude and latitude in degrees
+LANDMARKS = {
+    "Galactic centre": (0.0, 0.0),
+    "anticentre": (180.0, 0.0),
+    "north Galactic pole": (0.0, 90.0),
+    "south Galactic pole": (0.0, -90.0),
+}
+
+
+BOLTZMANN = 1.380649e-23  # J/K
+LIGHT_SPEED = 299792458.0  # m/s
+JANSKY = 1e-26  # W / m^2 / Hz
+
+# Optical depth of free-free absorption is close to nu^-2.1 (Mezger & Henderson 1967, ApJ 147, 471).
+FREE_FREE_SLOPE = -2.1
+
+
+@dataclass(frozen=True)
+class PointSource:
+    """A source small against LuSEE-Night's resolution (Cen A's lobes, 8 degrees long, least so).
+
+    Attributes
+    ----------
+    name : str
+        The source's name.
+    ra_deg, dec_deg : float
+        Position in degrees, ICRS (J2000).
+    log_flux : tuple of float
+        a_i in log10 S/Jy = sum_i a_i (log10 nu/GHz)^i.
+    valid_from_mhz : float
+        Lowest frequency of that polynomial, in MHz.
+    turnover_mhz : float
+        Frequency in MHz where the optical depth towards the source is one.
+    """
+
+    name: str
+    ra_deg: float
+    dec_deg: float
+    log_flux: tuple[float, ...]
+    valid_from_mhz: float
+    turnover_mhz: float
+
+    def _measured(self, frequency_mhz: float | np.ndarray) -> float | np.ndarray:
+        x = np.log10(np.asarray(frequency_mhz, dtype=np.float64) / 1e3)
+        return 10.0 ** np.polynomial.polynomial.polyval(x, self.log_flux)
+
+    def _depth(self, frequency_mhz: float | np.ndarray) -> float | np.ndarray:
+        return (np.asarray(frequency_mhz, dtype=np.float64) / self.turnover_mhz) ** FREE_FREE_SLOPE
+
+    def flux_jy(self, frequency_mhz: float | np.ndarray) -> float | np.ndarray:
+        """Compute the flux density in Jy.
+
+        Parameters
+        ----------
+        frequency_mhz : float or array
+            Frequencies in MHz.
+
+        Raises
+        ------
+        InputError
+            For frequencies that are not positive.
+        """
+        frequency = np.asarray(frequency_mhz, dtype=np.float64)
+        if not np.all(frequency > 0.0):
+            raise InputError(
+                f"frequency_mhz is {frequency_mhz}, expected positive numbers; give it in MHz"
+            )
+        edge = self.valid_from_mhz
+        # The mean slope of two octaves: the tangent of a quartic at its end is mostly noise.
+        slope = math.log(self._measured(4.0 * edge) / self._measured(edge)) / math.log(4.0)
+        below = np.minimum(frequency, edge)
+        extrapolated = (below / edge) ** slope * np.exp(self._depth(edge) - self._depth(below))
+        return self._measured(np.maximum(frequency, edge)) * extrapolated
+
+    def galactic(self) -> tuple[float, float]:
+        """Return Galactic longitude (0 to 360) and latitude in degrees."""
+        at = coordinates.SkyCoord(self.ra_deg, self.dec_deg, unit="deg", frame="icrs").galactic
+        return float(at.l.deg), float(at.b.deg)
+
+    def kelvin_steradian(self, frequency_mhz: float | np.ndarray) -> float | np.ndarray:
+        """Compute the brightness temperature integrated over the source, in K sr."""
+        return kelvin_steradian(self.flux_jy(frequency_mhz), frequency_mhz)
+
+    def modes(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
+        """Compute the source's coefficients: its K sr times the harmonics at its position.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+            Frequency in MHz.
+        lmax : int
+            Highest ell.
+
+        Returns
+        -------
+        (modes,) array
+            Real packed coefficients, Galactic, in K.
+        """
+        l_deg, b_deg = self.galactic()
+        theta, phi = np.array([np.radians(90.0 - b_deg)]), np.array([np.radians(l_deg)])
+        return self.kelvin_steradian(frequency_mhz) * synthesis_matrix(theta, phi, lmax)[0]
+
+
+def kelvin_steradian(
+    flux_jy: float | np.ndarray, frequency_mhz: float | np.ndarray
+) -> float | np.ndarray:
+    """Convert flux densities to brightness temperature times solid angle, S c^2 / (2 k nu^2).
+
+    Parameters
+    ----------
+    flux_jy : float or array
+        Flux densities in Jy.
+    frequency_mhz : float or array
+        Frequencies in MHz.
+
+    Returns
+    -------
+    float or array
+        In K sr.
+    """
+    nu = np.asarray(frequency_mhz, dtype=np.float64) * 1e6
+    return flux_jy * JANSKY * (LIGHT_SPEED / nu) ** 2 / (2.0 * BOLTZMANN)
+
+
+def galactic_unit_vector(ra_deg: float, dec_deg: float) -> Float[np.ndarray, "3"]:
+    """Return the Galactic unit vector of an ICRS (J2000) position in degrees."""
+    position = coordinates.SkyCoord(ra_deg, dec_deg, unit="deg", frame="icrs").galactic
+    return np.asarray(position.cartesian.xyz.value, dtype=np.float64)
+
+
+# Positions: NED and SIMBAD. Polynomials and their lower ends: Perley & Butler 2017 (ApJS 230, 7),
+# table 6, epoch 2016 for the two supernova remnants. Cen A: 2740 Jy at 408 MHz with its giant lobes
+# (Cooper, Price & Cole 1965, Aust. J. Phys. 18, 589) and the one index, -0.70, that holds from 10
+# to 4750 MHz (Alvarez et al. 2000, A&A 355, 863).
+# Turnovers: Cyg A from 13.5 kJy at 10.05 MHz and Cas A from 28 kJy there in 1965 (Bridle 1967, in
+# Baars et al. 1977, A&A 61, 99), 18.5 kJy in 2016 if fading by 0.8 % a year (Helmboldt & Kassim
+# 2009, AJ 138, 838); the others from the column of electrons in :mod:`.galaxy`, which
+# for Tau A, 2 kpc away, is an upper limit.
+BRIGHT_SOURCES = (
+    PointSource("Cas A", 350.8500, 58.8150, (3.3584, -0.7518, -0.035, -0.071), 200.0, 11.9),
+    PointSource("Cyg A", 299.8682, 40.7339, (3.3498, -1.0022, -0.225, 0.023, 0.043), 50.0, 12.7),
+    PointSource("Vir A", 187.7059, 12.3911, (2.4466, -0.8116, -0.048), 50.0, 1.2),
+    PointSource("Tau A", 83.6331, 22.0145, (2.9516, -0.2170, -0.047, -0.067), 50.0, 2.7),
+    PointSource("Cen A", 201.3651, -43.0191, (3.4378 + 0.70 * math.log10(0.408), -0.70), 10.0, 2.3),
+    PointSource("For A", 50.6738, -37.2082, (2.2180, -0.661), 200.0, 1.2),
+    PointSource("Her A", 252.7839, 4.9926, (1.8298, -1.0247, -0.0951), 200.0, 1.9),
+    PointSource("Hyd A", 139.5235, -12.0955, (1.7795, -0.9176, -0.084, -0.0139, 0.030), 50.0, 1.6),
+    PointSource("Pic A", 79.9572, -45.7788, (1.9380, -0.7470, -0.074), 200.0, 1.3),
+)
+
 
 # Synchrotron emissivity (Cong et al. 2021, constant spectral index).
 EMISSIVITY_K_PER_KPC = 43.10
@@ -113,7 +426,7 @@ class Slabs:
         cos_lon, cos_lat, sin_lat = np.cos(lon), np.cos(lat), np.sin(lat)
         up = np.stack([np.sin(lon) * cos_lat, -cos_lon * cos_lat, sin_lat], axis=-1)
         direction = np.stack([up, up * [1.0, 1.0, -1.0]])
-        chords = [(region.chord(direction), region) for region in free_free.REGIONS]
+        chords = [(region.chord(direction), region) for region in REGIONS]
 
         # The discs do not tell l from -l: they are computed once for both.
         _, one, of_line = np.unique(
@@ -138,9 +451,9 @@ class Slabs:
             s, ds = node * stretch, weight * stretch
             along, z = s * cos_lat, s * sin_lat
             radius = np.sqrt(SUN_RADIUS_KPC**2 + along * (along - 2.0 * SUN_RADIUS_KPC * cos_lon))
-            n_squared = free_free.thick_disc(radius) * free_free.height_profile(
-                z, free_free.THICK_HEIGHT_KPC
-            ) + free_free.thin_disc(radius) * free_free.height_profile(z, free_free.THIN_HEIGHT_KPC)
+            n_squared = thick_disc(radius) * height_profile(z, THICK_HEIGHT_KPC) + thin_disc(
+                radius
+            ) * height_profile(z, THIN_HEIGHT_KPC)
             disc = emissivity_in_plane(radius) * emissivity_height_profile(z) * ds
             emitted[k], smooth = disc[of_line], n_squared[of_line]
 
@@ -170,7 +483,7 @@ class Slabs:
         electrons : float
             Factor of <n_e^2>.
         """
-        kappa = 1e3 * electrons * free_free.absorption_per_emission_measure(frequency_mhz)
+        kappa = 1e3 * electrons * absorption_per_emission_measure(frequency_mhz)
         scale = (frequency_mhz / REFERENCE_MHZ) ** SPECTRAL_INDEX
         synchrotron, depth = np.zeros((2, *self.column.shape[1:]))
         transmission = np.ones(self.column.shape[1:])
@@ -226,7 +539,7 @@ def brightness(synchrotron: np.ndarray, depth: np.ndarray, frequency_mhz: float)
         Frequency in MHz.
     """
     behind = background(frequency_mhz) * np.exp(-depth)
-    return synchrotron + free_free.thermal_emission(depth) + behind
+    return synchrotron + thermal_emission(depth) + behind
 
 
 @lru_cache(maxsize=1)
@@ -264,7 +577,7 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> n
     positive. The background is absorbed by the whole Galactic column.
 
     Two numbers were tuned against ULSA's maps, by hand: the clumping of the thick disc
-    (:mod:`.free_free`) and FLUCTUATION_RMS. With seed 1 the mean is within 2 % of ULSA's at 1, 3
+    (:mod:`.galaxy`) and FLUCTUATION_RMS. With seed 1 the mean is within 2 % of ULSA's at 1, 3
     and 10 MHz, and C_ell at 10 MHz within 15 % for 1 <= ell <= 30. At 1 MHz the local gas rules
     the sky, and only the largest scales agree.
 

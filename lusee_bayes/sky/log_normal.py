@@ -25,7 +25,7 @@ from lusee_bayes.core.checks import Described, extent, is_traced, require_finite
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mode_numbers, n_modes, per_mode
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.sky.bright_sources import PointSource
+from lusee_bayes.sky.galaxy import PointSource
 from lusee_bayes.sky.template import Template
 
 # band limit of the grid: this many times that of the map, and at least so much, since what the

@@ -28,7 +28,7 @@ from lusee_bayes.core.checks import (
 )
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import per_mode, power_spectrum
-from lusee_bayes.sky.priors import HarmonicPrior
+from lusee_bayes.sky.prior import HarmonicPrior
 
 # spectra over the power law: x is frequency / reference, y frequency / turnover; ionised gas takes
 # 1 - exp(-tau) away, and tau goes as nu^-2.1 (Altenhoff et al. 1960)

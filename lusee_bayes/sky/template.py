@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lusee_bayes.sky.galaxy import MAXIMUM_MHZ, Slabs, background, brightness, galaxy_map
-from lusee_bayes.sky.source import GalaxySource
+from lusee_bayes.sky.sky_source import GalaxySource
 
 
 @lru_cache(maxsize=1)

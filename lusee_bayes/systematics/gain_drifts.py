@@ -11,17 +11,17 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.lazy import dist, numpyro
-from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.noise import GainDrift, white_grid, with_gains
-from lusee_bayes.systematics.base import (
+from lusee_bayes.noise.instrument_errors import GainDrift, white_grid, with_gains
+from lusee_bayes.systematics.systematic import (
     SKY,
+    Chart,
     Systematic,
     multiplied,
     scalar_or_none,
     uncertain_scale,
 )
-from lusee_bayes.systematics.chart import Chart
 
 # how far, in standard deviations of ln, a correlation time that is not known can be off, and by
 # which factor where a program of its own says how it is not known

@@ -34,12 +34,10 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.lazy import dist, numpyro
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.products import all_products
+from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankCovariance
-from lusee_bayes.systematics.base import Systematic, multiplied, with_added
-from lusee_bayes.systematics.templated import Expanded
+from lusee_bayes.systematics.systematic import Expanded, Systematic, multiplied, with_added
 
 # the site of the errors, in prior standard deviations
 GAIN_TABLE = "gain_table"

@@ -23,7 +23,7 @@ from astropy.io import fits
 import lusee_bayes
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
-from lusee_bayes.experiment.schema import OutputSection
+from lusee_bayes.experiment.section import OutputSection
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.runs import map_run
 from lusee_bayes.runs import map_run as runs

@@ -14,20 +14,17 @@ import wrong_data
 from scipy import linalg, stats
 
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.inference import infer
-from lusee_bayes.experiment.learned_prior import learned_prior
-from lusee_bayes.experiment.model import full_model, radiometer
-from lusee_bayes.experiment.rounds import settled
-from lusee_bayes.experiment.schema import FileSkySection
+from lusee_bayes.experiment.experiment import build, infer
+from lusee_bayes.experiment.model import full_model, radiometer, simulate
+from lusee_bayes.experiment.rounds import learned_prior, settled
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.experiment.simulate import simulate
-from lusee_bayes.experiment.terms import Around, gains_about, radiometer_about
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.noise import GainDrift, with_gains
+from lusee_bayes.experiment.sky_sections import FileSkySection
+from lusee_bayes.experiment.term import Around, gains_about, radiometer_about
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.noise.instrument_errors import GainDrift, with_gains
 from lusee_bayes.results.draws import doubts
-from lusee_bayes.sky import Sky
-from lusee_bayes.sky.priors import HarmonicPrior
+from lusee_bayes.sky.prior import HarmonicPrior
+from lusee_bayes.sky.sky_source import Sky
 
 LMAX = 8
 TERMS = {
@@ -167,8 +164,8 @@ def test_the_default_path_with_drifts(sigma, test_data):
 
 def test_a_prior_that_does_not_settle_with_n_is_said_to(monkeypatch):
     """Rounds that may never end are cut short, and the map says by how much it still moves."""
-    monkeypatch.setattr("lusee_bayes.experiment.learned_prior.SETTLED", 0.0)
-    monkeypatch.setattr("lusee_bayes.experiment.learned_prior.MAX_ROUNDS", 1)
+    monkeypatch.setattr("lusee_bayes.experiment.rounds.SETTLED", 0.0)
+    monkeypatch.setattr("lusee_bayes.experiment.rounds.MAX_ROUNDS", 1)
     scenario = wrong_data.scenario(4, "observation.step_s=60000", *TERMS["gain drifts"])
     data = wrong_data.measured(scenario, wrong_data.Mixed(1).at(25.0, 4), 1)
     experiment = build(scenario, data)

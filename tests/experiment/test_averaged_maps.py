@@ -15,10 +15,9 @@ import pytest
 from scipy import stats
 from scipy.linalg import eigh
 
-from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.model import full_model, simulate
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.experiment.simulate import simulate
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian

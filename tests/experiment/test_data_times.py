@@ -13,11 +13,12 @@ from lusee_bayes.experiment.data_files import digest_of, items_of, read_data
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.averaging import averaged
-from lusee_bayes.instrument.observation import Observation, Run
-from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.instrument.visibilities_file import read_visibilities
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.schedule import Run
+from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities
 from lusee_bayes.instrument.waterfalls import write_waterfall
-from lusee_bayes.testing import assert_refused, small_scenario
+from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.checks import assert_refused
 
 STEP = 7200.0
 # from the stamps to the beginning of the windows

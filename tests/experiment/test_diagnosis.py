@@ -8,16 +8,19 @@ import wrong_data
 
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.harmonics import lmax_of, synthesis_matrix
-from lusee_bayes.experiment.any_sky import UnderAnySky
-from lusee_bayes.experiment.diagnosis import diagnose
-from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.inference import infer
-from lusee_bayes.experiment.mistakes import data_mistakes, model_mistakes, port_mixing
-from lusee_bayes.experiment.mixed_products import MixedProducts
+from lusee_bayes.experiment.diagnosis import (
+    MixedProducts,
+    UnderAnySky,
+    data_mistakes,
+    diagnose,
+    model_mistakes,
+    port_mixing,
+)
+from lusee_bayes.experiment.experiment import build, infer
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.products import to_matrix, to_real
-from lusee_bayes.linear.residuals import residuals
-from lusee_bayes.sky.priors import HarmonicPrior
+from lusee_bayes.judge.residuals import residuals
+from lusee_bayes.sky.prior import HarmonicPrior
 
 LMAX = 8
 QUICK = (

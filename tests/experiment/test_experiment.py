@@ -10,17 +10,15 @@ from experiments import small_experiment as make_small_experiment
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.model import full_model, radiometer
+from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.experiment.simulate import simulate
-from lusee_bayes.experiment.terms import Around
-from lusee_bayes.experiment.terms.noise_about import measured_visibilities
-from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.experiment.term import Around, measured_visibilities
+from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.results.map_result import map_result
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.testing.cases import small_scenario
 
 
 def flagged(whole: Visibilities, flags: np.ndarray) -> Visibilities:

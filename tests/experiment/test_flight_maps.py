@@ -9,14 +9,13 @@ from naive_flight import naive_band
 import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.data_files import read_data
-from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.experiment import build, infer
 from lusee_bayes.experiment.flight_data import per_kelvin_of, reduce_files
-from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.instrument.calibration import Calibration
 from lusee_bayes.instrument.products import auto_indices, labels
+from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.results.unknowns import unknowns_report
-from lusee_bayes.testing import assert_refused
+from lusee_bayes.testing.checks import assert_refused
 
 NAMES = "abcd"
 

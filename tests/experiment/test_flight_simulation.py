@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.experiment import build, infer
 from lusee_bayes.experiment.flight_data import reduce_files, visibilities_of
 from lusee_bayes.experiment.flight_simulation import simulate_flight
-from lusee_bayes.experiment.inference import infer
 from lusee_bayes.experiment.leave_out import without
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.scenario import load_scenario
@@ -22,7 +21,7 @@ from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.flight.synthesis import Disturbances
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.noise.radiometer import exact_blocks
-from lusee_bayes.runs.flight_run import run_simulate_flight
+from lusee_bayes.runs.data_run import run_simulate_flight
 
 FREQUENCIES = [10.0, 25.0]
 SMALL = ["lmax=4", f"frequencies_mhz={FREQUENCIES}", "flight={per_kelvin_v2_hz: 1e-21}"]

@@ -6,16 +6,18 @@ from fits_files import write_images
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import as_yaml, parse_yaml
-from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.experiment.schema import (
-    FileSkySection,
-    GalaxySection,
-    IsotropicPriorSection,
-    LocalScalesPriorSection,
+from lusee_bayes.experiment.instrument_sections import (
     MonopoleBeamSection,
     ResponseSection,
     ScalarBeamSection,
     section_of_file,
+)
+from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.experiment.sky_sections import (
+    FileSkySection,
+    GalaxySection,
+    IsotropicPriorSection,
+    LocalScalesPriorSection,
 )
 
 # all keys, as a resolved scenario was written before sections came in kinds

@@ -10,15 +10,15 @@ import pytest
 from scipy.linalg import LinAlgError
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment import comparison
+from lusee_bayes.experiment import leave_out
 from lusee_bayes.experiment.experiment import build, explained
 from lusee_bayes.experiment.leave_out import NOT_JUDGED, TOO_MANY, fitting, without
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.experiment.terms.noise_about import measured_visibilities
-from lusee_bayes.instrument.calibration import Calibration
-from lusee_bayes.testing import assert_refused
+from lusee_bayes.experiment.term import measured_visibilities
+from lusee_bayes.instrument.visibilities import Calibration
+from lusee_bayes.testing.checks import assert_refused
 
 FALSE_ALARM = 1e-4
 
@@ -199,8 +199,8 @@ def test_data_go_without_another_fit(experiment, monkeypatch):
         calls.append(arguments)
         return settled(*arguments)
 
-    settled = comparison.settled
-    monkeypatch.setattr(comparison, "settled", counted)
+    settled = leave_out.settled
+    monkeypatch.setattr(leave_out, "settled", counted)
     data = with_bursts(experiment, [7], 8.0)
     data = replace(data, data=with_bursts(replace_data(experiment, data), [30, 44], 60.0).data)
     found = fitting(experiment.setup, data, FALSE_ALARM)
@@ -209,7 +209,7 @@ def test_data_go_without_another_fit(experiment, monkeypatch):
 
 
 def test_what_cannot_be_judged_is_said(experiment, monkeypatch):
-    monkeypatch.setattr("lusee_bayes.experiment.comparison.memory_limit", lambda: 1000)
+    monkeypatch.setattr("lusee_bayes.experiment.leave_out.memory_limit", lambda: 1000)
     found = fitting(experiment.setup, experiment.data, FALSE_ALARM)
     assert not found.flagged.any()
     assert found.remark == NOT_JUDGED
@@ -226,7 +226,7 @@ def test_what_64_bits_do_not_tell_is_not_compared(experiment, monkeypatch):
     def singular(*_, **__):
         raise LinAlgError("singular")
 
-    monkeypatch.setattr("lusee_bayes.linear.left_out_dense.cho_factor", singular)
+    monkeypatch.setattr("lusee_bayes.judge.left_out.cho_factor", singular)
     data = with_bursts(experiment, [7], 1e3)
     found = fitting(experiment.setup, data, FALSE_ALARM)
     assert not found.flagged.any()

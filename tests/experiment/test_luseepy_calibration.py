@@ -23,8 +23,8 @@ from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.instrument.beams import read_beam
-from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.beams.sampled import read_beam
+from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.waterfalls import read_waterfall
 
 pytestmark = pytest.mark.long

@@ -7,10 +7,10 @@ import pytest
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.plausibility import SIGNIFICANT, about_information, require_plausible
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.products import to_matrix
-from lusee_bayes.noise import radiometer_noise
+from lusee_bayes.judge.plausibility import SIGNIFICANT, about_information, require_plausible
+from lusee_bayes.noise.radiometer import radiometer_noise
 
 
 @pytest.fixture(scope="module")

@@ -11,21 +11,18 @@ from scipy import stats
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.diagnosis import diagnose
-from lusee_bayes.experiment.experiment import Experiment, build
-from lusee_bayes.experiment.inference import infer
-from lusee_bayes.experiment.model import base_model, full_model, radiometer
-from lusee_bayes.experiment.pieces import program_pieces
+from lusee_bayes.experiment.experiment import Experiment, build, infer, program_pieces
+from lusee_bayes.experiment.instrument_terms import pointing_offsets, second_order, shifted
+from lusee_bayes.experiment.model import base_model, full_model, radiometer, simulate, true_values
 from lusee_bayes.experiment.rounds import offset_posterior
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.simulate import simulate, true_values
-from lusee_bayes.experiment.terms import Around, pointing_offsets, second_order
-from lusee_bayes.experiment.terms.pointing import shifted
+from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.source_response import source_response
-from lusee_bayes.linear.residuals import residuals
-from lusee_bayes.results.pointing import pointing_report
-from lusee_bayes.sky import galactic_unit_vector
-from lusee_bayes.sky.priors import HarmonicPrior
+from lusee_bayes.judge.residuals import residuals
+from lusee_bayes.results.unknowns import pointing_report
+from lusee_bayes.sky.galaxy import galactic_unit_vector
+from lusee_bayes.sky.prior import HarmonicPrior
 
 TWO_RUNS = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
 OFF = "clock_s: 60, turntable_0_deg: 0.3, turntable_1_deg: 0.0, clock_drift_s_per_day: 0.0"

@@ -12,8 +12,8 @@ import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import map_to_modes
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.sky.prior_files import read_spectrum
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.sky.prior import read_spectrum
+from lusee_bayes.testing.cases import small_scenario
 
 LMAX, NSIDE = 6, 16
 

@@ -6,7 +6,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.keys import scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario, scenario_names
-from lusee_bayes.experiment.schema.section import FILES
+from lusee_bayes.experiment.section import FILES
 
 
 def test_the_fiducial_scenario_is_the_papers():

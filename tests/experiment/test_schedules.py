@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.experiment import build, infer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.schedule_file import read_schedule
-from lusee_bayes.results.cost import posterior_cost, simulation_cost
-from lusee_bayes.results.variations import default_variations
-from lusee_bayes.runs.forecasting import forecast
-from lusee_bayes.runs.simulate_run import run_simulate
+from lusee_bayes.instrument.schedule import read_schedule
+from lusee_bayes.runs.cost import posterior_cost, simulation_cost
+from lusee_bayes.runs.data_run import run_simulate
+from lusee_bayes.runs.forecasting import default_variations, forecast
 
 STEP_S = 20000.0
 TABLE = """\

@@ -14,33 +14,29 @@ from experiments import small_experiment
 from scipy.stats import chi2, kstest
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.experiment import Experiment, build
-from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.experiment import Experiment, build, infer
+from lusee_bayes.experiment.instrument_terms import beam_directions, beam_rms_difference, true_beams
 from lusee_bayes.experiment.model import full_model, radiometer
 from lusee_bayes.experiment.rounds import SETTLED, Inference, prediction
 from lusee_bayes.experiment.scenario import load_scenario, scenario_names
-from lusee_bayes.experiment.terms import (
-    Around,
-    beam_directions,
-    beam_rms_difference,
-    true_beams,
-)
-from lusee_bayes.instrument.beams import monopole_beams
+from lusee_bayes.experiment.term import Around
+from lusee_bayes.instrument.beams.monopoles import monopole_beams
 from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.observation import Observation, Run
+from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
+from lusee_bayes.instrument.schedule import Run
 from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.noise import (
+from lusee_bayes.noise.covariance import DiagonalCovariance, LowRankUpdate, TimeBandedCovariance
+from lusee_bayes.noise.instrument_errors import (
     GainDrift,
     beam_error_noise,
     difference,
-    radiometer_noise,
     template_noise,
     with_gains,
 )
-from lusee_bayes.noise.covariance import DiagonalCovariance, LowRankUpdate, TimeBandedCovariance
-from lusee_bayes.sky.priors import HarmonicPrior
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.noise.radiometer import radiometer_noise
+from lusee_bayes.sky.prior import HarmonicPrior
+from lusee_bayes.testing.cases import small_scenario
 
 GAIN = "noise.gain.sigma=0.01"
 SHIFT = "noise.beam.shift_mhz=4"

@@ -12,17 +12,23 @@ from experiments import small_experiment
 from reference_linear import assert_draws_follow
 
 from lusee_bayes.experiment import model as model_module
-from lusee_bayes.experiment import simulate as simulate_module
 from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.model import full_model, model_to_sample, radiometer, systematics
+from lusee_bayes.experiment.model import (
+    full_model,
+    model_to_sample,
+    radiometer,
+    simulate,
+    systematics,
+    true_values,
+)
+from lusee_bayes.experiment.noise_sections import NoiseSection
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.schema import NoiseSection
-from lusee_bayes.experiment.schema.section import Positive, Section, Treatment
+from lusee_bayes.experiment.section import Positive, Section, Treatment
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.simulate import simulate, true_values
-from lusee_bayes.experiment.terms import TERMS, AdditiveTerm, Around, Term, Truth
+from lusee_bayes.experiment.term import AdditiveTerm, Around, Term, Truth
+from lusee_bayes.experiment.terms import TERMS
 from lusee_bayes.noise.covariance import Covariance, LowRankCovariance
-from lusee_bayes.systematics import AdditiveNoise
+from lusee_bayes.systematics.systematic import AdditiveNoise
 
 KEY = "noise.hum"
 TREATMENTS = ("marginalised", "sampled", "ignored")

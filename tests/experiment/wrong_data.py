@@ -14,16 +14,15 @@ import numpy as np
 
 from lusee_bayes.core.harmonics import mode_numbers, turn_about_z
 from lusee_bayes.experiment.model import radiometer
-from lusee_bayes.experiment.overrides import apply_override
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, apply_override
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.instrument.beams import ProductBeams
+from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.products import labels
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.noise import GainDrift, with_gains
-from lusee_bayes.sky import Sky, SkySource
-from lusee_bayes.testing.skies import SmoothSky, SpottySky
+from lusee_bayes.noise.instrument_errors import GainDrift, with_gains
+from lusee_bayes.sky.sky_source import Sky, SkySource
+from lusee_bayes.testing.cases import SmoothSky, SpottySky
 
 LABELS = labels(4)
 

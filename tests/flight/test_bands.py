@@ -5,7 +5,7 @@ import pytest
 
 from lusee_bayes.flight.bands import FRAME, ChannelBand, impulse_response, shared_noise
 from lusee_bayes.flight.session import AVERAGING, channel_mhz
-from lusee_bayes.testing import assert_refused
+from lusee_bayes.testing.checks import assert_refused
 
 
 def spectrum(mhz, coefficients):

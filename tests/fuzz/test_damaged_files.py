@@ -24,16 +24,16 @@ from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
 from lusee_bayes.flight.session_files import read_session
-from lusee_bayes.instrument.beams import read_beam, sampled_beams, write_sampled_beams
-from lusee_bayes.instrument.visibilities_file import read_visibilities
+from lusee_bayes.instrument.beams.sampled import read_beam, sampled_beams, write_sampled_beams
+from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe
 from lusee_bayes.results.updatable import read_updatable
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
-from lusee_bayes.runs.flight_run import run_simulate_flight
-from lusee_bayes.sky import write_alms
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.runs.data_run import run_simulate_flight
+from lusee_bayes.sky.sky_files import write_alms
+from lusee_bayes.testing.cases import small_scenario
 
 FEW, MANY = 10, 150 * SCALE
 

@@ -12,9 +12,9 @@ from outcomes import SCALE, require_answer
 from pydantic import BaseModel
 
 from lusee_bayes.cli.options import parse_frequencies
-from lusee_bayes.cli.plan_variations import own_variations
+from lusee_bayes.cli.plan_command import own_variations
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.results.cost import posterior_cost, require_fits
+from lusee_bayes.runs.cost import posterior_cost, require_fits
 
 FEW, MANY = 100, 500 * SCALE
 

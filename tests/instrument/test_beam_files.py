@@ -18,14 +18,15 @@ from reference import hemisphere, real_harmonics
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
-from lusee_bayes.experiment.pieces import program_pieces
+from lusee_bayes.experiment.experiment import program_pieces
+from lusee_bayes.experiment.instrument_terms import beam_directions, beam_rms_difference, true_beams
+from lusee_bayes.experiment.model import true_signal, true_values
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.experiment.simulate import true_signal, true_values
-from lusee_bayes.experiment.terms import beam_directions, beam_rms_difference, true_beams
-from lusee_bayes.instrument.beams import HemisphereGrid, ScalarBeam, read_beam
-from lusee_bayes.instrument.beams.scalar_file import FIELDS
+from lusee_bayes.instrument.beams.fields import HemisphereGrid
+from lusee_bayes.instrument.beams.luseepy_files import FIELDS, ScalarBeam
+from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.products import labels, to_matrix
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.testing.cases import small_scenario
 
 LMAX, PORTS = 47, 4
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.beams import (
+from lusee_bayes.instrument.beams.monopoles import Monopoles
+from lusee_bayes.instrument.beams.sampled import read_beam
+from lusee_bayes.instrument.beams.source import (
     BeamSource,
     EmbeddedBeams,
-    Monopoles,
     ResponseBeams,
     ScalarFileBeams,
-    read_beam,
 )
-from lusee_bayes.testing import check_beam_source
+from lusee_bayes.testing.checks import check_beam_source
 
 FREQUENCY, LMAX, TURNED_DEG = 25.0, 6, 30.0
 

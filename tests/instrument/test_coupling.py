@@ -15,12 +15,10 @@ from scipy.stats import norm, truncnorm
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import Rotation, n_modes, turn_about_z
-from lusee_bayes.instrument.beam_operator import BeamOperator
-from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, as_coupling
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.products import auto_indices, labels, to_matrix
-from lusee_bayes.systematics import BeamError, InstrumentParameters
-from lusee_bayes.testing import check_coupling
+from lusee_bayes.instrument.coupling import BeamOperator, CouplingMatrix, DenseCoupling, as_coupling
+from lusee_bayes.instrument.products import DataLayout, auto_indices, labels, to_matrix
+from lusee_bayes.systematics.instrument_unknowns import BeamError, InstrumentParameters
+from lusee_bayes.testing.checks import check_coupling
 
 LMAX = 8
 SITE = {"lon_deg": 182.258, "lat_deg": -23.814}
@@ -225,7 +223,7 @@ def test_the_moons_axis_is_not_fixed(cycles, lmax, monkeypatch):
         pointing = lb.Pointing.of(o, lmax, order)
         return np.asarray(CouplingMatrix.build(beams, pointing) @ sky)
 
-    monkeypatch.setattr("lusee_bayes.instrument.window_average.TOLERANCE", 1e-14)
+    monkeypatch.setattr("lusee_bayes.instrument.averaging.TOLERANCE", 1e-14)
     exact = visibilities_at(5)  # itself good to 1e-9 sigma
     v = exact.reshape(16, -1)
     autos = v[auto_indices()]

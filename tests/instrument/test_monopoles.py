@@ -11,14 +11,13 @@ from reference import SPEED_OF_LIGHT, arm_response, layered_reflection, vectors
 import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import turn_about_z
-from lusee_bayes.instrument.beams import (
-    HemisphereGrid,
+from lusee_bayes.instrument.beams.fields import HemisphereGrid, stokes_beam
+from lusee_bayes.instrument.beams.monopoles import (
+    PORT_AZIMUTHS_DEG,
     Monopoles,
     Regolith,
     monopole_beams,
-    stokes_beam,
 )
-from lusee_bayes.instrument.beams.monopoles import PORT_AZIMUTHS_DEG
 from lusee_bayes.instrument.products import to_matrix
 
 GRID = HemisphereGrid.gauss_legendre(6, 8)

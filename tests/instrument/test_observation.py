@@ -21,8 +21,8 @@ from lunarsky import MCMF, LunarTopo, MoonLocation
 from reference import galactic_directions, vectors
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.ephemeris import BODIES, MOON_RADIUS_KM, body_direction
-from lusee_bayes.instrument.moon import CYCLE_DAYS
+from lusee_bayes.instrument.observation import BODIES, MOON_RADIUS_KM, body_direction
+from lusee_bayes.instrument.schedule import CYCLE_DAYS
 from lusee_bayes.instrument.times import unannounced_leap_seconds
 
 # the leap seconds of years far ahead are unknown; astropy says so whenever it converts them

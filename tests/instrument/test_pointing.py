@@ -16,21 +16,19 @@ from scipy.spatial.transform import Rotation as SpatialRotation
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import Rotation, generators, tilt_powers, turn_about_x, turn_about_y
-from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.pointing import (
     LEAST_ORDER,
+    OFFSETS,
     TILT_TOLERANCE,
     Pointing,
     mean_pole_frame,
+    offset_names,
     split,
     sufficient_order,
-)
-from lusee_bayes.instrument.pointing_offsets import (
-    OFFSETS,
-    offset_names,
     turned_by_offsets,
     with_offsets,
 )
+from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.source_response import antenna_directions
 from lusee_bayes.noise.radiometer import paper_variance
 
@@ -122,7 +120,7 @@ def test_runs_and_fixed_rotations():
 
 
 def test_functions_and_factors_expand_the_transposed_tilt(monkeypatch):
-    monkeypatch.setattr("lusee_bayes.instrument.window_average.TOLERANCE", 1e-15)
+    monkeypatch.setattr("lusee_bayes.instrument.averaging.TOLERANCE", 1e-15)
     lmax, order = 3, 6
     o = lb.Observation.from_runs([lb.Run(0.05)])
     p = Pointing.of(o, lmax, order=order)

@@ -19,10 +19,15 @@ import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.model import radiometer
-from lusee_bayes.instrument.beams import CapacitorReceiver, JFETReceiver, read_beam, read_receiver
-from lusee_bayes.instrument.beams.circuit import loading_matrix
+from lusee_bayes.instrument.beams.monopoles import (
+    CapacitorReceiver,
+    JFETReceiver,
+    loading_matrix,
+    read_receiver,
+)
+from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.products import labels, to_matrix
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.testing.cases import small_scenario
 
 VACUUM = physical_constants["characteristic impedance of vacuum"][0]
 LMAX, MOON = 47, 250.0

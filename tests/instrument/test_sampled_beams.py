@@ -13,19 +13,18 @@ from assertions import close, refused
 from astropy.io import fits
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.beams import (
-    HemisphereGrid,
-    Monopoles,
+from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings, unit_vectors, wavenumber
+from lusee_bayes.instrument.beams.monopoles import Monopoles
+from lusee_bayes.instrument.beams.sampled import (
     SampledFileBeams,
     read_beam,
     sampled_beams,
     write_sampled_beams,
 )
-from lusee_bayes.instrument.beams.fields import unit_vectors, wavenumber
-from lusee_bayes.instrument.beams.healpix_rings import from_rings
 from lusee_bayes.instrument.products import labels, to_real
 from lusee_bayes.report.describe import describe
-from lusee_bayes.testing import check_beam_source, small_scenario
+from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.checks import check_beam_source
 
 FREQUENCY, LMAX, NSIDE = 25.0, 4, 16
 THETA, PHI = healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2))
@@ -373,6 +372,6 @@ def test_without_pyuvdata_its_files_are_refused_with_what_to_install(tmp_path, m
     hdu = fits.PrimaryHDU(np.zeros((2, 2)))
     hdu.header["NORMSTD"], hdu.header["FEEDLIST"] = "physical", "[x, y]"
     hdu.writeto(path)
-    monkeypatch.setattr("lusee_bayes.instrument.beams.uvbeam.find_spec", lambda name: None)
+    monkeypatch.setattr("lusee_bayes.instrument.beams.sampled.find_spec", lambda name: None)
     with pytest.raises(lb.InputError, match=r"pip install '\.\[uvdata\]'"):
         read_beam(path)

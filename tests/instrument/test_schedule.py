@@ -9,7 +9,7 @@ from astropy.time import Time
 from lunarsky import MCMF, MoonLocation
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.moon import CYCLE_DAYS
+from lusee_bayes.instrument.schedule import CYCLE_DAYS, Interval, Run, read_schedule
 
 # three lunar nights at half duty, the table turned in the middle of the first and of the last
 NIGHTS = """\
@@ -42,7 +42,7 @@ def schedule(seed, n=5, **options):
         at += timedelta(seconds=int(rng.choice([0, 1, 4000])))
         end = at + timedelta(seconds=int(rng.integers(2, 50000)))
         angle, duty = float(rng.choice([0.0, 30.0])), float(rng.choice([1.0, 0.5, 0.1]))
-        intervals.append(lb.Interval(at.isoformat(), end.isoformat(), angle, duty, **options))
+        intervals.append(Interval(at.isoformat(), end.isoformat(), angle, duty, **options))
         at = end
     return intervals
 
@@ -98,17 +98,15 @@ def test_no_time_is_lost_or_found(seed):
 
 def test_instants_begin_before_the_end():
     intervals = [
-        lb.Interval(
-            "2027-01-15T00:00:00", "2027-01-15T04:00:00"
-        ),  # two steps: the end is no sample
-        lb.Interval("2027-01-15T05:00:00", "2027-01-15T09:00:01"),  # a second more: it is
+        Interval("2027-01-15T00:00:00", "2027-01-15T04:00:00"),  # two steps: the end is no sample
+        Interval("2027-01-15T05:00:00", "2027-01-15T09:00:01"),  # a second more: it is
     ]
     o = lb.Observation.from_schedule(intervals, window="instant")
     hours = np.array([0.0, 2.0, 5.0, 7.0, 9.0])
     np.testing.assert_allclose(seconds(o, "2027-01-15"), 3600.0 * hours, rtol=0, atol=1e-8)
     assert o.windows is None
     assert (o.live_s == 7200.0).all()
-    half = [lb.Interval("2027-01-15", "2027-01-16", duty_cycle=0.5)]
+    half = [Interval("2027-01-15", "2027-01-16", duty_cycle=0.5)]
     with pytest.raises(
         lb.InputError, match=r"no duty cycle; take windows \(observation.window=mean\)"
     ):
@@ -117,7 +115,7 @@ def test_instants_begin_before_the_end():
 
 def test_runs_are_where_the_table_turns():
     days = [("15", 0.0), ("16", 0.0), ("17", 30.0), ("18", 0.0), ("21", 0.0)]
-    intervals = [lb.Interval(f"2027-01-{d}", f"2027-01-{int(d) + 1}", angle) for d, angle in days]
+    intervals = [Interval(f"2027-01-{d}", f"2027-01-{int(d) + 1}", angle) for d, angle in days]
     o = lb.Observation.from_schedule(intervals, step_s=43200.0)
     assert o.turntable_deg == (0.0, 30.0, 0.0)
     np.testing.assert_array_equal(o.run, [0, 0, 0, 0, 1, 1, 2, 2, 2, 2])
@@ -129,7 +127,7 @@ def test_runs_are_a_schedule(window, step_s):
     """Runs of so many steps and a half: their samples fill the steps, the next begins later."""
     counts, angles = (10, 7, 12), (0.0, 30.0, -15.0)
     month = CYCLE_DAYS * 86400.0
-    runs = [lb.Run((n + 0.5) * step_s / month, a) for n, a in zip(counts, angles, strict=True)]
+    runs = [Run((n + 0.5) * step_s / month, a) for n, a in zip(counts, angles, strict=True)]
     site = {"lon_deg": 10.0, "lat_deg": 20.0}
     expected = lb.Observation.from_runs(
         runs, start="2027-02-01T00:00:00", step_s=step_s, window=window, **site
@@ -137,7 +135,7 @@ def test_runs_are_a_schedule(window, step_s):
     at, intervals = datetime(2027, 2, 1), []
     for n, angle in zip(counts, angles, strict=True):
         end = at + timedelta(seconds=n * step_s)
-        intervals.append(lb.Interval(at.isoformat(), end.isoformat(), angle))
+        intervals.append(Interval(at.isoformat(), end.isoformat(), angle))
         at = end + timedelta(seconds=0.5 * step_s)
     got = lb.Observation.from_schedule(intervals, step_s=step_s, window=window, **site)
     # lengths in cycles are rounded, to 1e-16 of 1e5 seconds, and so are differences of dates
@@ -164,7 +162,7 @@ def is_dark(times, lon_deg, lat_deg):
 def test_windows_at_night_are_dark_from_end_to_end():
     step_s, lon, lat = 40000.0, 182.258, -23.814
     dates = [("2027-01-14T00:00:00", "2027-01-31T00:00:00"), ("2027-02-01", "2027-02-16")]
-    intervals = [lb.Interval(*pair, night_only=True) for pair in dates]
+    intervals = [Interval(*pair, night_only=True) for pair in dates]
     o = lb.Observation.from_schedule(intervals, step_s=step_s, lon_deg=lon, lat_deg=lat)
     windows = naive(intervals, step_s)
     start, end = (Time([w[k] for w in windows]) for k in (0, 1))
@@ -175,7 +173,7 @@ def test_windows_at_night_are_dark_from_end_to_end():
     assert (dark.any(axis=0) & ~expected).sum() == 3
     apart = (o.times - middle[expected]).to_value(u.s)
     np.testing.assert_allclose(apart, 0.0, rtol=0, atol=1e-8)
-    by_day = [lb.Interval(*dates[0], night_only=True), lb.Interval(*dates[1])]
+    by_day = [Interval(*dates[0], night_only=True), Interval(*dates[1])]
     mixed = lb.Observation.from_schedule(by_day, step_s=step_s, lon_deg=lon, lat_deg=lat)
     second = start >= Time("2027-02-01")
     assert mixed.n_times == (expected | second).sum()
@@ -186,20 +184,20 @@ def test_windows_at_night_are_dark_from_end_to_end():
 
 
 def test_a_table_in_csv(write):
-    intervals = lb.read_schedule(write(NIGHTS))
+    intervals = read_schedule(write(NIGHTS))
     assert intervals == (
-        lb.Interval("2027-01-14T00:00:00Z", "2027-01-22T12:00:00Z", 0.0, 0.5, True),
-        lb.Interval("2027-01-22T12:30:00", "2027-01-31T00:00:00", 30.0, 0.5, True),
-        lb.Interval("2027-02-13T00:00:00", "2027-03-01T00:00:00", 30.0, 1.0, True),
-        lb.Interval("2027-03-14T00:00:00", "2027-03-22T12:00:00", 30.0, 0.25, True),
-        lb.Interval("2027-03-22T13:00:00", "2027-03-23", -60.5, 1.0, False),
+        Interval("2027-01-14T00:00:00Z", "2027-01-22T12:00:00Z", 0.0, 0.5, True),
+        Interval("2027-01-22T12:30:00", "2027-01-31T00:00:00", 30.0, 0.5, True),
+        Interval("2027-02-13T00:00:00", "2027-03-01T00:00:00", 30.0, 1.0, True),
+        Interval("2027-03-14T00:00:00", "2027-03-22T12:00:00", 30.0, 0.25, True),
+        Interval("2027-03-22T13:00:00", "2027-03-23", -60.5, 1.0, False),
     )
     assert intervals[2].where.endswith("schedule.csv, row 3")
     o = lb.Observation.from_schedule(intervals, step_s=7200.0)
     assert o.turntable_deg == (0.0, 30.0, -60.5)
     assert o.times[0].isot[:16] == "2027-01-15T03:00"  # sunset is late on the 14th
     columns = "turntable_deg,end,start\n7,2027-01-02,2027-01-01\n"
-    assert lb.read_schedule(write(columns)) == (lb.Interval("2027-01-01", "2027-01-02", 7.0),)
+    assert read_schedule(write(columns)) == (Interval("2027-01-01", "2027-01-02", 7.0),)
 
 
 HEADER = "start,end,turntable_deg,duty_cycle,night_only\n"
@@ -243,7 +241,7 @@ HEADER = "start,end,turntable_deg,duty_cycle,night_only\n"
 )
 def test_bad_tables_are_refused(write, text, message):
     with pytest.raises(lb.InputError, match=message):
-        lb.read_schedule(write(text))
+        read_schedule(write(text))
 
 
 def test_an_interval_without_a_night_is_refused(write):
@@ -252,8 +250,8 @@ def test_an_interval_without_a_night_is_refused(write):
     with pytest.raises(
         lb.InputError, match=r"schedule.csv, row 2 holds no lunar night; lengthen it"
     ):
-        lb.Observation.from_schedule(lb.read_schedule(write(text)))
-    unnamed = [lb.Interval("2027-02-05", "2027-02-07", night_only=True)]
+        lb.Observation.from_schedule(read_schedule(write(text)))
+    unnamed = [Interval("2027-02-05", "2027-02-07", night_only=True)]
     with pytest.raises(lb.InputError, match="interval 0 holds no lunar night"):
         lb.Observation.from_schedule(unnamed)
 
@@ -270,7 +268,7 @@ def test_an_interval_without_a_night_is_refused(write):
 )
 def test_bad_schedules_are_refused(intervals, options, message):
     with pytest.raises(lb.InputError, match=message):
-        lb.Observation.from_schedule([lb.Interval(*pair) for pair in intervals], **options)
+        lb.Observation.from_schedule([Interval(*pair) for pair in intervals], **options)
 
 
 # a table as those of OpSim, with the states that its simulator adds
@@ -293,7 +291,7 @@ COMMANDS = """\
 
 
 def test_a_command_table_of_opsim(write):
-    intervals = lb.read_schedule(write(COMMANDS, "comtable.yml"))
+    intervals = read_schedule(write(COMMANDS, "comtable.yml"))
     mjd = [(61065.7, 61080.5), (61095.25, 61095.75), (61095.75, 61096.0)]
     assert len(intervals) == 3
     for one, (start, end) in zip(intervals, mjd, strict=True):
@@ -335,11 +333,11 @@ def test_a_command_table_of_opsim(write):
 )
 def test_bad_command_tables_are_refused(write, text, message):
     with pytest.raises(lb.InputError, match=message):
-        lb.read_schedule(write(text, "comtable.yml"))
+        read_schedule(write(text, "comtable.yml"))
 
 
 def test_a_file_that_has_changed_is_read_again(write):
     path = write("start,end,turntable_deg\n2027-01-01,2027-01-02,0\n")
-    assert lb.read_schedule(path)[0].turntable_deg == 0.0
+    assert read_schedule(path)[0].turntable_deg == 0.0
     write("start,end,turntable_deg\n2027-01-01,2027-01-02,30\n")
-    assert lb.read_schedule(path)[0].turntable_deg == 30.0
+    assert read_schedule(path)[0].turntable_deg == 30.0

@@ -11,13 +11,13 @@ from scipy.signal import hilbert
 from scipy.special import eval_legendre
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.beams import (
+from lusee_bayes.instrument.beams.fields import STOKES, stokes_pairs
+from lusee_bayes.instrument.beams.monopoles import (
     Monopoles,
     Regolith,
     beams_towards,
     monopole_beams,
 )
-from lusee_bayes.instrument.beams.product_beams import STOKES, stokes_pairs
 from lusee_bayes.instrument.products import labels, to_matrix
 from lusee_bayes.instrument.source_response import antenna_directions, source_response
 

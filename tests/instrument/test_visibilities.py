@@ -14,8 +14,8 @@ from astropy.time import Time
 
 import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.layout import DataLayout
 from lusee_bayes.instrument.products import (
+    DataLayout,
     Product,
     all_products,
     auto_indices,

@@ -19,8 +19,7 @@ from lusee_bayes.cli.main import main
 from lusee_bayes.cli.options import parse_frequencies
 from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.products import labels
+from lusee_bayes.instrument.products import DataLayout, labels
 from lusee_bayes.report.describe import describe
 
 PAIRS = [[i, j] for i in range(4) for j in range(i, 4)]

@@ -17,11 +17,9 @@ from reference import steep_sky
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import Rotation
-from lusee_bayes.instrument.averaging import averaged, product_live_s
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.times import unannounced_leap_seconds
-from lusee_bayes.instrument.window_average import sufficient_nodes
-from lusee_bayes.instrument.windows import Windows
+from lusee_bayes.instrument.averaging import averaged, product_live_s, sufficient_nodes
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.instrument.times import Windows, unannounced_leap_seconds
 from lusee_bayes.noise.radiometer import paper_variance
 from lusee_bayes.report.describe import describe
 

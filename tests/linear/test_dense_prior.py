@@ -27,11 +27,10 @@ from scipy.stats import multivariate_normal, ortho_group
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.linear.left_out_dense import DenseLeftOut
-from lusee_bayes.linear.left_out_structured import StructuredLeftOut
-from lusee_bayes.linear.pixel_variance import pixel_std, prior_pixel_std
-from lusee_bayes.linear.residuals import residuals
-from lusee_bayes.linear.resolution import resolution_rows
+from lusee_bayes.judge.left_out import DenseLeftOut, StructuredLeftOut
+from lusee_bayes.judge.measures import resolution_rows
+from lusee_bayes.judge.residuals import residuals
+from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
 from lusee_bayes.runs.forecasting import informed_modes
 
 N = 25
@@ -60,7 +59,7 @@ def problem(n_data: int, *, turned: bool) -> tuple[lb.LinearGaussian, np.ndarray
 
 
 @lru_cache
-def solved(n_data: int, form: str, *, turned: bool) -> lb.Posterior:
+def solved(n_data: int, form: str, *, turned: bool) -> Posterior:
     model, data = problem(n_data, turned=turned)
     return model.condition(jnp.asarray(data), form)
 

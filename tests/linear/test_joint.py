@@ -9,9 +9,8 @@ from scipy import stats
 
 from lusee_bayes.core.arrays import on_device, on_host
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.linear import joint, joint_skies
-from lusee_bayes.linear.joint import solve_directly
-from lusee_bayes.linear.joint_skies import channel_sky, paired
+from lusee_bayes.linear import joint
+from lusee_bayes.linear.joint import channel_sky, paired, solve_directly
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.sky.spectral_prior import SpectralPrior
@@ -116,7 +115,7 @@ def case(request):
 @pytest.mark.parametrize("place", [on_host, on_device])
 def test_the_direct_solution_is_the_textbooks(case, place, monkeypatch):
     """In NumPy, as on a machine without accelerator, and in JAX."""
-    for module in (joint, joint_skies):
+    for module in (joint, joint):
         monkeypatch.setattr(module, "on_processor", place)
     prior, _, channels, reference, mean, covariance, evidence = case
     posterior = solve_directly(prior, channels, reference)

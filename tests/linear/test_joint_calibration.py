@@ -9,8 +9,7 @@ from scipy import stats
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.linear.joint import solve_directly
-from lusee_bayes.linear.joint_skies import channel_sky, paired
+from lusee_bayes.linear.joint import channel_sky, paired, solve_directly
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 FREQUENCIES = [10, 16, 22, 28, 34, 40]

@@ -13,18 +13,19 @@ from scipy.optimize import minimize
 
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.linear.learning import (
+from lusee_bayes.linear.information import integrated_out
+from lusee_bayes.priors.families import IsotropicFamily
+from lusee_bayes.priors.learning import (
     ROUNDING,
     Learned,
     _root,
     demanded_factor,
+    draws_with_parameters,
+    information_behind,
     learn,
     learn_whatever_fits,
 )
-from lusee_bayes.linear.marginal_information import marginalised
-from lusee_bayes.linear.parameter_draws import draws_with_parameters, information_behind
-from lusee_bayes.sky.local_scales import embedded_local_scales
-from lusee_bayes.sky.prior_family import IsotropicFamily
+from lusee_bayes.priors.local_scales import embedded_local_scales
 
 LMAX, N_DATA = 6, 120
 
@@ -115,17 +116,17 @@ def test_others_integrated_out(case):
     prior = lb.HarmonicPrior(spectrum)
     everything = case.information.posterior(prior)
     n = 16
-    few = marginalised(case.information, n, np.asarray(prior.variance())[n:])
+    few = integrated_out(case.information, n, np.asarray(prior.variance())[n:])
     found = few.posterior(lb.HarmonicPrior(spectrum[:4]))
     assert float(found.log_evidence) == pytest.approx(float(everything.log_evidence), abs=1e-6)
     np.testing.assert_allclose(found.mean, everything.mean[:n], rtol=1e-7, atol=1e-4)
     np.testing.assert_allclose(found.std(), everything.std()[:n], rtol=1e-7)
     with pytest.raises((lb.InputError, TypeCheckError)):
-        marginalised(case.information, n, np.ones(3))
+        integrated_out(case.information, n, np.ones(3))
 
 
 def test_nothing_settles_without_steps(case, monkeypatch):
-    monkeypatch.setattr("lusee_bayes.linear.learning.MAX_STEPS", 0)
+    monkeypatch.setattr("lusee_bayes.priors.learning.MAX_STEPS", 0)
     with pytest.raises(lb.InputError, match="did not settle in 0 steps"):
         learn(case.family, case.information)
     # a family far from its own start is still found
@@ -188,7 +189,7 @@ def test_what_no_sky_explains_raises_n(case):
 
 
 def test_where_nothing_settles_the_prior_is_fixed_and_wide(case, monkeypatch):
-    monkeypatch.setattr("lusee_bayes.linear.learning.MAX_STEPS", 0)
+    monkeypatch.setattr("lusee_bayes.priors.learning.MAX_STEPS", 0)
     found = learn_whatever_fits(case.family, case.information)
     assert not found.settled and not found.fits and found.as_rows() == []
     expected = case.family.expected()

@@ -19,7 +19,7 @@ from reference_linear import (
 from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.solver import CONVERGENCE, FORMS
 
 LMAX, N_MODES = 3, 16

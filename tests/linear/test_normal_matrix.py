@@ -11,12 +11,11 @@ from assertions import close
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_device, on_host
 from lusee_bayes.core.harmonics import pixel_matrix
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.window_average import windowed
+from lusee_bayes.instrument.averaging import windowed
+from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear import information
-from lusee_bayes.linear.normal_matrix import normal_matrix
-from lusee_bayes.linear.pixel_variance import pixel_std
-from lusee_bayes.linear.time_sums import CHUNK, time_sums
+from lusee_bayes.linear.normal_matrix import CHUNK, normal_matrix, time_sums
+from lusee_bayes.linear.posterior import pixel_std
 
 LMAX, N_PRODUCTS = 5, 4
 # the first and the last run see the sky through the same beams

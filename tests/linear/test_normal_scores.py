@@ -8,11 +8,11 @@ import pytest
 from scipy import stats
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.linear.learning import learn
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
-from lusee_bayes.sky.prior_family import FREEDOM, Hyperprior, IsotropicFamily
-from lusee_bayes.sky.priors import HarmonicPrior
+from lusee_bayes.priors.families import FREEDOM, Hyperprior, IsotropicFamily
+from lusee_bayes.priors.learning import learn
+from lusee_bayes.sky.prior import HarmonicPrior
 
 LMAX, N_DATA, NOISE = 4, 40, 2000.0
 

@@ -10,11 +10,14 @@ from scipy import optimize, stats
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
-from lusee_bayes.linear.joint_skies import paired
-from lusee_bayes.linear.positive_channel import positive_sky
-from lusee_bayes.linear.positive_joint import ChannelsInMemory, find_joint_mode, linearised
-from lusee_bayes.sky.field_laws import FieldLaws
-from lusee_bayes.sky.positive_skies import PositiveSkies
+from lusee_bayes.linear.joint import paired
+from lusee_bayes.linear.positive_joint import (
+    ChannelsInMemory,
+    find_joint_mode,
+    linearised,
+    positive_sky,
+)
+from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
 from lusee_bayes.sky.template import Template
 
 LMAX = 3

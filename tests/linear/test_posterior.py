@@ -15,10 +15,9 @@ import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import pixel_matrix, to_healpy
 from lusee_bayes.experiment.model import base_model, full_model
-from lusee_bayes.experiment.terms import Around
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.linear import posterior as posterior_module
-from lusee_bayes.linear.metrics import (
+from lusee_bayes.experiment.term import Around
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.judge.chi2 import (
     correlation,
     effective_resolution_deg,
     ell_cross,
@@ -27,9 +26,10 @@ from lusee_bayes.linear.metrics import (
     prior_fraction_per_ell,
     signal_to_noise,
 )
-from lusee_bayes.linear.model import FORMS, LinearGaussian
-from lusee_bayes.linear.resolution import resolution_rows
-from lusee_bayes.linear.updating import deviation_model, updated
+from lusee_bayes.judge.measures import resolution_rows
+from lusee_bayes.linear import posterior as posterior_module
+from lusee_bayes.linear.model import LinearGaussian, deviation_model, updated
+from lusee_bayes.linear.solver import FORMS
 from lusee_bayes.results.updatable import read_updatable
 
 SPECTRUM = np.array([4.0, 1.0, 0.5, 0.25])
@@ -364,7 +364,7 @@ def assert_update_equals(whole, data, models, parts, sigma):
 def exact_tilt(monkeypatch):
     """Tilts about the pole between two runs as exact as about each one's own."""
     monkeypatch.setattr("lusee_bayes.instrument.pointing.LEAST_ORDER", 4)
-    monkeypatch.setattr("lusee_bayes.instrument.window_average.TOLERANCE", 1e-13)
+    monkeypatch.setattr("lusee_bayes.instrument.averaging.TOLERANCE", 1e-13)
 
 
 @pytest.mark.long

@@ -14,14 +14,21 @@ from scipy.stats import chi2
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.linear import residuals as residuals_module
-from lusee_bayes.linear.fit import FALSE_ALARM, LEVELS, ChiSquare, stands_out, two_sided, worst
-from lusee_bayes.linear.freedom import data_freedom
-from lusee_bayes.linear.left_out_dense import DenseLeftOut
-from lusee_bayes.linear.offset_tests import preferences
-from lusee_bayes.linear.residuals import residuals
-from lusee_bayes.linear.split import WIDER, Split, widened
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.judge.chi2 import (
+    FALSE_ALARM,
+    LEVELS,
+    WIDER,
+    ChiSquare,
+    Split,
+    stands_out,
+    two_sided,
+    widened,
+    worst,
+)
+from lusee_bayes.judge.left_out import DenseLeftOut
+from lusee_bayes.judge.measures import data_freedom, preferences
+from lusee_bayes.judge.residuals import residuals
 
 RUNS = "observation.runs=[{cycles: 0.03}, {cycles: 0.03, turntable_deg: 40}, {cycles: 0.02}]"
 
@@ -445,8 +452,8 @@ def test_what_the_sky_takes_up_is_not_told():
 @pytest.mark.parametrize("dense", [0, 10**8])
 def test_it_is_the_diagonal_of_a_product_of_matrices(monkeypatch, dense):
     """K_s K^-1 with templates and another low-rank term, five directions at once."""
-    monkeypatch.setattr("lusee_bayes.linear.freedom.CHUNK", 5)
-    monkeypatch.setattr("lusee_bayes.linear.freedom.DENSE", dense)
+    monkeypatch.setattr("lusee_bayes.judge.measures.CHUNK", 5)
+    monkeypatch.setattr("lusee_bayes.judge.measures.DENSE", dense)
     rng = np.random.default_rng(0)
     a, v, other = rng.normal(size=(30, 9)), rng.normal(size=(30, 2)), rng.normal(size=(30, 1))
     spectrum, n = np.array([4.0, 1.0, 0.3]), rng.uniform(0.5, 2.0, 30)

@@ -9,9 +9,15 @@ from assertions import close
 from reference import real_harmonics
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.beams import Monopoles, ProductBeams, Regolith, monopole_beams, placed
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.noise import beam_error_noise, derivative, difference, rms_difference
+from lusee_bayes.instrument.beams.fields import ProductBeams
+from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith, monopole_beams, placed
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.noise.instrument_errors import (
+    beam_error_noise,
+    derivative,
+    difference,
+    rms_difference,
+)
 
 LMAX, FREQUENCY = 4, 25.0
 START = {

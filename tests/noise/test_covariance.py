@@ -13,7 +13,8 @@ from reference_linear import random_covariance
 
 import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.layout import DataLayout
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.noise import covariance
 from lusee_bayes.noise.covariance import (
     Covariance,
     DenseCovariance,
@@ -22,10 +23,8 @@ from lusee_bayes.noise.covariance import (
     LowRankUpdate,
     TimeBandedCovariance,
     TimeBlockCovariance,
-    time_banded,
 )
-from lusee_bayes.testing import check_covariance
-from lusee_bayes.testing.covariance import TOL, close
+from lusee_bayes.testing.checks import TOL, check_covariance, close
 
 N_PRODUCTS, N_TIMES = 3, 4
 FLAGS = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
@@ -56,7 +55,7 @@ def check_square_root(cov: Covariance, dense: np.ndarray):
 @pytest.fixture
 def small_blocks(monkeypatch):
     """Block rows of two times of three products, so that small matrices have several."""
-    monkeypatch.setattr(time_banded, "ROWS", 7)
+    monkeypatch.setattr(covariance, "ROWS", 7)
 
 
 def _entries(flags):

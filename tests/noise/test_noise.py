@@ -10,10 +10,13 @@ from reference_linear import z_of
 
 import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.products import to_matrix, to_real
-from lusee_bayes.noise import exact_blocks, paper_variance, radiometer_noise
-from lusee_bayes.noise.sample_covariances import sample_covariances
+from lusee_bayes.instrument.products import DataLayout, to_matrix, to_real
+from lusee_bayes.noise.radiometer import (
+    exact_blocks,
+    paper_variance,
+    radiometer_noise,
+    sample_covariances,
+)
 
 N_ANTENNAS, N_PRODUCTS, N_TIMES = 4, 16, 3
 BANDWIDTH, STEP = 2.0e5, 600.0

@@ -15,7 +15,7 @@ from astropy.coordinates import SkyCoord
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import map_to_modes
-from lusee_bayes.instrument.beams import HemisphereGrid
+from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.instrument.products import labels
 from lusee_bayes.paper import cases as paper
 from lusee_bayes.paper.claims import CLAIMS

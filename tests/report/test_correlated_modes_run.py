@@ -11,9 +11,9 @@ from page_in_node import NODE, run_page
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
-from lusee_bayes.linear.resolution import resolution_rows
+from lusee_bayes.judge.measures import resolution_rows
 from lusee_bayes.report.explorer import KERNEL_NSIDE
-from lusee_bayes.results.diagnostics_file import read_diagnostics
+from lusee_bayes.results.diagnostics import read_diagnostics
 from lusee_bayes.results.updatable import read_updatable
 
 LMAX = 8

@@ -10,7 +10,7 @@ import pytest
 from astropy.io import fits
 from page_in_node import NODE, run_page
 
-from lusee_bayes.report.cube_explorer import BUDGET, nside_of_page
+from lusee_bayes.report.explorer import BUDGET, nside_of_page
 
 
 @pytest.mark.skipif(NODE is None, reason="no node on this machine")

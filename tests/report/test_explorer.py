@@ -13,11 +13,10 @@ from page_in_node import NODE, run_page
 
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
 from lusee_bayes.core.lazy import healpy as lazy_healpy
-from lusee_bayes.linear.resolution import resolution_rows
+from lusee_bayes.judge.measures import resolution_rows
 from lusee_bayes.report.explorer import KERNEL_NSIDE, std_scale
-from lusee_bayes.results.diagnostics import packed_resolution
-from lusee_bayes.results.diagnostics_file import read_diagnostics
-from lusee_bayes.sky.priors import IndependentPrior
+from lusee_bayes.results.diagnostics import packed_resolution, read_diagnostics
+from lusee_bayes.sky.prior import IndependentPrior
 
 needs_node = pytest.mark.skipif(NODE is None, reason="no node on this machine")
 POINTS = [(0.0, 0.0), (280.0, -32.0), (123.4, 56.7), (33.0, -89.0), (180.0, 90.0)]

@@ -6,8 +6,14 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.projections.geo import MollweideAxes
 
-from lusee_bayes.report.figures import mollweide as module
-from lusee_bayes.report.figures.mollweide import EDGE, WIDTH, mollweide, unprojected, view
+from lusee_bayes.report.figures.drawing import (
+    EDGE,
+    WIDTH,
+    _projection,
+    mollweide,
+    unprojected,
+    view,
+)
 
 
 def test_points_lie_where_matplotlib_puts_them():
@@ -54,9 +60,9 @@ def test_a_map_of_longitude_and_latitude_comes_out_as_it_went_in():
 
 
 def test_all_maps_of_one_nside_share_one_projection():
-    module._projection.cache_clear()
+    _projection.cache_clear()
     figure = Figure()
     for pixels in np.random.default_rng(5).normal(size=(3, 12 * 16**2)):
         mollweide(figure.add_subplot(), pixels, norm=Normalize(-1, 1), highest_altitude=pixels)
-    assert module._projection.cache_info().misses == 1
+    assert _projection.cache_info().misses == 1
     assert figure.axes[0].images[0].get_extent() == [-EDGE[0], EDGE[0], -EDGE[1], EDGE[1]]

@@ -21,11 +21,9 @@ from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.linear import residuals as residuals_module
-from lusee_bayes.linear.resolution import resolution_rows
+from lusee_bayes.judge.measures import resolution_rows
 from lusee_bayes.report.pages import write_report
-from lusee_bayes.results.diagnostics import region_of
-from lusee_bayes.results.diagnostics_file import read_diagnostics
+from lusee_bayes.results.diagnostics import read_diagnostics, region_of
 from lusee_bayes.runs.map_run import run_map
 from lusee_bayes.runs.sample_run import run_sample
 from lusee_bayes.sampling.hmc import Sampler

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lusee_bayes.report.figures.drawing import number_of_tick
-from lusee_bayes.results.convergence import warnings_of
+from lusee_bayes.results.draws import warnings_of
 
 GOOD = {"r_hat": [1.0, 1.005], "ess_bulk": [900.0, 800.0], "ess_tail": [700.0, 600.0]}
 SAMPLED = {"chains": 4, "draws": 500, "divergences": 0}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lusee_bayes.core.harmonics import map_to_modes, modes_to_map
-from lusee_bayes.report.figures.taper import LEFT_AT_LMAX, shown, taper, taper_fwhm_deg
+from lusee_bayes.report.figures.drawing import LEFT_AT_LMAX, shown, taper, taper_fwhm_deg
 
 
 @pytest.mark.parametrize("lmax", [1, 8, 47])

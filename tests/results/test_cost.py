@@ -4,8 +4,8 @@ import pytest
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.results import cost
 from lusee_bayes.results.forecast import AS_GIVEN, Variation
+from lusee_bayes.runs import cost
 from lusee_bayes.runs.plan_run import run_plan
 
 SOURCES = "sources.list=[{name: Cas A}, {name: Cyg A}]"

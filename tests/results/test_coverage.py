@@ -12,12 +12,12 @@ import pytest
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.experiment.experiment import build, under_sky
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.linear.levels import LEVELS
-from lusee_bayes.results.coverage import N_DRAWS, Counts, Coverage
+from lusee_bayes.judge.coverage import LEVELS, N_DRAWS, Counts, Coverage
 from lusee_bayes.results.draws import deviations
 from lusee_bayes.results.map_result import map_result
-from lusee_bayes.sky import FileSource, GalaxySource, write_alms
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.sky.sky_files import write_alms
+from lusee_bayes.sky.sky_source import FileSource, GalaxySource
+from lusee_bayes.testing.cases import small_scenario
 
 NSIDE, LMAX = 8, 6
 N_MODES = (LMAX + 1) ** 2

@@ -16,10 +16,9 @@ from lusee_bayes.core.harmonics import per_mode
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.report.cube_page import FIGURES as CUBE_FIGURES
 from lusee_bayes.report.cube_page import cube_page
-from lusee_bayes.results import cube_channels
-from lusee_bayes.results.cube_channels import cube_result
 from lusee_bayes.results.unknowns import unknowns_report
-from lusee_bayes.runs import map_run
+from lusee_bayes.runs import cube, map_run
+from lusee_bayes.runs.cube import cube_result
 
 RECEIVER, GROUND = "noise.receiver={power_k: 2000, slope: -2}", "noise.regolith={std_k: 30}"
 TABLE = "noise.gain_table={std: 0.01}"
@@ -72,7 +71,7 @@ def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch
 def test_a_resumed_run_has_them_too(response_file, tmp_path, monkeypatch):
     scenario = cube_of(response_file, RECEIVER, GROUND)
     whole = cube_result(scenario, tmp_path / "whole").unknowns
-    inform, done = cube_channels.inform, []
+    inform, done = cube.inform, []
 
     def once(experiment, *arguments):
         if done:
@@ -81,7 +80,7 @@ def test_a_resumed_run_has_them_too(response_file, tmp_path, monkeypatch):
         return inform(experiment, *arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(cube_channels, "inform", once)
+        patch.setattr(cube, "inform", once)
         with pytest.raises(KeyboardInterrupt):
             cube_result(scenario, tmp_path / "resumed")
     resumed = cube_result(scenario, tmp_path / "resumed").unknowns

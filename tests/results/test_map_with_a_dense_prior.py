@@ -10,12 +10,12 @@ from reference_linear import matrices, random_covariance
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers
-from lusee_bayes.linear.pixel_variance import pixel_std
+from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.results.diagnostics import region_rows
+from lusee_bayes.results.map_files import posterior_dataset
 from lusee_bayes.results.map_result import MapResult, map_result
-from lusee_bayes.results.posterior_file import posterior_dataset
 from lusee_bayes.results.updatable import read_updatable
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.testing.cases import small_scenario
 
 LMAX = 6
 

@@ -17,17 +17,18 @@ from lusee_bayes.core.harmonics import sum_over_m
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.products import all_products
-from lusee_bayes.linear.metrics import ell_cross
-from lusee_bayes.linear.model import FORMS, LinearGaussian
-from lusee_bayes.results import variations
+from lusee_bayes.instrument.products import DataLayout, all_products
+from lusee_bayes.judge.chi2 import ell_cross
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.solver import FORMS
 from lusee_bayes.results.forecast import Variation, forecast_rows
-from lusee_bayes.results.forecasts import ForecastFiles, forecasts_of
-from lusee_bayes.results.variations import default_variations
+from lusee_bayes.runs import forecasting
 from lusee_bayes.runs.forecasting import (
+    ForecastFiles,
+    default_variations,
     expected_snr_squared,
     forecast,
+    forecasts_of,
     informed_modes,
     without_ports,
 )
@@ -243,7 +244,7 @@ def test_what_is_there_twice_is_computed_once(monkeypatch, tmp_path):
     whole = varied()
     first = forecast(whole)
     monkeypatch.setattr(
-        "lusee_bayes.results.forecasts.forecast",
+        "lusee_bayes.runs.forecasting.forecast",
         lambda variation: computed.append(variation) or replace(first, variation=variation),
     )
     again, broken = replace(whole, name="again"), replace(whole, lost=(1,))
@@ -302,8 +303,8 @@ def rows_of(folder):
 
 def test_the_command_writes_table_and_figure(tmp_path, capsys, monkeypatch):
     # a few variations are enough; the Sun is up all the time
-    monkeypatch.setattr(variations, "CYCLES", (0.05,))
-    monkeypatch.setattr(variations, "PARTS", (1,))
+    monkeypatch.setattr(forecasting, "CYCLES", (0.05,))
+    monkeypatch.setattr(forecasting, "PARTS", (1,))
     tiny = [*TINY, "--set", "observation.start=2027-02-03"]
     assert run("plan", "fiducial", "noise_x100", *tiny, "-o", tmp_path) == 0
     assert {p.name for p in tmp_path.iterdir()} == {"plan.csv", "figures", "manifest.json"}

@@ -12,11 +12,10 @@ from experiments import four_ports
 from reference_linear import Answer, white_posterior
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.experiment.model import radiometer, true_values
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.experiment.simulate import true_values
-from lusee_bayes.results import cube_channels
-from lusee_bayes.results.cube_channels import cube_result
+from lusee_bayes.runs import cube as cube_module
+from lusee_bayes.runs.cube import cube_result
 
 FREQUENCIES, OCTAVES = np.array([15.0, 20.0, 22.0]), 0.4
 RECEIVER = (
@@ -182,7 +181,7 @@ def test_a_resumed_run_is_the_same(scenario, folder, cube, tmp_path, monkeypatch
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     for frequency in (15, 22):
         (tmp_path / "channels" / f"{frequency}.result.nc").unlink()
-    monkeypatch.setattr(cube_channels, "inform", None)
+    monkeypatch.setattr(cube_module, "inform", None)
     resumed = cube_result(scenario, tmp_path)
     assert resumed.log_evidence == cube.log_evidence
     for here, there in zip(resumed.channels, cube.channels, strict=True):

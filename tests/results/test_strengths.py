@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix
-from lusee_bayes.results.strengths import strengths, strengths_in_words
+from lusee_bayes.judge.measures import strengths, strengths_in_words
 
 LMAX, NSIDE = 6, 8
 

@@ -14,10 +14,10 @@ from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.averaging import averaged
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.visibilities_file import read_visibilities
-from lusee_bayes.runs.average_run import run_average
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.instrument.visibilities import read_visibilities
+from lusee_bayes.runs.data_run import run_average
+from lusee_bayes.testing.cases import small_scenario
 
 LMAX = 5
 MEANS = ("observation.window=mean", "observation.step_s=1800")

@@ -18,15 +18,14 @@ from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.experiment.terms import Around
-from lusee_bayes.linear.metrics import signal_to_noise
-from lusee_bayes.report import head
-from lusee_bayes.results import cube_channels
+from lusee_bayes.experiment.term import Around
+from lusee_bayes.judge.chi2 import signal_to_noise
+from lusee_bayes.report import html
+from lusee_bayes.runs import cube, map_run
 from lusee_bayes.runs import folder as folder_module
-from lusee_bayes.runs import map_run
 from lusee_bayes.runs.map_run import run_map
 from lusee_bayes.sampling.datatree import read_datatree
-from lusee_bayes.sky import SkyCube
+from lusee_bayes.sky.sky_files import SkyCube
 
 SMALL = ["--set", "lmax=4", "--set", "observation.runs.0.cycles=0.1"]
 THREE = ["--frequencies", "20:30:5", *SMALL]
@@ -156,15 +155,15 @@ def test_the_independent_means_of_a_joint_run_are_those_of_an_independent_run(jo
 @pytest.fixture
 def made(monkeypatch):
     """Channels whose posterior was really computed, in order."""
-    done, inform = [], cube_channels.inform
+    done, inform = [], cube.inform
 
     def counting(experiment, *arguments):
         done.append(experiment.scenario.frequency_mhz)
         return inform(experiment, *arguments)
 
-    for module in (engine_module, cube_channels):
+    for module in (engine_module, cube):
         monkeypatch.setattr(module, "ThisProcess", lambda *_: ThisProcess(1))
-    monkeypatch.setattr(cube_channels, "inform", counting)
+    monkeypatch.setattr(cube, "inform", counting)
     return done
 
 
@@ -172,7 +171,7 @@ def made(monkeypatch):
 def test_an_interrupted_run_goes_on_where_it_was(
     independent, tmp_path, made, monkeypatch, capsys, numbers_alone
 ):
-    inform = cube_channels.inform
+    inform = cube.inform
 
     def some(*arguments):
         if len(made) == 2:
@@ -181,7 +180,7 @@ def test_an_interrupted_run_goes_on_where_it_was(
 
     command = ["map", "fiducial", *THREE, "--draws", 3, "-o", tmp_path, "-q"]
     with monkeypatch.context() as patch:
-        patch.setattr(cube_channels, "inform", some)
+        patch.setattr(cube, "inform", some)
         assert run(*command) == 130
     assert capsys.readouterr().err.strip() == (
         f"lusee-bayes: interrupted; no results are written in '{tmp_path}'; the same command "
@@ -267,7 +266,7 @@ def test_a_channel_that_cannot_be_mapped_leaves_the_others_as_they_are(
 
 def head_of(folder):
     """What a report says of channels that could not be mapped."""
-    return head.unmapped(folder / "summary.json", json.loads((folder / "summary.json").read_text()))
+    return html.unmapped(folder / "summary.json", json.loads((folder / "summary.json").read_text()))
 
 
 def test_too_few_channels_for_a_joint_posterior_are_named(gap, tmp_path, numbers_alone):
@@ -280,7 +279,7 @@ def test_too_few_channels_for_a_joint_posterior_are_named(gap, tmp_path, numbers
 def test_a_run_with_a_channel_that_cannot_be_mapped_goes_on(
     gap, tmp_path, made, monkeypatch, numbers_alone
 ):
-    inform = cube_channels.inform
+    inform = cube.inform
 
     def some(*arguments):
         if made:
@@ -288,7 +287,7 @@ def test_a_run_with_a_channel_that_cannot_be_mapped_goes_on(
         return inform(*arguments)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(cube_channels, "inform", some)
+        patch.setattr(cube, "inform", some)
         run_map(three(), tmp_path, data=gap)
     assert made == [20]
     result = run_map(three(), tmp_path, data=gap).result

@@ -11,8 +11,7 @@ from lusee_bayes.cli.main import main
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map, n_modes
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.results.cube_channels import cube_result
-from lusee_bayes.results.positive_components import lmax_of_fields, positive_skies
+from lusee_bayes.runs.cube import cube_result, lmax_of_fields, positive_skies
 
 SMALL = [
     *("lmax=4", "observation.runs.0.cycles=0.1", "spectral.model=positive"),

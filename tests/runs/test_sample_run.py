@@ -30,16 +30,15 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import LOCK
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.experiment import Experiment, build
-from lusee_bayes.experiment.inference import infer
+from lusee_bayes.experiment.experiment import Experiment, build, infer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.results import sample_result as results
-from lusee_bayes.results.map_channel import channel_of_posterior
+from lusee_bayes.results.channel import channel_of_posterior
 from lusee_bayes.runs import sample_run, validate_run
 from lusee_bayes.runs.folder import run_folder, write_run
 from lusee_bayes.runs.sample_run import SAMPLE
 from lusee_bayes.runs.sampling import sample_result
-from lusee_bayes.sampling import checkpoints
+from lusee_bayes.sampling import hmc
 from lusee_bayes.sampling.datatree import read_datatree
 from lusee_bayes.sampling.hmc import CHUNK, Sampler
 from lusee_bayes.sampling.programs import load_program
@@ -77,7 +76,7 @@ def start(folder, *extra, settings=SETTINGS):
 
 def chunks(folder) -> dict[int, Path]:
     """Files of draws by their iteration, warmup's included."""
-    found = (folder / "chains").glob(checkpoints.CHUNK_GLOB)
+    found = (folder / "chains").glob(hmc.CHUNK_GLOB)
     return {int(path.stem.removeprefix("chunk-")): path for path in sorted(found)}
 
 
@@ -193,7 +192,7 @@ def test_a_killed_run_resumes_to_the_draws_of_an_undisturbed_one(runs, killed, t
     """Bit by bit, in another process, with nothing done twice."""
     before = {i: (p.stat().st_ino, p.stat().st_mtime_ns) for i, p in chunks(killed).items()}
     written, untouched = [], []
-    write = checkpoints.Chunk.write
+    write = hmc.Chunk.write
 
     def spy(chunk, folder):
         written.append(chunk.iteration)
@@ -201,7 +200,7 @@ def test_a_killed_run_resumes_to_the_draws_of_an_undisturbed_one(runs, killed, t
         now = {i: (p.stat().st_ino, p.stat().st_mtime_ns) for i, p in chunks(killed).items()}
         untouched.append(before.items() <= now.items())
 
-    monkeypatch.setattr(checkpoints.Chunk, "write", spy)
+    monkeypatch.setattr(hmc.Chunk, "write", spy)
     assert run("sample", *SMALL, *SETTINGS, "-q", "-o", killed, "--resume") == 0
     total = SAMPLER.warmup + SAMPLER.draws
     assert written == list(range(max(before) + CHUNK, total + 1, CHUNK))
@@ -599,7 +598,7 @@ def test_programs_that_cannot_be_sampled_are_refused_before_it(
     path = tmp_path / "mine.py"
     path.write_text(text)
     begun = []
-    monkeypatch.setattr(checkpoints.Chunk, "write", lambda *_: begun.append(1))
+    monkeypatch.setattr(hmc.Chunk, "write", lambda *_: begun.append(1))
     arguments = ["--model", path, "--draws", "10", "--warmup", "20", "--chains", "1"]
     try:
         code = run("sample", *SMALL, *arguments, "-q", "-o", tmp_path / "out")

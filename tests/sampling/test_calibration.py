@@ -22,9 +22,9 @@ import lusee_bayes as lb
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.sampling.calibration import (
+from lusee_bayes.judge.coverage import LEVELS
+from lusee_bayes.sampling.validation import (
     FALSE_ALARM,
-    LEVELS,
     N_DRAWS,
     Ranks,
     SkyQuantities,

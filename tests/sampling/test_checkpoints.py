@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.sampling import checkpoints
-from lusee_bayes.sampling.checkpoints import Checkpoints, Chunk
+from lusee_bayes.sampling import hmc
+from lusee_bayes.sampling.hmc import Checkpoints, Chunk
 
 IDENTITY = {"program": "sky", "sampler's seed": 3, "versions": {"jax": "0.10"}}
 N_CHUNKS, N_DRAWS, N_CHAINS = 3, 4, 2
@@ -48,7 +48,7 @@ def again(folder, **changes):
 
 
 def chunks(folder):
-    return sorted(folder.glob(checkpoints.CHUNK_GLOB))
+    return sorted(folder.glob(hmc.CHUNK_GLOB))
 
 
 def test_a_chunk_comes_back_bit_by_bit(tmp_path):
@@ -124,7 +124,7 @@ def test_a_chunk_is_written_whole_or_not_at_all(folder, monkeypatch, moment):
 
     before = {path.name: path.read_bytes() for path in chunks(folder)}
     run = again(folder)
-    owner = checkpoints.np if moment == "savez" else checkpoints.os
+    owner = hmc.np if moment == "savez" else hmc.os
     with monkeypatch.context() as patch:
         patch.setattr(owner, moment, fail)
         with pytest.raises(OSError, match="disk full"):
@@ -143,7 +143,7 @@ def test_a_chunk_is_on_the_disk_before_it_has_its_name(folder, monkeypatch):
             events.append(name)
             return real(*args)
 
-        monkeypatch.setattr(checkpoints.os, name, spy)
+        monkeypatch.setattr(hmc.os, name, spy)
     again(folder).append(99, *arrays_of(9))
     assert events == ["fsync", "replace"]
 
@@ -224,7 +224,7 @@ def test_a_chunk_missing_in_the_middle_is_noticed(folder):
 
 def test_chunks_without_a_marker_are_not_taken_for_ones_own(folder):
     """What a kill during the folder's removal can leave: chunks of who knows which run."""
-    (folder / checkpoints.IDENTITY).unlink()
+    (folder / hmc.IDENTITY).unlink()
     try:
         run = Checkpoints(folder, IDENTITY | {"sampler's seed": 4}, resume=False)
     except InputError:
@@ -234,7 +234,7 @@ def test_chunks_without_a_marker_are_not_taken_for_ones_own(folder):
 
 @pytest.mark.parametrize("content", ["", "{", "[1]"])
 def test_an_unreadable_marker_is_bad_input(folder, content):
-    (folder / checkpoints.IDENTITY).write_text(content)
+    (folder / hmc.IDENTITY).write_text(content)
     with pytest.raises(InputError, match=re.escape(str(folder))):
         again(folder)
 
@@ -278,7 +278,7 @@ def _kill_removal(folder, survivors, monkeypatch):
 
         return delete
 
-    run = Checkpoints(folder, json.loads((folder / checkpoints.IDENTITY).read_text()), resume=True)
+    run = Checkpoints(folder, json.loads((folder / hmc.IDENTITY).read_text()), resume=True)
     with monkeypatch.context() as patch:
         for name in ("unlink", "remove"):
             patch.setattr(os, name, guarded(getattr(os, name)))

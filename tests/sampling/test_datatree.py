@@ -15,9 +15,9 @@ from reference_linear import posterior as naive_posterior
 
 import lusee_bayes as lb
 from lusee_bayes.core import formats
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.sampling.chains import STATISTICS, Chains
+from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree, write_datatree
+from lusee_bayes.sampling.hmc import STATISTICS, Chains
 
 # two antennas, so four products
 PRODUCTS, N_TIMES, N_MODES = ("00R", "01R", "01I", "11R"), 4, 9

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers
-from lusee_bayes.sampling.chains import Chains
+from lusee_bayes.sampling.hmc import Chains, Sampler, Whitening, sample
 from lusee_bayes.sampling.validation import Comparison, validate_draws
 
 NOISES = {
@@ -42,8 +42,8 @@ def drawn(
     program = lb.load_program("sky")
     arguments = {**program.arguments(model), "data": data.data}
     # of the seeds 0 to 3, with gains, 0 is one of the false alarms that are stated
-    sampler = lb.Sampler(draws=DRAWS, **{"seed": 2, **options})
-    return lb.sample(program.model, arguments, sampler, lb.Whitening.of(coordinates))
+    sampler = Sampler(draws=DRAWS, **{"seed": 2, **options})
+    return sample(program.model, arguments, sampler, Whitening.of(coordinates))
 
 
 @dataclass(frozen=True)

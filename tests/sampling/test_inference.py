@@ -22,10 +22,8 @@ from scipy.stats import lognorm, multivariate_normal
 
 import lusee_bayes as lb
 from lusee_bayes.sampling import hmc as inference
-from lusee_bayes.sampling.chains import STATISTICS
-from lusee_bayes.sampling.checkpoints import Checkpoints
-from lusee_bayes.sampling.hmc import CHUNK, Sampler, draw_within, sample
-from lusee_bayes.sampling.program_sites import latent_sites
+from lusee_bayes.sampling.hmc import CHUNK, STATISTICS, Checkpoints, Sampler, draw_within, sample
+from lusee_bayes.sampling.programs import latent_sites
 
 ROOT = Path(lb.__file__).resolve().parents[1]
 TESTS = Path(__file__).parent

@@ -18,16 +18,16 @@ from reference_linear import assert_draws_follow, posterior, random_covariance
 import lusee_bayes
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.experiment.pieces import program_pieces
+from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.sampling.program_checks import require_sampleable
 from lusee_bayes.sampling.programs import (
     collapsed_skies,
     is_collapsed,
     load_program,
+    numpyro_promotion,
     program_names,
     replicated_data,
 )
-from lusee_bayes.sampling.promotion import numpyro_promotion
 
 SPECTRUM = np.array([4.0, 1.0, 0.5])
 ELL_OF_MODE = np.repeat([0, 1, 2], [1, 3, 5])

@@ -18,8 +18,8 @@ from reference_linear import matrices, z_of
 from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
-from lusee_bayes.linear.model import FORMS
-from lusee_bayes.sampling.promotion import numpyro_promotion
+from lusee_bayes.linear.solver import FORMS
+from lusee_bayes.sampling.programs import numpyro_promotion
 
 LMAX = 2
 N_DATA = 30

@@ -13,17 +13,20 @@ from scipy import optimize
 from lusee_bayes.core.arrays import on_device
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.information import Information
-from lusee_bayes.sampling.log_normal_prior import AMPLITUDE, STRUCTURE, TILT, LogNormalPrior
-from lusee_bayes.sampling.straight_log_normal import (
+from lusee_bayes.sampling.log_normal import (
+    AMPLITUDE,
+    STRUCTURE,
+    TILT,
     LogNormalMode,
+    LogNormalPrior,
     coordinates_of,
     find_mode,
     learn_spectrum,
     straight_coordinates,
 )
-from lusee_bayes.sky import BRIGHT_SOURCES
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
-from lusee_bayes.sky.priors import DensePrior
+from lusee_bayes.sky.prior import DensePrior
 from lusee_bayes.sky.template import EmbeddedTemplate
 
 MHZ, LMAX, TILTED = 25.0, 3, -2.0

@@ -12,15 +12,12 @@ from numpyro.infer.util import log_density
 from scipy import stats
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.inference import infer
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.instrument.products import auto_indices
+from lusee_bayes.experiment.experiment import build, infer
+from lusee_bayes.instrument.products import DataLayout, auto_indices
 from lusee_bayes.runs.sampling import coordinates, sample_result
 from lusee_bayes.sampling.hmc import Sampler, sample
-from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.promotion import numpyro_promotion
-from lusee_bayes.sampling.uncertainty import summary
+from lusee_bayes.sampling.mode import summary
+from lusee_bayes.sampling.programs import load_program, numpyro_promotion
 
 N_TIMES = 8
 FORMS = ["paper", "exact"]

@@ -12,8 +12,8 @@ from scipy.stats import norm
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
-from lusee_bayes.sampling import uncertainty
-from lusee_bayes.sampling.uncertainty import (
+from lusee_bayes.sampling import mode
+from lusee_bayes.sampling.mode import (
     disc,
     pixel_interval_of_draws,
     pixel_mean_of_draws,
@@ -97,7 +97,7 @@ def test_intervals_are_of_90_percent_unless_asked(skies):
 )
 def test_pixels_do_not_depend_on_how_many_are_held_at_once(skies, monkeypatch, statistic):
     whole = statistic(skies[:, :50], NSIDE)
-    monkeypatch.setattr(uncertainty, "CHUNK", 100)  # 192 pixels: 100 and 92
+    monkeypatch.setattr(mode, "CHUNK", 100)  # 192 pixels: 100 and 92
     # sums of sixteen terms, perhaps in another order
     np.testing.assert_allclose(statistic(skies[:, :50], NSIDE), whole, rtol=1e-9, atol=1e-12)
 

@@ -13,8 +13,8 @@ from scipy.integrate import quad
 import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map
-from lusee_bayes.sky import free_free, galaxy
-from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES
+from lusee_bayes.sky import galaxy
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 
 NSIDE = 64
 
@@ -60,9 +60,9 @@ def n_squared(s, lon_deg, lat_deg):
     lon, lat = np.radians(lon_deg), np.radians(lat_deg)
     x, y = s * np.cos(lat) * np.sin(lon), 8.5 - s * np.cos(lat) * np.cos(lon)
     z, radius = s * np.sin(lat), np.hypot(x, y)
-    total = free_free.thick_disc(radius) / np.cosh(np.minimum(np.abs(z) / 0.97, 90.0)) ** 4
-    total += free_free.thin_disc(radius) / np.cosh(np.minimum(np.abs(z) / 0.15, 90.0)) ** 4
-    for region in reversed(free_free.REGIONS):
+    total = galaxy.thick_disc(radius) / np.cosh(np.minimum(np.abs(z) / 0.97, 90.0)) ** 4
+    total += galaxy.thin_disc(radius) / np.cosh(np.minimum(np.abs(z) / 0.15, 90.0)) ** 4
+    for region in reversed(galaxy.REGIONS):
         turn = np.radians(region.angle_deg)
         dx, dy, dz = (q - c for q, c in zip((x, y, z), region.centre_kpc, strict=True))
         a, b, c = region.semi_axes_kpc
@@ -150,7 +150,7 @@ def test_with_electrons_the_integral_is_that_of_tiny_steps(
     # at 10 MHz than at 1 MHz. Tolerances: see the measured errors in line_of_sight.
     steps = 100_000
     s, ds = (np.arange(steps) + 0.5) * 50.0 / steps, 50.0 / steps
-    kappa = 1e3 * free_free.absorption_per_emission_measure(frequency_mhz)
+    kappa = 1e3 * galaxy.absorption_per_emission_measure(frequency_mhz)
     slab = kappa * n_squared(s, lon_deg, lat_deg) * ds
     source = emissivity(s, lon_deg, lat_deg, frequency_mhz) * ds
     got, depth = one_line(lon_deg, lat_deg, frequency_mhz)
@@ -164,7 +164,7 @@ def test_optically_thick_limit_is_the_local_source_function(lon_deg, lat_deg):
     # All that is seen lies within the first node, 2 pc, where j changes by less than 1e-3.
     electrons, frequency_mhz = 1e12, 5.0
     got, _ = one_line(lon_deg, lat_deg, frequency_mhz, electrons)
-    kappa = 1e3 * electrons * free_free.absorption_per_emission_measure(frequency_mhz)
+    kappa = 1e3 * electrons * galaxy.absorption_per_emission_measure(frequency_mhz)
     local = n_squared(np.zeros(1), 0.0, 0.0)[0]
     want = emissivity(0.0, lon_deg, lat_deg, frequency_mhz) / (kappa * local)
     assert got == pytest.approx(want, rel=2e-3)
@@ -186,7 +186,7 @@ def test_an_isothermal_slab_between_two_emitters_has_the_closed_form(tau):
     # In front of it all is seen, behind it exp(-tau): at tau = 50 it is a black body of T_e.
     frequency_mhz, front, behind = 25.0, 0.7, 3.0
     scale = (frequency_mhz / 408.0) ** -2.51
-    column = tau / free_free.absorption_per_emission_measure(frequency_mhz)
+    column = tau / galaxy.absorption_per_emission_measure(frequency_mhz)
     farther = scale * behind + 1.2 * (frequency_mhz / 1e3) ** -2.58
     want = scale * front + np.exp(-tau) * farther + 8000.0 * (1.0 - np.exp(-tau))
     got = seen([front, 0.0, behind], [0.0, column, 0.0], frequency_mhz)
@@ -205,7 +205,7 @@ def test_brightness_solves_the_equation_of_transfer(lon_deg, lat_deg):
     # the quadrature's at 10 MHz (line_of_sight).
     frequency_mhz, steps = 25.0, 100_000
     s, ds = (np.arange(steps) + 0.5) * 50.0 / steps, 50.0 / steps
-    kappa = 1e3 * free_free.absorption_per_emission_measure(frequency_mhz)
+    kappa = 1e3 * galaxy.absorption_per_emission_measure(frequency_mhz)
     slab = kappa * n_squared(s, lon_deg, lat_deg) * ds
     source = emissivity(s, lon_deg, lat_deg, frequency_mhz) * ds
     temperature = 1.2 * (frequency_mhz / 1e3) ** -2.58
@@ -227,19 +227,19 @@ def test_absorption_coefficient_against_the_altenhoff_law():
     # tau = 8.235e-2 T^-1.35 nu^-2.1 EM (Altenhoff et al. 1960) is a fit of the same Gaunt factor
     # around 1 GHz, good to 5 % there (Mezger & Henderson 1967, ApJ 147, 471).
     for nu_ghz in (0.3, 1.0, 3.0):
-        altenhoff = 8.235e-2 * free_free.ELECTRON_TEMPERATURE_K**-1.35 * nu_ghz**-2.1
-        ours = free_free.absorption_per_emission_measure(1e3 * nu_ghz)
+        altenhoff = 8.235e-2 * galaxy.ELECTRON_TEMPERATURE_K**-1.35 * nu_ghz**-2.1
+        ours = galaxy.absorption_per_emission_measure(1e3 * nu_ghz)
         assert ours == pytest.approx(altenhoff, rel=0.05)
     # Below, nu^-2 and the logarithm alone: ln(49.55) + 1.5 ln 8000 = 17.383 at 1 MHz, ln 10 less
     # at 10 MHz.
-    ratio = free_free.absorption_per_emission_measure(1.0)
-    ratio /= free_free.absorption_per_emission_measure(10.0)
+    ratio = galaxy.absorption_per_emission_measure(1.0)
+    ratio /= galaxy.absorption_per_emission_measure(10.0)
     assert ratio == pytest.approx(100.0 * 17.383 / 15.081, rel=1e-3)
 
 
 def test_chord_through_a_sphere():
     # Centre 2 kpc away, radius 1: straight on [1, 3]; at 20 degrees the cosine rule; behind, none.
-    sphere = free_free.Region("test", (0.0, 6.5, 0.0), (1.0, 1.0, 1.0), 30.0, 1.0)
+    sphere = galaxy.Region("test", (0.0, 6.5, 0.0), (1.0, 1.0, 1.0), 30.0, 1.0)
     angle = np.radians([0.0, 20.0, 180.0])
     direction = np.stack([np.sin(angle), -np.cos(angle), np.zeros(3)], axis=-1)
     enter, leave = sphere.chord(direction)
@@ -254,7 +254,7 @@ def test_chord_through_a_sphere():
 def test_transparent_sky_scales_as_its_two_power_laws(monkeypatch):
     # Without electrons T = G (nu/408)^-2.51 + 1.2 (nu/1000)^-2.58 exactly: rounding only.
     per_measure = "absorption_per_emission_measure"
-    monkeypatch.setattr(free_free, per_measure, lambda frequency_mhz: 0.0)
+    monkeypatch.setattr(galaxy, per_measure, lambda frequency_mhz: 0.0)
     low, high = (galaxy.galaxy_map(f, 16) - 1.2 * (f / 1e3) ** -2.58 for f in (2.0, 40.0))
     np.testing.assert_allclose(low / high, (2.0 / 40.0) ** -2.51, rtol=1e-9)
 

@@ -13,8 +13,7 @@ from scipy import stats
 from lusee_bayes.core.arrays import on_device
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
-from lusee_bayes.sky import BRIGHT_SOURCES
-from lusee_bayes.sky.galaxy import FLUCTUATION_RMS, galaxy_map
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, FLUCTUATION_RMS, galaxy_map
 from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
 from lusee_bayes.sky.template import EmbeddedTemplate, Template
 

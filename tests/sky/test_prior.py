@@ -13,8 +13,8 @@ from scipy.special import eval_legendre
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
-from lusee_bayes.sky.priors import DensePrior, HarmonicPrior, IndependentPrior, PixelPrior
-from lusee_bayes.testing import check_prior
+from lusee_bayes.sky.prior import DensePrior, HarmonicPrior, IndependentPrior, PixelPrior
+from lusee_bayes.testing.checks import check_prior
 
 SPECTRUM = np.array([4.0, 1.0, 0.0, 0.25])  # nothing at ell = 2
 LMAX, NSIDE = 3, 2

@@ -8,8 +8,8 @@ from scipy.integrate import quad
 
 from lusee_bayes.core.harmonics import n_modes, per_mode, synthesis_matrix
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.sky.local_scales import embedded_local_scales, windows
-from lusee_bayes.sky.prior_family import Hyperprior, IsotropicFamily, PriorFamily
+from lusee_bayes.priors.families import Hyperprior, IsotropicFamily, PriorFamily
+from lusee_bayes.priors.local_scales import embedded_local_scales, windows
 
 LMAX = 5
 

@@ -14,13 +14,12 @@ from scipy.stats import multivariate_normal
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.instrument.coupling import DenseCoupling
-from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.linear.residuals import residuals
-from lusee_bayes.linear.updating import updated
-from lusee_bayes.noise import beam_error_noise
+from lusee_bayes.judge.residuals import residuals
+from lusee_bayes.linear.model import LinearGaussian, updated
 from lusee_bayes.noise.covariance import DiagonalCovariance
+from lusee_bayes.noise.instrument_errors import beam_error_noise
 from lusee_bayes.sampling.distributions import Marginal, SkyPrior
-from lusee_bayes.sky.priors import HarmonicPrior
+from lusee_bayes.sky.prior import HarmonicPrior
 
 SPECTRUM = np.array([4.0, 1.0, 0.5, 0.25])
 PER_MODE = np.repeat(SPECTRUM, [1, 3, 5, 7])

@@ -11,7 +11,8 @@ import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map
 from lusee_bayes.report.describe import describe
-from lusee_bayes.sky import SkyAlms, SkyCube, sky_from_file, write_alms
+from lusee_bayes.sky.sky_files import SkyAlms, SkyCube, write_alms
+from lusee_bayes.sky.sky_source import sky_from_file
 
 NSIDE = 8
 

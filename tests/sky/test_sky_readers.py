@@ -8,7 +8,8 @@ import pytest
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map, synthesis_matrix
-from lusee_bayes.sky import BRIGHT_SOURCES, Sky, galaxy_sky, read_sky_file, sky_from_file
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
+from lusee_bayes.sky.sky_source import Sky, galaxy_sky, read_sky_file, sky_from_file
 
 NSIDE = 16
 

@@ -11,19 +11,16 @@ from reference import real_harmonics
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import map_to_modes, modes_to_map, to_healpy
-from lusee_bayes.sky import (
+from lusee_bayes.sky.sky_files import SkyAlms, SkyCube, SkyMap, write_alms
+from lusee_bayes.sky.sky_source import (
     SKY_READERS,
     FileSource,
     GalaxySource,
-    SkyAlms,
-    SkyCube,
-    SkyMap,
     read_sky_file,
     sky_from_file,
-    write_alms,
 )
-from lusee_bayes.testing import assert_refused, check_sky_source
-from lusee_bayes.testing.skies import SmoothSky, SpottySky
+from lusee_bayes.testing.cases import SmoothSky, SpottySky
+from lusee_bayes.testing.checks import assert_refused, check_sky_source
 
 NSIDE, LMAX = 16, 8
 # healpy's iterated quadrature of a map of NSIDE 16 without power above ell = 4, rms

@@ -9,7 +9,7 @@ import pytest
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.sky import galaxy
-from lusee_bayes.sky.bright_sources import BRIGHT_SOURCES
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 
 SOURCES = {source.name: source for source in BRIGHT_SOURCES}
 

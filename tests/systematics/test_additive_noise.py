@@ -9,8 +9,8 @@ import pytest
 from numpyro import handlers
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.layout import DataLayout
-from lusee_bayes.systematics.base import MOST_COLLAPSED, AdditiveNoise
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.systematics.systematic import MOST_COLLAPSED, AdditiveNoise
 
 N_PRODUCTS, N_TIMES, N_MODES = 4, 20, 9
 

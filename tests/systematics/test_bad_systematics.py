@@ -13,14 +13,14 @@ from numpyro import handlers
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.experiment.model import base_model, systematics
-from lusee_bayes.experiment.schema import SourceSection
+from lusee_bayes.experiment.model import base_model, simulate, systematics, true_values
 from lusee_bayes.experiment.setup import Setup, mean_flux, source_responses
-from lusee_bayes.experiment.simulate import simulate, true_values
-from lusee_bayes.experiment.terms import point_sources
-from lusee_bayes.sampling.program_sites import latent_sites
-from lusee_bayes.systematics import Source, SpectrumBands, normal_within
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.experiment.sky_sections import SourceSection
+from lusee_bayes.experiment.sky_terms import point_sources
+from lusee_bayes.sampling.programs import latent_sites
+from lusee_bayes.systematics.sky_unknowns import Source, SpectrumBands
+from lusee_bayes.systematics.systematic import normal_within
+from lusee_bayes.testing.cases import small_scenario
 
 CAS_A = "sources.list=[{name: Cas A}]"
 

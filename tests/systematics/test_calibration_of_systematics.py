@@ -16,18 +16,18 @@ from numpyro import handlers
 from scipy import stats
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.pieces import program_pieces
+from lusee_bayes.experiment.experiment import program_pieces
+from lusee_bayes.experiment.model import full_model, simulate, true_values
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.simulate import simulate, true_values
-from lusee_bayes.linear.templates import template_amplitudes
+from lusee_bayes.judge.coverage import LEVELS
+from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.results.unknowns import GAIN, SKY, unknowns_report
-from lusee_bayes.sampling.calibration import FALSE_ALARM, LEVELS, N_DRAWS, Ranks, calibrate
 from lusee_bayes.sampling.hmc import Sampler, draw_within
-from lusee_bayes.sampling.promotion import numpyro_promotion
-from lusee_bayes.systematics import SCALES
-from lusee_bayes.systematics.chart import Chart
+from lusee_bayes.sampling.programs import numpyro_promotion
+from lusee_bayes.sampling.validation import FALSE_ALARM, N_DRAWS, Ranks, calibrate
+from lusee_bayes.systematics.gain_drifts import SCALES
+from lusee_bayes.systematics.systematic import Chart
 
 TINY = ("lmax=6", "observation.runs.0.cycles=0.02")  # 96 data, 49 modes
 MONTH = ("lmax=6", "observation.step_s=172800")  # a sample every other day: all sources rise

@@ -14,16 +14,22 @@ from scipy.optimize import least_squares
 from scipy.stats import norm
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.model import full_model, radiometer, systematics
+from lusee_bayes.experiment.instrument_terms import pointed, table_errors
+from lusee_bayes.experiment.model import (
+    full_model,
+    radiometer,
+    simulate,
+    systematics,
+    true_signal,
+    true_values,
+)
 from lusee_bayes.experiment.rounds import Inference, model_about, offset_posterior
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.simulate import simulate, true_signal, true_values
-from lusee_bayes.experiment.terms import Around, pointed
-from lusee_bayes.experiment.terms.gain_table import table_errors
-from lusee_bayes.instrument.calibration import Calibration
+from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import all_products, labels
-from lusee_bayes.linear.templates import template_amplitudes
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.instrument.visibilities import Calibration
+from lusee_bayes.linear.amplitudes import template_amplitudes
+from lusee_bayes.testing.cases import small_scenario
 
 RECEIVER = "noise.receiver={power_k: 2000, relative_std: 0.1, treatment: %s}"
 GROUND = "noise.regolith={std_k: 30, treatment: %s}"

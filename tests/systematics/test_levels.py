@@ -16,22 +16,15 @@ from reference_linear import exact_posterior, random_covariance
 from scipy.stats import lognorm, multivariate_normal, norm
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.model import full_model, model_to_sample, radiometer
+from lusee_bayes.experiment.model import full_model, model_to_sample, radiometer, true_values
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.simulate import true_values
-from lusee_bayes.experiment.terms import Around, point_sources
-from lusee_bayes.noise import difference
-from lusee_bayes.sampling.program_sites import site_names
-from lusee_bayes.sampling.promotion import numpyro_promotion
-from lusee_bayes.systematics import (
-    Marginalised,
-    NoiseLevel,
-    PointSources,
-    PowerSpectrum,
-    Source,
-    SpectrumBands,
-    uncertain_scale,
-)
+from lusee_bayes.experiment.sky_terms import point_sources
+from lusee_bayes.experiment.term import Around
+from lusee_bayes.noise.instrument_errors import difference
+from lusee_bayes.sampling.programs import numpyro_promotion, site_names
+from lusee_bayes.systematics.instrument_unknowns import NoiseLevel
+from lusee_bayes.systematics.sky_unknowns import PointSources, PowerSpectrum, Source, SpectrumBands
+from lusee_bayes.systematics.systematic import Marginalised, uncertain_scale
 
 LMAX, N_DATA = 4, 40
 ELLS = np.arange(LMAX + 1)

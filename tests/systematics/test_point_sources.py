@@ -26,16 +26,17 @@ from lusee_bayes.experiment.model import (
     full_model,
     model_to_sample,
     radiometer,
+    simulate,
+    true_values,
 )
 from lusee_bayes.experiment.setup import Setup, source_responses
-from lusee_bayes.experiment.simulate import simulate, true_values
-from lusee_bayes.experiment.terms import Around, point_sources
-from lusee_bayes.linear.fit import RULE
-from lusee_bayes.linear.templates import template_amplitudes
-from lusee_bayes.results.fluxes import flux_lines, flux_table
-from lusee_bayes.results.map_result import map_result
-from lusee_bayes.sky import BRIGHT_SOURCES, galactic_unit_vector
-from lusee_bayes.testing import small_scenario
+from lusee_bayes.experiment.sky_terms import point_sources
+from lusee_bayes.experiment.term import Around
+from lusee_bayes.judge.chi2 import RULE
+from lusee_bayes.linear.amplitudes import template_amplitudes
+from lusee_bayes.results.map_result import flux_lines, flux_table, map_result
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galactic_unit_vector
+from lusee_bayes.testing.cases import small_scenario
 
 # Cas A is up, For A has an amplitude for every two of the six samples, and the last lies near the
 # north pole of the Moon, 24 degrees below the horizon for ever

@@ -15,9 +15,10 @@ from reference_linear import exact_posterior, z_of
 from scipy.stats import lognorm, loguniform, norm, truncnorm, uniform
 
 import lusee_bayes as lb
+from lusee_bayes.experiment.experiment import program_pieces
+from lusee_bayes.experiment.instrument_terms import gain_drifts
 from lusee_bayes.experiment.model import full_model, radiometer
-from lusee_bayes.experiment.pieces import program_pieces
-from lusee_bayes.experiment.terms import Around, gain_drifts
+from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import all_products
 
 GAINS = "noise.gain={sigma: %g, correlation_h: 10, treatment: %s, visibilities: %s}"

@@ -1,15 +1,145 @@
-"""Electric-field patterns of antennas: their response to a wave from every direction."""
+"""Fields of antennas on the sphere, and the beams of products made of them.
+
+Quadrature over the hemisphere above the horizon.
+
+A beam ends at the horizon. Gauss-Legendre nodes in cos theta over [0, 1] never see the cut, so
+harmonic coefficients converge exponentially where pixel sums ring. Azimuth is uniform: a Fourier
+sum there is exact up to aliasing.
+
+Electric-field patterns of antennas: their response to a wave from every direction.
+
+Interpolation between the directions and the frequencies of a file.
+
+The beam B_k of every correlation product, and its spherical-harmonic coefficients.
+
+Functions on HEALPix pixels in other directions above the horizon.
+
+A ring of pixels is a Fourier series in phi. Order m of a smooth function passes the zenith as
+f_m(-theta) = (-1)^m f_m(theta), and is zero there unless m is: splines in theta need no end at the
+zenith, and no rings that have too few pixels for an order (4 i in ring number i). The error is that
+of cubic splines with the distance h = 1 / NSIDE of rings at most, 5/384 (h l)^4 of a pattern of
+degree l, and in the last step to the horizon, which is extrapolated, up to 35 times that. Orders 3
+pass for orders 1 in the first ring, by (h l)^3 / 43 of the pattern there.
+"""
 
 from __future__ import annotations
 
+from typing import Literal
+
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+import scipy
+from jaxtyping import Complex, Float, Inexact
+from scipy.special import roots_legendre
 
 from lusee_bayes.core.arrays import Array, as_complex, namespace
-from lusee_bayes.core.checks import Described, require_shape
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.beams.grid import HemisphereGrid
+from lusee_bayes.core.checks import (
+    Described,
+    extent,
+    listed,
+    require_float64,
+    require_shape,
+    require_whole,
+)
+from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.harmonics import LARGEST_LMAX, SQRT2, lmax_of, mode_numbers, polar_functions
+from lusee_bayes.core.lazy import healpy
+from lusee_bayes.instrument.products import auto_indices, labels, to_real
+
+
+class HemisphereGrid(eqx.Module):
+    """Directions above the horizon and their quadrature weights.
+
+    Frame: topocentric, theta from the zenith, phi from East towards North.
+
+    Attributes
+    ----------
+    theta : (theta,) array
+        In radians.
+    weights : (theta,) array
+        Such that sum_theta sum_phi weights * 2 pi / n_phi = 2 pi.
+    n_phi : int
+        Number of azimuths phi_k = 2 pi k / n_phi.
+    """
+
+    theta: Float[np.ndarray, " theta"]
+    weights: Float[np.ndarray, " theta"]
+    n_phi: int = eqx.field(static=True)
+
+    @classmethod
+    def gauss_legendre(cls, n_theta: int, n_phi: int) -> HemisphereGrid:
+        """Return a grid, exact for polynomials in cos theta up to degree 2 n_theta - 1."""
+        nodes, weights = roots_legendre(n_theta)
+        return cls(np.arccos((nodes[::-1] + 1.0) / 2.0), weights[::-1] / 2.0, n_phi)
+
+    @classmethod
+    def for_lmax(cls, lmax: int) -> HemisphereGrid:
+        """Return a grid that is fine enough for harmonics up to ``lmax`` of the embedded antennas.
+
+        Their coefficients change by less than 1e-11 of the largest when the number of nodes
+        doubles (tests/instrument/test_monopoles.py). A loss tangent below 0.001 needs more nodes,
+        since echoes from deep layers then vary quickly with the angle.
+        """
+        require_whole("lmax", lmax, 0, LARGEST_LMAX)
+        n = max(lmax, 63) + 1
+        return cls.gauss_legendre(2 * n, 2 * n)
+
+    @property
+    def phi(self) -> Float[np.ndarray, " phi"]:
+        """Azimuths in radians."""
+        return 2.0 * np.pi * np.arange(self.n_phi) / self.n_phi
+
+    def polar_weights(self, lmax: int) -> Float[np.ndarray, "theta modes"]:
+        """Return the weight of the Fourier sum at each theta in every coefficient: w lambda_lm."""
+        return polar_functions(self.theta, lmax) * self.weights[:, None]
+
+    def integrate(self, f: Float[Array, "*batch theta phi"]) -> Float[Array, "*batch"]:
+        """Integrate over the hemisphere; the result is in units of f times steradian."""
+        return (f.sum(-1) @ self.weights) * (2.0 * np.pi / self.n_phi)
+
+    def modes(self, f: Float[Array, "*batch theta phi"], lmax: int) -> Float[Array, "*batch modes"]:
+        """Return the harmonic coefficients of a function that is zero below the horizon.
+
+        a_lm = sum_theta w lambda_lm(theta) sum_phi f exp(-i m phi) 2 pi / n_phi.
+
+        Parameters
+        ----------
+        f : (..., theta, phi) array
+            The function on this grid.
+        lmax : int
+
+        Returns
+        -------
+        (..., modes) array
+            Real packed coefficients.
+
+        Raises
+        ------
+        InputError
+            If ``f`` does not fit the grid, or its azimuths are too few for ``lmax``.
+        """
+        require_shape("the field", f, (*f.shape[:-2], len(self.theta), self.n_phi))
+        if self.n_phi <= 2 * lmax:
+            raise InputError(
+                f"{self.n_phi} azimuths cannot resolve lmax = {lmax}; give more than {2 * lmax}"
+            )
+        ell, m = mode_numbers(lmax)
+        xp = namespace(f)
+        fourier = xp.fft.rfft(f, axis=-1)[..., : lmax + 1] * (2.0 * np.pi / self.n_phi)
+        parts = xp.concatenate(
+            [
+                SQRT2 * fourier.imag[..., :0:-1],
+                fourier.real[..., :1],
+                SQRT2 * fourier.real[..., 1:],
+            ],
+            axis=-1,
+        )
+        # for every order a product with its functions of theta, zero where there is no mode
+        polar = np.zeros((2 * lmax + 1, len(self.theta), lmax + 1))
+        polar[m + lmax, :, ell] = self.polar_weights(lmax).T
+        by_order = xp.moveaxis(parts, -1, 0).reshape(2 * lmax + 1, -1, len(self.theta)) @ polar
+        return xp.moveaxis(by_order[m + lmax, :, ell], 0, -1).reshape(*f.shape[:-2], -1)
+
 
 SPEED_OF_LIGHT = 299792458.0  # m/s
 
@@ -105,3 +235,336 @@ def displaced(
     path = np.einsum("ac,ctp->atp", positions_m, unit_vectors(one.grid))
     phase = phasor(wavenumber(frequency_mhz) * path)
     return AntennaFields(one.e_theta * phase, one.e_phi * phase, one.grid)
+
+
+# between the frequencies of a file: luseepy's rule, straight lines between products of fields and
+# between impedances, or cubic splines through fields and impedances
+Interpolation = Literal["linear", "spline"]
+# frequencies that differ by less are one, as in luseepy; a header holds 15 digits of them
+SAME_FREQUENCY_MHZ = 1e-6
+
+
+def neighbours(
+    path: str, known_mhz: Float[np.ndarray, " frequencies"], frequency_mhz: float
+) -> list[tuple[int, float]]:
+    """Return the frequencies of a file that linear interpolation takes, and their weights.
+
+    Parameters
+    ----------
+    path : str
+        File that the frequencies come from, for the error message.
+    known_mhz : (frequencies,) array
+        Growing.
+    frequency_mhz : float
+
+    Returns
+    -------
+    list of (int, float)
+        Place and weight: one of them where the file has the frequency, else two.
+
+    Raises
+    ------
+    InputError
+        Outside the known frequencies.
+    """
+    nearest = int(np.argmin(np.abs(known_mhz - frequency_mhz)))
+    if abs(known_mhz[nearest] - frequency_mhz) <= SAME_FREQUENCY_MHZ:
+        return [(nearest, 1.0)]
+    if not known_mhz[0] < frequency_mhz < known_mhz[-1]:
+        raise InputError(
+            f"{path} has values from {known_mhz[0]:g} to {known_mhz[-1]:g} MHz, not at "
+            f"{frequency_mhz:.12g}; change frequency_mhz, or give a file that reaches there"
+        )
+    above = int(np.searchsorted(known_mhz, frequency_mhz))
+    low, high = known_mhz[above - 1], known_mhz[above]
+    part = float((frequency_mhz - low) / (high - low))
+    return [(above - 1, 1.0 - part), (above, part)]
+
+
+def at_frequency(
+    path: str,
+    known_mhz: Float[np.ndarray, " frequencies"],
+    frequency_mhz: float,
+    *parts: np.ndarray,
+    interpolation: Interpolation = "linear",
+) -> list[np.ndarray]:
+    """Interpolate arrays in frequency.
+
+    Parameters
+    ----------
+    path : str
+        File that the arrays come from, for the error message.
+    known_mhz : (frequencies,) array
+        Growing.
+    frequency_mhz : float
+    *parts : (frequencies, ...) array
+    interpolation : {"linear", "spline"}
+
+    Returns
+    -------
+    list of array
+        The parts at ``frequency_mhz``, without their first axis; exactly those of the file where
+        it has this frequency.
+
+    Raises
+    ------
+    InputError
+        Outside the known frequencies.
+    """
+    places = neighbours(path, known_mhz, frequency_mhz)
+    if len(places) == 1:
+        return [np.asarray(part[places[0][0]]) for part in parts]
+    if interpolation == "linear":
+        return [np.asarray(sum(weight * part[k] for k, weight in places)) for part in parts]
+    degree = min(3, len(known_mhz) - 1)
+    splines = [scipy.interpolate.make_interp_spline(known_mhz, part, k=degree) for part in parts]
+    return [np.asarray(spline(frequency_mhz)) for spline in splines]
+
+
+def on_grid(
+    rows: Complex[np.ndarray, "theta phi"],
+    theta: Float[np.ndarray, " theta"],
+    grid: HemisphereGrid,
+    angle_deg: float = 0.0,
+) -> Complex[np.ndarray, "grid_theta grid_phi"]:
+    """Interpolate a pattern to a grid: splines in theta, Fourier sums in phi.
+
+    Parameters
+    ----------
+    rows : (theta, phi) array
+        The pattern at azimuths 2 pi k / n.
+    theta : (theta,) array
+        Of the pattern, in radians.
+    grid : HemisphereGrid
+        Nothing is interpolated where its directions are those of the pattern.
+    angle_deg : float
+        How far to turn the pattern, from East towards North.
+
+    Returns
+    -------
+    (grid_theta, grid_phi) array
+    """
+    same = len(grid.theta) == len(theta) and bool((grid.theta == theta).all())
+    rows = rows if same else scipy.interpolate.CubicSpline(theta, rows)(grid.theta)
+    n = rows.shape[1]
+    steps = angle_deg * n / 360.0
+    if grid.n_phi == n and steps == round(steps):
+        return np.roll(rows, round(steps), axis=1)
+    m = np.fft.fftfreq(n, 1.0 / n)
+    spectrum = np.fft.fft(rows, axis=1) / n
+    phi = grid.phi - np.radians(angle_deg)
+    return spectrum @ np.exp(1j * m[:, None] * phi[None])
+
+
+STOKES = ("I", "Q", "U", "V")
+
+
+def stokes_beam(
+    fields: AntennaFields, stokes: str = "I"
+) -> Complex[Array, "antennas antennas theta phi"]:
+    """Return :func:`stokes_pairs` of the fields, on their grid."""
+    return stokes_pairs(fields.e_theta, fields.e_phi, stokes)
+
+
+def stokes_pairs(
+    e_theta: Complex[Array, "antennas *directions"],
+    e_phi: Complex[Array, "antennas *directions"],
+    stokes: str = "I",
+) -> Complex[Array, "antennas antennas *directions"]:
+    """Return the response of <s_i conj(s_j)> to one Stokes parameter of the sky, for every pair.
+
+    With E = E_i, F = E_j::
+
+        I: (Et Ft* + Ep Fp*) / 2      Q: (Et Ft* - Ep Fp*) / 2
+        U: (Et Fp* + Ep Ft*) / 2      V: i (Ep Ft* - Et Fp*) / 2
+
+    from <e_a conj(e_b)> = [[I + Q, U - i V], [U + i V, I - Q]] / 2 in the basis (theta, phi), with
+    exp(+i w t). V is the IAU's, right-handed minus left-handed: where it is positive, a receiver
+    that looks towards the source sees the electric field turn counter-clockwise. The paper's U and
+    V lack the factor 1/2; with it a fully polarised wave gives ``|E.e|^2``.
+
+    Parameters
+    ----------
+    e_theta, e_phi : (antennas, ...) complex array
+        Fields in any set of directions.
+    stokes : {"I", "Q", "U", "V"}
+
+    Returns
+    -------
+    (antennas, antennas, ...) complex array
+
+    Raises
+    ------
+    InputError
+        If the Stokes parameter is unknown.
+
+    References
+    ----------
+    Hamaker and Bregman 1996, A&AS 117, 161 (the IAU's convention for V).
+    """
+    if stokes not in STOKES:
+        raise InputError(f"unknown Stokes parameter '{stokes}'; {nearest(stokes, STOKES)}")
+    et, ep = e_theta[:, None], e_phi[:, None]
+    ft, fp = e_theta[None].conj(), e_phi[None].conj()
+    if stokes == "I":
+        return (et * ft + ep * fp) / 2.0
+    if stokes == "Q":
+        return (et * ft - ep * fp) / 2.0
+    if stokes == "U":
+        return (et * fp + ep * ft) / 2.0
+    return 1j * (ep * ft - et * fp) / 2.0
+
+
+class ProductBeams(Described, eqx.Module):
+    """Harmonic coefficients of the beam of every product, in the topocentric frame.
+
+    Beams are zero below the horizon.
+
+    Attributes
+    ----------
+    modes : (products, modes) array
+        Real packed; V_k = sum_c modes[k, c] a_c for a sky a_c in the topocentric frame. In K per K.
+    frequency_mhz : float
+
+    Raises
+    ------
+    InputError
+        If the shape of ``modes`` fits no number of antennas or no lmax.
+    """
+
+    modes: Float[Array, "products modes"]
+    frequency_mhz: float = eqx.field(static=True)
+
+    def __check_init__(self):
+        require_float64("the beam coefficients", self.modes)
+        lmax_of(self.modes.shape[-1])
+        n = round(np.sqrt(self.modes.shape[0]))
+        if n * n != self.modes.shape[0]:
+            raise InputError(
+                f"{self.modes.shape[0]} products do not come from any number of antennas; "
+                "expected 1, 4, 9, 16, ..."
+            )
+
+    def description(self) -> tuple[str, ...]:
+        autos = self.modes[auto_indices(round(np.sqrt(self.n_products))), 0]
+        return (
+            f"{self.n_products} products at {self.frequency_mhz:g} MHz, lmax = {self.lmax}",
+            f"{self.modes.shape[1]} real coefficients each, topocentric, K per K: "
+            f"{listed(self.labels)}",
+            f"integrals of the autos over the sky {extent(autos * np.sqrt(4.0 * np.pi), 'sr K/K')}",
+        )
+
+    @property
+    def lmax(self) -> int:
+        """Highest ell."""
+        return lmax_of(self.modes.shape[-1])
+
+    @property
+    def n_products(self) -> int:
+        """Number of real products."""
+        return self.modes.shape[0]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the products, in order."""
+        return labels(round(np.sqrt(self.n_products)))
+
+
+def product_beams(
+    fields: AntennaFields,
+    frequency_mhz: float,
+    lmax: int,
+    *,
+    stokes: str = "I",
+    normalise: bool = True,
+) -> ProductBeams:
+    """Return the beams of all products of the antennas.
+
+    Parameters
+    ----------
+    fields : AntennaFields
+    frequency_mhz : float
+    lmax : int
+    stokes : {"I", "Q", "U", "V"}
+    normalise : bool
+        Scale the beams so that the Stokes I autos integrate to one on average, which makes
+        visibilities antenna temperatures in K. Otherwise the scale of the fields is kept.
+
+    Returns
+    -------
+    ProductBeams
+
+    Raises
+    ------
+    InputError
+        If the Stokes parameter is unknown or the grid is too coarse for ``lmax``.
+    """
+    modes = product_modes(fields, lmax, stokes=stokes, normalise=normalise)
+    return ProductBeams(modes, float(frequency_mhz))
+
+
+def product_modes(
+    fields: AntennaFields, lmax: int, *, stokes: str = "I", normalise: bool = True
+) -> Float[Array, "products modes"]:
+    """Return the coefficients of :func:`product_beams`, a (products, modes) array."""
+    patterns = to_real(stokes_beam(fields, stokes))
+    if normalise:
+        patterns = patterns / mean_auto_integral(fields)
+    return fields.grid.modes(patterns, lmax)
+
+
+def mean_auto_integral(fields: AntennaFields) -> Float[Array, ""]:
+    """Return the integral of the Stokes I auto beam in steradian, averaged over antennas."""
+    autos = to_real(stokes_beam(fields))[auto_indices(fields.n_antennas)]
+    integrals = fields.grid.integrate(autos)
+    return namespace(integrals).asarray(integrals.mean())
+
+
+def from_rings(
+    pixels: Inexact[np.ndarray, "*batch pixels"],
+    theta: Float[np.ndarray, " theta"],
+    phi: Float[np.ndarray, " phi"],
+) -> Inexact[np.ndarray, "*batch theta phi"]:
+    """Interpolate scalar functions from HEALPix RING pixels to a grid above the horizon.
+
+    Only pixels with theta < 90 degrees are used.
+
+    Parameters
+    ----------
+    pixels : (..., pixels) array
+    theta : (theta,) array
+        In radians, from the zenith, up to pi / 2.
+    phi : (phi,) array
+        In radians.
+
+    Returns
+    -------
+    (..., theta, phi) array
+        Complex if the pixels are.
+    """
+    nside = healpy.npix2nside(pixels.shape[-1])
+    sizes = 4 * np.minimum(np.arange(1, 2 * nside), nside)
+    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    ring_theta, first_phi = healpy.pix2ang(nside, starts)
+    orders = np.arange(1 - 2 * nside, 2 * nside)
+    # f_m of every ring; orders that a ring has too few pixels for are not looked at
+    series = np.zeros((*pixels.shape[:-1], len(sizes), len(orders)), dtype=np.complex128)
+    for ring, (n, start) in enumerate(zip(sizes, starts, strict=True)):
+        spectrum = np.fft.fft(pixels[..., start : start + n], axis=-1) / n
+        series[..., ring, :] = spectrum[..., orders % n] * np.exp(-1j * orders * first_phi[ring])
+    spread = np.empty((*pixels.shape[:-1], len(theta), len(orders)), dtype=np.complex128)
+    for m in range(2 * nside):
+        enough = np.flatnonzero(sizes > 2 * m)
+        both = 2 * nside - 1 + np.unique([-m, m])
+        known = series[..., enough, :][..., both]
+        parts = [(-1.0) ** m * known[..., ::-1, :], known]
+        nodes = [-ring_theta[enough][::-1], ring_theta[enough]]
+        if m:
+            parts.insert(1, np.zeros_like(known[..., :1, :]))
+            nodes.insert(1, np.zeros(1))
+        spline = scipy.interpolate.CubicSpline(
+            np.concatenate(nodes), np.concatenate(parts, axis=-2), axis=-2
+        )
+        spread[..., both] = spline(theta)
+    values = spread @ np.exp(1j * orders[:, None] * phi[None])
+    return values if np.iscomplexobj(pixels) else values.real

@@ -1,4 +1,8 @@
-"""The package's own antenna model: thin monopoles above layered ground.
+"""Monopoles on a lossy ground: fields, circuit, receiver and their parameters.
+
+Reflection of a plane wave off the layered lunar ground.
+
+The package's own antenna model: thin monopoles above layered ground.
 
 An arm of length L points outwards and up from the feed, at height h over the ground; its current
 is I(s) ~ sin k(L - s). A wave from direction n reaches it directly and off the ground, so its
@@ -9,20 +13,161 @@ response to the theta and phi components is
 with u the arm, n' = n mirrored in the ground and e' the reflected polarisation. No coupling
 between arms, no lander: this is good enough for the paper's findings, and differentiable in all
 parameters.
+
+The parameters of the embedded antennas by name, with their domains.
+
+The receivers' input impedance ZL, of luseepy's models of receivers.
+
+Coupled antennas and their receivers as a circuit, at one frequency.
+
+Antennas of impedance matrix ZA with open-circuit voltages v make the voltages M v at the inputs of
+receivers of impedance ZL (Thevenin's theorem), M = ZL (ZA + ZL)^-1.
+
+The beam of every product in given directions: the exact response to a point source.
+
+Harmonic coefficients up to lmax blur a point source; the field pattern itself does not.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy.constants import Boltzmann
 
 from lusee_bayes.core.arrays import Array, as_complex, compiled, namespace
-from lusee_bayes.core.checks import require_finite, require_positive
-from lusee_bayes.instrument.beams.fields import AntennaFields, phasor, wavenumber
-from lusee_bayes.instrument.beams.grid import HemisphereGrid
-from lusee_bayes.instrument.beams.product_beams import ProductBeams, product_modes
-from lusee_bayes.instrument.beams.regolith import Regolith
+from lusee_bayes.core.checks import (
+    is_traced,
+    require_finite,
+    require_float64,
+    require_positive,
+    require_shape,
+)
+from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.formats import read_fits
+from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.instrument.beams.fields import (
+    AntennaFields,
+    HemisphereGrid,
+    ProductBeams,
+    at_frequency,
+    mean_auto_integral,
+    phasor,
+    product_modes,
+    stokes_pairs,
+    wavenumber,
+)
+from lusee_bayes.instrument.products import N_ANTENNAS, to_real
+
+N_LAYERS = 8
+DEPTH_M = 100.0
+
+
+def _scalar(x) -> Float[Array, ""]:
+    return namespace(x).asarray(x, dtype=np.float64)
+
+
+class Regolith(eqx.Module):
+    """Eight homogeneous layers, the last one infinitely deep; differentiable in all parameters.
+
+    The real permittivity rises linearly over 100 m. Time convention exp(+i w t), so that
+    eps = eps' (1 - i tan delta).
+
+    Attributes
+    ----------
+    surface_permittivity, deep_permittivity : float
+        Real relative permittivity of the top and of the bottom layer; 3.7 and 6.1 in the paper.
+    loss_tangent : float
+        The same in all layers; 0.01 in the paper.
+
+    Raises
+    ------
+    InputError
+        If a permittivity is not positive or the loss tangent is negative.
+
+    References
+    ----------
+    Grimm 2018, fits to the surface electrical properties experiment of Apollo 17.
+    """
+
+    surface_permittivity: Float[Array, ""] = eqx.field(default=3.7, converter=_scalar)
+    deep_permittivity: Float[Array, ""] = eqx.field(default=6.1, converter=_scalar)
+    loss_tangent: Float[Array, ""] = eqx.field(default=0.01, converter=_scalar)
+
+    def __check_init__(self):
+        require_positive("surface_permittivity", self.surface_permittivity)
+        require_positive("deep_permittivity", self.deep_permittivity)
+        if not is_traced(self.loss_tangent) and not self.loss_tangent >= 0:
+            raise InputError(f"loss_tangent must not be negative, got {self.loss_tangent}")
+
+    def permittivities(self) -> Complex[Array, " layers"]:
+        """Return the complex relative permittivity of each layer from the top down."""
+        rise = np.linspace(0.0, 1.0, N_LAYERS)
+        real = self.surface_permittivity + rise * (
+            self.deep_permittivity - self.surface_permittivity
+        )
+        return as_complex(real, -real * self.loss_tangent)
+
+    def reflection(
+        self,
+        cos_theta: Float[Array, " theta"],
+        frequency_mhz: float | Float[Array, ""],
+    ) -> tuple[Complex[Array, " theta"], Complex[Array, " theta"]]:
+        """Return the reflection coefficients for waves that arrive at zenith angle theta.
+
+        By recursion over the interfaces from the bottom up, with Fresnel coefficients at each.
+
+        Parameters
+        ----------
+        cos_theta : (theta,) array
+        frequency_mhz : float
+
+        Returns
+        -------
+        s : (theta,) complex array
+            Coefficient of the horizontal electric field (phi component); -1 for a conductor.
+        p : (theta,) complex array
+            Coefficient of the magnetic field: the reflected theta component is -p cos theta along
+            the horizontal and -p sin theta along the vertical; +1 for a conductor.
+
+        References
+        ----------
+        Born & Wolf, Principles of Optics, section 1.6.4.
+        """
+        thickness = wavenumber(frequency_mhz) * DEPTH_M / (N_LAYERS - 1)  # in radians of vacuum
+        xp = namespace(self, cos_theta, frequency_mhz)
+        thickness = xp.asarray(thickness, dtype=np.complex128)
+        cosine = xp.asarray(cos_theta, dtype=np.complex128)
+        sin2 = 1.0 - cosine**2
+        eps = [xp.ones((), dtype=np.complex128), *self.permittivities()]
+        # vertical wave numbers over k; the root with Im <= 0 decays downwards under exp(+i w t)
+        vertical = [cosine] + [_decaying_root(e - sin2) for e in eps[1:]]
+        s, p = xp.zeros_like(vertical[0]), xp.zeros_like(vertical[0])
+        for upper in range(N_LAYERS - 1, -1, -1):
+            q0, q1 = vertical[upper], vertical[upper + 1]
+            y0, y1 = q0 * eps[upper + 1], q1 * eps[upper]
+            fresnel_s, fresnel_p = (q0 - q1) / (q0 + q1), (y0 - y1) / (y0 + y1)
+            if upper == N_LAYERS - 1:  # nothing comes back from below the last interface
+                s, p = fresnel_s, fresnel_p
+                continue
+            delay = xp.exp(-2j * thickness * q1)
+            s = (fresnel_s + s * delay) / (1.0 + fresnel_s * s * delay)
+            p = (fresnel_p + p * delay) / (1.0 + fresnel_p * p * delay)
+        return s, p
+
+
+def _decaying_root(z: Complex[Array, " theta"]) -> Complex[Array, " theta"]:
+    """The root with Im <= 0, which decays downwards under exp(+i w t)."""
+    xp = namespace(z)
+    root = xp.sqrt(z)
+    return xp.where(root.imag > 0, -root, root)
+
 
 # ports 0, 1, 2, 3 point North, East, South, West; phi counts from East towards North
 PORT_AZIMUTHS_DEG = (90.0, 0.0, -90.0, 180.0)
@@ -200,3 +345,351 @@ def _modes(
     exact = HemisphereGrid.for_lmax
     grid = exact(lmax) if nodes is None else HemisphereGrid.gauss_legendre(*nodes)
     return product_modes(monopoles.fields(frequency_mhz, grid), lmax, stokes=stokes)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of the embedded antennas.
+
+    Attributes
+    ----------
+    where : callable
+        Returns the parameter of given antennas.
+    low, high : float
+        Ends of its domain.
+    """
+
+    where: Callable[[Monopoles], Float[Array, ""]]
+    low: float = -np.inf
+    high: float = np.inf
+
+
+PARAMETERS = {
+    "length_m": Parameter(lambda m: m.length_m, low=0.0),
+    "zenith_angle_deg": Parameter(lambda m: m.zenith_angle_deg, low=0.0, high=180.0),
+    "height_m": Parameter(lambda m: m.height_m, low=0.0),
+    "turntable_offset_deg": Parameter(lambda m: m.turntable_offset_deg),
+    "surface_permittivity": Parameter(lambda m: m.regolith.surface_permittivity, low=1.0),
+    "deep_permittivity": Parameter(lambda m: m.regolith.deep_permittivity, low=1.0),
+    "loss_tangent": Parameter(lambda m: m.regolith.loss_tangent, low=0.0),
+}
+
+
+def parameter(name: str) -> Parameter:
+    """Return the parameter of this name.
+
+    Raises
+    ------
+    InputError
+        If there is none; the message gives the nearest name.
+    """
+    if name not in PARAMETERS:
+        raise InputError(f"unknown beam parameter '{name}'; {nearest(name, PARAMETERS)}")
+    return PARAMETERS[name]
+
+
+def placed(monopoles: Monopoles, values: Mapping[str, float | Float[Array, ""]]) -> Monopoles:
+    """Return the antennas with other values of the named parameters.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown.
+    """
+    for name, value in values.items():
+        value = namespace(value).asarray(value, dtype=np.float64)
+        monopoles = eqx.tree_at(parameter(name).where, monopoles, value)
+    return monopoles
+
+
+LOADS = ("ZL_real", "ZL_imag")
+LAYOUT = Layout(
+    "loads ZL of four receivers, as luseepy's four-port waterfalls hold them",
+    {
+        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+        **{name: Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm") for name in LOADS},
+    },
+)
+
+
+class Receiver(ABC):
+    """What is connected to the ports.
+
+    Attributes
+    ----------
+    luseepy_name : str
+        Of the class that luseepy has for it.
+    """
+
+    luseepy_name: ClassVar[str]
+
+    @abstractmethod
+    def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
+        """Return ZL in Ohm. InputError at a frequency that the receiver does not know."""
+
+    @abstractmethod
+    def luseepy_parameters(self) -> dict[str, tuple[float, ...]]:
+        """Return what luseepy's class takes, by its names."""
+
+
+@dataclass(frozen=True)
+class JFETReceiver(Receiver):
+    """The preamplifier of each port, by the circuit that its input impedance follows:
+
+    ::
+
+        Z = series + skin w^power + i w L + parallel / (1 + i w parallel C)
+
+    Defaults are luseepy's fits to the four spare flight preamplifiers. Nothing couples them.
+
+    Attributes
+    ----------
+    capacitance_pf, inductance_nh : (ports,) tuple of float
+        C and L.
+    parallel_ohm, series_ohm : (ports,) tuple of float
+    skin_ohm, skin_power : (ports,) tuple of float
+        Skin effect, with w in rad/s.
+    """
+
+    luseepy_name: ClassVar[str] = "JFETReceiver"
+
+    capacitance_pf: tuple[float, ...] = (33.79, 35.32, 34.89, 36.85)
+    inductance_nh: tuple[float, ...] = (35.0, 36.4, 34.7, 8.5)
+    parallel_ohm: tuple[float, ...] = (1101e3, 331e3, 288e3, 375e3)
+    series_ohm: tuple[float, ...] = (0.21, 2.16, 3.71, 1.65)
+    skin_ohm: tuple[float, ...] = (5.2e-12, 6.9e-20, 2.2e-38, 1.9e-16)
+    skin_power: tuple[float, ...] = (1.39, 2.26, 4.35, 1.88)
+
+    def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
+        w = 2.0e6 * np.pi * frequency_mhz
+        parallel = np.array(self.parallel_ohm)
+        z = np.array(self.series_ohm) + np.array(self.skin_ohm) * w ** np.array(self.skin_power)
+        z = z + 1j * w * 1e-9 * np.array(self.inductance_nh)
+        z = z + parallel / (1.0 + 1j * w * parallel * 1e-12 * np.array(self.capacitance_pf))
+        return np.diag(z)
+
+    def luseepy_parameters(self) -> dict[str, tuple[float, ...]]:
+        return {
+            "C_pf": self.capacitance_pf,
+            "L_nh": self.inductance_nh,
+            "Rp_ohm": self.parallel_ohm,
+            "Rs_ohm": self.series_ohm,
+            "a": self.skin_ohm,
+            "n": self.skin_power,
+        }
+
+
+@dataclass(frozen=True)
+class CapacitorReceiver(Receiver):
+    """A capacitor at each port, Z = 1 / (i w C): luseepy's ``IdealCapacitorReceiver``.
+
+    Attributes
+    ----------
+    capacitance_pf : (ports,) tuple of float
+    """
+
+    luseepy_name: ClassVar[str] = "IdealCapacitorReceiver"
+
+    capacitance_pf: tuple[float, ...] = (30.0, 30.0, 30.0, 30.0)
+
+    def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
+        return np.diag(1.0 / (2.0e-6j * np.pi * frequency_mhz * np.array(self.capacitance_pf)))
+
+    def luseepy_parameters(self) -> dict[str, tuple[float, ...]]:
+        return {"C_pf": self.capacitance_pf}
+
+
+@dataclass(frozen=True)
+class MeasuredReceiver(Receiver):
+    """Loads that were measured, or that a file of data holds; they may couple the ports.
+
+    Attributes
+    ----------
+    path : str
+        The file, for error messages.
+    frequencies_mhz : (frequencies,) array
+    load_ohm : (frequencies, ports, ports) complex array
+        ZL; linear between these frequencies, as in luseepy.
+    """
+
+    luseepy_name: ClassVar[str] = "MeasuredReceiver"
+
+    path: str
+    frequencies_mhz: Float[np.ndarray, " frequencies"]
+    load_ohm: Complex[np.ndarray, "frequencies ports ports"]
+
+    def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
+        (ohm,) = at_frequency(self.path, self.frequencies_mhz, frequency_mhz, self.load_ohm)
+        return ohm
+
+    def luseepy_parameters(self) -> dict[str, tuple[float, ...]]:
+        return {}
+
+
+def read_receiver(path: str | Path) -> MeasuredReceiver:
+    """Read loads from a FITS file with the images ``freq`` (MHz), ``ZL_real``, ``ZL_imag`` (Ohm).
+
+    Parameters
+    ----------
+    path : str or Path
+        For instance a four-port waterfall.
+
+    Returns
+    -------
+    MeasuredReceiver
+
+    Raises
+    ------
+    InputError
+        For a missing or damaged file, or one that has no such images.
+    """
+    images = read_fits(path, LAYOUT, "check beam.receiver").arrays
+    return MeasuredReceiver(str(path), images["freq"], images["ZL_real"] + 1j * images["ZL_imag"])
+
+
+@dataclass(frozen=True)
+class Circuit:
+    """Antennas, what dissipates in them, and receivers.
+
+    Attributes
+    ----------
+    frequency_mhz : float
+    antenna_ohm : (ports, ports) complex array
+        ZA.
+    moon_ohm, loss_ohm : (ports, ports) complex array
+        Resistive parts of ZA: radiation into the Moon, losses in the antennas.
+    receiver : Receiver or None
+        None for open ports.
+    """
+
+    frequency_mhz: float
+    antenna_ohm: Complex[np.ndarray, "ports ports"]
+    moon_ohm: Complex[np.ndarray, "ports ports"]
+    loss_ohm: Complex[np.ndarray, "ports ports"]
+    receiver: Receiver | None
+
+    @property
+    def load_ohm(self) -> Complex[np.ndarray, "ports ports"] | None:
+        """ZL; None for open ports."""
+        return None if self.receiver is None else self.receiver.load(self.frequency_mhz)
+
+    @property
+    def resistance_ohm(self) -> Complex[np.ndarray, "ports ports"]:
+        """The whole resistive part, (ZA + ZA^H) / 2."""
+        return (self.antenna_ohm + self.antenna_ohm.conj().T) / 2.0
+
+    @property
+    def loading(self) -> Complex[np.ndarray, "ports ports"]:
+        """M; the identity for open ports."""
+        return loading_matrix(self.antenna_ohm, self.load_ohm)
+
+    @property
+    def per_kelvin(self) -> Complex[np.ndarray, "ports ports"]:
+        """U = 4 k M (ZA + ZA^H) / 2 M^H, the V^2/Hz that an enclosure of 1 K makes."""
+        return self.emitted(self.resistance_ohm)
+
+    def emitted(
+        self, kelvin_ohm: Complex[np.ndarray, "ports ports"]
+    ) -> Complex[np.ndarray, "ports ports"]:
+        """Return the V^2/Hz at the receivers of resistances times their temperatures in K."""
+        return 4.0 * Boltzmann * self.loading @ kelvin_ohm @ self.loading.conj().T
+
+
+def loading_matrix(
+    antenna_ohm: Complex[np.ndarray, "ports ports"],
+    load_ohm: Complex[np.ndarray, "ports ports"] | None,
+) -> Complex[np.ndarray, "ports ports"]:
+    """Return M = ZL (ZA + ZL)^-1; the identity for open ports (``load_ohm`` None)."""
+    if load_ohm is None:
+        return np.eye(len(antenna_ohm), dtype=complex)
+    return np.linalg.solve((antenna_ohm + load_ohm).T, load_ohm.T).T
+
+
+# rotations keep |n| = 1 to rounding; a vector that is further from it is a mistake
+UNIT_TOLERANCE = 1e-9
+
+# the autos' integral is converged on this grid, the one of every lmax up to 63
+NORMALISATION_LMAX = 63
+
+
+def beams_towards(
+    frequency_mhz: float | Float[Array, ""],
+    directions: Float[Array, "directions 3"],
+    monopoles: Monopoles | None = None,
+    *,
+    stokes: str = "I",
+) -> Float[Array, "products directions"]:
+    """Return the beams B_k(n) of the embedded antennas in the directions n.
+
+    A source of x K sr in direction n adds x B_k(n) kelvin to product k (for ``stokes`` V, x is the
+    integral of V over the source). Differentiable in every parameter of ``monopoles``, also below
+    the horizon, and in the directions, except at the zenith, where theta and phi have no slope.
+
+    Parameters
+    ----------
+    frequency_mhz : float
+    directions : (directions, 3) array
+        Unit vectors: East, North, up in the frame of the antennas.
+    monopoles : Monopoles, optional
+        By default the paper's four arms on its ground.
+    stokes : {"I", "Q", "U", "V"}
+        Q and U refer to the directions of increasing theta and phi; at the zenith, to East and
+        North.
+
+    Returns
+    -------
+    (products, directions) array
+        In 1/sr, with the normalisation of :func:`monopole_beams`; zero where up <= 0.
+
+    Raises
+    ------
+    InputError
+        For a frequency that is not positive, vectors whose length is not one, or an unknown Stokes
+        parameter.
+    """
+    require_positive("frequency_mhz", frequency_mhz)
+    require_shape("directions", directions, (None, 3))
+    require_float64("directions", directions)
+    require_finite("directions", directions)
+    _require_unit(directions)
+    monopoles = Monopoles() if monopoles is None else monopoles
+    # an array: one compilation for all frequencies
+    frequency = namespace(frequency_mhz).asarray(frequency_mhz, dtype=np.float64)
+    patterns = _patterns(frequency, directions, monopoles, stokes)
+    return patterns / _normalisation(frequency, monopoles)
+
+
+@compiled
+def _patterns(
+    frequency_mhz: Float[Array, ""],
+    directions: Float[Array, "directions 3"],
+    monopoles: Monopoles,
+    stokes: str,
+) -> Float[Array, "products directions"]:
+    visible = directions[:, 2] > 0.0
+    # a visible direction replaces the hidden ones: its field and its slopes are finite
+    xp = namespace(frequency_mhz, directions, monopoles)
+    stand_in = np.array([0.6, 0.0, 0.8])[None]
+    east, north, up = xp.where(visible[:, None], directions, stand_in).T
+    theta, phi = xp.arctan2(xp.hypot(east, north), up), xp.arctan2(north, east)
+    patterns = to_real(stokes_pairs(*monopoles.towards(frequency_mhz, theta, phi), stokes))
+    return xp.where(visible[None], patterns, 0.0)
+
+
+@compiled
+def _normalisation(frequency_mhz: Float[Array, ""], monopoles: Monopoles) -> Float[Array, ""]:
+    grid = HemisphereGrid.for_lmax(NORMALISATION_LMAX)
+    e_theta, e_phi = monopoles.towards(frequency_mhz, grid.theta[:, None], grid.phi[None])
+    return mean_auto_integral(AntennaFields(e_theta, e_phi, grid))
+
+
+def _require_unit(directions: Float[Array, "directions 3"]) -> None:
+    if is_traced(directions):
+        return
+    length = np.linalg.norm(np.asarray(directions), axis=1)
+    bad = np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)
+    if bad.size:
+        raise InputError(
+            f"directions must be unit vectors, number {bad[0]} has length {length[bad[0]]:.6g}; "
+            "divide them by their length"
+        )

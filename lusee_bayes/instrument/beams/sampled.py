@@ -1,27 +1,229 @@
-"""Beams of one's own: known in directions of a grid or of HEALPix pixels, at some frequencies.
+"""Beams that were sampled: on a grid of directions, by another program, in a file.
+
+The directions that beams are sampled in, and interpolation between them.
+
+Beams of one's own: known in directions of a grid or of HEALPix pixels, at some frequencies.
 
 Either E_theta and E_phi of every antenna, or the beam of every product. Frame: topocentric at
 turntable angle zero, theta from the zenith, phi from East towards North; time goes as exp(+i w t).
 Nothing is received from below the horizon.
+
+Files of beams of one's own: netCDF, or FITS with images of the same names.
+
+``frequency_mhz`` (frequency), growing; then either ``e_theta_real``, ``e_theta_imag``,
+``e_phi_real`` and ``e_phi_imag`` (frequency, antenna, directions), or ``product_beam`` (frequency,
+product, directions). Directions are (theta, phi) with ``theta_deg`` (theta) and ``phi_deg`` (phi),
+or (pixel): HEALPix, RING. Attributes, words of the primary header in FITS: ``format``, ``absolute``
+(0 or 1, see :class:`.SampledBeams`), and ``products``, the labels of product beams in their order.
+
+Sampled beams as a source of beams.
+
+pyuvdata's UVBeam as sampled beams; pyuvdata is optional (the extra ``uvdata``).
+
+A UVBeam of type efield holds, for every feed, the response to the components of the field along
+azimuth and zenith angle (``az_za``), or along phi and theta (``healpix``); azimuth is phi, from
+East towards North.
+
+Read beam files: luseepy's, scalar or four-port, sampled beams, and pyuvdata's UVBeam.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float
+import xarray as xr
+from astropy.io import fits
+from jaxtyping import Complex, Float, Inexact
 
+from lusee_bayes.core import formats
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import Described, listed
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.layouts import require_mhz
-from lusee_bayes.instrument.beams.fields import AntennaFields
-from lusee_bayes.instrument.beams.grid import HemisphereGrid
-from lusee_bayes.instrument.beams.gridded import at_frequency
-from lusee_bayes.instrument.beams.product_beams import ProductBeams, stokes_beam
-from lusee_bayes.instrument.beams.sampling import Directions
-from lusee_bayes.instrument.products import auto_indices, to_matrix, to_real
+from lusee_bayes.core.files import replacing, user_path
+from lusee_bayes.core.formats import (
+    UVBEAM_WORDS,
+    has_words,
+    image_names,
+    is_fits,
+    read_fits,
+    read_netcdf,
+)
+from lusee_bayes.core.layouts import Attribute, Layout, Variable, require_mhz
+from lusee_bayes.core.lazy import healpy, pyuvdata
+from lusee_bayes.core.reading import naming, reading, require_file
+from lusee_bayes.instrument.beams.fields import (
+    AntennaFields,
+    HemisphereGrid,
+    ProductBeams,
+    at_frequency,
+    from_rings,
+    on_grid,
+    stokes_beam,
+)
+from lusee_bayes.instrument.beams.luseepy_files import (
+    PortResponse,
+    ScalarBeam,
+    read_response,
+    read_scalar_beam,
+)
+from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.instrument.products import auto_indices, labels, to_matrix, to_real
+
+# of angles in degrees that are written with few digits
+ANGLE_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class Directions:
+    """A grid of theta and phi, or HEALPix pixels, above the horizon.
+
+    Programs differ in whether a direction on the horizon counts as above it: none is used, and the
+    last step to the horizon is extrapolated.
+
+    Attributes
+    ----------
+    theta : (theta,) array or None
+        In radians, below pi / 2; None for HEALPix.
+    n_phi : int
+        Azimuths 2 pi k / n_phi.
+    nside : int
+        Of the pixels; 0 for a grid.
+    """
+
+    theta: Float[np.ndarray, " theta"] | None
+    n_phi: int
+    nside: int = 0
+
+    @classmethod
+    def of(cls, theta_deg: Any, phi_deg: Any, shape: tuple[int, ...], path: str) -> Directions:
+        """Return the directions of the last axes of arrays.
+
+        Parameters
+        ----------
+        theta_deg, phi_deg : array or None
+            See :func:`.sampled_beams`.
+        shape : tuple of int
+            Of the last axes.
+        path : str
+            For messages.
+
+        Raises
+        ------
+        InputError
+            If angles do not cover the hemisphere, or neither they nor pixels fit the shape.
+        """
+        if (theta_deg is None) != (phi_deg is None):
+            raise InputError(f"{path}: give both theta_deg and phi_deg, or neither for HEALPix")
+        if theta_deg is None or phi_deg is None:
+            if len(shape) != 1 or not healpy.isnpixok(shape[0]):
+                raise InputError(
+                    f"{path}: directions of shape {shape} are no HEALPix map of 12 NSIDE^2 pixels; "
+                    "give theta_deg and phi_deg for a grid"
+                )
+            return cls(None, 0, healpy.npix2nside(shape[0]))
+        theta, phi = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in (theta_deg, phi_deg))
+        if shape != (len(theta), len(phi)):
+            raise InputError(
+                f"{path}: directions of shape {shape}, expected {len(theta)} theta x {len(phi)} phi"
+            )
+        used = theta[theta < 90.0 - ANGLE_TOLERANCE]
+        steps = np.diff(theta)
+        covers = len(used) >= 4 and (steps > 0.0).all() and theta[0] >= 0.0
+        if not covers or max(theta[0], 90.0 - used[-1]) > steps[: len(used)].max():
+            raise InputError(
+                f"{path}: theta_deg runs from {theta[0]:g} to {theta[-1]:g} in {len(theta)} steps, "
+                "expected growing angles from the zenith (0) to the horizon (90), four at least"
+            )
+        n = len(phi) - int(len(phi) > 1 and abs(phi[-1] - 360.0) < ANGLE_TOLERANCE)
+        if np.abs(phi[:n] - 360.0 * np.arange(n) / n).max() > ANGLE_TOLERANCE:
+            raise InputError(
+                f"{path}: phi_deg runs from {phi[0]:g} to {phi[-1]:g} in {len(phi)} steps, "
+                f"expected 360 k / n from East towards North, such as 0, {360.0 / n:g}, ..."
+            )
+        return cls(np.radians(used), n)
+
+    @property
+    def text(self) -> str:
+        """What they are, in words."""
+        if self.theta is None:
+            return f"HEALPix pixels of NSIDE {self.nside}"
+        return f"{len(self.theta)} theta x {self.n_phi} phi"
+
+    def above(self, values: np.ndarray, what: str) -> np.ndarray:
+        """Return the values in these directions of those in all directions that were given.
+
+        Raises
+        ------
+        InputError
+            If one is not finite.
+        """
+        kept = values
+        if self.theta is not None:
+            kept = values[..., : len(self.theta), : self.n_phi]
+        else:
+            # pixels below the horizon are zeros, whatever a file has there
+            theta, _ = healpy.pix2ang(self.nside, np.arange(values.shape[-1]))
+            kept = np.where(theta < np.pi / 2.0, values, 0.0)
+        bad = ~np.isfinite(kept)
+        if bad.any():
+            raise InputError(
+                f"{what} holds NaN or infinity in {int(bad.sum())} of {bad.size} places above the "
+                "horizon"
+            )
+        return kept
+
+    def quadrature(self, lmax: int) -> HemisphereGrid:
+        """Return nodes that resolve both these directions and harmonics up to ``lmax``."""
+        rings = 2 * self.nside if self.theta is None else len(self.theta)
+        azimuths = 4 * self.nside if self.theta is None else self.n_phi
+        return HemisphereGrid.gauss_legendre(2 * max(rings, lmax + 1), max(azimuths, 2 * lmax + 2))
+
+    def scalars_on(
+        self, values: Inexact[np.ndarray, "n *directions"], grid: HemisphereGrid, turn_deg: float
+    ) -> Inexact[np.ndarray, "n theta phi"]:
+        """Interpolate functions, turned from East towards North, to a grid."""
+        if self.theta is None:
+            return from_rings(values, grid.theta, grid.phi - np.radians(turn_deg))
+        turned = [on_grid(one.astype(np.complex128), self.theta, grid, turn_deg) for one in values]
+        return np.stack(turned) if np.iscomplexobj(values) else np.stack(turned).real
+
+    def vectors_on(
+        self,
+        e_theta: Complex[np.ndarray, "n *directions"],
+        e_phi: Complex[np.ndarray, "n *directions"],
+        grid: HemisphereGrid,
+        turn_deg: float,
+    ) -> tuple[Complex[np.ndarray, "n theta phi"], Complex[np.ndarray, "n theta phi"]]:
+        """Interpolate theta and phi components of vectors, turned likewise, to a grid.
+
+        Between pixels the components along three fixed axes are interpolated: those along theta
+        and phi have no value at the zenith.
+        """
+        if self.theta is not None:
+            return (
+                self.scalars_on(e_theta, grid, turn_deg),
+                self.scalars_on(e_phi, grid, turn_deg),
+            )
+        theta, phi = healpy.pix2ang(self.nside, np.arange(e_theta.shape[-1]))
+        along = [a * e_theta + b * e_phi for a, b in zip(*_axes(theta, phi), strict=True)]
+        own_phi = grid.phi - np.radians(turn_deg)
+        fixed = [from_rings(one, grid.theta, own_phi) for one in along]
+        back = _axes(grid.theta[:, None], own_phi[None])
+        turned = [sum(a * one for a, one in zip(axis, fixed, strict=True)) for axis in back]
+        return turned[0], turned[1]
+
+
+def _axes(theta: np.ndarray, phi: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """East, North and up components of the unit vectors along theta and phi."""
+    zero = np.zeros(np.broadcast_shapes(theta.shape, phi.shape))
+    return (
+        [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), zero - np.sin(theta)],
+        [zero - np.sin(phi), zero + np.cos(phi), zero],
+    )
 
 
 @dataclass(frozen=True, repr=False)
@@ -244,3 +446,351 @@ def sampled_beams(
             "1, 4, 9, 16, ..."
         )
     return SampledBeams(known, directions, **arrays, absolute=absolute, path=path)
+
+
+FIELDS = ("e_theta_real", "e_theta_imag", "e_phi_real", "e_phi_imag")
+POWER = "product_beam"
+WHAT = "sampled beams"
+HINT = "lusee_bayes.sampled_beams(...).write makes one of arrays"
+
+
+def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
+    """Return what a file holds.
+
+    Parameters
+    ----------
+    fields : bool
+        Whether it has fields, not product beams.
+    grid : bool
+        Whether it has a grid, not HEALPix pixels.
+    upper : bool
+        Whether attributes are words of a FITS header.
+    """
+    directions = ("theta", "phi") if grid else ("pixel",)
+    first = "antenna" if fields else "product"
+    # below the horizon there may be anything
+    values = Variable(("frequency", first, *directions), missing=True)
+    angles = {
+        "theta_deg": Variable(("theta",), low=0.0, high=180.0, grows=True, unit="deg"),
+        "phi_deg": Variable(("phi",), low=0.0, high=360.0, grows=True, unit="deg"),
+    }
+    attributes = {
+        "absolute": Attribute("boolean"),
+        "products": Attribute("text", optional=fields),
+    }
+    return Layout(
+        WHAT,
+        {
+            "frequency_mhz": Variable(("frequency",), low=0.0, grows=True, unit="MHz"),
+            **dict.fromkeys(FIELDS if fields else (POWER,), values),
+            **(angles if grid else {}),
+        },
+        {name.upper() if upper else name: one for name, one in attributes.items()},
+    )
+
+
+def is_sampled_file(path: str | Path) -> bool:
+    """Whether there is a file of this layout at a path."""
+    path = user_path(path)
+    if not path.is_file():
+        return False
+    if is_fits(path):
+        return bool({FIELDS[0], POWER} & set(image_names(path)))
+    return formats.format_of(path) == formats.BEAMS
+
+
+def read_sampled_beams(path: str | Path) -> SampledBeams:
+    """Read a file that :func:`write_sampled_beams` has written, or one of the same layout.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    SampledBeams
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or of another kind, or not as declared.
+    """
+    path = user_path(path)
+    in_fits = path.is_file() and is_fits(path)
+    if in_fits:
+        there = frozenset(image_names(path))
+    else:
+        there = read_netcdf(path, formats.BEAMS, Layout(WHAT), HINT).there
+    declared = layout(fields=POWER not in there, grid="theta_deg" in there, upper=in_fits)
+    if in_fits:
+        found = read_fits(path, declared, HINT)
+    else:
+        found = read_netcdf(path, formats.BEAMS, declared, HINT)
+    arrays, said = found.arrays, {key.lower(): value for key, value in found.values.items()}
+    given: dict[str, np.ndarray] = {}
+    if POWER in arrays:
+        with naming(path):
+            given["products"] = _in_order(arrays[POWER], said["products"])
+    else:
+        parts = [arrays[name] for name in FIELDS]
+        # set part by part: infinity times 1j would be NaN, with a warning
+        given["e_theta"], given["e_phi"] = np.empty((2, *parts[0].shape), dtype=complex)
+        given["e_theta"].real, given["e_theta"].imag = parts[0], parts[1]
+        given["e_phi"].real, given["e_phi"].imag = parts[2], parts[3]
+    return sampled_beams(
+        arrays["frequency_mhz"],
+        **given,
+        theta_deg=arrays.get("theta_deg"),
+        phi_deg=arrays.get("phi_deg"),
+        absolute=said["absolute"],
+        path=str(path),
+    )
+
+
+def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
+    """Write beams to netCDF, or to FITS where the name ends in .fits; whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+    beams : SampledBeams
+
+    Returns
+    -------
+    Path
+    """
+    path, fields = user_path(path), beams.products is None
+    grid = beams.directions.theta is not None
+    arrays = {"frequency_mhz": beams.frequencies_mhz}
+    if fields:
+        parts = (beams.e_theta.real, beams.e_theta.imag, beams.e_phi.real, beams.e_phi.imag)
+        arrays |= dict(zip(FIELDS, parts, strict=True))
+    else:
+        arrays[POWER] = beams.products
+    if grid:
+        arrays["theta_deg"] = np.degrees(beams.directions.theta)
+        n = beams.directions.n_phi
+        arrays["phi_deg"] = 360.0 * np.arange(n) / n
+    said = {"format": formats.BEAMS, "absolute": int(beams.absolute)}
+    if not fields:
+        said["products"] = ",".join(labels(beams.n_ports))
+    with replacing(path) as partial:
+        if path.suffix.lower() in (".fits", ".fit"):
+            _write_fits(partial, arrays, said)
+        else:
+            declared = layout(fields=fields, grid=grid).variables
+            variables = {name: (declared[name].dims, one) for name, one in arrays.items()}
+            xr.Dataset(variables, attrs=said).to_netcdf(partial, engine="h5netcdf")
+    return path
+
+
+def _write_fits(path: Path, arrays: dict[str, np.ndarray], said: dict[str, object]) -> None:
+    hdus = fits.HDUList([fits.PrimaryHDU()])
+    for key, value in said.items():
+        hdus[0].header[key.upper()] = value
+    for name, array in arrays.items():
+        hdus.append(fits.ImageHDU(np.ascontiguousarray(array), name=name))
+    hdus.writeto(path)
+
+
+def _in_order(beams: np.ndarray, products: str) -> np.ndarray:
+    """Product beams in the package's order."""
+    names = [name.strip() for name in products.split(",")]
+    expected = labels(round(np.sqrt(beams.shape[1])))
+    if len(names) != beams.shape[1] or sorted(names) != sorted(expected):
+        raise InputError(
+            f"products is {products}, expected the names of its {beams.shape[1]} product beams: "
+            f"{', '.join(expected)}"
+        )
+    return beams[:, [names.index(name) for name in expected]]
+
+
+@dataclass(frozen=True, eq=False)
+class SampledFileBeams(BeamSource):
+    """Fields of antennas or beams of products that are sampled in directions; nothing emits.
+
+    Attributes
+    ----------
+    sampled : SampledBeams
+    turntable_offset_deg : float
+        How much further the turntable is than it says, from East towards North.
+    normalise : bool or None
+        Scale the beams so that autos integrate to one on average; None for as the file says.
+    """
+
+    sampled: SampledBeams
+    turntable_offset_deg: float = 0.0
+    normalise: bool | None = None
+
+    @property
+    def n_ports(self) -> int:
+        return self.sampled.n_ports
+
+    @property
+    def emits(self) -> bool:
+        return False
+
+    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
+        return self.sampled.fields(frequency_mhz, grid, self.turntable_offset_deg)
+
+    def patterns(
+        self, frequency_mhz: float, grid: HemisphereGrid
+    ) -> Complex[Array, "antennas antennas theta phi"]:
+        return self.sampled.patterns(frequency_mhz, grid, self.turntable_offset_deg)
+
+    def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
+        return self.sampled.beams(
+            frequency_mhz,
+            lmax,
+            turn_deg=self.turntable_offset_deg,
+            normalise=self.normalise,
+        )
+
+    def background(self, frequency_mhz: float) -> Float[Array, " products"]:
+        return np.zeros(self.n_ports**2)
+
+
+def is_uvbeam_file(path: str | Path) -> bool:
+    """Whether there is a beam FITS file of pyuvdata at a path."""
+    path = user_path(path)
+    return path.is_file() and has_words(path, UVBEAM_WORDS)
+
+
+def read_uvbeam(path: str | Path) -> SampledBeams:
+    """Read a beam FITS file of pyuvdata.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    SampledBeams
+
+    Raises
+    ------
+    InputError
+        If pyuvdata is not installed, or as :func:`from_uvbeam`.
+    """
+    if find_spec("pyuvdata") is None:
+        raise InputError(
+            f"{path} is a beam file of pyuvdata, which is not installed; install it with "
+            "pip install '.[uvdata]' in the clone of lusee_bayes"
+        )
+    with reading(path, "a beam file of pyuvdata") as file:
+        beam = pyuvdata.UVBeam.from_file(str(file))
+    return from_uvbeam(beam, path=str(path))
+
+
+def from_uvbeam(beam: Any, *, conjugate: bool = False, path: str = "the UVBeam") -> SampledBeams:
+    """Convert a UVBeam of type efield, one port for every feed.
+
+    Parameters
+    ----------
+    beam : pyuvdata.UVBeam
+        Of type efield, in coordinates az_za or healpix (RING); scaled so that the autos integrate
+        to one, as UVBeams are in units of their own.
+    conjugate : bool
+        Take the complex conjugates: for fields that were made with exp(-i w t).
+    path : str
+        Where it comes from, for messages.
+
+    Returns
+    -------
+    SampledBeams
+
+    Raises
+    ------
+    InputError
+        For beams of another type, coordinates or basis, pixels that do not cover the sky, or as
+        :func:`sampled_beams`.
+    """
+    if beam.beam_type != "efield":
+        raise InputError(
+            f"{path} is a UVBeam of type {beam.beam_type}; give one of type efield, since the "
+            "crosses between ports need fields"
+        )
+    system = beam.pixel_coordinate_system
+    if system not in ("az_za", "healpix"):
+        raise InputError(f"{path} has coordinates {system}; expected az_za or healpix")
+    basis = np.asarray(beam.basis_vector_array)
+    unit = np.zeros_like(basis)
+    unit[0, 0] = unit[1, 1] = 1.0
+    if basis.shape[:2] != (2, 2) or not np.allclose(basis, unit, atol=1e-9):
+        raise InputError(
+            f"{path} has fields along other vectors than azimuth and zenith angle; convert it "
+            "first (basis_vector_array is not the unit matrix)"
+        )
+    # (vector, feed, frequency, ...) to (frequency, feed, ...)
+    along_phi, along_theta = np.swapaxes(np.asarray(beam.data_array), 1, 2)
+    angles: dict[str, np.ndarray] = {}
+    if system == "az_za":
+        angles["theta_deg"] = np.round(np.degrees(beam.axis2_array), 9)
+        angles["phi_deg"] = np.round(np.degrees(beam.axis1_array), 9)
+    else:
+        n = 12 * int(beam.nside) ** 2
+        if beam.ordering != "ring" or not np.array_equal(beam.pixel_array, np.arange(n)):
+            raise InputError(
+                f"{path} has {len(beam.pixel_array)} pixels in {beam.ordering} order; expected all "
+                f"{n} of NSIDE {beam.nside}, in ring order"
+            )
+    fields = {"e_theta": along_theta, "e_phi": along_phi}
+    if conjugate:
+        fields = {name: one.conj() for name, one in fields.items()}
+    return sampled_beams(np.asarray(beam.freq_array) / 1e6, **fields, **angles, path=path)
+
+
+def read_beam(path: str | Path) -> ScalarBeam | PortResponse | SampledBeams:
+    """Read a beam file of whichever kind.
+
+    luseepy's scalar beams (FITS version 2) and responses (version 3), sampled beams
+    (:mod:`.sampled`), and pyuvdata's beam FITS (:mod:`.sampled`).
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    ScalarBeam, PortResponse or SampledBeams
+
+    Raises
+    ------
+    InputError
+        If there is no file, or as the reader of its kind.
+    """
+    path = require_file(path, "beam file", "check beam.file")
+    return READERS[kind_of(path)](path)
+
+
+def kind_of(path: str | Path) -> str:
+    """Return the kind of a beam file, the ``model`` of a scenario; others are luseepy's scalar.
+
+    Raises
+    ------
+    InputError
+        If the file is FITS or HDF5, and damaged.
+    """
+    try:
+        path = require_file(path, "beam file")
+    except InputError:
+        return "luseepy"
+    if is_sampled_file(path) or is_uvbeam_file(path):
+        return "sampled"
+    if is_fits(path) and "h_theta_real" in image_names(path):
+        return "response"
+    return "luseepy"
+
+
+def read_sampled(path: str | Path) -> SampledBeams:
+    """Read sampled beams, the package's own files or pyuvdata's.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_sampled_beams` and :func:`read_uvbeam`.
+    """
+    return read_uvbeam(path) if is_uvbeam_file(path) else read_sampled_beams(path)
+
+
+READERS = {"sampled": read_sampled, "response": read_response, "luseepy": read_scalar_beam}

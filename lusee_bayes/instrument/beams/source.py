@@ -16,15 +16,16 @@ from jaxtyping import Complex, Float
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.beams.circuit import Circuit
-from lusee_bayes.instrument.beams.fields import AntennaFields
-from lusee_bayes.instrument.beams.grid import HemisphereGrid
-from lusee_bayes.instrument.beams.gridded import Interpolation, neighbours
-from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams
-from lusee_bayes.instrument.beams.product_beams import ProductBeams, stokes_beam
-from lusee_bayes.instrument.beams.receiver import Receiver
-from lusee_bayes.instrument.beams.response_file import PortResponse
-from lusee_bayes.instrument.beams.scalar_file import ROTATIONS_DEG, ScalarBeam
+from lusee_bayes.instrument.beams.fields import (
+    AntennaFields,
+    HemisphereGrid,
+    Interpolation,
+    ProductBeams,
+    neighbours,
+    stokes_beam,
+)
+from lusee_bayes.instrument.beams.luseepy_files import ROTATIONS_DEG, PortResponse, ScalarBeam
+from lusee_bayes.instrument.beams.monopoles import Circuit, Monopoles, Receiver, monopole_beams
 from lusee_bayes.instrument.products import N_ANTENNAS
 
 

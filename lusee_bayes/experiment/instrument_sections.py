@@ -1,0 +1,743 @@
+"""Sections of a scenario on the instrument and its data.
+
+Where, when and with which turntable angles.
+
+What is not known about clock and pointing.
+
+What is connected to the ports of a response: one section for each kind, told by ``model``.
+
+The beams: one section for each kind, selected by ``model``.
+
+A new kind is a class here, with its :class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
+
+Sessions of the spectrometer that are simulated, and what disturbs them.
+
+How sessions of the spectrometer become visibilities.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache, reduce
+from operator import or_
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from lusee_bayes.experiment.section import (
+    LARGEST,
+    Angle,
+    Frequency,
+    Positive,
+    Section,
+    Temperature,
+    Treatment,
+    without_other_kinds,
+)
+from lusee_bayes.instrument.beams.fields import Interpolation
+from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
+from lusee_bayes.instrument.beams.monopoles import (
+    CapacitorReceiver,
+    JFETReceiver,
+    Monopoles,
+    Receiver,
+    Regolith,
+    read_receiver,
+)
+from lusee_bayes.instrument.beams.sampled import SampledFileBeams, kind_of, read_sampled
+from lusee_bayes.instrument.beams.source import (
+    BeamSource,
+    EmbeddedBeams,
+    ResponseBeams,
+    ScalarFileBeams,
+)
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.pointing import OFFSETS
+from lusee_bayes.instrument.products import N_ANTENNAS
+from lusee_bayes.instrument.schedule import CYCLE_DAYS, Interval, Run, read_schedule
+from lusee_bayes.instrument.times import Timestamp
+
+
+class RunSection(Section):
+    """One stretch of data at one turntable angle.
+
+    Attributes
+    ----------
+    cycles : float
+        Length in lunar cycles of 27.321661 days.
+    turntable_deg : float
+        Angle of the turntable, from East towards North.
+    night_only : bool
+        Leave out samples with the Sun above the horizon.
+    """
+
+    cycles: Positive = 1.0
+    turntable_deg: Angle = 0.0
+    night_only: bool = False
+
+
+class ObservationSection(Section):
+    """Where and when; ``runs`` follow one another from ``start``, or a ``schedule`` has dates.
+
+    Attributes
+    ----------
+    lon_deg : float
+        Longitude of the site on the Moon (MCMF).
+    lat_deg : float
+        Latitude of the site on the Moon (MCMF).
+    start : str
+        Beginning of the first sample, UTC, as 2027-01-15T00:00:00.
+    step_s : float
+        Time between samples.
+    window : {"mean", "instant"}
+        What a sample is where no data say it: the mean over its step, or the sky at its beginning,
+        as in the paper and in luseepy's simulators.
+    timestamp : {"start", "middle", "end", "instant"}
+        What the times of a file of data are, if it does not say so itself; windows then last for
+        the file's step.
+    average_s : float
+        Data of a file are averaged over this time when they are read.
+    runs : tuple of RunSection
+        Stretches of data, one after another.
+    schedule : str, optional
+        File of the intervals in which data are taken, instead of ``start`` and ``runs``: CSV, or a
+        command table of OpSim.
+    fixed_axis : bool
+        The Moon turns about the axis of the first sample, as luseepy's engine ``croissant`` has
+        it; for data that it has made, with ``window: instant``.
+    """
+
+    lon_deg: Annotated[float, Field(ge=-360, le=360)] = 182.258
+    lat_deg: Annotated[float, Field(ge=-90, le=90)] = -23.814
+    start: str = "2027-01-15T00:00:00"
+    step_s: Positive = 7200.0
+    window: Literal["mean", "instant"] = "mean"
+    timestamp: Timestamp | None = None
+    average_s: Positive | None = None
+    runs: Annotated[tuple[RunSection, ...], Field(min_length=1)] = (RunSection(),)
+    schedule: str | None = None
+    fixed_axis: bool = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _before_there_were_windows(cls, tree: Any) -> Any:
+        """Scenarios that were written with all entries, but without this one, had instants."""
+        if isinstance(tree, Mapping) and "fixed_axis" in tree and "window" not in tree:
+            return {**tree, "window": "instant"}
+        return tree
+
+    @model_validator(mode="after")
+    def _a_fixed_axis_has_instants(self) -> ObservationSection:
+        if self.fixed_axis and self.window != "instant":
+            raise ValueError("fixed_axis is for samples that are instants; add window: instant")
+        return self
+
+    @model_validator(mode="after")
+    def _a_schedule_has_all_dates(self) -> ObservationSection:
+        if self.schedule is None:
+            return self
+        for name in ("start", "runs"):
+            if getattr(self, name) != type(self).model_fields[name].default:
+                raise ValueError(
+                    f"schedule {self.schedule} says when data are taken, and so does {name}; leave "
+                    "out one of them"
+                )
+        return self
+
+    def observation(self) -> Observation:
+        """Site, times and turntable angles."""
+        return _observation(self, self._intervals())
+
+    def n_samples(self) -> int:
+        """Count the samples, those by day among them."""
+        if self.schedule is None:
+            return sum(int(run.cycles * CYCLE_DAYS * 86400.0 // self.step_s) for run in self.runs)
+        return sum(interval.n_samples(self.step_s) for interval in self._intervals())
+
+    def _intervals(self) -> tuple[Interval, ...]:
+        return () if self.schedule is None else read_schedule(self.schedule)
+
+
+@lru_cache(maxsize=2)
+def _observation(section: ObservationSection, intervals: tuple[Interval, ...]) -> Observation:
+    """One for all channels, with their times' orientations."""
+    if intervals:
+        return Observation.from_schedule(
+            intervals,
+            step_s=section.step_s,
+            lon_deg=section.lon_deg,
+            lat_deg=section.lat_deg,
+            fixed_axis=section.fixed_axis,
+            window=section.window,
+        )
+    return Observation.from_runs(
+        tuple(Run(r.cycles, r.turntable_deg, r.night_only) for r in section.runs),
+        start=section.start,
+        step_s=section.step_s,
+        lon_deg=section.lon_deg,
+        lat_deg=section.lat_deg,
+        fixed_axis=section.fixed_axis,
+        window=section.window,
+    )
+
+
+# wider priors are none: the sky looks nothing like it did
+Offset = Annotated[Positive, Field(le=45)]
+
+
+class PointingSection(Section):
+    """Offsets of clock and pointing: prior standard deviations of what has to be added.
+
+    Attributes
+    ----------
+    clock_s : float
+        Samples were taken later than their times say by so many seconds.
+    clock_drift_s_per_day : float
+        And later by so much more every day from the first sample on.
+    turntable_deg : float
+        Angle of the turntable, of every run on its own.
+    lon_deg : float
+        Longitude of the site.
+    lat_deg : float
+        Latitude of the site.
+    tilt_east_deg : float
+        Lean of the lander towards East.
+    tilt_north_deg : float
+        Lean of the lander towards North.
+    treatment : {"marginalised", "sampled", "ignored"}
+        Their covariance is added to N to first order, they are sampled with the map, or they are
+        left out of the model.
+    around : {"posterior", "model"}
+        The sky and the offsets about which data depend on offsets to first order: those that the
+        data tell, found in rounds, or the scenario's sky and none.
+    true_values : dict
+        What simulated data hold, by name (turntable_0_deg, ... where there are several runs);
+        the others are drawn from their priors.
+    """
+
+    clock_s: Annotated[Positive, Field(le=1e6)] | None = None
+    clock_drift_s_per_day: Annotated[Positive, Field(le=1e4)] | None = None
+    turntable_deg: Offset | None = None
+    lon_deg: Offset | None = None
+    lat_deg: Offset | None = None
+    tilt_east_deg: Offset | None = None
+    tilt_north_deg: Offset | None = None
+    treatment: Treatment = "marginalised"
+    around: Literal["posterior", "model"] = "posterior"
+    true_values: dict[str, Annotated[float, Field(ge=-1e6, le=1e6)]] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _something_is_not_known(self) -> PointingSection:
+        if not self.kinds:
+            raise ValueError(f"give a standard deviation of at least one of {', '.join(OFFSETS)}")
+        return self
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """What is not known."""
+        return tuple(kind for kind in OFFSETS if getattr(self, kind) is not None)
+
+
+def _each_port(value: Any) -> Any:
+    """One number stands for all ports."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return (value,) * N_ANTENNAS if number else value
+
+
+def _ports(entry: Any) -> Any:
+    four = Field(min_length=N_ANTENNAS, max_length=N_ANTENNAS)
+    return Annotated[tuple[entry, ...], four, BeforeValidator(_each_port)]
+
+
+NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+_JFET, _CAPACITOR = JFETReceiver(), CapacitorReceiver()
+
+
+class JFETSection(Section):
+    """luseepy's preamplifiers; every entry is one number, or one for each port.
+
+    Attributes
+    ----------
+    capacitance_pf : tuple of float
+        Capacitance.
+    inductance_nh : tuple of float
+        Inductance.
+    parallel_ohm : tuple of float
+        Parallel resistance.
+    series_ohm : tuple of float
+        Series resistance.
+    skin_ohm : tuple of float
+        Resistance of the skin effect.
+    skin_power : tuple of float
+        Power of the frequency in the skin effect.
+    """
+
+    model: Literal["jfet"] = "jfet"
+    capacitance_pf: _ports(Positive) = _JFET.capacitance_pf
+    inductance_nh: _ports(NotNegative) = _JFET.inductance_nh
+    parallel_ohm: _ports(Positive) = _JFET.parallel_ohm
+    series_ohm: _ports(NotNegative) = _JFET.series_ohm
+    skin_ohm: _ports(NotNegative) = _JFET.skin_ohm
+    skin_power: _ports(Annotated[float, Field(ge=-10, le=10)]) = _JFET.skin_power
+
+    def receiver(self) -> Receiver | None:
+        """The receiver, or None for open ports."""
+        return JFETReceiver(**self.model_dump(exclude={"model"}))
+
+
+class CapacitorSection(Section):
+    """Capacitors: one number, or one for each port.
+
+    Attributes
+    ----------
+    capacitance_pf : tuple of float
+        Capacitance.
+    """
+
+    model: Literal["capacitor"] = "capacitor"
+    capacitance_pf: _ports(Positive) = _CAPACITOR.capacitance_pf
+
+    def receiver(self) -> Receiver | None:
+        """The receiver, or None for open ports."""
+        return CapacitorReceiver(self.capacitance_pf)
+
+
+class ReceiverFileSection(Section):
+    """Loads from a file: images ``freq``, ``ZL_real`` and ``ZL_imag``.
+
+    Attributes
+    ----------
+    file : str
+        Path of the file.
+    """
+
+    model: Literal["file"] = "file"
+    file: str
+
+    def receiver(self) -> Receiver | None:
+        """The receiver, or None for open ports."""
+        return read_receiver(self.file)
+
+
+class OpenSection(Section):
+    """Nothing."""
+
+    model: Literal["open"] = "open"
+
+    def receiver(self) -> Receiver | None:
+        """The receiver, or None for open ports."""
+        return None
+
+
+def _named(value: Any) -> Any:
+    """``receiver: open`` is ``receiver: {model: open}``."""
+    return {"model": value} if isinstance(value, str) else value
+
+
+ReceiverSection = Annotated[
+    JFETSection | CapacitorSection | ReceiverFileSection | OpenSection,
+    Field(discriminator="model"),
+    BeforeValidator(_named),
+]
+
+
+class MonopoleBeamSection(Section):
+    """The embedded antennas: four monopoles over layered regolith.
+
+    Attributes
+    ----------
+    length_m : float
+        Length of an arm.
+    zenith_angle_deg : float
+        Angle of the arms from the zenith.
+    height_m : float
+        Height of the feed over the ground.
+    surface_permittivity : float
+        Permittivity of the regolith at the surface.
+    deep_permittivity : float
+        Permittivity of the regolith 100 m deep.
+    loss_tangent : float
+        Loss tangent of the regolith.
+    turntable_offset_deg : float
+        Added to every angle of the turntable, from East towards North.
+    """
+
+    is_file: ClassVar[bool] = False
+
+    model: Literal["monopole"] = "monopole"
+    length_m: Positive = 3.0
+    zenith_angle_deg: Annotated[float, Field(gt=0, lt=180)] = 75.0
+    height_m: Positive = 2.0
+    surface_permittivity: Annotated[float, Field(ge=1, le=1e6)] = 3.7
+    deep_permittivity: Annotated[float, Field(ge=1, le=1e6)] = 6.1
+    loss_tangent: Annotated[float, Field(ge=0, le=1e6)] = 0.01
+    turntable_offset_deg: Angle = 0.0
+
+    @property
+    def label(self) -> str:
+        """Which antennas, for the header of a file."""
+        return self.model
+
+    @property
+    def n_ports(self) -> int:
+        """Number of antennas."""
+        return N_ANTENNAS
+
+    def source(self) -> BeamSource:
+        """The antennas."""
+        return EmbeddedBeams(
+            Monopoles(
+                regolith=Regolith(
+                    self.surface_permittivity, self.deep_permittivity, self.loss_tangent
+                ),
+                length_m=self.length_m,
+                zenith_angle_deg=self.zenith_angle_deg,
+                height_m=self.height_m,
+                turntable_offset_deg=self.turntable_offset_deg,
+            )
+        )
+
+
+class _FileSection(Section):
+    """What the beams of luseepy's files have in common."""
+
+    is_file: ClassVar[bool] = True
+
+    file: str
+    turntable_offset_deg: Angle = 0.0
+    quadrature: Literal["exact", "luseepy"] = "exact"
+    interpolation: Interpolation = "linear"
+    moon_temperature_k: Temperature = 0.0
+
+    @property
+    def label(self) -> str:
+        """Which antennas, for the header of a file."""
+        return Path(self.file).name
+
+
+class ScalarBeamSection(_FileSection):
+    """A scalar beam of luseepy: the pattern of one arm, used once for every port.
+
+    Attributes
+    ----------
+    file : str
+        FITS version 2.
+    rotations_deg : tuple of float
+        Angle of the pattern for each port, from East towards North; ``turntable_offset_deg`` is
+        added.
+    taper : bool
+        Fade out towards the horizon as luseepy does.
+    turntable_offset_deg : float
+        Added to every angle of the turntable, from East towards North.
+    quadrature : {"exact", "luseepy"}
+        ``luseepy`` is luseepy's own rule, for data that luseepy has made.
+    interpolation : {"linear", "spline"}
+        Between the file's frequencies: products of fields linearly as in luseepy, or fields by
+        cubic splines.
+    moon_temperature_k : float
+        Temperature of the ground, which adds its own radiation.
+    """
+
+    model: Literal["luseepy"] = "luseepy"
+    taper: bool = True
+    rotations_deg: Annotated[tuple[Angle, ...], Field(min_length=1)] = (0.0, 90.0, 180.0, 270.0)
+
+    @property
+    def n_ports(self) -> int:
+        """Number of ports."""
+        return len(self.rotations_deg)
+
+    def source(self) -> BeamSource:
+        """The pattern of the file, turned to every angle."""
+        return ScalarFileBeams(
+            replace(read_scalar_beam(self.file), interpolation=self.interpolation),
+            turntable_offset_deg=self.turntable_offset_deg,
+            taper=self.taper,
+            rotations_deg=self.rotations_deg,
+            luseepy_quadrature=self.quadrature == "luseepy",
+            moon_k=self.moon_temperature_k,
+        )
+
+
+class ResponseSection(_FileSection):
+    """A four-port response of luseepy: coupled antennas with their receivers.
+
+    Attributes
+    ----------
+    file : str
+        FITS version 3.
+    interpolation : {"linear", "spline"}
+        Between the file's frequencies: impedances and products of fields linearly as in luseepy, or
+        impedances and fields by cubic splines.
+    receiver : {"jfet", "capacitor", "file", "open"} or mapping, optional
+        What is connected to the ports, with its parameters. If it is left out, that of the data
+        where their file holds it, else luseepy's preamplifiers.
+    turntable_offset_deg : float
+        Added to every angle of the turntable, from East towards North.
+    quadrature : {"exact", "luseepy"}
+        ``luseepy`` is luseepy's own rule, for data that luseepy has made.
+    moon_temperature_k : float
+        Temperature of the ground, which adds its own radiation.
+    antenna_temperature_k : float
+        Temperature of the antennas' losses, which add their own radiation.
+    """
+
+    model: Literal["response"] = "response"
+    receiver: ReceiverSection | None = None
+    antenna_temperature_k: Temperature = 0.0
+
+    @property
+    def n_ports(self) -> int:
+        """Number of ports."""
+        return N_ANTENNAS
+
+    def source(self) -> BeamSource:
+        """The response of the file, with its receivers."""
+        response = replace(read_response(self.file), interpolation=self.interpolation)
+        if self.receiver is not None:
+            response = replace(response, receiver=self.receiver.receiver())
+        return ResponseBeams(
+            response,
+            receiver_said=self.receiver is not None,
+            turntable_offset_deg=self.turntable_offset_deg,
+            luseepy_quadrature=self.quadrature == "luseepy",
+            moon_k=self.moon_temperature_k,
+            antenna_k=self.antenna_temperature_k,
+        )
+
+
+class SampledBeamSection(Section):
+    """Beams of one's own in directions: fields of antennas or beams of products, or a UVBeam.
+
+    Attributes
+    ----------
+    file : str
+        netCDF or FITS of :func:`lusee_bayes.sampled_beams`, or pyuvdata's beam FITS.
+    turntable_offset_deg : float
+        By how much the turntable is further round than it says, from East towards North.
+    normalise : bool
+        Scale the beams so that autos integrate to one on average; by default as the file says.
+    """
+
+    is_file: ClassVar[bool] = True
+
+    model: Literal["sampled"] = "sampled"
+    file: str
+    turntable_offset_deg: float = 0.0
+    normalise: bool | None = None
+
+    @property
+    def label(self) -> str:
+        """Which antennas, for the header of a file."""
+        return Path(self.file).name
+
+    @property
+    def n_ports(self) -> int:
+        """Number of ports."""
+        return read_sampled(self.file).n_ports
+
+    def source(self) -> BeamSource:
+        """The beams of the file."""
+        return SampledFileBeams(read_sampled(self.file), self.turntable_offset_deg, self.normalise)
+
+
+BEAM_SECTIONS = {
+    section.model_fields["model"].default: section
+    for section in (MonopoleBeamSection, ScalarBeamSection, ResponseSection, SampledBeamSection)
+}
+
+
+def _one_kind(value: Any) -> Any:
+    """``beam: {file: ...}`` without a model, as scenarios had it before: the file tells."""
+    if not isinstance(value, dict):
+        return value
+    tree = dict(value)
+    default = MonopoleBeamSection.model_fields["model"].default
+    tree["model"] = tree.get("model") or default
+    file = tree.get("file")
+    if tree["model"] == default and file is not None:
+        tree["model"] = kind_of(file) if isinstance(file, str) else "luseepy"
+    if tree["model"] != "response" and tree.get("receiver") == "jfet":
+        del tree["receiver"]  # scenarios of 0.1 held all keys of all kinds
+    temperatures = ("moon_temperature_k", "antenna_temperature_k")
+    if tree["model"] == default and any(tree.get(name) for name in temperatures):
+        raise ValueError(
+            "the beams of the embedded antennas are scaled to the sky alone: temperatures of "
+            "Moon and antennas need beam.file"
+        )
+    if tree["model"] == "luseepy" and tree.get("antenna_temperature_k"):
+        raise ValueError(
+            f"{file} is a scalar beam, which knows of no losses; leave out "
+            "beam.antenna_temperature_k"
+        )
+    return without_other_kinds(tree, BEAM_SECTIONS, strict=True)
+
+
+BeamSection = Annotated[
+    reduce(or_, BEAM_SECTIONS.values()), Field(discriminator="model"), BeforeValidator(_one_kind)
+]
+
+
+def section_of_file(file: str, like: Any) -> Any:
+    """The section of another beam file, turned as the beams of ``like`` are."""
+    kind = BEAM_SECTIONS[kind_of(file)]
+    shared = {
+        name: value
+        for name, value in like.model_dump().items()
+        if name in kind.model_fields and name not in ("model", "file")
+    }
+    return kind(file=file, **shared)
+
+
+Share = Annotated[float, Field(ge=0, le=0.5)]
+Levels = Annotated[str, Field(pattern="^[LMH]{4}$")]
+
+
+class FlightSimulatedSection(Section):
+    """Sessions that ``simulate --flight`` writes; by default nothing disturbs them.
+
+    Attributes
+    ----------
+    kind : {"hdf5", "fits"}
+        Of file.
+    navgf : {1, 2, 3, 4}
+        Averaging over channels.
+    levels : str
+        Gains of the four ports, of L, M and H.
+    session_h : float
+        Length of a session.
+    clock : {"known", "unknown"}
+        Whether the files say which UTC their clock stands for; if not, a clock file does.
+    radiometer : bool
+        Add the radiometer noise of every channel.
+    switch_h : float
+        When the gains change to ``switch_levels``, from the beginning of the observation.
+    switch_levels : str
+        Gains from then on.
+    absent_share : float
+        Share of the spectra that lack one of the products.
+    saturated_share : float
+        Share of the spectra in which the ADCs are at their ends.
+    tones_mhz : tuple of float
+        Frequencies of tones, each in one channel.
+    tone_share : float
+        Share of the spectra that have the tones.
+    tone_factor : float
+        Power of a tone, in multiples of the radiometer noise of a channel.
+    comb_share : float
+        Share of the spectra in which the calibrator's comb is on.
+    comb_factor : float
+        Power of each of its lines, in multiples of the radiometer noise of a channel.
+    burst_every_h : float
+        Mean time from burst to burst, as those of Jupiter and the Sun.
+    burst_s : float
+        Length of the longest; the shortest last for a spectrum.
+    burst_factor : float
+        Power of a burst, in multiples of the radiometer noise of a spectrum in 1 MHz.
+    """
+
+    kind: Literal["hdf5", "fits"] = "hdf5"
+    navgf: Literal[1, 2, 3, 4] = 1
+    levels: Levels = "MMMM"
+    session_h: Positive = 24.0
+    clock: Literal["known", "unknown"] = "known"
+    radiometer: bool = True
+    switch_h: Positive | None = None
+    switch_levels: Levels = "LLLL"
+    absent_share: Share = 0.0
+    saturated_share: Share = 0.0
+    tones_mhz: Annotated[tuple[Frequency, ...], Field(max_length=100)] = ()
+    tone_share: Share = 0.1
+    tone_factor: Positive = 30.0
+    comb_share: Share = 0.0
+    comb_factor: Positive = 3.0
+    # a month with a burst every 4 s takes 10 s to draw
+    burst_every_h: Annotated[float, Field(ge=1e-3, le=LARGEST)] | None = None
+    burst_s: Positive = 600.0
+    burst_factor: Positive = 30.0
+
+    def disturbances(self) -> dict[str, Any]:
+        """Return gains and disturbances, as :meth:`.Disturbances.drawn` takes them."""
+        return self.model_dump(exclude={"kind", "session_h", "clock", "radiometer"})
+
+
+# probabilities of a false alarm
+Rare = Annotated[float, Field(ge=1e-12, le=0.1)]
+
+
+class FlightSection(Section):
+    """How sessions of the spectrometer become visibilities, where --data are sessions.
+
+    Attributes
+    ----------
+    gain_table : str
+        Folder of luseepy's gain model, or a gain table in netCDF.
+    gain_model : {"quadratic", "linear"}
+        Which coefficients of luseepy's folder.
+    component_std : tuple of float
+        Standard deviations of the strengths of the two components of the gains, of each level of
+        each port on its own, where the gain table does not have them.
+    gain_std : float
+        Standard deviation of the power gain of each level of each port, relative, besides; of each
+        port, if simulated with ``noise.gain_table`` as anything but sessions.
+    bin_origin : {"centre", "edge"}
+        What of channel k lies at k times 25 kHz. It is not settled, and has to be said.
+    clock : str
+        Clock reference in JSON, for files with no absolute time, or to correct the UTC that they
+        state.
+    site : {"file", "scenario"}
+        Whose site counts: luseepy writes one that nobody has established if it is told none.
+    bandwidth_hz : float
+        Width of the band about the frequency of a map.
+    degree : int
+        Of the polynomial that is fitted to the spectrum in the band, and taken in its middle.
+    filter_taps : int
+        Taps of the filter bank: how much noise neighbouring channels share; 0 for none.
+    filter_window : {"rectangular", "hann", "hamming", "blackman"}
+        Its window.
+    convention : {"s_i conj(s_j)", "conj(s_i) s_j"}
+        What the complex products are the mean of.
+    per_kelvin_v2_hz : float
+        V^2/Hz that 1 K makes at each port, for beams that know no volts.
+    turntable_deg : float
+        Angle of the turntable, from East towards North.
+    lines : str
+        CSV table of known lines: frequency_mhz, source.
+    comb : {"found", "always", "never"}
+        Whether the calibrator's comb is looked for in every spectrum, or known to be on or off.
+    false_alarm : float
+        Chance that a value of pure noise is flagged, of each kind of test.
+    leave_out : bool
+        Flag bins of time, single values, products and days that do not fit what all others predict
+        for them.
+    simulated : FlightSimulatedSection
+        Sessions that are simulated, and what disturbs them.
+    """
+
+    gain_table: str | None = None
+    gain_model: Literal["quadratic", "linear"] = "quadratic"
+    component_std: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)] | None = None
+    gain_std: Positive | None = None
+    bin_origin: Literal["centre", "edge"] | None = None
+    clock: str | None = None
+    site: Literal["file", "scenario"] = "file"
+    bandwidth_hz: Positive = 1.0e6
+    degree: Annotated[int, Field(ge=0, le=6)] = 2
+    filter_taps: Annotated[int, Field(ge=0, le=64)] = 0
+    filter_window: Literal["rectangular", "hann", "hamming", "blackman"] = "hann"
+    convention: Literal["s_i conj(s_j)", "conj(s_i) s_j"] = "s_i conj(s_j)"
+    per_kelvin_v2_hz: Positive | None = None
+    turntable_deg: Angle = 0.0
+    lines: str | None = None
+    comb: Literal["found", "always", "never"] = "found"
+    false_alarm: Rare = 1e-4
+    leave_out: bool = True
+    simulated: FlightSimulatedSection | None = None
+
+    @model_validator(mode="after")
+    def _one_kind_of_error(self) -> FlightSection:
+        if self.gain_std is not None and self.gain_std >= 1.0:
+            raise ValueError("gain_std is relative to the gain; give a number below 1")
+        return self

@@ -1,0 +1,161 @@
+"""What every section of a scenario has in common.
+
+What all sections of a scenario have in common.
+
+What a map run writes besides its maps.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from lusee_bayes.core.files import user_path
+from lusee_bayes.core.layouts import LARGEST_MHZ, NOT_HZ
+
+S = TypeVar("S", bound="Section")
+
+
+def _not_tiny(value: float) -> float:
+    if value < SMALLEST:
+        raise ValueError(f"input should be at least {SMALLEST:g}")
+    return value
+
+
+def _not_hz(value: Any) -> Any:
+    if isinstance(value, int | float) and value > LARGEST_MHZ:
+        raise ValueError(NOT_HZ)
+    return value
+
+
+# what is smaller or larger has no meaning here, and its powers no room in 64 bits
+SMALLEST, LARGEST = 1e-30, 1e30
+Positive = Annotated[float, Field(gt=0, le=LARGEST), AfterValidator(_not_tiny)]
+Temperature = Annotated[float, Field(ge=0, le=1e6)]
+Angle = Annotated[float, Field(ge=-3600, le=3600)]
+# of random numbers; channels have one each, so that some room is left below 64 bits
+Seed = Annotated[int, Field(ge=0, lt=2**62)]
+# of LuSEE-Night's band, in MHz
+Frequency = Annotated[float, Field(ge=1, le=50), BeforeValidator(_not_hz)]
+# of a file, or of a spectrum
+Megahertz = Annotated[Positive, BeforeValidator(_not_hz)]
+# what is done about something that is not known
+Treatment = Literal["marginalised", "sampled", "ignored"]
+
+
+# entries that name files; one that has its default names none
+FILES = (
+    "clock",
+    "file",
+    "gain_table",
+    "lines",
+    "mean_file",
+    "schedule",
+    "spectrum_file",
+)
+
+
+class Section(BaseModel):
+    """Part of a scenario: no key that is not declared, no NaN, nothing changed once made.
+
+    Types are strict: no text for numbers, no ``true`` for 1, no 12.0 for 12.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+    def anchored(self: S) -> S:
+        """The same with absolute names of files, which are then the same in any folder."""
+        found: dict[str, Any] = {}
+        for name, declared in type(self).model_fields.items():
+            value = getattr(self, name)
+            if isinstance(value, Section):
+                found[name] = value.anchored()
+            elif name in FILES and value is not None and value != declared.default:
+                found[name] = os.path.abspath(value)
+        return self.model_copy(update=found)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_sections_have_it(cls, tree: Any) -> Any:
+        """YAML has lists where sections have tuples, and ``~`` in the names of files."""
+        if not isinstance(tree, Mapping):
+            return tree
+        found = {key: tuple(v) if isinstance(v, list) else v for key, v in tree.items()}
+        names = {key: found[key] for key in FILES if isinstance(found.get(key), str)}
+        return found | {key: str(user_path(n)) for key, n in names.items() if n.startswith("~")}
+
+
+def known_keys(kinds: Mapping[str, type[Section]]) -> set[str]:
+    """Every key of a section that comes in several kinds."""
+    return {name for kind in kinds.values() for name in kind.model_fields}
+
+
+def without_other_kinds(
+    tree: dict[str, Any], kinds: Mapping[str, type[Section]], *, strict: bool
+) -> dict[str, Any]:
+    """A section's entries without those that only other kinds of it have.
+
+    Scenarios that were written with all keys, or in which one kind is put in another's place by
+    ``--set``, still hold the keys of the other kind.
+
+    Parameters
+    ----------
+    tree : dict
+        The section's entries, ``model`` among them.
+    kinds : mapping
+        The section of each ``model``.
+    strict : bool
+        Refuse a key of another kind whose value is not that kind's default.
+
+    Returns
+    -------
+    dict
+        The entries that the kind has, and those that no kind has.
+
+    Raises
+    ------
+    ValueError
+        For such a key, where ``strict``.
+    """
+    own = kinds.get(tree["model"]) if isinstance(tree["model"], str) else None
+    if own is None:
+        return tree
+    kept = {}
+    for key, value in tree.items():
+        others = [k for k in kinds.values() if key in k.model_fields]
+        if key in own.model_fields or not others:
+            kept[key] = value
+            continue
+        theirs = others[0]
+        default = theirs.model_fields[key].get_default(call_default_factory=True)
+        same = value is None or value == default or value == _plain(default)
+        if strict and not same:
+            names = ", ".join(name for name, kind in kinds.items() if kind in others)
+            raise ValueError(f"{key} is an entry of model {names}, not of {tree['model']}")
+    return kept
+
+
+def _plain(value: Any) -> Any:
+    """As YAML has it."""
+    return list(value) if isinstance(value, tuple) else value
+
+
+class OutputSection(Section):
+    """Results that are written on request.
+
+    Attributes
+    ----------
+    draws : int
+        Number of posterior draws ``posterior.nc`` keeps.
+    covariance : bool
+        Keep the posterior covariance in ``posterior.nc``.
+    updatable : bool
+        Keep in ``posterior.nc`` what new data need to be added later.
+    """
+
+    draws: Annotated[int, Field(ge=0)] = 0
+    covariance: bool = False
+    updatable: bool = False

@@ -1,0 +1,500 @@
+"""Sections of a scenario on skies and priors.
+
+The sky: one section for each kind, selected by ``model``.
+
+A new kind is a class here, with its :class:`SkySource`, and its name in ``SKY_SECTIONS``.
+
+Point sources that are not part of the map.
+
+The prior on the sky: one section for each kind, selected by ``model``.
+
+A new kind is a class here, which makes its :class:`Prior`, and its name in ``PRIOR_SECTIONS``.
+
+The prior on skies of several frequencies.
+"""
+
+from __future__ import annotations
+
+from functools import reduce
+from operator import or_
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field, model_validator
+
+from lusee_bayes.experiment.section import (
+    Megahertz,
+    Positive,
+    Section,
+    Seed,
+    Treatment,
+    without_other_kinds,
+)
+from lusee_bayes.priors.families import IsotropicFamily, PriorFamily
+from lusee_bayes.priors.local_scales import embedded_local_scales
+from lusee_bayes.sampling.log_normal import LogNormalPrior
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
+from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
+from lusee_bayes.sky.positive_skies import check_fields
+from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_mean, read_spectrum
+from lusee_bayes.sky.sky_source import FileSource, GalaxySource, Sky, SkySource
+from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components
+from lusee_bayes.sky.template import EmbeddedTemplate
+
+
+class GalaxySection(Section):
+    """The embedded Galaxy.
+
+    Attributes
+    ----------
+    seed : int
+        Seed of the random small scales.
+    sources : bool
+        Add the brightest point sources.
+    """
+
+    has_sources: ClassVar[bool] = True
+
+    model: Literal["galaxy"] = "galaxy"
+    seed: Seed = 1
+    sources: bool = True
+
+    def source(self) -> SkySource:
+        """The embedded Galaxy with these sources."""
+        return GalaxySource(self.seed, BRIGHT_SOURCES if self.sources else ())
+
+
+class FileSkySection(Section):
+    """A sky from a file: ULSA's HDF5, HEALPix FITS, luseepy's FITS of many maps, coefficients.
+
+    Attributes
+    ----------
+    file : str
+        Path of the file.
+    dataset : str
+        Data set of an HDF5 file.
+    file_frequency_mhz : float
+        Frequency that the file was made for; by default the scenario's. Of a file with many
+        frequencies, this one is taken.
+    spectral_index : float
+        Scales the sky from ``file_frequency_mhz`` to the scenario's frequency.
+    """
+
+    model: Literal["file"] = "file"
+    file: str
+    dataset: str | None = None
+    file_frequency_mhz: Megahertz | None = None
+    spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
+
+    @property
+    def sources(self) -> bool:
+        """Whether the catalogue's sources are added: they are in the file, if at all."""
+        return False
+
+    def source(self) -> SkySource:
+        """The file."""
+        return FileSource(
+            self.file,
+            dataset=self.dataset,
+            file_frequency_mhz=self.file_frequency_mhz,
+            spectral_index=self.spectral_index,
+        )
+
+
+SKY_SECTIONS = {
+    section.model_fields["model"].default: section for section in (GalaxySection, FileSkySection)
+}
+
+
+def _kind_of_sky(value: Any) -> Any:
+    """``sky: {file: ...}`` without a model, as scenarios had it before."""
+    if not isinstance(value, dict):
+        return value
+    tree = dict(value)
+    default = GalaxySection.model_fields["model"].default
+    tree["model"] = tree.get("model") or default
+    if tree["model"] == default and tree.get("file") is not None:
+        tree["model"] = "file"
+    # the sources of the embedded sky were said beside a file, too, where they had no effect
+    return without_other_kinds(tree, SKY_SECTIONS, strict=False)
+
+
+SkySection = Annotated[
+    reduce(or_, SKY_SECTIONS.values()), Field(discriminator="model"), BeforeValidator(_kind_of_sky)
+]
+
+
+class SourceSection(Section):
+    """A point source, apart from the map: one of the catalogue, a body of the solar system, or own.
+
+    Attributes
+    ----------
+    name : str
+        Of the catalogue (Cas A, ...), of a body (Sun, Jupiter, ...), or any other with a position.
+    flux_jy : float
+        Mean of the prior on its flux density; by default the catalogue's.
+    relative_std : float
+        Standard deviation of that prior over its mean.
+    ra_deg : float
+        Right ascension of an own source (ICRS).
+    dec_deg : float
+        Declination of an own source (ICRS).
+    stokes_v : float
+        Circularly polarised fraction V / I, positive if right-handed (IAU).
+    block_h : float
+        Length of blocks of time that have independent amplitudes; by default one for all times.
+    """
+
+    name: str
+    flux_jy: Positive | None = None
+    relative_std: Positive = 0.5
+    ra_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
+    dec_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
+    stokes_v: Annotated[float, Field(ge=-1, le=1)] = 0.0
+    block_h: Positive | None = None
+
+    @model_validator(mode="after")
+    def _both_coordinates(self) -> SourceSection:
+        if (self.ra_deg is None) != (self.dec_deg is None):
+            raise ValueError("give both ra_deg and dec_deg, or none")
+        return self
+
+
+class SourcesSection(Section):
+    """Point sources that are not part of the map: in N, sampled, or ignored.
+
+    Attributes
+    ----------
+    list : tuple of SourceSection
+        The sources.
+    treatment : {"marginalised", "sampled", "ignored"}
+        Their covariance is added to N, their fluxes are sampled with the map, or they are left out
+        of the model.
+    """
+
+    list: tuple[SourceSection, ...] = ()
+    treatment: Treatment = "marginalised"
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> SourcesSection:
+        names = [source.name for source in self.list]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ValueError(f"the source '{twice}' is there twice")
+        return self
+
+
+# where C_ell comes from
+LEARNED = "learned from these data"
+# what is expected of A and of the tilt where they are sampled: as of relative deviations
+AMPLITUDE, TILT = 0.04, -2.5
+LOG_AMPLITUDE_STD, TILT_STD = 1.0, 0.5
+
+
+class IsotropicPriorSection(Section):
+    """Independent coefficients: C_ell learned from the data, the sky's own, or a file's; mean 0.
+
+    ``sky`` takes C_ell of the scenario's sky, which simulations know and observers do not: the
+    paper's setting. With it or with a file's, an amplitude and a tilt can be sampled,
+    C_ell A ((ell + 1) / 10)^tilt, or one amplitude for every band of ell.
+
+    Attributes
+    ----------
+    spectrum : {"learned", "sky"}
+        Where C_ell comes from, if not from a file: by default learned, unless another entry acts on
+        a C_ell that is known.
+    scale : float
+        Multiplies C_ell.
+    spectrum_file : str
+        Text with lines of ell and C_ell in K^2, in place of the scenario's sky.
+    mean_file : str
+        The prior mean: a HEALPix FITS map in K, Galactic.
+    file_frequency_mhz : float
+        What these files were made for; by default the scenario's frequency.
+    spectral_index : float
+        Scales them from ``file_frequency_mhz`` to the scenario's frequency: the mean once, C_ell
+        twice.
+    log_amplitude_std : float
+        Prior standard deviation of ln A; A is sampled if it is given.
+    tilt_std : float
+        Prior standard deviation of the tilt, which is sampled if it is given.
+    band_edges : tuple of int
+        First ell of each band but the lowest; amplitudes of the bands are sampled if it is given.
+    log_band_std : float
+        Prior standard deviation of ln of each band's amplitude.
+    """
+
+    model: Literal["isotropic"] = "isotropic"
+    spectrum: Literal["learned", "sky"] = "learned"
+    scale: Positive = 1.0
+    spectrum_file: str | None = None
+    mean_file: str | None = None
+    file_frequency_mhz: Megahertz | None = None
+    spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
+    log_amplitude_std: Positive | None = None
+    tilt_std: Positive | None = None
+    band_edges: tuple[Annotated[int, Field(ge=1)], ...] = ()
+    log_band_std: Positive = 1.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_where_something_acts_on_it(cls, value: Any) -> Any:
+        if not isinstance(value, dict) or value.get("spectrum") is not None:
+            return value
+        acting = ("scale", "mean_file", "log_amplitude_std", "tilt_std", "band_edges")
+        known = any(value.get(name) for name in acting)
+        return {**value, "spectrum": "sky" if known else "learned"}
+
+    @model_validator(mode="after")
+    def _one_parameterisation(self) -> IsotropicPriorSection:
+        if self.band_edges and (self.log_amplitude_std or self.tilt_std):
+            raise ValueError("give either band_edges or log_amplitude_std and tilt_std")
+        if self.is_learned and (self.samples or self.scale != 1.0 or self.mean_file is not None):
+            raise ValueError(
+                "a learned C_ell has no scale, no mean_file and nothing to sample; give "
+                "spectrum=sky or a spectrum_file with them"
+            )
+        if list(self.band_edges) != sorted(set(self.band_edges)):
+            raise ValueError("band_edges must grow from one to the next")
+        return self
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether the data tell C_ell."""
+        return self.spectrum == "learned" and self.spectrum_file is None
+
+    def family(self, frequency_mhz: float, lmax: int) -> PriorFamily | None:
+        """The family that data choose a prior of, up to an ell; None if C_ell is given."""
+        if not self.is_learned:
+            return None
+        return IsotropicFamily.around(_mean_temperature(frequency_mhz), lmax)
+
+    def prior(self, sky: Sky) -> Prior:
+        """S, and the mean, at the frequency and up to the lmax of a model sky."""
+        read_at = self.file_frequency_mhz or sky.frequency_mhz
+        steepening = (sky.frequency_mhz / read_at) ** self.spectral_index
+        spectrum = sky.spectrum()
+        if self.spectrum_file is not None:
+            spectrum = read_spectrum(self.spectrum_file, sky.lmax) * steepening**2
+        mean = None
+        if self.mean_file is not None:
+            mean = read_mean(self.mean_file, read_at, sky.lmax) * steepening
+        return HarmonicPrior(spectrum * self.scale, mean=mean)
+
+    @property
+    def origin(self) -> str:
+        """Where C_ell comes from."""
+        if self.spectrum_file is not None:
+            return f"of {self.spectrum_file}"
+        return LEARNED if self.is_learned else "of the scenario's own sky"
+
+    @property
+    def has_files(self) -> bool:
+        """Whether the prior is read from files, which are of one frequency."""
+        return self.spectrum_file is not None or self.mean_file is not None
+
+    @property
+    def samples(self) -> bool:
+        """Whether something of the prior is to be sampled."""
+        known = self.log_amplitude_std is None and self.tilt_std is None
+        return not known or bool(self.band_edges)
+
+
+class LocalScalesPriorSection(Section):
+    """A template, and Gaussian deviations whose strength at every place and scale is learned.
+
+    The template is the embedded diffuse Galaxy; how much of it there is, whether the catalogue's
+    sources are there, C_ell of the deviations, and how their strength goes with the template's
+    brightness, with the Galactic plane and from place to place are all told by the data.
+
+    Attributes
+    ----------
+    sources : bool
+        Allow for the catalogue's sources.
+    """
+
+    model: Literal["local_scales"] = "local_scales"
+    sources: bool = True
+
+    @property
+    def origin(self) -> str:
+        """Where C_ell comes from."""
+        return LEARNED
+
+    @property
+    def has_files(self) -> bool:
+        """Whether the prior is read from files, which are of one frequency."""
+        return False
+
+    @property
+    def samples(self) -> bool:
+        """Whether something of the prior is to be sampled."""
+        return False
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether the data tell C_ell."""
+        return True
+
+    def family(self, frequency_mhz: float, lmax: int) -> PriorFamily:
+        """The family that data choose a prior of, up to an ell."""
+        return embedded_local_scales(frequency_mhz, lmax, BRIGHT_SOURCES if self.sources else ())
+
+
+PRIOR_SECTIONS = {
+    section.model_fields["model"].default: section
+    for section in (
+        LocalScalesPriorSection,
+        IsotropicPriorSection,
+    )
+}
+
+
+def _kind_of_prior(value: Any) -> Any:
+    """``prior`` without a model is that of its entries: isotropic, as scenarios had it before."""
+    if not isinstance(value, dict):
+        return value
+    tree = dict(value)
+    if not tree.get("model"):
+        told = set(tree) & set(IsotropicPriorSection.model_fields) - {"model"}
+        default = IsotropicPriorSection if told else LocalScalesPriorSection
+        tree["model"] = default.model_fields["model"].default
+    if tree["model"] != "isotropic":  # another kind in the place of the paper's prior
+        tree.pop("spectrum", None)
+    return without_other_kinds(tree, PRIOR_SECTIONS, strict=True)
+
+
+def _mean_temperature(frequency_mhz: float) -> float:
+    """Of the embedded sky, in K."""
+    return float(EmbeddedTemplate(frequency_mhz).modes(0)[0] / np.sqrt(4.0 * np.pi))
+
+
+PriorSection = Annotated[
+    reduce(or_, PRIOR_SECTIONS.values()),
+    Field(discriminator="model"),
+    BeforeValidator(_kind_of_prior),
+]
+
+
+class LogNormalSection(Section):
+    """The positive sky of the program ``log_normal``, which has a prior of its own.
+
+    It is the embedded diffuse Galaxy times the exponential of a Gaussian field, whose C_ell is
+    A^2 ((ell + 1) / 10)^tilt. A and the tilt are sampled with the sky, or given.
+
+    Attributes
+    ----------
+    amplitude : float
+        A, of the logarithm of the sky over the Galaxy; sampled, with the tilt, if it is left out.
+    tilt : float
+        Slope of C_ell; needed with A.
+    scale_std : float
+        Standard deviation of the logarithm of the Galaxy's overall scale.
+    sources : bool
+        Add the catalogue's sources, each with a positive flux that may be small.
+    """
+
+    amplitude: Positive | None = None
+    tilt: Annotated[float, Field(ge=-20, le=20)] | None = None
+    scale_std: Positive = 0.5
+    sources: bool = True
+
+    @model_validator(mode="after")
+    def _both_or_neither(self) -> LogNormalSection:
+        if (self.amplitude is None) != (self.tilt is None):
+            raise ValueError("give both amplitude and tilt, or neither, and they are sampled")
+        return self
+
+    def prior(self, frequency_mhz: float, lmax: int) -> LogNormalPrior:
+        """The prior up to an ell."""
+        amplitude, tilt, widths = AMPLITUDE, TILT, (LOG_AMPLITUDE_STD, TILT_STD)
+        if self.amplitude is not None and self.tilt is not None:
+            amplitude, tilt, widths = self.amplitude, self.tilt, None
+        level = np.array([4.0 * np.pi * self.scale_std**2])
+        spectrum = deviation_spectrum(lmax, amplitude, tilt, level)
+        sources = BRIGHT_SOURCES if self.sources else ()
+        template = EmbeddedTemplate(frequency_mhz)
+        sky = LogNormalSky.of(template, spectrum, frequency_mhz, sources)
+        return LogNormalPrior.of(sky, amplitude, tilt, widths)
+
+
+class SpectralSection(Section):
+    """The prior on skies of several frequencies that are mapped together.
+
+    C_ell of components and kernel follow from the scenario's skies; that of positive skies is
+    learned from the data.
+
+    Attributes
+    ----------
+    model : {"components", "kernel", "positive"}
+        A sum of maps with given spectra, a power law times a Gaussian process in ln nu, or the
+        embedded diffuse Galaxy times the exponential of fields, which is positive everywhere.
+    components : tuple of str
+        Spectra of the maps: a power law, its curvature (times ln nu) and its turnover (times
+        1 - exp(-tau), tau = (turnover_mhz / nu)^2.1).
+    fields : tuple of str
+        What varies over positive skies: their level, spectral index and curvature (times ln nu and
+        ln^2 nu), and the optical depth at turnover_mhz, which goes as nu^-2.1.
+    sources : bool
+        Give the catalogue's sources fluxes of their own in every channel of positive skies, each as
+        uncertain as it is large.
+    index : float
+        Spectral index of the power law.
+    reference_mhz : float
+        Frequency at which the components are given.
+    turnover_mhz : float
+        Frequency of optical depth 1 in the turnover.
+    length : float
+        Correlation length of the Gaussian process in ln nu.
+    residual : float
+        rms of what each channel has of its own, over that of its sky; by default what the
+        components leave of the skies, 0.01 with the kernel.
+    """
+
+    model: Literal["components", "kernel", "positive"] = "components"
+    components: Annotated[
+        tuple[Literal["power_law", "curvature", "turnover"], ...], Field(min_length=1)
+    ] = ("power_law", "curvature", "turnover")
+    fields: Annotated[
+        tuple[Literal["level", "index", "curvature", "absorption"], ...], Field(min_length=1)
+    ] = ("level", "index", "curvature", "absorption")
+    sources: bool = True
+    index: Annotated[float, Field(ge=-20, le=20)] = -2.5
+    reference_mhz: Megahertz = 20.0
+    turnover_mhz: Megahertz = 5.0
+    length: Positive = 1.0
+    residual: Annotated[float, Field(ge=0, le=1)] | None = None
+
+    def require_channels(self, n: int) -> None:
+        """InputError for so few channels that they cannot share a posterior."""
+        if self.model == "components":
+            check_components(self.components, n, self.residual)
+        if self.model == "positive":
+            check_fields(self.fields, n)
+
+    def n_maps(self, frequencies_mhz: tuple[float, ...]) -> int:
+        """How many maps the skies of these channels are made of."""
+        if self.model == "positive":
+            return len(self.fields)
+        if self.model == "components":
+            return len(self.components)
+        # as many principal spectra as matter
+        frequencies = np.array(frequencies_mhz)
+        return self.prior(frequencies, np.ones((len(frequencies), 1))).n_components
+
+    def prior(self, frequencies_mhz: np.ndarray, skies: np.ndarray) -> SpectralPrior:
+        """The prior on linear skies of all channels; ``skies`` (channels, modes) model them."""
+        common = {"index": self.index, "reference_mhz": self.reference_mhz}
+        if self.model == "components":
+            return SpectralPrior.components(
+                frequencies_mhz,
+                skies,
+                self.components,
+                turnover_mhz=self.turnover_mhz,
+                residual=self.residual,
+                **common,
+            )
+        residual = {} if self.residual is None else {"residual": self.residual}
+        return SpectralPrior.kernel(
+            frequencies_mhz, skies, length=self.length, **common, **residual
+        )

@@ -1,0 +1,681 @@
+"""Beams in luseepy's files: responses of the ports, and scalar beams.
+
+What the headers of luseepy's beam files state about their own conventions.
+
+A word that is absent, or "UNKNOWN", as luseepy writes where it was not given any, states nothing.
+
+luseepy's quadrature over the directions of a file, for data that luseepy has made.
+
+Coupled antennas over ground, with their receivers, from the four-port files of luseepy.
+
+FITS version 3: bare effective lengths H_theta, H_phi (port, frequency, theta, phi) in m, RMS, of a
+wave arriving from (theta, phi), phi from East towards North; impedance ZA and its resistive parts
+Rsky, Rmoon, Rloss (frequency, port, port) in Ohm, with ZA + ZA^H = 2 (Rsky + Rmoon + Rloss); freq
+in MHz, theta and phi in degrees. At the receivers' inputs, one-sided, ::
+
+    V_ab = k eta0 / lambda^2 int (M Ht)_a conj((M Ht)_b) + (M Hp)_a conj((M Hp)_b) T dOmega
+           + 4 k (M (T_moon Rmoon + T_antenna Rloss) M^H)_ab    in V^2/Hz.
+
+An enclosure of 1 K makes U = 4 k M (ZA + ZA^H) / 2 M^H; V_ab / sqrt(U_aa U_bb) is in K. Between the
+frequencies of the file luseepy interpolates impedances and the integrals of open ports (M left out)
+linearly, and takes M of the interpolated ZA.
+
+The field pattern of one arm, used once for each port, from the scalar files of luseepy.
+
+FITS version 2: images Etheta_real, Etheta_imag, EPhi_real, EPhi_imag (frequency, theta, phi), the
+response to a wave arriving from (theta, phi), phi from East towards North, time convention
+exp(+i w t); gain_conv g(frequency), freq in MHz, Z_real and Z_imag in Ohm. Visibilities in K are ::
+
+    T_ij = sqrt(g_i g_j) / (4 pi) int (Et_i conj(Et_j) + Ep_i conj(Ep_j)) I dOmega,
+
+so that fields times sqrt(2 g / 4 pi) give product beams without any other normalisation. Between
+the frequencies of the file luseepy interpolates g and the integrals linearly, not the fields.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.constants import Boltzmann, physical_constants
+from scipy.special import roots_legendre
+
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.formats import read_fits
+from lusee_bayes.core.harmonics import mode_numbers, polar_functions
+from lusee_bayes.core.layouts import UNSTATED, Attribute, Layout, Variable
+from lusee_bayes.instrument.beams.fields import (
+    SPEED_OF_LIGHT,
+    AntennaFields,
+    HemisphereGrid,
+    Interpolation,
+    ProductBeams,
+    at_frequency,
+    neighbours,
+    on_grid,
+    product_modes,
+)
+from lusee_bayes.instrument.beams.monopoles import Circuit, JFETReceiver, Receiver
+from lusee_bayes.instrument.products import N_ANTENNAS, to_matrix, to_real
+
+# what this package assumes of the images, in lower case
+CONVENTIONS: Mapping[str, str] = {
+    "TIMECONV": "e+jwt",
+    "COORDSYS": "instrument-topocentric",
+    "THETADEF": "colatitude-from-+z",
+    "PHIDEF": "right-handed-about-+z",
+    "OMEGADEF": "source-arrival-direction",
+    "POLBASIS": "e_theta,e_phi",
+    "PORTS": "0123",
+    "CANONICAL": "h[m],si-rms",
+}
+# of responses: what luseepy has converted to effective lengths in m, and how, by NORM_KIND
+SOURCES = ("NORM_KIND", "INPUT_KIND", "FIELD_KIND", "FIELD_UNIT")
+CONVERTED: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
+    "already-effective-length": ("bare", "effective-length", ("m",)),
+    "already-per-ampere": ("bare", "re-per-current", ("v/a", "mv/a")),
+    "current": ("bare", "re", ("v", "mv")),
+    "vsource": ("embedded", "re", ("v", "mv")),
+    "unloaded-zl": ("loaded", "effective-length", ("m",)),
+}
+
+
+def require_conventions(path: str | Path, said: Mapping[str, Any]) -> None:
+    """Check the words of a header against what this package assumes.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, for the message.
+    said : mapping of str to str
+        Its words.
+
+    Raises
+    ------
+    InputError
+        If one contradicts it.
+    """
+    stated = {key: str(value).strip().lower() for key, value in said.items()}
+    stated = {key: text for key, text in stated.items() if text not in UNSTATED}
+    kind = stated.get("NORM_KIND", "already-effective-length")
+    if kind not in CONVERTED:
+        raise InputError(f"{path}: NORM_KIND is '{kind}'; {nearest(kind, CONVERTED)}")
+    source = dict(zip(SOURCES[1:], CONVERTED[kind], strict=True))
+    for key, expected in (CONVENTIONS | source).items():
+        allowed = (expected,) if isinstance(expected, str) else expected
+        if key in stated and stated[key] not in allowed:
+            raise InputError(
+                f"{path}: {key} is '{said[key]}', expected '{' or '.join(allowed)}'; convert the "
+                "file with luseepy, or correct its header"
+            )
+
+
+def rectangle_rule(theta: Float[np.ndarray, " theta"], n_phi: int) -> HemisphereGrid:
+    """Return luseepy's rule for scalar beams: sin(theta) dtheta dphi, equal steps up to pi / 2."""
+    return HemisphereGrid(theta, np.sin(theta) * theta[1], n_phi)
+
+
+class BandLimitedGrid(HemisphereGrid):
+    """luseepy's rule for responses: the pattern as a band-limited function on the whole sphere.
+
+    The samples above the horizon are continued by zeros below it, those on it count half, and the
+    trigonometric polynomial in theta through all of them is integrated exactly.
+
+    References
+    ----------
+    McEwen and Wiaux 2011, IEEE Trans. Signal Process. 59, 5876 (symmetric sampling).
+    """
+
+    @classmethod
+    def of(cls, theta: Float[np.ndarray, " theta"], n_phi: int) -> BandLimitedGrid:
+        """Return the rule for ``theta`` in equal steps from 0 to pi / 2, both included."""
+        n = len(theta)
+        nodes, weights = roots_legendre(4 * n)
+        even = weights @ cardinal_functions(np.arccos(nodes), 2 * n - 2, 0)[:, :n]
+        even[-1] /= 2.0
+        return cls(theta, even, n_phi)
+
+    def polar_weights(self, lmax: int) -> Float[np.ndarray, "theta modes"]:
+        """Return the integrals of each sample's cardinal function times lambda_lm(theta)."""
+        n = len(self.theta)
+        # exact: the product has degree 2 n + lmax in theta
+        nodes, weights = roots_legendre(4 * n + lmax)
+        fine = np.arccos(nodes)
+        polar = polar_functions(fine, lmax) * weights[:, None]
+        _, m = mode_numbers(lmax)
+        summed = np.empty((n, polar.shape[1]))
+        for parity in (0, 1):
+            same = m % 2 == parity
+            cardinal = cardinal_functions(fine, 2 * n - 2, parity)[:, :n]
+            summed[:, same] = cardinal.T @ polar[:, same]
+        summed[-1] /= 2.0
+        return summed
+
+
+def cardinal_functions(
+    theta: Float[np.ndarray, " theta"], intervals: int, parity: int
+) -> Float[np.ndarray, "theta samples"]:
+    """Return trigonometric polynomials that are 1 at one sample and 0 at the others.
+
+    The samples are pi k / intervals, k = 0 .. intervals.
+
+    Parameters
+    ----------
+    theta : (theta,) array
+        Where to evaluate them, in radians.
+    intervals : int
+    parity : {0, 1}
+        Whether they continue beyond the poles evenly (0) or oddly (1), as the Fourier coefficients
+        of a smooth function on the sphere do for even and odd m.
+
+    Returns
+    -------
+    (theta, samples) array
+    """
+    samples = np.pi * np.arange(2 * intervals) / intervals
+    difference = theta[:, None] - samples[None]
+    orders = np.arange(1, intervals)
+    kernel = 1.0 + np.cos(intervals * difference)
+    kernel = (kernel + 2.0 * np.cos(orders[:, None, None] * difference).sum(0)) / (2 * intervals)
+    cardinal = kernel[:, : intervals + 1].copy()
+    mirrored = kernel[:, :intervals:-1]
+    cardinal[:, 1:-1] += mirrored if parity == 0 else -mirrored
+    if parity:
+        cardinal[:, [0, -1]] = 0.0
+    return cardinal
+
+
+VACUUM_OHM = physical_constants["characteristic impedance of vacuum"][0]
+LENGTHS = ("H_theta", "H_phi")
+MATRICES = ("ZA", "Rsky", "Rmoon", "Rloss")
+AXES = ("freq", "theta", "phi")
+PARTS = ("real", "imag")
+RESPONSE_LAYOUT = Layout(
+    "a four-port response of luseepy, FITS version 3",
+    {
+        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+        **{name: Variable((name,), grows=True, unit="deg") for name in AXES[1:]},
+        **{
+            f"{name}_{part}": Variable((N_ANTENNAS, *AXES), unit="m")
+            for name in LENGTHS
+            for part in PARTS
+        },
+        **{
+            f"{name}_{part}": Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm")
+            for name in MATRICES
+            for part in PARTS
+        },
+    },
+    dict.fromkeys((*CONVENTIONS, *SOURCES), Attribute("word", optional=True)),
+)
+# files hold the matrices in single precision; three of them are added up
+RESISTANCE_TOLERANCE = 1e-6
+UNITS = ("K", "V2/Hz")
+Unit = Literal["K", "V2/Hz"]
+
+
+@dataclass(frozen=True)
+class PortResponse:
+    """Coupled antennas at several frequencies.
+
+    Attributes
+    ----------
+    path : str
+        The file, for error messages.
+    frequencies_mhz : (frequencies,) array
+    theta : (theta,) array
+        From 0 to pi / 2 in equal steps; azimuths are 2 pi k / n_phi.
+    h_theta, h_phi : (frequencies, ports, theta, phi) complex array
+        Effective lengths in m.
+    impedance : (frequencies, ports, ports) complex array
+        ZA in Ohm.
+    moon_resistance, loss_resistance : (frequencies, ports, ports) complex array
+        Rmoon and Rloss in Ohm.
+    receiver : Receiver or None
+        What is connected to the ports; None leaves them open.
+    interpolation : {"linear", "spline"}
+        Between the frequencies: luseepy's rule, impedances and products of fields linearly, or
+        cubic splines through impedances and fields.
+    """
+
+    path: str
+    frequencies_mhz: Float[np.ndarray, " frequencies"]
+    theta: Float[np.ndarray, " theta"]
+    h_theta: Complex[np.ndarray, "frequencies ports theta phi"]
+    h_phi: Complex[np.ndarray, "frequencies ports theta phi"]
+    impedance: Complex[np.ndarray, "frequencies ports ports"]
+    moon_resistance: Complex[np.ndarray, "frequencies ports ports"]
+    loss_resistance: Complex[np.ndarray, "frequencies ports ports"]
+    receiver: Receiver | None = JFETReceiver()
+    interpolation: Interpolation = "linear"
+
+    @property
+    def n_phi(self) -> int:
+        """Number of azimuths."""
+        return self.h_theta.shape[3]
+
+    @property
+    def luseepy_grid(self) -> BandLimitedGrid:
+        """The directions of the file with the rule of luseepy's four-port engine."""
+        return BandLimitedGrid.of(self.theta, self.n_phi)
+
+    def circuit(self, frequency_mhz: float) -> Circuit:
+        """Return antennas and receivers. InputError outside the frequencies of the file."""
+        parts = (self.impedance, self.moon_resistance, self.loss_resistance)
+        return Circuit(frequency_mhz, *self._at(frequency_mhz, *parts), self.receiver)
+
+    def per_kelvin(self, frequency_mhz: float) -> Float[np.ndarray, " ports"]:
+        """Return U_aa, the V^2/Hz that an enclosure of 1 K makes at each receiver's input."""
+        return self.circuit(frequency_mhz).per_kelvin.diagonal().real
+
+    def fields(
+        self,
+        frequency_mhz: float,
+        *,
+        grid: HemisphereGrid | None = None,
+        turn_deg: float = 0.0,
+        unit: Unit = "K",
+    ) -> AntennaFields:
+        """Return the fields of the ports; their products are beams in ``unit`` per K and sr.
+
+        Between the frequencies of the file this is so with splines only. With linear interpolation
+        the fields themselves are interpolated here, for pictures; use :meth:`beams` for products.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+        grid : HemisphereGrid, optional
+            By default nodes that integrate across the horizon exactly; ``luseepy_grid`` is the
+            rule of luseepy.
+        turn_deg : float
+            How far the instrument is turned, from East towards North.
+        unit : {"K", "V2/Hz"}
+            V^2/Hz are those at the receivers' inputs.
+
+        Returns
+        -------
+        AntennaFields
+
+        Raises
+        ------
+        InputError
+            Outside the frequencies of the file, or for an unknown unit.
+        """
+        opened = self._open(self._at(frequency_mhz, self.h_theta, self.h_phi), grid, turn_deg)
+        mixing = self._mixing(frequency_mhz, unit) / (SPEED_OF_LIGHT / (1e6 * frequency_mhz))
+        parts = (np.tensordot(mixing, part, axes=1) for part in (opened.e_theta, opened.e_phi))
+        return AntennaFields(*parts, opened.grid)
+
+    def beams(
+        self,
+        frequency_mhz: float,
+        lmax: int,
+        *,
+        grid: HemisphereGrid | None = None,
+        turn_deg: float = 0.0,
+        unit: Unit = "K",
+    ) -> ProductBeams:
+        """Return the beams of all products, in ``unit`` per K; arguments as of :meth:`fields`."""
+        if self.interpolation == "spline":
+            fields = self.fields(frequency_mhz, grid=grid, turn_deg=turn_deg, unit=unit)
+            modes = product_modes(fields, lmax, normalise=False)
+            return ProductBeams(modes, float(frequency_mhz))
+        opened = np.zeros((N_ANTENNAS**2, (lmax + 1) ** 2))
+        for k, weight in neighbours(self.path, self.frequencies_mhz, frequency_mhz):
+            fields = self._open([self.h_theta[k], self.h_phi[k]], grid, turn_deg)
+            wavelength = SPEED_OF_LIGHT / (1e6 * self.frequencies_mhz[k])
+            opened += weight / wavelength**2 * product_modes(fields, lmax, normalise=False)
+        mixing = self._mixing(frequency_mhz, unit)
+        seen = np.einsum("ai,ijm,bj->abm", mixing, to_matrix(opened), mixing.conj(), optimize=True)
+        return ProductBeams(to_real(seen), float(frequency_mhz))
+
+    def background(
+        self,
+        frequency_mhz: float,
+        moon_k: float,
+        antenna_k: float = 0.0,
+        *,
+        unit: Unit = "K",
+    ) -> Float[Array, " products"]:
+        """Return the visibilities without any sky: what the Moon and lossy antennas emit.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+        moon_k, antenna_k : float
+            Temperatures of the Moon and of the antennas in K.
+        unit : {"K", "V2/Hz"}
+
+        Returns
+        -------
+        (products,) array
+
+        Raises
+        ------
+        InputError
+            Outside the frequencies of the file.
+        """
+        circuit = self.circuit(frequency_mhz)
+        seen = circuit.emitted(moon_k * circuit.moon_ohm + antenna_k * circuit.loss_ohm)
+        if unit == "K":
+            root = np.sqrt(self.per_kelvin(frequency_mhz))
+            seen = seen / (root[:, None] * root[None])
+        return to_real(seen)
+
+    def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
+        return at_frequency(
+            self.path,
+            self.frequencies_mhz,
+            frequency_mhz,
+            *parts,
+            interpolation=self.interpolation,
+        )
+
+    def _mixing(self, frequency_mhz: float, unit: str) -> Complex[np.ndarray, "ports ports"]:
+        """M, scaled such that products of open ports' fields / wavelength become beams."""
+        if unit not in UNITS:
+            raise InputError(f"unknown unit '{unit}'; {nearest(unit, UNITS)}")
+        # product beams are halves of the sums over polarisations
+        scale = np.full(N_ANTENNAS, np.sqrt(2.0 * Boltzmann * VACUUM_OHM))
+        if unit == "K":
+            scale = scale / np.sqrt(self.per_kelvin(frequency_mhz))
+        return scale[:, None] * self.circuit(frequency_mhz).loading
+
+    def _open(
+        self, parts: list[np.ndarray], grid: HemisphereGrid | None, turn_deg: float
+    ) -> AntennaFields:
+        """The effective lengths of one frequency on a grid, of ports that are open."""
+        if grid is None:
+            grid = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
+        turned = (np.stack([on_grid(h, self.theta, grid, turn_deg) for h in p]) for p in parts)
+        return AntennaFields(*turned, grid)
+
+
+def read_response(path: str | Path) -> PortResponse:
+    """Read a four-port response of luseepy, FITS version 3.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    PortResponse
+        With luseepy's receivers on the ports.
+
+    Raises
+    ------
+    InputError
+        For a missing or truncated file, a missing image, shapes that do not fit, directions other
+        than the hemisphere above the horizon, frequencies that do not grow, numbers that are not
+        finite, resistances that do not add up, or a header that states other conventions.
+    """
+    found = read_fits(path, RESPONSE_LAYOUT, "check beam.file")
+    require_conventions(path, found.values)
+    images = found.arrays
+    frequencies, theta_deg, phi_deg = (images[name] for name in AXES)
+    for name, degrees, last in (("theta", theta_deg, 90.0), ("phi", phi_deg, 360.0)):
+        if not np.allclose(degrees, np.linspace(0.0, last, len(degrees)), rtol=0, atol=1e-9):
+            raise InputError(
+                f"{path}: {name} goes from {degrees[0]:g} to {degrees[-1]:g} degrees; expected "
+                f"equal steps from 0 to {last:g}"
+            )
+    complex_ = {n: images[f"{n}_real"] + 1j * images[f"{n}_imag"] for n in (*LENGTHS, *MATRICES)}
+    # the last azimuth is the first once more
+    h_theta, h_phi = (np.moveaxis(complex_[name], 0, 1)[..., :-1] for name in LENGTHS)
+    impedance, sky, moon, loss = (complex_[name] for name in MATRICES)
+    resistance = (impedance + impedance.conj().swapaxes(1, 2)) / 2.0
+    off = np.abs(sky + moon + loss - resistance).max() / np.abs(resistance).max()
+    if off > RESISTANCE_TOLERANCE:
+        raise InputError(
+            f"{path}: Rsky + Rmoon + Rloss differ from (ZA + ZA^H) / 2 by {off:.1g} of the "
+            "largest; expected equality"
+        )
+    theta = np.linspace(0.0, np.pi / 2.0, len(theta_deg))
+    return PortResponse(str(path), frequencies, theta, h_theta, h_phi, impedance, moon, loss)
+
+
+FIELDS = ("Etheta_real", "Etheta_imag", "EPhi_real", "EPhi_imag")
+IMPEDANCE = ("Z_real", "Z_imag")
+FIELD, OHM = Variable(("freq", "theta", "phi")), Variable(("freq",), optional=True, unit="Ohm")
+SCALAR_LAYOUT = Layout(
+    "a scalar beam file of luseepy, FITS version 2",
+    {
+        **dict.fromkeys(FIELDS, FIELD),
+        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+        "gain_conv": Variable(("freq",)),
+        **dict.fromkeys(IMPEDANCE, OHM),
+    },
+    {
+        **{key: Attribute("integer", low=2.0) for key in ("THETA_N", "PHI_N")},
+        **{key: Attribute() for key in ("THETA_MIN", "THETA_MAX", "PHI_MIN", "PHI_MAX")},
+        **dict.fromkeys(CONVENTIONS, Attribute("word", optional=True)),
+    },
+)
+# luseepy turns the pattern by 90 degrees from port to port: North, West, South, East for an arm
+# that points North
+ROTATIONS_DEG = (0.0, 90.0, 180.0, 270.0)
+# luseepy fades beams out by 1 - (arctan((theta - pi / 2) / width) / pi + 1 / 2)^2
+TAPER_WIDTH = 0.03
+
+
+@dataclass(frozen=True)
+class ScalarBeam:
+    """The pattern of one arm at several frequencies.
+
+    Attributes
+    ----------
+    path : str
+        The file, for error messages.
+    frequencies_mhz : (frequencies,) array
+    theta : (theta,) array
+        From 0 to pi / 2 in equal steps; azimuths are 2 pi k / n_phi.
+    e_theta, e_phi : (frequencies, theta, phi) complex array
+        Fields in the unit of the file.
+    gain : (frequencies,) array
+        gain_conv of the file.
+    impedance : (frequencies,) complex array or None
+        Of the arm in Ohm; None where the file has none.
+    interpolation : {"linear", "spline"}
+        Between the frequencies: luseepy's rule, products of fields and gain linearly, or cubic
+        splines through the fields and the gain.
+    """
+
+    path: str
+    frequencies_mhz: Float[np.ndarray, " frequencies"]
+    theta: Float[np.ndarray, " theta"]
+    e_theta: Complex[np.ndarray, "frequencies theta phi"]
+    e_phi: Complex[np.ndarray, "frequencies theta phi"]
+    gain: Float[np.ndarray, " frequencies"]
+    impedance: Complex[np.ndarray, " frequencies"] | None = None
+    interpolation: Interpolation = "linear"
+
+    @property
+    def n_phi(self) -> int:
+        """Number of azimuths."""
+        return self.e_theta.shape[2]
+
+    @property
+    def luseepy_grid(self) -> HemisphereGrid:
+        """The directions of the file with luseepy's rule: sin(theta) dtheta dphi."""
+        return rectangle_rule(self.theta, self.n_phi)
+
+    def fields(
+        self,
+        frequency_mhz: float,
+        *,
+        grid: HemisphereGrid | None = None,
+        taper: bool = True,
+        rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
+    ) -> AntennaFields:
+        """Return the fields of the arms; their products are beams in K per K.
+
+        Between the frequencies of the file this is so with splines only. With linear interpolation
+        the fields themselves are interpolated here, for pictures; use :meth:`beams` for products.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+        grid : HemisphereGrid, optional
+            By default nodes that integrate across the horizon exactly; ``luseepy_grid`` is the
+            rule of luseepy.
+        taper : bool
+            Fade out towards the horizon as luseepy does.
+        rotations_deg : tuple of float
+            How far the pattern is turned for each port, from East towards North.
+
+        Returns
+        -------
+        AntennaFields
+            In sqrt(1 / sr).
+
+        Raises
+        ------
+        InputError
+            Outside the frequencies of the file.
+        """
+        *parts, gain = self._at(frequency_mhz, self.e_theta, self.e_phi, self.gain)
+        return self._put_up(parts, float(gain), grid, taper, rotations_deg)
+
+    def beams(
+        self,
+        frequency_mhz: float,
+        lmax: int,
+        *,
+        grid: HemisphereGrid | None = None,
+        taper: bool = True,
+        rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
+    ) -> ProductBeams:
+        """Return the beams of all products, in K per K; arguments as of :meth:`fields`."""
+        if self.interpolation == "spline":
+            fields = self.fields(frequency_mhz, grid=grid, taper=taper, rotations_deg=rotations_deg)
+            modes = product_modes(fields, lmax, normalise=False)
+        else:
+            (gain,) = self._at(frequency_mhz, self.gain)
+            modes = np.zeros((len(rotations_deg) ** 2, (lmax + 1) ** 2))
+            for k, weight in neighbours(self.path, self.frequencies_mhz, frequency_mhz):
+                parts = [self.e_theta[k], self.e_phi[k]]
+                fields = self._put_up(parts, float(gain), grid, taper, rotations_deg)
+                modes += weight * product_modes(fields, lmax, normalise=False)
+        return ProductBeams(modes, float(frequency_mhz))
+
+    def impedance_at(self, frequency_mhz: float) -> complex | None:
+        """Return the arm's impedance in Ohm, or None. InputError outside the file's frequencies."""
+        if self.impedance is None:
+            return None
+        (ohm,) = self._at(frequency_mhz, self.impedance)
+        return complex(ohm)
+
+    def background(
+        self,
+        frequency_mhz: float,
+        moon_k: float,
+        *,
+        grid: HemisphereGrid | None = None,
+        taper: bool = True,
+        rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
+    ) -> Float[Array, " products"]:
+        """Return the visibilities without any sky: what ground of ``moon_k`` kelvin emits.
+
+        An auto receives from the ground the part of its beam that the sky leaves. Arms in an
+        enclosure of one temperature are taken to be uncorrelated, as they are where nothing
+        couples them, so that a cross receives the part of the sky with the opposite sign.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+        moon_k : float
+            Temperature of the ground in K.
+        grid, taper, rotations_deg
+            As of :meth:`fields`.
+
+        Returns
+        -------
+        (products,) array
+            In K.
+
+        Raises
+        ------
+        InputError
+            Outside the frequencies of the file.
+        """
+        beams = self.beams(frequency_mhz, 0, grid=grid, taper=taper, rotations_deg=rotations_deg)
+        sky = np.sqrt(4.0 * np.pi) * beams.modes[:, 0]
+        return moon_k * (to_real(np.eye(len(rotations_deg), dtype=np.complex128)) - sky)
+
+    def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
+        return at_frequency(
+            self.path,
+            self.frequencies_mhz,
+            frequency_mhz,
+            *parts,
+            interpolation=self.interpolation,
+        )
+
+    def _put_up(
+        self,
+        parts: list[np.ndarray],
+        gain: float,
+        grid: HemisphereGrid | None,
+        taper: bool,
+        rotations_deg: tuple[float, ...],
+    ) -> AntennaFields:
+        """The fields of one arm, one for each port, with the scale that the gain gives them."""
+        if grid is None:
+            grid = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
+        scale = np.full(len(grid.theta), np.sqrt(2.0 * gain / (4.0 * np.pi)))
+        if taper:
+            below = np.arctan((grid.theta - np.pi / 2.0) / TAPER_WIDTH) / np.pi + 0.5
+            scale = scale * (1.0 - below**2)
+        turned = (
+            np.stack([on_grid(part, self.theta, grid, a) for a in rotations_deg]) * scale[:, None]
+            for part in parts
+        )
+        return AntennaFields(*(x.astype(np.complex128) for x in turned), grid)
+
+
+def read_scalar_beam(path: str | Path) -> ScalarBeam:
+    """Read a scalar beam file of luseepy, FITS version 2.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    ScalarBeam
+
+    Raises
+    ------
+    InputError
+        For a missing or truncated file, a missing image, shapes that do not fit, directions other
+        than the hemisphere above the horizon, frequencies that do not grow, numbers that are
+        not finite, or a header that states other conventions.
+    """
+    found = read_fits(path, SCALAR_LAYOUT, "check beam.file")
+    images, said, sizes = found.arrays, found.values, found.sizes
+    require_conventions(path, said)
+    ends = [said[key] for key in ("THETA_MIN", "THETA_MAX", "PHI_MIN", "PHI_MAX")]
+    if ends != [0.0, 90.0, 0.0, 360.0]:
+        raise InputError(
+            f"{path} covers theta {ends[0]:g} to {ends[1]:g} and phi {ends[2]:g} to {ends[3]:g} "
+            "degrees; expected 0 to 90 and 0 to 360"
+        )
+    if (sizes["theta"], sizes["phi"]) != (said["THETA_N"], said["PHI_N"]):
+        raise InputError(
+            f"{path}: the fields have {sizes['theta']} x {sizes['phi']} directions, the header "
+            f"says {said['THETA_N']} x {said['PHI_N']} (THETA_N, PHI_N)"
+        )
+    # the last azimuth is the first once more
+    e_theta, e_phi = (
+        (images[real] + 1j * images[imaginary])[:, :, :-1]
+        for real, imaginary in (FIELDS[:2], FIELDS[2:])
+    )
+    theta = np.linspace(0.0, np.pi / 2.0, sizes["theta"])
+    z = images["Z_real"] + 1j * images["Z_imag"] if set(IMPEDANCE) <= set(images) else None
+    return ScalarBeam(str(path), images["freq"], theta, e_theta, e_phi, images["gain_conv"], z)

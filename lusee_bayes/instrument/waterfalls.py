@@ -1,0 +1,741 @@
+"""luseepy's waterfalls: files of many frequencies, read and written.
+
+Visibilities of several frequencies, as files hold them.
+
+Where luseepy's ranges of time begin: the word LUNAR_DAY of its waterfalls.
+
+It is "UTC to UTC"; a calendar year, CY2026 or CY26, which luseepy begins at one o'clock on the
+first of January; a fiscal year, FY2026 or FY26, from the first of October of the year before; or
+the number of a lunar day: 2603 is the fourth of those that begin in 2026. A lunar day begins when
+the Sun is highest at 180 degrees of longitude on the Moon's equator. luseepy finds that to a few
+seconds, and so does this module.
+
+Waterfalls of luseepy's scalar simulator: visibilities in K.
+
+FITS: image ``data`` (time, product, frequency), ``freq`` in MHz, ``combinations`` (pairs of ports;
+an auto has one column, a cross two, Re and Im). Header: LUNAR_DAY (:mod:`.waterfalls`), DELTAT_SEC,
+LUN_LAT_DEG, LUN_LONG_DEG; times are start + k DELTAT_SEC. Impedances of the ports in Ohm, ZRe_i and
+ZIm_i, are there for luseepy's conversion to V^2/Hz.
+
+Waterfalls of luseepy's four-port simulator: covariances at the receivers' inputs, in V^2/Hz.
+
+FITS version 3: image ``data`` (time, product, frequency); ``freq`` in MHz; ``time`` (JD1, JD2) in
+the scale TIMESYS; table ``products`` with a column ``label``; U (frequency, port, port), the
+covariance that an enclosure of 1 K makes, as ``blackbody_normalization``; the receivers' loads ZL
+(frequency, port, port) in Ohm. Header: LUN_LAT_DEG, LUN_LONG_DEG, DELTAT_SEC, TMOON_K, TANT_K and
+FREQINT, the interpolation of the response between its frequencies. Divided by sqrt(U_aa U_bb),
+visibilities are in K.
+
+Read the waterfalls of luseepy, scalar or four-port.
+
+Write waterfalls in luseepy's layouts: what its scalar and its four-port files share.
+
+Write waterfalls as luseepy's four-port simulator does.
+
+Waterfalls in luseepy's layouts: visibilities of all times, products and frequencies.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import astropy.units as u
+import numpy as np
+from astropy.io import fits
+from astropy.time import Time
+from jaxtyping import Complex, Float, Int
+
+from lusee_bayes.core.checks import require_positive
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.files import replacing, user_path
+from lusee_bayes.core.formats import image_names, read_fits
+from lusee_bayes.core.layouts import Attribute, Layout, Variable
+from lusee_bayes.core.reading import naming, require_file
+from lusee_bayes.core.version import __version__
+from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ, Interpolation
+from lusee_bayes.instrument.beams.monopoles import LOADS, Circuit, MeasuredReceiver
+from lusee_bayes.instrument.observation import Observation, body_direction
+from lusee_bayes.instrument.products import (
+    N_ANTENNAS,
+    DataLayout,
+    Product,
+    all_products,
+    labels,
+    to_matrix,
+)
+from lusee_bayes.instrument.times import (
+    require_ephemeris,
+    scale_of,
+    unannounced_leap_seconds,
+    utc_from_text,
+    utc_of,
+)
+from lusee_bayes.instrument.visibilities import Visibilities
+
+# words of the header that both kinds of files have
+SITE_AND_STEP = {
+    "LUN_LONG_DEG": Attribute(low=-360.0, high=360.0),
+    "LUN_LAT_DEG": Attribute(low=-90.0, high=90.0),
+    "DELTAT_SEC": Attribute(low=1e-6, high=1e9),
+}
+
+
+@dataclass(frozen=True)
+class Waterfall:
+    """Visibilities of several frequencies.
+
+    Attributes
+    ----------
+    path : str
+        The file, for error messages.
+    grid : (products, times, frequencies) array
+        In K, in the package's order of products; NaN where a sample is missing.
+    frequencies_mhz : (frequencies,) array
+    observation : Observation
+        Of instants: luseepy's simulators evaluate the sky at the times, and neither layout has
+        windows.
+    per_kelvin : (frequencies, ports) array or None
+        V^2/Hz that 1 K makes at each port; None unless the file is in V^2/Hz.
+    moon_k, antenna_k : float
+        Temperatures in K of the Moon and of the antennas, whose emission the visibilities contain.
+    receiver : MeasuredReceiver or None
+        The receivers' loads at the channels; None unless the file holds them.
+    interpolation : str or None
+        How luseepy calls its interpolation of the response between channels; None if not said.
+    """
+
+    path: str
+    grid: Float[np.ndarray, "products times frequencies"]
+    frequencies_mhz: Float[np.ndarray, " frequencies"]
+    observation: Observation
+    per_kelvin: Float[np.ndarray, "frequencies ports"] | None = None
+    moon_k: float = 0.0
+    antenna_k: float = 0.0
+    receiver: MeasuredReceiver | None = None
+    interpolation: str | None = None
+
+    def channel(self, frequency_mhz: float) -> int:
+        """Return the number of the channel at a frequency.
+
+        Raises
+        ------
+        InputError
+            If the file has none there.
+        """
+        known = self.frequencies_mhz
+        nearest = int(np.argmin(np.abs(known - frequency_mhz)))
+        if abs(known[nearest] - frequency_mhz) > SAME_FREQUENCY_MHZ:
+            raise InputError(
+                f"{self.path} has no channel at {frequency_mhz:.15g} MHz (it has "
+                f"{', '.join(f'{f:.9g}' for f in known)}); use --set frequency_mhz="
+                f"{known[nearest]:.15g}"
+            )
+        return nearest
+
+    def at(self, frequency_mhz: float, n_ports: int = N_ANTENNAS) -> Visibilities:
+        """Return one channel, without the samples that are missing or not finite.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+        n_ports : int
+            Number of ports of the instrument.
+
+        Returns
+        -------
+        Visibilities
+
+        Raises
+        ------
+        InputError
+            If the file has no such channel, has products of other ports, or nothing is left.
+        """
+        channel = self.channel(frequency_mhz)
+        values = self.grid[:, :, channel]
+        present = np.isfinite(values)
+        within = np.array([p.j < n_ports for p in all_products()])
+        if present[~within].any():
+            first = int(np.argmax(present.any(1) & ~within))
+            raise InputError(
+                f"{self.path} has the product {all_products()[first].label}, but the beams are "
+                f"those of {n_ports} ports; give beam.rotations_deg an angle for every port"
+            )
+        try:
+            layout = DataLayout.from_flags(~present[within])
+        except InputError as error:
+            raise InputError(f"{self.path} at {frequency_mhz:g} MHz: {error}") from error
+        data = layout.gather(np.where(present, values, 0.0)[within])
+        return Visibilities(
+            data,
+            layout,
+            self.observation,
+            float(self.frequencies_mhz[channel]),
+            receiver=self.receiver,
+        )
+
+
+YEAR = re.compile(r"(CY|FY)([0-9]{2}|[0-9]{4})")
+LUNAR_DAY = re.compile(r"[0-9]{3,4}")
+# luseepy looks for noons day by day until the end of January of the next year
+DAYS_AFTER_NEW_YEAR = 30
+# each round finds the noon to a twentieth: after four, a day has become half a second
+ROUNDS, POINTS = 4, 41
+
+
+def start_of(text: str) -> Time:
+    """Return the first time of a range, in UTC.
+
+    Parameters
+    ----------
+    text : str
+        LUNAR_DAY.
+
+    Raises
+    ------
+    InputError
+        If the range is of no known kind, or outside the ephemeris.
+    """
+    word = text.strip()
+    if named := YEAR.fullmatch(word):
+        kind, year = named[1], int(named[2])
+        year += 2000 if year < 100 else 0
+        return utc_from_text(
+            "LUNAR_DAY", f"{year:04d}-01-01T01:00" if kind == "CY" else f"{year - 1:04d}-10-01"
+        )
+    if LUNAR_DAY.fullmatch(word):
+        return _noon(int(word))
+    first, to, _ = word.partition(" to ")
+    if not to:
+        raise InputError(
+            f"LUNAR_DAY '{text}' is not a date to a date (2027-01-15 00:00:00 to 2027-02-01), a "
+            "year (CY2027, FY27) or the number of a lunar day (2700)"
+        )
+    return utc_from_text("LUNAR_DAY", first)
+
+
+def _noon(number: int) -> Time:
+    year, place = 2000 + number // 100, number % 100
+    new_year, next_year = (utc_from_text("LUNAR_DAY", f"{y}-01-01").jd for y in (year, year + 1))
+    days = np.arange(new_year, next_year + DAYS_AFTER_NEW_YEAR)
+    height = _sun_height(days)
+    highest = (height[1:-1] > height[:-2]) & (height[1:-1] > height[2:])
+    # a lunar day needs an end, too
+    beginning = days[1:-1][highest][:-1]
+    noon = _refined(beginning[place]) if place < len(beginning) else np.inf
+    if noon >= next_year:
+        raise InputError(
+            f"LUNAR_DAY {number}: expected a number from {number - place}, the first lunar day of "
+            f"{year}; 12 or 13 of them begin in a year"
+        )
+    return utc_of(np.array([noon]), np.zeros(1))[0]
+
+
+def _refined(jd: float) -> float:
+    """The time when the Sun is highest, within a day."""
+    span = 1.0
+    for _ in range(ROUNDS):
+        around = jd + np.linspace(-span, span, POINTS)
+        jd, span = float(around[np.argmax(_sun_height(around))]), span * 2.0 / (POINTS - 1)
+    return jd
+
+
+def _sun_height(jd: Float[np.ndarray, " times"]) -> Float[np.ndarray, " times"]:
+    """Sine of the Sun's altitude in the middle of the far side."""
+    zeros = np.zeros(len(jd), dtype=int)
+    there = Observation(180.0, 0.0, utc_of(jd, np.zeros(len(jd))), zeros, (0.0,), 1.0)
+    return np.einsum("ti,ti->t", body_direction("Sun", there), there.zenith_galactic())
+
+
+SCALAR_WATERFALL = Layout(
+    "a waterfall of luseepy's simulator",
+    {
+        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+        # NaN where a sample is missing
+        "data": Variable(("time", "product", "freq"), finite=False, unit="K"),
+        "combinations": Variable(("pair", 2), "integer", low=0.0, high=N_ANTENNAS - 1.0),
+    },
+    {"LUNAR_DAY": Attribute("word"), **SITE_AND_STEP},
+)
+
+
+def read_scalar(path: Path) -> Waterfall:
+    """Read a waterfall of luseepy's scalar simulator, with any products in any order.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    Waterfall
+
+    Raises
+    ------
+    InputError
+        For a truncated file, a missing image or header entry, columns that do not fit the
+        products, ports beyond 0..3, or a bad date.
+    """
+    found = read_fits(path, SCALAR_WATERFALL)
+    data, frequencies = found.arrays["data"], found.arrays["freq"]
+    columns = _columns(path, found.arrays["combinations"])
+    if data.shape[1] != len(columns):
+        raise InputError(
+            f"{path}: data has {data.shape[1]} products, expected {len(columns)} for the pairs of "
+            "ports in combinations"
+        )
+    places = {product: k for k, product in enumerate(all_products())}
+    grid = np.full((len(places), len(data), len(frequencies)), np.nan)
+    for column, (product, sign) in enumerate(columns):
+        grid[places[product]] = sign * data[:, column]
+    return Waterfall(
+        str(path), grid, frequencies, _scalar_observation(path, found.values, len(data))
+    )
+
+
+def _columns(path: Path, combinations: Int[np.ndarray, "pairs 2"]) -> list[tuple[Product, float]]:
+    """The product in each column of the data, and its sign: V_ji is V_ij conjugated."""
+    columns: list[tuple[Product, float]] = []
+    for i, j in combinations:
+        low, high = (int(min(i, j)), int(max(i, j)))
+        columns.append((Product(low, high, "R"), 1.0))
+        if i != j:
+            columns.append((Product(low, high, "I"), 1.0 if i < j else -1.0))
+    products = [product for product, _ in columns]
+    if len(set(products)) < len(products):
+        raise InputError(f"{path}: combinations names the same pair of ports twice")
+    return columns
+
+
+def _scalar_observation(path: Path, said: dict[str, Any], n_times: int) -> Observation:
+    with naming(path):
+        first = start_of(said["LUNAR_DAY"])
+        require_ephemeris(first.jd + np.array([(n_times - 1) * said["DELTAT_SEC"] / 86400.0]))
+        with unannounced_leap_seconds():
+            times = first + said["DELTAT_SEC"] * np.arange(n_times) * u.s
+        return Observation(
+            said["LUN_LONG_DEG"],
+            said["LUN_LAT_DEG"],
+            times,
+            np.zeros(n_times, dtype=int),
+            (0.0,),
+            said["DELTAT_SEC"],
+        )
+
+
+UNIT = "V^2/Hz"
+# what FREQINT calls the interpolation of responses between their frequencies
+INTERPOLATIONS: dict[Interpolation, str] = {"linear": "linear-native-alm", "spline": "cubic-spline"}
+FOUR_PORT_WATERFALL = Layout(
+    "a waterfall of luseepy's four-port simulator",
+    {
+        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+        "time": Variable(("time", 2), unit="d"),
+        "products.label": Variable(("product",), "text"),
+        # NaN where a sample is missing
+        "data": Variable(("time", "product", "freq"), finite=False, unit=UNIT),
+        "blackbody_normalization_real": Variable(("freq", N_ANTENNAS, N_ANTENNAS)),
+        **{
+            name: Variable(("freq", N_ANTENNAS, N_ANTENNAS), optional=True, unit="Ohm")
+            for name in LOADS
+        },
+    },
+    {
+        **SITE_AND_STEP,
+        "TMOON_K": Attribute(low=0.0),
+        "TANT_K": Attribute(low=0.0, optional=True),
+        "TIMESYS": Attribute("text", optional=True),
+        "TIMEUNIT": Attribute("text", choices=("d",), optional=True),
+        "FREQINT": Attribute("text", optional=True),
+        "BUNIT": Attribute("text", choices=(UNIT,)),
+    },
+)
+
+
+def read_four_port(path: Path) -> Waterfall:
+    """Read a waterfall of luseepy's four-port simulator.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    Waterfall
+
+    Raises
+    ------
+    InputError
+        For a truncated file, a missing image or header entry, shapes or a unit that do not fit,
+        unknown products, or times that do not grow.
+    """
+    found = read_fits(path, FOUR_PORT_WATERFALL)
+    images, said = found.arrays, found.values
+    data, frequencies = images["data"], images["freq"]
+    places = _places(path, images["products.label"])
+    enclosure = images["blackbody_normalization_real"]
+    per_kelvin = enclosure.diagonal(axis1=1, axis2=2)
+    require_positive(f"{path}: the diagonal of blackbody_normalization_real", per_kelvin)
+    root = np.sqrt(per_kelvin)
+    grid = np.full((len(all_products()), len(data), len(frequencies)), np.nan)
+    for column, place in enumerate(places):
+        product = all_products()[place]
+        grid[place] = data[:, column] / (root[:, product.i] * root[:, product.j])
+    return Waterfall(
+        str(path),
+        grid,
+        frequencies,
+        _four_port_observation(path, said, images["time"]),
+        per_kelvin,
+        said["TMOON_K"],
+        said.get("TANT_K", 0.0),
+        _receiver(path, images),
+        said.get("FREQINT"),
+    )
+
+
+def _receiver(path: Path, images: dict[str, np.ndarray]) -> MeasuredReceiver | None:
+    if not set(LOADS) <= set(images):
+        return None
+    real, imaginary = (images[name] for name in LOADS)
+    return MeasuredReceiver(str(path), images["freq"], real + 1j * imaginary)
+
+
+def _places(path: Path, products: np.ndarray) -> list[int]:
+    """The number of the product in each column, in the package's order."""
+    named, known = [str(label).strip() for label in products], labels()
+    for label in named:
+        if label not in known:
+            raise InputError(
+                f"{path}: there is no product '{label}'; expected some of {', '.join(known)}"
+            )
+    if len(set(named)) < len(named):
+        raise InputError(f"{path}: products names the same product twice")
+    return [known.index(label) for label in named]
+
+
+def _four_port_observation(
+    path: Path, said: dict[str, Any], times: Float[np.ndarray, "times 2"]
+) -> Observation:
+    with naming(path):
+        scale = scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
+        return Observation(
+            said["LUN_LONG_DEG"],
+            said["LUN_LAT_DEG"],
+            utc_of(times[:, 0], times[:, 1], scale),
+            np.zeros(len(times), dtype=int),
+            (0.0,),
+            said["DELTAT_SEC"],
+        )
+
+
+def read_waterfall(path: str | Path) -> Waterfall:
+    """Read a waterfall of luseepy's simulators, with all products or some.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    Waterfall
+
+    Raises
+    ------
+    InputError
+        If there is no file, or as :func:`read_scalar` and :func:`read_four_port`.
+    """
+    path = require_file(path, "data")
+    names = set(image_names(path))
+    return read_four_port(path) if "blackbody_normalization_real" in names else read_scalar(path)
+
+
+HINT = "write netCDF instead (a name that does not end in .fits)"
+NO_ROOM = (
+    "luseepy's waterfalls have no room for windows, and the samples are means over theirs; write "
+    "netCDF (a name that does not end in .fits), or simulate with --set observation.window=instant"
+)
+
+
+def write_waterfall(
+    path: str | Path,
+    channels: Sequence[Visibilities],
+    impedance_ohm: Complex[np.ndarray, " frequencies"] | None = None,
+    scenario: str | None = None,
+) -> Path:
+    """Write channels of one observation as luseepy's scalar simulator does, whole or not at all.
+
+    Missing samples become NaN.
+
+    Parameters
+    ----------
+    path : str or Path
+    channels : sequence of Visibilities
+    impedance_ohm : (frequencies,) complex array, optional
+        Of the arms; NaN where it is not known.
+    scenario : str, optional
+        Text of the scenario, stored as an image of bytes that luseepy ignores.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError
+        For what the layout cannot hold: windows, times other than start + k step, turntable angles
+        other than 0, other than four ports, channels of different observations, fewer than two
+        channels.
+    """
+    path, first = user_path(path), channels[0].observation
+    if len(channels) < 2:
+        raise InputError(
+            f"{path}: luseepy's reader takes waterfalls of at least two channels; give it "
+            "--frequencies, or write netCDF (a name that does not end in .fits)"
+        )
+    grid = grid_of(path, channels)
+    with unannounced_leap_seconds():
+        seconds = (first.times - first.times[0]).to_value(u.s)
+    # the time of a Julian date in two parts is exact to less than a nanosecond
+    if np.abs(seconds - first.step_s * np.arange(first.n_times)).max() > 1e-6:
+        raise InputError(
+            f"{path}: luseepy's waterfalls have a sample every {first.step_s:g} s without gaps; "
+            f"{HINT}"
+        )
+    pairs = [(p.i, p.j) for p in all_products() if p.part == "R"]
+    z = np.full(len(channels), np.nan + 1j * np.nan) if impedance_ohm is None else impedance_ohm
+    images = {
+        "data": grid,
+        "freq": np.array([channel.frequency_mhz for channel in channels]),
+        "combinations": np.array(pairs),
+    }
+    for port in range(N_ANTENNAS):
+        images |= {f"ZRe_{port}": z.real.copy(), f"ZIm_{port}": z.imag.copy()}
+    hdus = [fits.ImageHDU(image, name=name) for name, image in images.items()]
+    return write_hdus(path, hdus, {"VERSION": 0.1} | site_and_times(first), scenario)
+
+
+def grid_of(
+    path: Path, channels: Sequence[Visibilities]
+) -> Float[np.ndarray, "times products frequencies"]:
+    """Return the samples of all channels in K, NaN where they are missing.
+
+    Raises
+    ------
+    InputError
+        For samples with windows, turntable angles other than 0, other than four ports, or channels
+        of different times.
+    """
+    first = channels[0].observation
+    for channel in channels:
+        observation = channel.observation
+        if observation.windows is not None:
+            raise InputError(f"{path}: {NO_ROOM}")
+        if observation.turntable_deg != (0.0,):
+            raise InputError(
+                f"{path}: luseepy's waterfalls have no turntable angles, the data have "
+                f"{observation.turntable_deg}; {HINT}"
+            )
+        if channel.layout.n_products != N_ANTENNAS**2:
+            raise InputError(f"{path}: expected {N_ANTENNAS**2} products; {HINT}")
+        same = observation.n_times == first.n_times
+        if not same or not bool((observation.times == first.times).all()):
+            raise InputError(f"{path}: the channels have different times; {HINT}")
+    return np.moveaxis(np.stack([channel.grid() for channel in channels], axis=-1), 0, 1)
+
+
+def site_and_times(observation: Observation) -> dict[str, Any]:
+    """Return the words of the header that say where and when."""
+    with unannounced_leap_seconds():
+        # luseepy counts steps up to the end: half a step less leaves no room for rounding
+        end = observation.times[-1] - 0.5 * observation.step_s * u.s
+    return {
+        "LUNAR_DAY": f"{_written(observation.times[0])} to {_written(end)}",
+        "LUN_LAT_DEG": observation.lat_deg,
+        "LUN_LONG_DEG": observation.lon_deg,
+        "LUN_HEIGHT_M": 0.0,
+        "DELTAT_SEC": observation.step_s,
+    }
+
+
+def write_hdus(
+    path: Path,
+    hdus: Sequence[fits.ImageHDU | fits.BinTableHDU],
+    header: Mapping[str, Any],
+    scenario: str | None,
+) -> Path:
+    """Write a FITS file, whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+    hdus : sequence of ImageHDU or BinTableHDU
+        The first one, ``data``, becomes the primary image.
+    header : mapping
+        Words of its header.
+    scenario : str or None
+        Text of the scenario, for an image of bytes.
+    """
+    primary = fits.PrimaryHDU(hdus[0].data)
+    for key, value in ({"EXTNAME": "data"} | dict(header)).items():
+        primary.header[key if len(key) <= 8 else f"HIERARCH {key}"] = value
+    primary.header["CREATOR"] = f"lusee_bayes {__version__}"
+    written = fits.HDUList([primary, *hdus[1:]])
+    if scenario is not None:
+        image = np.frombuffer(scenario.encode(), dtype=np.uint8)
+        written.append(fits.ImageHDU(image, name="scenario"))
+    with replacing(path) as partial:
+        written.writeto(partial)
+    return path
+
+
+def _written(time: Time) -> str:
+    """A time as luseepy reads it, to the nanosecond."""
+    exact = time.copy(format="iso")
+    exact.precision = 9
+    return str(exact.value)
+
+
+def write_four_port(
+    path: str | Path,
+    channels: Sequence[Visibilities],
+    circuits: Sequence[Circuit],
+    *,
+    moon_k: float = 0.0,
+    antenna_k: float = 0.0,
+    interpolation: Interpolation = "linear",
+    response: str = "unknown",
+    scenario: str | None = None,
+) -> Path:
+    """Write channels of one observation in V^2/Hz, whole or not at all.
+
+    Times are written as they are. Missing samples become NaN, and with them what is computed of the
+    covariance at their time.
+
+    Parameters
+    ----------
+    path : str or Path
+    channels : sequence of Visibilities
+        In K, with the emission of Moon and antennas.
+    circuits : sequence of Circuit
+        Antennas and loads of each channel.
+    moon_k, antenna_k : float
+        Temperatures of the Moon and of the antennas.
+    interpolation : {"linear", "spline"}
+        Of the response between its own frequencies.
+    response : str
+        Name of its file.
+    scenario : str, optional
+        Text of the scenario, stored as an image of bytes that luseepy ignores.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError
+        For what the layout cannot hold: open ports, windows, turntable angles other than 0, other
+        than four ports, channels of different observations.
+    """
+    path, observation = user_path(path), channels[0].observation
+    receiver, loads = circuits[0].receiver, [circuit.load_ohm for circuit in circuits]
+    if receiver is None:
+        raise InputError(
+            f"{path}: luseepy's four-port waterfalls hold the loads of receivers, and the ports "
+            "are open; give another beam.receiver, or write netCDF (a name that does not end in "
+            ".fits)"
+        )
+    kelvin = grid_of(path, channels)
+    enclosure = np.array([circuit.per_kelvin for circuit in circuits])
+    root = np.sqrt(enclosure.diagonal(axis1=1, axis2=2).real)
+    i, j = (np.array([getattr(p, end) for p in all_products()]) for end in ("i", "j"))
+    data = kelvin * (root[:, i] * root[:, j]).T
+    matrices = {
+        "ZA": [c.antenna_ohm for c in circuits],
+        "ZL": loads,
+        "M": [c.loading for c in circuits],
+        "Rsky": [c.resistance_ohm - c.moon_ohm - c.loss_ohm for c in circuits],
+        "Rmoon": [c.moon_ohm for c in circuits],
+        "Rloss": [c.loss_ohm for c in circuits],
+    }
+    times = np.stack([observation.times.jd1, observation.times.jd2], axis=-1)
+    clock = {"TIMESYS": "UTC", "TIMEUNIT": "d", "CLOCKSRC": "supplied", "SCALEASM": False}
+    hdus: list[fits.ImageHDU | fits.BinTableHDU] = [
+        _image("data", data, UNIT),
+        _image("freq", np.array([channel.frequency_mhz for channel in channels]), "MHz"),
+        _image("time", times, "d", TIMEFMT="JD1+JD2", **clock),
+        fits.BinTableHDU.from_columns([fits.Column("label", "8A", unit="1", array=labels())]),
+    ]
+    hdus[-1].header["EXTNAME"] = "products"
+    for name, values in matrices.items():
+        hdus += _complex(name, np.array(values), "1" if name == "M" else "Ohm")
+    hdus += _complex("blackbody_normalization", enclosure, "V^2/(Hz K)")
+    condition = np.linalg.cond(np.array(matrices["ZA"]) + np.array(loads))
+    eigenvalues = _eigenvalues(data)
+    largest = np.abs(eigenvalues).max(-1)
+    ratio = np.divide(eigenvalues[..., 0], largest, out=np.zeros_like(largest), where=largest > 0)
+    # visibilities are real products of a Hermitian matrix
+    none = np.zeros_like(ratio)
+    hdus += [
+        _image("loading_condition_number", condition, "1"),
+        _image("covariance_antihermitian_absolute", none, UNIT),
+        _image("covariance_antihermitian_relative", none, "1"),
+        _image("covariance_eigenvalues", eigenvalues, UNIT),
+        _image("covariance_minimum_eigenvalue_ratio", ratio, "1"),
+        _image("receiver_params", _bytes(receiver.luseepy_parameters()), "1"),
+    ]
+    header = {
+        "VERSION": 3,
+        "ENGINE": "lusee_bayes",
+        **site_and_times(observation),
+        "RESPONSE": Path(response).name,
+        "FREQINT": INTERPOLATIONS[interpolation],
+        **clock,
+        "RECMODEL": receiver.luseepy_name,
+        "RECSRC": getattr(receiver, "path", "analytic"),
+        "SKYFRAME": "galactic",
+        "TMOON_K": moon_k,
+        "TANT_K": antenna_k,
+        "LOADCMAX": float(condition.max()),
+        "AHABSMAX": 0.0,
+        "AHRELMAX": 0.0,
+        "BUNIT": UNIT,
+    }
+    if np.isfinite(eigenvalues).any():
+        header |= {"COVEIMIN": float(np.nanmin(eigenvalues)), "COVERMIN": float(np.nanmin(ratio))}
+    return write_hdus(path, hdus, header, scenario)
+
+
+def _image(name: str, values: np.ndarray, unit: str, **words: Any) -> fits.ImageHDU:
+    hdu = fits.ImageHDU(values)
+    for key, value in ({"EXTNAME": name, "BUNIT": unit} | words).items():
+        hdu.header[key] = value
+    return hdu
+
+
+def _complex(
+    name: str, values: Complex[np.ndarray, "frequencies ports ports"], unit: str
+) -> list[fits.ImageHDU]:
+    parts = {"real": values.real.copy(), "imag": values.imag.copy()}
+    return [_image(f"{name}_{part}", image, unit) for part, image in parts.items()]
+
+
+def _eigenvalues(
+    data: Float[np.ndarray, "times products frequencies"],
+) -> Float[np.ndarray, "times frequencies ports"]:
+    """Of the covariance of the ports at every time; NaN where a product is missing."""
+    covariance = np.moveaxis(to_matrix(np.moveaxis(data, 1, 0)), (0, 1), (2, 3))
+    complete = np.isfinite(data).all(1)
+    values = np.full((*complete.shape, covariance.shape[-1]), np.nan)
+    values[complete] = np.linalg.eigvalsh(covariance[complete])
+    return values
+
+
+def _bytes(parameters: dict[str, tuple[float, ...]]) -> np.ndarray:
+    text = json.dumps({name: list(values) for name, values in parameters.items()}, sort_keys=True)
+    return np.frombuffer(text.encode(), dtype=np.uint8)

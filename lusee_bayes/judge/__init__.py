@@ -1,0 +1,1 @@
+"""Do data and model agree, who disagrees, and does the error bar cover."""

@@ -1,0 +1,216 @@
+"""How often error bars hold the truth, and how often they would by chance.
+
+Levels of central intervals, in one place for all that counts coverage.
+
+Coverage: how often error bars hold the known truth, and how often they would by chance.
+
+If a posterior is right, the truth is one of its draws. The pulls (truth - mean) / std are then
+those of draws, z ~ N(0, corr(C)): each is standard normal, but neighbouring pixels pull alike, so
+that counts over a band of latitude scatter far more than counts of independent pixels would. How
+much they scatter is therefore counted, too, over the pulls of a few hundred draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lusee_bayes.core.engine import in_threads
+from lusee_bayes.core.harmonics import columns_to_maps, lmax_of, mode_numbers
+from lusee_bayes.core.lazy import healpy, special
+
+# of the intervals whose coverage is counted
+LEVELS = (0.50, 0.68, 0.90, 0.95)
+# names of the levels in files
+NAMES = tuple(f"{100 * level:.0f}" for level in LEVELS)
+
+
+# draws that tell the scatter: it is then known to 4 %
+N_DRAWS = 300
+# skies that are counted together: their maps fit into a cache
+BATCH = 50
+# degrees of |b|: the plane, where the sky is furthest from the prior, its surroundings, the rest
+LATITUDES = (10.0, 30.0)
+# first ell of each group
+ELLS = (0, 1, 5, 10, 20, 30, 50, 100, 200)
+# share of draws whose largest pull is below the one that is called allowed
+ALLOWED = 0.95
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """The pulls of a part of the sky, or of some multipoles.
+
+    Attributes
+    ----------
+    name : str
+    n : int
+        Number of pixels or modes.
+    held : tuple of float
+        Share of them whose truth lies within the central interval of each of ``LEVELS``.
+    scatter : tuple of float
+        Standard deviation of ``held`` if the posterior is right.
+    rms, rms_scatter : float
+        Root mean square of the pulls, 1 on average if the posterior is right, and its scatter.
+    largest : float
+        The largest absolute pull.
+    allowed : float
+        What the largest one of 95 % of draws does not exceed.
+    """
+
+    name: str
+    n: int
+    held: tuple[float, ...]
+    scatter: tuple[float, ...]
+    rms: float
+    rms_scatter: float
+    largest: float
+    allowed: float
+
+    def row(self) -> dict[str, float | str]:
+        """All of it by name, for JSON and CSV."""
+        return {
+            "name": self.name,
+            "n": self.n,
+            **{f"held_{name}": x for name, x in zip(NAMES, self.held, strict=True)},
+            **{f"scatter_{name}": x for name, x in zip(NAMES, self.scatter, strict=True)},
+            "rms": self.rms,
+            "rms_scatter": self.rms_scatter,
+            "largest": self.largest,
+            "allowed": self.allowed,
+        }
+
+    @classmethod
+    def from_row(cls, row: Mapping[str, float | str]) -> Coverage:
+        """The inverse of :meth:`row`."""
+        rest = {key: row[key] for key in ("name", "n", "rms", "rms_scatter", "largest", "allowed")}
+        held, scatter = (
+            tuple(float(row[f"{kind}_{name}"]) for name in NAMES) for kind in ("held", "scatter")
+        )
+        return cls(held=held, scatter=scatter, **rest)
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Statistics of the pulls of the truth and of draws, part by part.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the parts.
+    sizes : tuple of int
+        Number of pixels or modes of each.
+    values : (parts, statistics, skies) array
+        Shares within the intervals of ``LEVELS``, rms and largest absolute pull; of the truth
+        first, then of every draw.
+    """
+
+    names: tuple[str, ...]
+    sizes: tuple[int, ...]
+    values: Float[np.ndarray, "parts statistics skies"]
+
+    @classmethod
+    def of_pixels(
+        cls,
+        std: Float[np.ndarray, " pixels"],
+        error: Float[np.ndarray, " modes"],
+        deviations: Float[np.ndarray, "draws modes"],
+    ) -> Counts:
+        """By Galactic latitude.
+
+        Parameters
+        ----------
+        std : (pixels,) array
+            HEALPix RING, Galactic, in K.
+        error : (modes,) array
+            Truth less mean, in K.
+        deviations : (draws, modes) array
+            Draws of the posterior less its mean, in K.
+        """
+        nside = healpy.npix2nside(len(std))
+        bands = latitudes(nside)
+
+        def count(skies: Float[np.ndarray, "modes skies"]) -> np.ndarray:
+            maps = columns_to_maps(skies, nside)
+            maps /= std[:, None]
+            return _statistics(maps, bands.values())
+
+        both = np.concatenate([error[:, None], deviations.T], axis=1)
+        batches = np.array_split(both, max(1, both.shape[1] // BATCH), axis=1)
+        return cls._of(bands, np.concatenate(in_threads(count, batches), axis=2))
+
+    @classmethod
+    def of_modes(
+        cls,
+        std: Float[np.ndarray, " modes"],
+        error: Float[np.ndarray, " modes"],
+        deviations: Float[np.ndarray, "draws modes"],
+    ) -> Counts:
+        """By multipole, of harmonic coefficients; what is known exactly pulls at nothing."""
+        groups = multipoles(lmax_of(len(std)))
+        width = np.where(std > 0, std, np.inf)[:, None]
+        both = np.concatenate([error[:, None], deviations.T], axis=1) / width
+        return cls._of(groups, _statistics(both, groups.values()))
+
+    @classmethod
+    def _of(cls, parts: Mapping[str, np.ndarray], values: np.ndarray) -> Counts:
+        return cls(tuple(parts), tuple(int(inside.sum()) for inside in parts.values()), values)
+
+    def coverage(self) -> tuple[Coverage, ...]:
+        """What was counted, with its scatter, part by part."""
+        truth, draws = self.values[..., 0], self.values[..., 1:]
+        scatter, allowed = draws.std(2), np.quantile(draws[:, -1], ALLOWED, axis=1)
+        n = len(LEVELS)
+        return tuple(
+            Coverage(
+                name,
+                size,
+                tuple(truth[k, :n].tolist()),
+                tuple(scatter[k, :n].tolist()),
+                float(truth[k, n]),
+                float(scatter[k, n]),
+                float(truth[k, n + 1]),
+                float(allowed[k]),
+            )
+            for k, (name, size) in enumerate(zip(self.names, self.sizes, strict=True))
+        )
+
+
+def _statistics(
+    pulls: Float[np.ndarray, "n skies"], parts: Iterable[Bool[np.ndarray, " n"]]
+) -> Float[np.ndarray, "parts statistics skies"]:
+    limits = special.ndtri(0.5 + 0.5 * np.array(LEVELS))
+    found = []
+    for inside in parts:
+        size = np.abs(pulls[inside])
+        held = [(size < limit).sum(0) / len(size) for limit in limits]
+        rms = np.sqrt(np.einsum("ij,ij->j", size, size) / len(size))
+        found.append([*held, rms, size.max(0)])
+    return np.array(found)
+
+
+def latitudes(nside: int) -> dict[str, Bool[np.ndarray, " pixels"]]:
+    """Which pixels (RING) are in the plane, beside it, far from it, and in the whole sky."""
+    _, b = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)
+    near, far = LATITUDES
+    return {
+        f"|b| < {near:g} deg": np.abs(b) < near,
+        f"|b| {near:g} to {far:g} deg": (np.abs(b) >= near) & (np.abs(b) <= far),
+        f"|b| > {far:g} deg": np.abs(b) > far,
+        "whole sky": np.ones(len(b), dtype=np.bool_),
+    }
+
+
+def multipoles(lmax: int) -> dict[str, Bool[np.ndarray, " modes"]]:
+    """Which modes are of which group of multipoles, and all of them."""
+    ell, _ = mode_numbers(lmax)
+    first = [edge for edge in ELLS if edge <= lmax]
+    last = [*(edge - 1 for edge in first[1:]), lmax]
+    groups = {
+        f"ell {low} to {high}" if high > low else f"ell {low}": (ell >= low) & (ell <= high)
+        for low, high in zip(first, last, strict=True)
+    }
+    return groups | {"every ell": ell >= 0}

@@ -1,0 +1,237 @@
+"""Degrees of freedom, point-spread functions, score tests, and the sky's strength.
+
+How many degrees of freedom of sky and templates each datum determines.
+
+Rows of the resolution matrix: the point-spread functions of a map.
+
+On average over noise the posterior mean is R m, R = C A^T N^-1 A = 1 - C S^-1. A pixel in direction
+p is y_p^T R m: an integral of the sky with the kernel R(p, q) = y_p^T R y_q over directions q.
+
+What the data would prefer of something that the model leaves out: score tests of templates.
+
+With K = A S A^T + N the covariance of data under the model and u = K^-1 (d - E[d]), data that hold
+a t besides prefer ::
+
+    a = t^T u / F,    F = t^T K^-1 t = t^T N^-1 t - P^T C P,    P = A^T N^-1 t,
+
+with the standard deviation F^(-1/2), C being the covariance of the sky; chi^2 of the data would be
+lower by (t^T u)^2 / F. A is not formed.
+
+How strong the sky is compared with its prior: by Galactic latitude and by multipole.
+
+If the model holds, the deviation of the posterior mean from that of the prior is drawn from
+N(0, S - C): what the prior allows less what the data leave open. Its square over that expectation
+is 1 on average, larger where the prior is too narrow, and smaller where it is too wide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.arrays import Array, compiled, namespace, on_host
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import lmax_of, modes_to_map
+from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.linalg import solve_lower
+from lusee_bayes.judge.coverage import latitudes, multipoles
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.posterior import Posterior
+
+# directions of the sky that are seen at once, and entries of A up to which it is made a matrix:
+# products of matrices take a tenth of the time
+CHUNK, DENSE = 256, 10**8
+
+
+def data_freedom(
+    model: LinearGaussian, posterior: Posterior, columns: Float[Array, "data n"]
+) -> Float[np.ndarray, " data"]:
+    """Compute the diagonal of K_s K^-1: which share of each datum sky and templates follow.
+
+    With the templates V among the columns of N's square root, K_s = A S A^T + V V^T is the
+    covariance of what is no noise, and K = A S A^T + N that of the data. Where V = 0 this is the
+    diagonal of A C A^T N^-1. Its sum is the number of modes and templates that the data determine.
+
+    Parameters
+    ----------
+    model : LinearGaussian
+        With ``columns @ columns.T`` in its noise.
+    posterior : Posterior
+        Of this model, given any data.
+    columns : (data, n) array
+        V, in K.
+
+    Raises
+    ------
+    InputError
+        If N is not positive definite.
+    """
+    model, posterior, columns = on_host((model, posterior, columns))
+    factor, root = model.noise.factor(), np.asarray(posterior.root())
+    weighted_columns = np.asarray(factor.solve(columns))
+    solved = weighted_columns
+    freedom = np.zeros(model.n_data)
+    coupling = model.coupling
+    dense = np.asarray(coupling.dense()) if coupling.shape[0] * coupling.shape[1] <= DENSE else None
+    for start in range(0, root.shape[1], CHUNK):
+        directions = root[:, start : start + CHUNK]
+        if dense is not None:
+            seen = dense @ directions
+        else:
+            seen = np.stack([np.asarray(coupling @ r) for r in directions.T], axis=1)
+        weighted = np.asarray(factor.solve(seen))
+        freedom += (seen * weighted).sum(1)
+        solved = solved - weighted @ (seen.T @ weighted_columns)
+    return freedom + (columns * solved).sum(1)
+
+
+def resolution_rows(
+    posterior: Posterior, directions: Float[Array, "n modes"]
+) -> Float[Array, "n modes"]:
+    """Compute y^T R for linear combinations y of the modes.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Over harmonic coefficients.
+    directions : (n, modes) array
+        One y a row, for example of ``harmonics.pixel_matrix``.
+
+    Returns
+    -------
+    (n, modes) array
+        Rows of y^T R. Their values in a direction q, ``rows @ y_q``, are per steradian. Columns of
+        modes without prior variance are zero, as those modes are in the map.
+
+    Raises
+    ------
+    InputError
+        If the prior is not over harmonic coefficients.
+    """
+    if not posterior.prior.invertible:
+        raise InputError("resolution needs a prior over harmonic coefficients")
+    return _rows(posterior, namespace(posterior).asarray(directions))
+
+
+@compiled
+def _rows(posterior: Posterior, directions: Float[Array, "n modes"]) -> Float[Array, "n modes"]:
+    """y G (1 - C_w) G^-1, C_w the covariance of u."""
+    white = posterior.prior.colour_columns(directions)
+    inside = white if posterior.basis is None else white @ posterior.basis
+    half = solve_lower(posterior.lower, inside.T, transpose=False)
+    known = inside - solve_lower(posterior.lower, half, transpose=True).T
+    if posterior.basis is not None:
+        known = known @ posterior.basis.T
+    return posterior.prior.whiten_columns(known)
+
+
+# relative, of a difference of two quadratic forms
+ROUNDING = 1e-10
+
+
+@dataclass(frozen=True)
+class Preferences:
+    """What the data prefer of each template, all others being left out.
+
+    Attributes
+    ----------
+    amplitude, std : (n,) array
+        NaN where the data say nothing.
+    gain : (n,) array
+        By how much chi^2 of the data would be lower.
+    """
+
+    amplitude: Float[np.ndarray, " n"]
+    std: Float[np.ndarray, " n"]
+    gain: Float[np.ndarray, " n"]
+
+
+def preferences(
+    model: LinearGaussian,
+    posterior: Posterior,
+    covariance: Float[np.ndarray, "modes modes"],
+    data: Float[Array, " data"],
+    templates: Float[np.ndarray, "data n"],
+) -> Preferences:
+    """Test templates one by one.
+
+    Parameters
+    ----------
+    model : LinearGaussian
+        Without them.
+    posterior : Posterior
+        Of the model, given these data.
+    covariance : (modes, modes) array
+        Of the posterior, in K^2.
+    data : (data,) array
+        d, in K.
+    templates : (data, n) array
+        t, in K per unit of their amplitudes.
+
+    Returns
+    -------
+    Preferences
+        In these units.
+
+    Raises
+    ------
+    InputError
+        If N is not positive definite.
+    """
+    model, posterior, data = on_host((model, posterior, data))
+    factor = model.noise.factor()
+    residual = data - np.asarray(model.predict(posterior.mean))
+    pull = templates.T @ np.asarray(factor.solve(residual))
+    solved = np.asarray(factor.solve(templates))
+    # rows of P^T
+    seen = np.stack([np.asarray(model.coupling.transpose_mv(column)) for column in solved.T])
+    known = (templates * solved).sum(0) - ((seen @ covariance) * seen).sum(1)
+    # what the sky can take up altogether is left with rounding alone
+    told = known > ROUNDING * (templates * solved).sum(0)
+    inverse = np.divide(1.0, known, out=np.full(len(known), np.nan), where=told)
+    return Preferences(pull * inverse, np.sqrt(inverse), pull**2 * inverse)
+
+
+def strengths(
+    deviation: Float[np.ndarray, " modes"],
+    of_modes: Float[np.ndarray, " modes"],
+    of_pixels: Float[np.ndarray, " pixels"],
+) -> dict[str, float]:
+    """Compute the square of a sky's deviation over what is expected, part by part.
+
+    The monopole, of which priors know little, is left out.
+
+    Parameters
+    ----------
+    deviation : (modes,) array
+        Posterior mean less prior mean, in K.
+    of_modes, of_pixels : (modes,), (pixels,) array
+        The diagonal of S - C, of the modes and of the pixels without the monopole, in K^2.
+
+    Returns
+    -------
+    dict of str to float
+        By name of the part; parts of which the data know nothing are left out.
+    """
+    rest = np.where(np.arange(len(deviation)) > 0, deviation, 0.0)
+    nside = healpy.npix2nside(len(of_pixels))
+    bands = latitudes(nside)
+    ells = multipoles(lmax_of(len(deviation)))
+    parts = [(name, modes_to_map(rest, nside), of_pixels, bands[name]) for name in list(bands)[:-1]]
+    parts += [(name, rest, of_modes, ells[name]) for name in list(ells)[1:-1]]
+    return {
+        name: float((values[inside] ** 2).sum() / expected[inside].sum())
+        for name, values, expected, inside in parts
+        if expected[inside].sum() > 0
+    }
+
+
+def strengths_in_words(found: Mapping[str, float]) -> str:
+    """A sentence of them; empty if there are none."""
+    if not found:
+        return ""
+    listed = ", ".join(f"{value:.2g} at {name}" for name, value in found.items())
+    return f"Power of the sky over what the prior expects: {listed}."

@@ -1,0 +1,470 @@
+"""Amplitudes beside the sky: templates in N, patterns, and amplitudes that channels share.
+
+Amplitudes of templates that are part of the noise, as point sources' fluxes are.
+
+With N = N_0 + T T^T, an amplitude of each column of T is N(0, 1) before there are data. With
+K = A S A^T + N the covariance of data under the model, and C that of the sky, ::
+
+    mean = T^T K^-1 (d - offset) = T^T N^-1 (d - offset - A m),    m the posterior mean of the sky,
+    covariance = 1 - T^T K^-1 T = 1 - T^T N^-1 T + P C P^T,        P = T^T N^-1 A,
+    Cov(m, amplitudes) = -S A^T K^-1 T = -C P^T.
+
+A is not formed.
+
+Patterns of unknown strength beside a sky, such as point sources: integrated out and put back.
+
+::
+
+    m = d + sum_j (1 + g_j) t_j,    g_j ~ N(0, 1)
+
+With T the patterns as rows and K = 1 + T M T^T = L L^T, the information about d is that about m at
+d + sum_j t_j with ::
+
+    M' = M - M T^T K^-1 T M,    v' = v - M T^T K^-1 T v,
+
+and given d, g ~ N(K^-1 T v(d + sum_j t_j), K^-1).
+
+Amplitudes of several channels that are tied to one another, where each was worked out alone.
+
+Channel k has amplitudes z_k, N(0, 1) when it is worked out, and its posterior of them is
+N(E_k, V_k). Its likelihood is then exp(-z^T (V_k^-1 - 1) z / 2 + z^T V_k^-1 E_k) up to a factor.
+Let the prior of all of them be N(0, K x 1) instead: K_kk = 1 ties the channels' values of one
+amplitude, and different amplitudes are independent. With K = R R^T and z = R w, w ~ N(0, 1), ::
+
+    Lambda = 1 + sum_k R_k^T (V_k^-1 - 1) R_k,    mean of w = Lambda^-1 sum_k R_k^T V_k^-1 E_k,
+
+which needs no inverse of K. What follows for channel k, N(E'_k, V'_k), is its own posterior times
+exp(-z^T Q z / 2 + q^T z), which is what the other channels tell of its amplitudes: ::
+
+    Q = V'^-1 - V^-1,    q = V'^-1 E' - V^-1 E.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.linalg import checked_cholesky, solve_lower
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.posterior import Posterior
+
+
+@dataclass(frozen=True)
+class Amplitudes:
+    """Posterior of templates' amplitudes in prior standard deviations, the sky integrated out.
+
+    Attributes
+    ----------
+    mean : (n,) array
+    covariance : (n, n) array
+        The unit matrix where the data say nothing.
+    with_sky : (modes, n) array
+        Covariance of the sky with the amplitudes, in K.
+    """
+
+    mean: Float[np.ndarray, " n"]
+    covariance: Float[np.ndarray, "n n"]
+    with_sky: Float[np.ndarray, "modes n"]
+
+    @property
+    def std(self) -> Float[np.ndarray, " n"]:
+        """Standard deviations."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+
+@dataclass(frozen=True)
+class AmplitudesOfSky:
+    """Posterior of templates' amplitudes given the data and a sky, in prior standard deviations.
+
+    ::
+
+        mean = T^T N^-1 (d - offset - A m0) - P (m - m0),    covariance = 1 - T^T N^-1 T
+
+    of a sky m. Other data may tell of the sky, too, where they have amplitudes of their own: these
+    hold under any posterior of the sky.
+
+    Attributes
+    ----------
+    mean : (n,) array
+        Of the reference sky.
+    pull : (n, modes) array
+        P, in 1/K.
+    covariance : (n, n) array
+    reference : (modes,) array
+        The reference sky m0, in K.
+    """
+
+    mean: Float[np.ndarray, " n"]
+    pull: Float[np.ndarray, "n modes"]
+    covariance: Float[np.ndarray, "n n"]
+    reference: Float[np.ndarray, " modes"]
+
+    def integrated(
+        self, mean: Float[np.ndarray, " modes"], covariance: Float[np.ndarray, "modes modes"]
+    ) -> Amplitudes:
+        """Integrate a sky N(mean, covariance) out, in K and K^2: given any data besides."""
+        with_sky = -covariance @ self.pull.T
+        return Amplitudes(
+            self.mean - self.pull @ (mean - self.reference),
+            self.covariance - self.pull @ with_sky,
+            with_sky,
+        )
+
+    def given(
+        self, precision: Float[np.ndarray, "n n"], vector: Float[np.ndarray, " n"]
+    ) -> AmplitudesOfSky:
+        """Take in what is known of the amplitudes besides: exp(-z^T Q z / 2 + q^T z).
+
+        Parameters
+        ----------
+        precision : (n, n) array
+            Q.
+        vector : (n,) array
+            q.
+        """
+        kept = np.linalg.inv(np.eye(len(vector)) + self.covariance @ precision)
+        covariance = kept @ self.covariance
+        return AmplitudesOfSky(
+            self.mean + covariance @ (vector - precision @ self.mean),
+            kept @ self.pull,
+            covariance,
+            self.reference,
+        )
+
+
+def amplitudes_of_sky(
+    model: LinearGaussian,
+    reference: Float[Array, " modes"],
+    data: Float[Array, " data"],
+    templates: Float[Array, "data n"],
+) -> AmplitudesOfSky:
+    """Compute the posterior of templates' amplitudes given the sky.
+
+    Parameters
+    ----------
+    model : LinearGaussian
+        With ``templates @ templates.T`` in its noise.
+    reference : (modes,) array
+        A sky near the one that is meant, in K: differences from it keep their digits.
+    data : (data,) array
+        d, in K.
+    templates : (data, n) array
+        T, in K.
+
+    Raises
+    ------
+    InputError
+        If N is not positive definite.
+    """
+    model, reference, data, t = on_host((model, reference, data, templates))
+    solved = np.asarray(model.noise.factor().solve(t))
+    pull = np.stack([np.asarray(model.coupling.transpose_mv(column)) for column in solved.T])
+    return AmplitudesOfSky(
+        solved.T @ (data - np.asarray(model.predict(reference))),
+        pull,
+        np.eye(t.shape[1]) - t.T @ solved,
+        np.asarray(reference),
+    )
+
+
+def template_amplitudes(
+    model: LinearGaussian,
+    posterior: Posterior,
+    data: Float[Array, " data"],
+    templates: Float[Array, "data n"],
+) -> Amplitudes:
+    """Compute the posterior of templates' amplitudes.
+
+    Parameters
+    ----------
+    model : LinearGaussian
+        With ``templates @ templates.T`` in its noise.
+    posterior : Posterior
+        Of this model, given these data alone.
+    data : (data,) array
+        d, in K.
+    templates : (data, n) array
+        T, in K.
+
+    Raises
+    ------
+    InputError
+        As :meth:`Posterior.covariance`, and if N is not positive definite.
+    """
+    posterior = on_host(posterior)
+    found = amplitudes_of_sky(model, posterior.mean, data, templates)
+    return found.integrated(np.asarray(posterior.mean), np.asarray(posterior.covariance()))
+
+
+def weighted_residual(
+    model: LinearGaussian, posterior: Posterior, data: Float[Array, " data"]
+) -> Float[np.ndarray, " data"]:
+    """Compute N^-1 (d - offset - A m), m the posterior mean of the sky.
+
+    T^T of it is the mean of amplitudes, and a term N_0 of N times it that of its part in the data.
+
+    Parameters
+    ----------
+    model : LinearGaussian
+    posterior : Posterior
+        Of this model, given these data alone.
+    data : (data,) array
+        d, in K.
+
+    Raises
+    ------
+    InputError
+        If N is not positive definite.
+    """
+    model, posterior, data = on_host((model, posterior, data))
+    residual = data - np.asarray(model.predict(posterior.mean))
+    return np.asarray(model.noise.factor().solve(residual))
+
+
+class Patterns(eqx.Module):
+    """Patterns beside a sky, as far as data know them.
+
+    Attributes
+    ----------
+    patterns : (patterns, modes) array
+        T: each as strong as expected, and as it is uncertain; in K.
+    information : Information
+        Of the whole sky m.
+    lower : (patterns, patterns) array
+        L.
+    """
+
+    patterns: Float[np.ndarray, "patterns modes"]
+    information: Information
+    lower: Float[np.ndarray, "patterns patterns"]
+
+    @classmethod
+    def of(
+        cls, patterns: Float[np.ndarray, "patterns modes"], information: Information
+    ) -> Patterns:
+        """Make it of patterns and of what data say of the whole sky.
+
+        Raises
+        ------
+        InputError
+            If they have other numbers of modes.
+        """
+        require_shape("the patterns", patterns, (None, information.n_modes))
+        lower = np.eye(len(patterns))
+        if len(patterns):
+            seen = patterns @ information.matrix @ patterns.T
+            lower = checked_cholesky("the patterns' precision", seen + lower)
+        return cls(patterns, information, lower)
+
+    @property
+    def expected(self) -> Float[np.ndarray, " modes"]:
+        """sum_j t_j, in K."""
+        return self.patterns.sum(0)
+
+    def without(self) -> Information:
+        """Integrate the patterns out: what the data say of d."""
+        whole = self.information
+        if not len(self.patterns):
+            return whole
+        across = solve_lower(self.lower, self.patterns @ whole.matrix, transpose=False)
+        pull = solve_lower(self.lower, (self.patterns @ whole.vector)[:, None], transpose=False)
+        return replace(
+            whole,
+            matrix=whole.matrix - across.T @ across,
+            vector=whole.vector - across.T @ pull[:, 0],
+            reference=whole.reference - self.expected,
+            misfit=np.asarray(whole.misfit - (pull**2).sum()),
+            log_det=np.asarray(whole.log_det + 2.0 * np.log(np.diagonal(self.lower)).sum()),
+        )
+
+    def whole_sky(self, diffuse: Float[np.ndarray, " modes"]) -> Float[np.ndarray, " modes"]:
+        """Compute the mean of m given d, in K.
+
+        Parameters
+        ----------
+        diffuse : (modes,) array
+            d, in K.
+        """
+        return self.whole_skies(diffuse[None], np.zeros((1, len(self.patterns))))[0]
+
+    def whole_skies(
+        self,
+        diffuse: Float[np.ndarray, "skies modes"],
+        z: Float[np.ndarray, "skies patterns"],
+    ) -> Float[np.ndarray, "skies modes"]:
+        """Compute draws of m given draws of d, in K.
+
+        Parameters
+        ----------
+        diffuse : (skies, modes) array
+            d, in K.
+        z : (skies, patterns) array
+            Draws of independent unit normals; zero for the mean.
+        """
+        there = diffuse + self.expected
+        if not len(self.patterns):
+            return there
+        pull = self.information.vector - (there - self.information.reference) @ (
+            self.information.matrix
+        )
+        half = solve_lower(self.lower, self.patterns @ pull.T, transpose=False) + z.T
+        return there + solve_lower(self.lower, half, transpose=True).T @ self.patterns
+
+    def whole_covariance(
+        self, covariance: Float[np.ndarray, "modes modes"]
+    ) -> Float[np.ndarray, "modes modes"]:
+        """Compute the covariance of m from that of d, in K^2.
+
+        Parameters
+        ----------
+        covariance : (modes, modes) array
+            Of d, in K^2.
+        """
+        if not len(self.patterns):
+            return covariance
+        white = solve_lower(self.lower, self.patterns, transpose=False)
+        # m = d - back (d - mean) + white^T z
+        back = white.T @ (white @ self.information.matrix)
+        left = covariance - back @ covariance
+        return left - left @ back.T + white.T @ white
+
+
+# the mean is repeated on what is left: rounding is then that of E - z, not of z
+REFINEMENTS = 2
+
+
+@dataclass(frozen=True)
+class Tied:
+    """Posterior of amplitudes given the data of all channels.
+
+    Attributes
+    ----------
+    mean : (channels, n) array
+    covariance : (channels, n, n) array
+        Of each channel's amplitudes.
+    draws : (draws, channels, n) array
+        Of all channels together.
+    log_evidence : float
+        ln p of all data, less the sum of the channels' ln p with amplitudes of N(0, 1).
+    """
+
+    mean: Float[np.ndarray, "channels n"]
+    covariance: Float[np.ndarray, "channels n n"]
+    draws: Float[np.ndarray, "draws channels n"]
+    log_evidence: float
+
+
+def tie(
+    mean: Float[np.ndarray, "channels n"],
+    covariance: Float[np.ndarray, "channels n n"],
+    kernel: Float[np.ndarray, "channels channels"],
+    normals: Float[np.ndarray, "draws white"],
+) -> Tied:
+    """Give amplitudes that were independent from channel to channel a prior that ties them.
+
+    Parameters
+    ----------
+    mean, covariance : (channels, n) and (channels, n, n) array
+        E and V: of each channel's own data, with amplitudes of N(0, 1).
+    kernel : (channels, channels) array
+        K, with ones on its diagonal; it may be singular.
+    normals : (draws, channels * n) array
+        Standard normals, of which draws are made.
+
+    Raises
+    ------
+    InputError
+        If a covariance is not positive definite.
+    """
+    n_channels, n = mean.shape
+    if not (np.linalg.eigvalsh(covariance) > 0).all():
+        raise InputError(
+            "the data tell the powers of receivers better than rounding lets their covariance be "
+            "known; leave out noise.receiver.smooth_octaves"
+        )
+    strength, vectors = np.linalg.eigh(kernel)
+    root = np.kron(vectors * np.sqrt(np.maximum(strength, 0.0)), np.eye(n))
+    blocks = root.reshape(n_channels, n, -1)
+    told = np.linalg.inv(covariance)
+    pulled = np.einsum("kij,kjw->kiw", told - np.eye(n), blocks)
+    precision = np.eye(root.shape[1]) + root.T @ pulled.reshape(root.shape)
+    lower = np.linalg.cholesky(precision)
+    white, z = np.zeros(root.shape[1]), np.zeros(mean.shape)
+    for _ in range(1 + REFINEMENTS):
+        pull = np.einsum("kij,kj->ki", told, mean - z) + z
+        left = (root.T @ pull.ravel() - white)[:, None]
+        step = solve_lower(lower, solve_lower(lower, left, transpose=False), transpose=True)
+        white = white + step[:, 0]
+        z = (root @ white).reshape(mean.shape)
+    half = solve_lower(lower, root.T, transpose=False).T.reshape(n_channels, n, -1)
+    draws = solve_lower(lower, normals.T, transpose=True).T @ root.T
+    off = mean - z
+    quadratic = np.einsum("ki,kij,kj->", off, told, off) - (z**2).sum() + white @ white
+    log_dets = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diagonal(lower)).sum()
+    return Tied(
+        z,
+        half @ np.swapaxes(half, 1, 2),
+        z + draws.reshape(-1, n_channels, n),
+        float(-0.5 * (quadratic + log_dets)),
+    )
+
+
+def told_by_others(
+    mean: Float[np.ndarray, " n"],
+    covariance: Float[np.ndarray, "n n"],
+    tied_mean: Float[np.ndarray, " n"],
+    tied_covariance: Float[np.ndarray, "n n"],
+) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
+    """Q and q of one channel, from its own posterior and that given all data."""
+    own, tied = np.linalg.inv(covariance), np.linalg.inv(tied_covariance)
+    return tied - own, own @ (tied_mean - mean) + (tied - own) @ tied_mean
+
+
+def information_given(
+    information: Information,
+    amplitudes: AmplitudesOfSky,
+    precision: Float[np.ndarray, "n n"],
+    vector: Float[np.ndarray, " n"],
+) -> Information:
+    """What data say of the sky where amplitudes are known to be N((1 + Q)^-1 q, (1 + Q)^-1).
+
+    ::
+
+        M + P^T W P,    v + P^T (1 + Q D)^-1 (Q z - q),    W = (1 + Q D)^-1 Q,
+
+    of z = ``amplitudes.mean``, D = ``amplitudes.covariance`` and P = ``amplitudes.pull``.
+
+    Parameters
+    ----------
+    information : Information
+        With amplitudes of N(0, 1).
+    amplitudes : AmplitudesOfSky
+        About the same reference sky.
+    precision : (n, n) array
+        Q.
+    vector : (n,) array
+        q.
+    """
+    z, pull, inner = amplitudes.mean, amplitudes.pull, amplitudes.covariance
+    one = np.eye(len(z))
+    mixed = one + precision @ inner
+    gradient = np.linalg.solve(mixed, vector - precision @ z)
+    weight = np.linalg.solve(mixed, precision)
+    least = z + inner @ gradient
+    misfit = gradient @ inner @ gradient + least @ (precision @ least - 2.0 * vector)
+    misfit += vector @ np.linalg.solve(one + precision, vector)
+    log_det = np.linalg.slogdet(mixed)[1] - np.linalg.slogdet(one + precision)[1]
+    return replace(
+        information,
+        matrix=np.asarray(information.matrix) + pull.T @ (0.5 * (weight + weight.T)) @ pull,
+        vector=np.asarray(information.vector) - pull.T @ gradient,
+        misfit=np.asarray(information.misfit + misfit),
+        log_det=np.asarray(information.log_det + log_det),
+    )

@@ -1,0 +1,368 @@
+"""Errors of gains and beams as terms of N.
+
+Noise along templates of the user: T P T^T.
+
+Gain drifts: Gaussian processes g_i(t), one per antenna, that multiply the visibilities.
+
+::
+
+    V_ij -> (1 + g_i)(1 + g_j) V_ij,    <g_i(t) g_j(t')> = delta_ij C_g(t, t'),
+    C_g = sigma_g^2 exp(-(t - t')^2 / (2 sigma_t^2))
+
+Marginalised over g, the error is a noise term with (paper, appendix A) ::
+
+    Cov(e_ij(t), e_kl(t')) = d_ij(t) d_kl(t') C_g [ (dik + dil + djk + djl)
+                                                    + C_g (dik djl + dil djk) ]
+
+and with the mean sigma_g^2 d_ii in the autos. The quadratic part is not negligible: at sigma_g =
+0.01 it is 1e-4 of the signal, ten times the radiometer noise.
+
+Errors of the beams in A: N_beam = dA (S + mu mu^T) dA^T along known directions dA.
+
+If the true coupling matrix is A + dA, the data hold dA m besides A m; over skies of the prior, that
+is noise of covariance dA S dA^T (paper, section on beam precision). Directions: the
+difference to another beam (a frequency shift, another file), or the derivative with respect to a
+parameter of the embedded beam times its standard deviation.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import (
+    is_traced,
+    require_finite,
+    require_float64,
+    require_positive,
+    require_shape,
+    require_symmetric,
+)
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.linalg import checked_cholesky
+from lusee_bayes.instrument.beams.fields import ProductBeams
+from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, placed
+from lusee_bayes.instrument.coupling import Coupling
+from lusee_bayes.instrument.products import DataLayout, Product, all_products
+from lusee_bayes.noise.covariance import LowRankCovariance, TimeBandedCovariance
+from lusee_bayes.sky.prior import Prior
+
+
+def template_noise(
+    templates: Float[Array, "data templates"],
+    prior: Float[Array, " templates"] | Float[Array, "templates templates"],
+    layout: DataLayout,
+) -> LowRankCovariance:
+    """Return the covariance T P T^T of known patterns with amplitudes a ~ N(0, P).
+
+    Parameters
+    ----------
+    templates : (data, templates) array
+        T: one column for each pattern, in K per unit of its amplitude.
+    prior : (templates,) or (templates, templates) array
+        The variances of the amplitudes, or their covariance P.
+    layout : DataLayout
+
+    Returns
+    -------
+    LowRankCovariance
+        In K^2.
+
+    Raises
+    ------
+    InputError
+        For templates of the wrong length, and for a P that is not positive definite.
+    """
+    require_float64("the templates", templates)
+    require_shape("the templates", templates, (layout.size, None))
+    require_finite("the templates", templates)
+    require_float64("the templates' prior", prior)
+    n = templates.shape[1]
+    if prior.ndim == 1:
+        require_shape("the templates' prior", prior, (n,))
+        require_positive("the templates' prior variance", prior)
+        return LowRankCovariance(templates * jnp.sqrt(prior)[None], "the templates")
+    require_shape("the templates' prior", prior, (n, n))
+    require_finite("the templates' prior", prior)
+    require_symmetric("the templates' prior", prior)
+    root = jnp.tril(checked_cholesky("the templates' prior", prior))
+    return LowRankCovariance(templates @ root, "the templates")
+
+
+# C_g is dropped where it is below double precision relative to sigma_g^2: exp(-x^2 / 2) = eps
+REACH = float(np.sqrt(-2.0 * np.log(np.finfo(np.float64).eps)))
+
+
+def _scalar(x) -> Float[Array, ""]:
+    return jnp.asarray(x, dtype=jnp.float64)
+
+
+class GainDrift(eqx.Module):
+    """Gain drifts, independent between antennas and alike for all of them.
+
+    Differentiable in both parameters where the width of the band is given.
+
+    Attributes
+    ----------
+    sigma : float
+        Standard deviation sigma_g, relative.
+    correlation_h : float
+        Correlation time sigma_t in hours.
+
+    Raises
+    ------
+    InputError
+        If one of them is not positive.
+    """
+
+    sigma: Float[Array, ""] = eqx.field(converter=_scalar)
+    correlation_h: Float[Array, ""] = eqx.field(default=10.0, converter=_scalar)
+
+    def __check_init__(self):
+        require_positive("the gain drift's sigma", self.sigma)
+        require_positive("the gain drift's correlation time in hours", self.correlation_h)
+
+    def kernel(self, lag_h: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return C_g at lags in hours."""
+        return self.sigma**2 * jnp.exp(-((lag_h / self.correlation_h) ** 2) / 2.0)
+
+    def width(self, hours: Float[np.ndarray, " times"]) -> int:
+        """Return how many samples apart two times can be and still be correlated."""
+        reach = REACH * float(self.correlation_h)
+        first = np.searchsorted(hours, np.asarray(hours) - reach)
+        return int((np.arange(len(hours)) - first).max())
+
+    def covariance(
+        self,
+        visibilities: Float[Array, "products times"],
+        hours: Float[Array, " times"],
+        layout: DataLayout,
+        width: int | None = None,
+    ) -> TimeBandedCovariance:
+        """Return the noise term of the drifts around given visibilities d.
+
+        It is semidefinite: add the radiometer noise before solving with it.
+
+        Parameters
+        ----------
+        visibilities : (products, times) array
+            d_k(t) on the full grid, in K.
+        hours : (times,) array
+            Growing times of the samples.
+        layout : DataLayout
+        width : int, optional
+            Of the band in samples, by default as far as C_g reaches.
+
+        Returns
+        -------
+        TimeBandedCovariance
+            In K^2.
+
+        Raises
+        ------
+        InputError
+            If shapes do not fit, visibilities are not finite or times do not grow.
+        """
+        require_float64("the visibilities", visibilities)
+        require_shape("the visibilities", visibilities, (layout.n_products, layout.n_times))
+        require_finite("the visibilities", visibilities)
+        require_shape("hours", hours, (layout.n_times,))
+        if not is_traced(hours) and not (np.diff(hours) > 0).all():
+            raise InputError("the sample times (hours) must grow from one to the next")
+        width = self.width(hours) if width is None else width
+        earlier = np.arange(layout.n_times)[:, None] - np.arange(width + 1)[None]
+        lag = jnp.asarray(hours)[:, None] - jnp.asarray(hours)[np.maximum(earlier, 0)]
+        kernel = jnp.where(jnp.asarray(earlier >= 0), self.kernel(lag), 0.0)
+        linear, quadratic = shared_antennas(layout.n_products)
+        band = _band(
+            visibilities, kernel, jnp.asarray(earlier), jnp.asarray(linear), jnp.asarray(quadratic)
+        )
+        return TimeBandedCovariance(band, layout, "the gain-drift covariance")
+
+    def mean_response(self, n_products: int) -> Float[Array, " products"]:
+        """Return the mean factor of each product: 1 + sigma_g^2 for autos, 1 for crosses."""
+        products = all_products(round(np.sqrt(n_products)))
+        auto = jnp.asarray([1.0 if p.i == p.j else 0.0 for p in products])
+        return 1.0 + self.sigma**2 * auto
+
+    def sample(
+        self, key: PRNGKeyArray, hours: Float[np.ndarray, " times"], n_antennas: int = 4
+    ) -> Float[Array, "antennas times"]:
+        """Draw g_i(t), (antennas, times), with exactly this covariance."""
+        grid = white_grid(hours, float(self.correlation_h))
+        white = jax.random.normal(key, (n_antennas, len(grid)), dtype=jnp.float64)
+        return self.history(white, hours, grid)
+
+    def history(
+        self,
+        white: Float[Array, "antennas grid"],
+        hours: Float[Array, " times"],
+        grid: Float[Array, " grid"],
+    ) -> Float[Array, "antennas times"]:
+        """Return the gains that white noise on an even grid of times makes.
+
+        The noise is convolved with a Gaussian of width sigma_t / sqrt(2); a sum over a spacing of
+        sigma_t / 3 or less equals the integral to exp(-9 pi^2 / 2). Differentiable in everything.
+
+        Parameters
+        ----------
+        white : (antennas, grid) array
+            Independent unit normals.
+        hours : (times,) array
+        grid : (grid,) array
+            Even times in hours, as of :func:`white_grid`.
+
+        Returns
+        -------
+        (antennas, times) array
+            g_i(t).
+        """
+        spacing = (grid[1] - grid[0]) / self.correlation_h
+        lag = jnp.asarray(hours)[None] - jnp.asarray(grid)[:, None]
+        shape = jnp.sqrt(spacing * np.sqrt(2.0 / np.pi))
+        return self.sigma * shape * white @ jnp.exp(-((lag / self.correlation_h) ** 2))
+
+
+def white_grid(
+    hours: Float[np.ndarray, " times"],
+    shortest_h: float,
+    longest_h: float | None = None,
+    *,
+    per_correlation: float = 4.0,
+    margin: float = REACH,
+) -> Float[np.ndarray, " grid"]:
+    """Return a grid of times for :meth:`GainDrift.history`.
+
+    Parameters
+    ----------
+    hours : (times,) array
+        Of the samples.
+    shortest_h, longest_h : float
+        Range of correlation times in hours that the grid has to serve; by default one.
+    per_correlation : float
+        Number of grid times in the shortest correlation time.
+    margin : float
+        How far the grid goes on beyond the samples, in longest correlation times.
+
+    Returns
+    -------
+    (grid,) array
+        In hours.
+    """
+    longest_h = shortest_h if longest_h is None else longest_h
+    hours = np.asarray(hours)
+    first, end = hours.min() - margin * longest_h, hours.max() + margin * longest_h
+    return np.arange(first, end, shortest_h / per_correlation)
+
+
+def with_gains(
+    visibilities: Float[Array, "products times"], gains: Float[Array, "antennas times"]
+) -> Float[Array, "products times"]:
+    """Return (1 + g_i)(1 + g_j) V_ij, exactly, for every product."""
+    products = all_products(gains.shape[0])
+    i, j = np.array([p.i for p in products]), np.array([p.j for p in products])
+    return (1.0 + gains[i]) * (1.0 + gains[j]) * visibilities
+
+
+def shared_antennas(n_products: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return (dik + dil + djk + djl) and (dik djl + dil djk) for every pair of products."""
+    products = all_products(round(np.sqrt(n_products)))
+
+    def linear(p: Product, q: Product) -> int:
+        return (p.i == q.i) + (p.i == q.j) + (p.j == q.i) + (p.j == q.j)
+
+    def quadratic(p: Product, q: Product) -> int:
+        return (p.i == q.i) * (p.j == q.j) + (p.i == q.j) * (p.j == q.i)
+
+    return tuple(
+        np.array([[float(f(p, q)) for q in products] for p in products])
+        for f in (linear, quadratic)
+    )
+
+
+@eqx.filter_jit
+def _band(
+    visibilities: Array, kernel: Array, earlier: Array, linear: Array, quadratic: Array
+) -> Float[Array, "times widths products products"]:
+    row = visibilities.T
+    column = row[jnp.maximum(earlier, 0)]  # (times, widths, products)
+    weight = kernel[:, :, None, None]
+    pattern = linear[None, None] + weight * quadratic[None, None]
+    return row[:, None, :, None] * column[:, :, None, :] * weight * pattern
+
+
+def beam_error_noise(direction: Coupling, prior: Prior) -> LowRankCovariance:
+    """Return the covariance dA (S + mu mu^T) dA^T of a beam error, mu being the prior's mean.
+
+    Parameters
+    ----------
+    direction : Coupling
+        dA: the coupling matrix of a difference of beams.
+    prior : Prior
+        S and mu.
+
+    Returns
+    -------
+    LowRankCovariance
+        In K^2.
+    """
+    columns = prior.colour_columns(direction.dense())
+    if prior.white_mean is not None:
+        columns = jnp.concatenate([columns, (columns @ prior.white_mean)[:, None]], axis=1)
+    return LowRankCovariance(columns, "the beam-error covariance")
+
+
+def difference(true: ProductBeams, model: ProductBeams) -> ProductBeams:
+    """Return the difference true - model of two beams, the direction of a beam error.
+
+    Raises
+    ------
+    InputError
+        If their shapes differ.
+    """
+    require_shape("the other beam's coefficients", true.modes, model.modes.shape)
+    return ProductBeams(true.modes - model.modes, model.frequency_mhz)
+
+
+def derivative(name: str, frequency_mhz: float, lmax: int, monopoles: Monopoles) -> ProductBeams:
+    """Return the derivative of the beams in a parameter of the embedded antennas.
+
+    Parameters
+    ----------
+    name : str
+        One of ``beams.PARAMETERS``.
+    frequency_mhz : float
+    lmax : int
+    monopoles : Monopoles
+        Where to take the derivative.
+
+    Returns
+    -------
+    ProductBeams
+        In K per K and unit of the parameter.
+
+    Raises
+    ------
+    InputError
+        If the parameter is unknown.
+    """
+
+    def modes(value: Float[Array, ""]) -> Float[Array, "products modes"]:
+        return monopole_beams(frequency_mhz, lmax, placed(monopoles, {name: value})).modes
+
+    value = parameter(name).where(monopoles)
+    _, slope = jax.jvp(modes, (value,), (jnp.ones_like(value),))
+    return ProductBeams(slope, float(frequency_mhz))
+
+
+def rms_difference(true: ProductBeams, model: ProductBeams) -> float:
+    """Return the RMS difference of two beams, relative to the RMS of ``model``.
+
+    Over products and directions, by Parseval's theorem from the coefficients up to lmax.
+    """
+    error = difference(true, model).modes
+    return float(jnp.sqrt((error**2).sum() / (model.modes**2).sum()))

@@ -1,0 +1,361 @@
+"""Families of Gaussian priors: m ~ N(mean, S(theta)), with parameters theta that data can tell.
+
+What learning theta needs of a family are S and sums over its derivatives, ::
+
+    d ln p(d) / d theta_i = 1/2 tr[(dS / d theta_i) (g g^T - F)],
+    g = S^-1 (mean of m - prior mean),    F = S^-1 - S^-1 C S^-1,
+
+C being the posterior covariance. F is the covariance of g where the family holds, so that the
+Fisher information is the covariance of 1/2 h^T (dS / d theta_i) h over draws h ~ N(0, F).
+
+A C_ell that is learned has an amplitude, a tilt, a curvature and departures at half octaves, ::
+
+    ln C_ell = a + tilt x + curvature x^2 / 2 + sum_k d_k hat_k(x),    x = ln((ell + 1) / 10).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import (
+    gammainc,
+    gammaincc,
+    gammainccinv,
+    gammaincinv,
+    gammaln,
+    ndtr,
+    ndtri,
+    stdtr,
+    stdtrit,
+)
+
+from lusee_bayes.core.harmonics import per_mode, sum_over_m
+from lusee_bayes.sky.prior import PIVOT, HarmonicPrior, Prior
+
+# degrees of freedom of the parameters' Student distribution: near their centre they are held as by
+# a normal one of the same width, and a few may be far from it
+FREEDOM = 2.0
+
+# distance in ln(ell + 1) of the knots of departures
+SPACING = 0.5 * np.log(2.0)
+
+# Diffuse Galactic emission falls as ell^-2.4 to ell^-3.1 (La Porta et al. 2008, A&A 479, 641), with
+# little curvature. The hyperprior's tails leave room for skies that are unlike it.
+TILT, TILT_WIDTH = -2.7, 0.2
+CURVATURE_WIDTH = 0.3
+DEPARTURE_WIDTH = 0.15
+# standard deviation of ln C at the pivot: hardly anything is known
+LOG_AMPLITUDE_WIDTH = 6.0
+# standard deviation of the logarithm of C_0, which is not part of the spectrum's form
+LOG_MONOPOLE_WIDTH = 2.0
+# fluctuations relative to the mean, where the spectrum is started
+RELATIVE_STRENGTH = 0.05
+
+# variance of parameters' linear combinations, one a row
+Spread = Callable[[Float[np.ndarray, "rows parameters"]], Float[np.ndarray, " rows"]]
+
+
+@dataclass(frozen=True)
+class Hyperprior:
+    """What is expected of a family's parameters: theta, and then the logarithms of cells' scales.
+
+    Each theta follows a Student distribution with two degrees of freedom. The logarithm t of a
+    factor of the variance in a cell has the density ::
+
+        p(t) ~ exp(-tail t - (tail / steepness) exp(-steepness t)),
+
+    greatest at t = 0: a power law towards large factors, and little room for small ones.
+
+    Attributes
+    ----------
+    centre, width : (theta,) array
+    n_cells : int
+    tail : float
+        The factor's density falls as its power -(1 + tail).
+    steepness : float
+        Its power is gamma distributed with the inverse scale, tail / steepness.
+    """
+
+    centre: Float[np.ndarray, " theta"]
+    width: Float[np.ndarray, " theta"]
+    n_cells: int = 0
+    tail: float = 1.5
+    steepness: float = 2.0
+
+    @property
+    def size(self) -> int:
+        """Number of parameters, with the cells'."""
+        return len(self.centre) + self.n_cells
+
+    def start(self) -> Float[np.ndarray, " parameters"]:
+        """Return the most probable parameters."""
+        return np.concatenate([self.centre, np.zeros(self.n_cells)])
+
+    def log_density(self, parameters: Float[np.ndarray, " parameters"]) -> float:
+        """Compute ln p(theta, t)."""
+        return float(self._log_densities(parameters).sum())
+
+    def _log_densities(
+        self, parameters: Float[np.ndarray, " parameters"]
+    ) -> Float[np.ndarray, " parameters"]:
+        z, t = self._parts(parameters)
+        half = FREEDOM / 2.0
+        theta = -(half + 0.5) * np.log1p(z**2 / FREEDOM) - np.log(self.width)
+        constant = gammaln(half + 0.5) - gammaln(half) - 0.5 * np.log(FREEDOM * np.pi)
+        shape = self.tail / self.steepness
+        cells = -self.tail * t - shape * np.exp(-self.steepness * t)
+        of_cell = np.log(self.steepness) + shape * np.log(shape) - gammaln(shape)
+        return np.concatenate([theta + constant, cells + of_cell])
+
+    def gradient(
+        self, parameters: Float[np.ndarray, " parameters"]
+    ) -> Float[np.ndarray, " parameters"]:
+        """Compute its derivative."""
+        z, t = self._parts(parameters)
+        theta = -(FREEDOM + 1.0) * z / (FREEDOM + z**2) / self.width
+        return np.concatenate([theta, self.tail * np.expm1(-self.steepness * t)])
+
+    def curvature(
+        self, parameters: Float[np.ndarray, " parameters"]
+    ) -> Float[np.ndarray, " parameters"]:
+        """Compute positive second derivatives of -ln p, of a normal density that touches p.
+
+        That of theta is p's own at the centre and goes with the slope where p is not concave.
+        """
+        z, t = self._parts(parameters)
+        theta = (FREEDOM + 1.0) / (FREEDOM + z**2) / self.width**2
+        cells = self.tail * self.steepness * np.exp(-self.steepness * t)
+        return np.concatenate([theta, cells])
+
+    def scores(
+        self, parameters: Float[np.ndarray, " parameters"]
+    ) -> Float[np.ndarray, " parameters"]:
+        """Compute z with Phi(z) = P(parameter is smaller), one by one: standard normal."""
+        x, t = self._parts(parameters)
+        shape = self.tail / self.steepness
+        # the smaller of both tails keeps its digits
+        theta = np.sign(x) * -ndtri(stdtr(FREEDOM, -np.abs(x)))
+        power = shape * np.exp(-self.steepness * t)
+        below, above = gammaincc(shape, power), gammainc(shape, power)
+        cells = np.where(below < above, ndtri(below), -ndtri(above))
+        return np.concatenate([theta, cells])
+
+    def of_scores(
+        self, scores: Float[np.ndarray, " parameters"]
+    ) -> Float[np.ndarray, " parameters"]:
+        """Compute the inverse of :meth:`scores`."""
+        x, t = np.split(scores, [len(self.centre)])
+        shape = self.tail / self.steepness
+        theta = np.sign(x) * -stdtrit(FREEDOM, ndtr(-np.abs(x)))
+        power = np.where(t < 0, gammainccinv(shape, ndtr(t)), gammaincinv(shape, ndtr(-t)))
+        cells = -np.log(power / shape) / self.steepness
+        return np.concatenate([self.centre + self.width * theta, cells])
+
+    def slopes_of_scores(
+        self, scores: Float[np.ndarray, " parameters"]
+    ) -> Float[np.ndarray, " parameters"]:
+        """Compute d parameter / d score of each: phi(z) over the parameter's density."""
+        log_normal = -0.5 * (scores**2 + np.log(2.0 * np.pi))
+        return np.exp(log_normal - self._log_densities(self.of_scores(scores)))
+
+    def _parts(
+        self, parameters: Float[np.ndarray, " parameters"]
+    ) -> tuple[Float[np.ndarray, " theta"], Float[np.ndarray, " cells"]]:
+        theta, cells = np.split(parameters, [len(self.centre)])
+        return (theta - self.centre) / self.width, cells
+
+
+class Member(ABC):
+    """The prior of a family at some parameters, and how its S changes with them."""
+
+    @property
+    @abstractmethod
+    def covariance(self) -> Float[np.ndarray, "modes modes"]:
+        """S, in K^2."""
+
+    @abstractmethod
+    def traces(self, matrix: Float[np.ndarray, "modes modes"]) -> Float[np.ndarray, " parameters"]:
+        """Compute 1/2 tr[(dS / d theta_i) F] of a symmetric F, in 1/K^2."""
+
+    @abstractmethod
+    def forms(self, columns: Float[np.ndarray, "modes n"]) -> Float[np.ndarray, "parameters n"]:
+        """Compute 1/2 h^T (dS / d theta_i) h of each column h, in 1/K."""
+
+
+class PriorFamily(ABC):
+    """Priors N(mean, S(theta)) over harmonic coefficients, in NumPy."""
+
+    @property
+    @abstractmethod
+    def hyperprior(self) -> Hyperprior:
+        """What is expected of the parameters."""
+
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """Names of those parameters that are reported: the first ones."""
+
+    @abstractmethod
+    def at(self, parameters: Float[np.ndarray, " parameters"]) -> Member:
+        """Return the member of these parameters."""
+
+    def expected(self) -> Prior:
+        """Return the prior of the parameters that are most probable before there are data."""
+        return self.prior(self.at(self.hyperprior.start()).covariance)
+
+    @abstractmethod
+    def averaged(
+        self, parameters: Float[np.ndarray, " parameters"], spread: Spread
+    ) -> Float[np.ndarray, "modes modes"]:
+        """Compute S with the parameters' uncertainty: its variances' means, in K^2.
+
+        Parameters
+        ----------
+        parameters : (parameters,) array
+            Mean of a normal distribution of the parameters.
+        spread : callable
+            Variance, under it, of linear combinations of the parameters. The logarithms of
+            variances are such combinations, so that their means are those of log-normal variables.
+        """
+
+    @abstractmethod
+    def prior(self, covariance: Float[np.ndarray, "modes modes"]) -> Prior:
+        """Return the prior with this S and the family's mean."""
+
+    @abstractmethod
+    def start_from(
+        self, coarse: PriorFamily, parameters: Float[np.ndarray, " parameters"]
+    ) -> Float[np.ndarray, " parameters"]:
+        """Return parameters of this family that stand for those of one with a lower lmax.
+
+        Parameters
+        ----------
+        coarse : PriorFamily
+            The same kind, with a lower lmax.
+        parameters : (parameters,) array
+            Of ``coarse``.
+        """
+
+
+@dataclass(frozen=True)
+class SpectrumBasis:
+    """ln C_ell as a linear function of its parameters.
+
+    Attributes
+    ----------
+    matrix : (ells, parameters) array
+    centre, width : (parameters,) array
+        What is expected of the parameters.
+    """
+
+    matrix: Float[np.ndarray, "ells parameters"]
+    centre: Float[np.ndarray, " parameters"]
+    width: Float[np.ndarray, " parameters"]
+
+    # of the parameters that are reported
+    names = ("ln C at ell = 9", "tilt", "curvature")
+
+    @classmethod
+    def around(cls, power: float, lmax: int) -> SpectrumBasis:
+        """Make the basis.
+
+        Parameters
+        ----------
+        power : float
+            Expected C_ell at the pivot, in K^2.
+        lmax : int
+        """
+        x = np.log((np.arange(lmax + 1) + 1.0) / PIVOT)
+        knots = np.arange(x[min(1, lmax)], x[-1] + SPACING, SPACING)
+        hats = np.maximum(0.0, 1.0 - np.abs(x[:, None] - knots) / SPACING)
+        matrix = np.column_stack([np.ones(lmax + 1), x, 0.5 * x**2, hats])
+        departures = np.full(len(knots), DEPARTURE_WIDTH)
+        return cls(
+            matrix,
+            np.concatenate([[np.log(power), TILT, 0.0], np.zeros(len(knots))]),
+            np.concatenate([[LOG_AMPLITUDE_WIDTH, TILT_WIDTH, CURVATURE_WIDTH], departures]),
+        )
+
+
+@dataclass(frozen=True)
+class IsotropicFamily(PriorFamily):
+    """S = diag(C_ell), with C_ell of :class:`SpectrumBasis` for ell > 0 and a C_0 of its own.
+
+    Attributes
+    ----------
+    spectrum : SpectrumBasis
+    log_monopole : float
+        Expected ln C_0.
+    """
+
+    spectrum: SpectrumBasis
+    log_monopole: float
+
+    @classmethod
+    def around(cls, temperature: float, lmax: int) -> IsotropicFamily:
+        """Make the family of skies of about a mean temperature, in K."""
+        power = 4.0 * np.pi * (RELATIVE_STRENGTH * temperature) ** 2 / 100.0
+        monopole = float(np.log(4.0 * np.pi * temperature**2))
+        return cls(SpectrumBasis.around(power, lmax), monopole)
+
+    @property
+    def hyperprior(self) -> Hyperprior:
+        return Hyperprior(
+            np.append(self.spectrum.centre, self.log_monopole),
+            np.append(self.spectrum.width, LOG_MONOPOLE_WIDTH),
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return SpectrumBasis.names
+
+    def at(self, parameters: Float[np.ndarray, " parameters"]) -> IsotropicMember:
+        return IsotropicMember(self, parameters)
+
+    def averaged(self, parameters, spread):
+        return np.diag(per_mode(np.exp(self.basis @ parameters + 0.5 * spread(self.basis))))
+
+    def prior(self, covariance):
+        lmax = self.basis.shape[0] - 1
+        return HarmonicPrior(np.diagonal(covariance)[np.arange(lmax + 1) ** 2].copy())
+
+    def start_from(self, coarse, parameters):
+        more = np.zeros(self.hyperprior.size - len(parameters))
+        return np.concatenate([parameters[:-1], more, parameters[-1:]])
+
+    @cached_property
+    def basis(self) -> Float[np.ndarray, "ells parameters"]:
+        """ln C_ell as a linear function of the parameters."""
+        form = self.spectrum.matrix.copy()
+        form[0] = 0.0
+        return np.column_stack([form, np.arange(len(form)) == 0])
+
+
+@dataclass(frozen=True)
+class IsotropicMember(Member):
+    """One prior of :class:`IsotropicFamily`."""
+
+    family: IsotropicFamily
+    parameters: Float[np.ndarray, " parameters"]
+
+    @cached_property
+    def spectrum(self) -> Float[np.ndarray, " ells"]:
+        """C_ell, in K^2."""
+        return np.exp(self.family.basis @ self.parameters)
+
+    @property
+    def covariance(self):
+        return np.diag(per_mode(self.spectrum))
+
+    def traces(self, matrix):
+        of_ells = sum_over_m(np.diagonal(matrix))
+        return self.family.basis.T @ (0.5 * self.spectrum * of_ells)
+
+    def forms(self, columns):
+        of_ells = sum_over_m((columns**2).T).T
+        return self.family.basis.T @ (0.5 * self.spectrum[:, None] * of_ells)

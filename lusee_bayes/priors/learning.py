@@ -1,0 +1,507 @@
+"""How the parameters of a family of priors are learned from data, and draws with them.
+
+A family's parameters in coordinates in which what is expected of them is standard normal.
+
+Parameters that the data do not tell keep what is expected of them, which has heavy tails: Laplace's
+approximation misses 0.32 in ln p(d) for every such theta, and 0.11 for every cell. In normal scores
+z, theta_i = F_i^-1(Phi(z_i)) with F_i the hyperprior's distribution function, it is exact for them.
+ln p(d | theta) being quadratic about the most probable theta*, with slope g and curvature F, ::
+
+    ln p(d, z) = const + g.(theta - theta*) - 1/2 (theta - theta*)^T F (theta - theta*) - 1/2 |z|^2
+
+is raised by Newton's method, J = d theta / d z, with the precision P = J F J + 1. Two steps get
+there; the quadratic form holds near theta* only, and further ones may leave for a maximum of its
+own.
+
+Learning the parameters of a family of priors from data, by their most probable values.
+
+With the sky integrated out, ln p(d, theta) is maximised by Fisher scoring: its gradient is exact,
+its curvature the Fisher information, estimated from simulated data, and that of the hyperprior.
+Around the maximum theta is taken for normal; the prior that is returned has the variances' means
+over it. The evidence is the integral of p(d, theta) by Laplace's approximation, in coordinates that
+know the hyperprior's tails (:mod:`.learning`).
+
+Draws of a sky whose prior was learned, with the parameters as uncertain as they are.
+
+::
+
+    p(m | d) = int p(m | d, theta) p(theta | d) d theta
+
+The posterior that a run reports is one Gaussian, with the variances' means over theta as its prior.
+Where the data hardly tell how strong the sky is, its draws are all of the same strength; those of
+p(m | d) are quieter in one sky than in another, and a few departures are far larger. Here theta is
+drawn from the normal distribution about its most probable value, and skies from the posterior under
+each S(theta).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.engine import in_threads
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cholesky, invert_lower
+from lusee_bayes.judge.chi2 import ChiSquare, Split, expected_chi2, stands_out
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.priors.families import Hyperprior, Member, PriorFamily
+from lusee_bayes.sky.prior import Prior
+
+# steps of Newton's method, each halved until ln p is not lower
+STEPS, HALVINGS = 2, 10
+
+
+@dataclass(frozen=True)
+class NormalScores:
+    """A normal distribution of normal scores, about their maximum.
+
+    Attributes
+    ----------
+    hyperprior : Hyperprior
+    mean : (parameters,) array
+    root : (parameters, parameters) array
+        R with the covariance R R^T.
+    """
+
+    hyperprior: Hyperprior
+    mean: Float[np.ndarray, " parameters"]
+    root: Float[np.ndarray, "parameters parameters"]
+
+    @classmethod
+    def around(
+        cls,
+        hyperprior: Hyperprior,
+        parameters: Float[np.ndarray, " parameters"],
+        covariance: Float[np.ndarray, "parameters parameters"],
+    ) -> NormalScores:
+        """Transform the normal distribution about the most probable parameters.
+
+        Parameters
+        ----------
+        hyperprior : Hyperprior
+        parameters : (parameters,) array
+            Most probable, hyperprior included.
+        covariance : (parameters, parameters) array
+            Of the normal distribution about them.
+
+        Raises
+        ------
+        InputError
+            If the data's curvature is far from positive.
+        """
+        known = np.linalg.inv(covariance) - np.diag(hyperprior.curvature(parameters))
+        slope = -hyperprior.gradient(parameters)
+
+        def value(z: Float[np.ndarray, " parameters"]) -> float:
+            off = hyperprior.of_scores(z) - parameters
+            return float(slope @ off - 0.5 * off @ known @ off - 0.5 * z @ z)
+
+        def precision(z: Float[np.ndarray, " parameters"]) -> np.ndarray:
+            j = hyperprior.slopes_of_scores(z)
+            return j[:, None] * known * j + np.eye(len(z))
+
+        z = hyperprior.scores(parameters)
+        for _ in range(STEPS):
+            pull = slope - known @ (hyperprior.of_scores(z) - parameters)
+            gradient = hyperprior.slopes_of_scores(z) * pull - z
+            step = np.linalg.solve(precision(z), gradient)
+            tried = (z + 0.5**k * step for k in range(HALVINGS))
+            z = next((there for there in tried if value(there) >= value(z)), z)
+        root = invert_lower(checked_cholesky("the curvature of the parameters", precision(z))).T
+        return cls(hyperprior, z, root)
+
+    def log_evidence(self, log_likelihood: float) -> float:
+        """Compute ln p(d) by Laplace's approximation, of ln p(d | theta) at the mean."""
+        volume = float(np.log(np.diagonal(self.root)).sum())
+        return log_likelihood + volume - 0.5 * float(self.mean @ self.mean)
+
+
+# the maximum is found when the next step could not add more than this to ln p
+SETTLED = 0.03
+MAX_STEPS = 60
+# longest step of a parameter
+LONGEST = 3.0
+# shortest part of a step that is tried
+SHORTEST = 2.0**-10
+# simulated data sets for the Fisher information: while going uphill, and at the top
+SIMULATIONS, FINAL_SIMULATIONS = 200, 500
+# added to a covariance with eigenvalues from 0 to 1, of which a root is needed: those near 0 are
+# wrong by eps times the condition number of Lambda, up to 1e-5, and count for nothing
+ROUNDING = 1e-4
+# of the factor of N that data that do not fit demand: what is tried, one after the other
+HIGHER = np.array([1.0, 1e2, 1e4])
+# how often a fixed prior is made ten times as wide where rounding leaves no posterior mean
+MOST_WIDENINGS = 4
+
+
+class NotSettled(InputError):
+    """The most probable parameters of a prior were not found."""
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A prior whose parameters were learned.
+
+    Attributes
+    ----------
+    prior : Prior
+    names : tuple of str
+        Of the first parameters.
+    parameters : (parameters,) array
+        Most probable values.
+    covariance : (parameters, parameters) array
+        Of the normal distribution around them.
+    log_evidence : float
+        ln p(d), with the sky and the parameters integrated out (Laplace).
+    steps : int
+        Steps that were taken.
+    noise_factor : float
+        Factor of N with which the parameters were learned; above 1 where the data do not fit.
+    settled : bool
+        Whether the parameters are learned; otherwise the prior is a fixed, wide one.
+    still_moves : float
+        By which part of its standard deviations (rms) the map still moves in the last round, where
+        prior and N are found together; 0 where they have settled.
+    """
+
+    prior: Prior
+    names: tuple[str, ...]
+    parameters: Float[np.ndarray, " parameters"]
+    covariance: Float[np.ndarray, "parameters parameters"]
+    log_evidence: float
+    steps: int
+    noise_factor: float = field(default=1.0, kw_only=True)
+    settled: bool = field(default=True, kw_only=True)
+    still_moves: float = field(default=0.0, kw_only=True)
+
+    @property
+    def fits(self) -> bool:
+        """Whether the parameters were learned under the model's own N."""
+        return self.settled and self.noise_factor == 1.0
+
+    def as_rows(self) -> list[dict[str, float | str]]:
+        """Name, value and standard deviation of the parameters that have a name."""
+        std = np.sqrt(np.diagonal(self.covariance))
+        return [
+            {"name": name, "value": float(value), "std": float(width)}
+            for name, value, width in zip(self.names, self.parameters, std, strict=False)
+        ]
+
+
+@dataclass(frozen=True)
+class _Point:
+    """What is known of ln p(d, theta) at some theta."""
+
+    parameters: Float[np.ndarray, " parameters"]
+    member: Member
+    posterior: Posterior
+    value: float
+
+
+def learn(
+    family: PriorFamily,
+    information: Information,
+    start: Float[np.ndarray, " parameters"] | None = None,
+    seed: int = 1,
+    report: Callable[[int, float], None] | None = None,
+) -> Learned:
+    """Find the most probable parameters of a family, and the prior that they give.
+
+    Parameters
+    ----------
+    family : PriorFamily
+    information : Information
+        What the data say of the sky.
+    start : (parameters,) array, optional
+        Where to begin; by default with the most probable ones before there are data.
+    seed : int
+        Of the simulated data.
+    report : callable, optional
+        Told the number of every step and ln p(d, theta).
+
+    Raises
+    ------
+    NotSettled
+        If the maximum is not found in 60 steps, or ln p falls along its own gradient.
+    InputError
+        If S is not positive definite.
+    """
+    rng, information = np.random.default_rng(seed), on_host(information)
+    here = _at(family, information, family.hyperprior.start() if start is None else start)
+    for steps in range(MAX_STEPS + 1):
+        if report is not None:
+            report(steps, here.value)
+        gradient, curvature = _slope(family, here, rng, SIMULATIONS)
+        step = np.linalg.solve(curvature, gradient)
+        gain = 0.5 * float(gradient @ step)
+        if gain < SETTLED:
+            return _learned(family, information, here, rng, steps)
+        here = _uphill(family, information, here, step * min(1.0, LONGEST / np.abs(step).max()))
+    raise NotSettled(
+        f"the prior's parameters did not settle in {MAX_STEPS} steps: the next would still add "
+        f"{gain:.2g} to ln p (accepted: {SETTLED:g})"
+    )
+
+
+def learn_whatever_fits(
+    family: PriorFamily,
+    information: Information,
+    start: Float[np.ndarray, " parameters"] | None = None,
+    seed: int = 1,
+) -> Learned:
+    """Learn a prior as :func:`learn`, from data that no sky explains, too.
+
+    Under N, such data ask for a sky that is stronger by orders of magnitude, and ln p is rough. N
+    is raised to what the residual chi^2, which no sky can absorb, demands; where ln p does not
+    settle there, by 100 and 10,000 times that. The last resort is a fixed prior: the family's
+    before there are data, wide enough for the sky that the data ask for.
+
+    Parameters
+    ----------
+    family, information, start, seed
+        As for :func:`learn`.
+    """
+    information = on_host(information)
+    demanded = demanded_factor(information, family.expected())
+    for factor in demanded * HIGHER:
+        try:
+            found = learn(family, information.raised(factor), start, seed)
+            if factor > 1.0:  # a posterior under N itself is what it is for
+                information.posterior(found.prior)
+        except InputError:
+            continue
+        return replace(found, noise_factor=float(factor))
+    return _fixed(family, information, float(demanded * HIGHER[-1]))
+
+
+def demanded_factor(information: Information, prior: Prior) -> float:
+    """Factor of N that makes the residual chi^2 what is expected; 1 where it does not stand out.
+
+    Parameters
+    ----------
+    information : Information
+    prior : Prior
+        Before there are data, over the same modes.
+    """
+    n_data = int(information.n_data)
+    try:
+        posterior = information.posterior(prior)
+        chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
+        left = Split.of(posterior, chi2, n_data).instrument
+    except InputError:  # the data are too far from any sky for these numbers: rounding rules them
+        left = ChiSquare(float(information.misfit), float(n_data))
+    fits = left.too_small or not stands_out(left.p, 1)
+    return 1.0 if fits else left.chi2 / left.degrees
+
+
+def _fixed(family: PriorFamily, information: Information, factor: float) -> Learned:
+    """The family's prior before there are data, as wide as data with N raised by a factor ask for.
+
+    Wider still, if under N itself no posterior mean can be computed: rounding grows with its
+    distance from the prior's, in the prior's standard deviations.
+    """
+    prior, n_data = family.expected(), int(information.n_data)
+    raised = information.raised(factor).posterior(prior)
+    known = max(n_data - expected_chi2(raised, n_data), 1.0)
+    prior = prior.widened(max(1.0, float(np.sqrt(float(raised.prior_chi2()) / known))))
+    for _ in range(MOST_WIDENINGS):
+        try:
+            evidence = float(information.posterior(prior).log_evidence)
+            break
+        except InputError as error:
+            prior, failed = prior.widened(10.0), error
+    else:
+        raise failed
+    return Learned(prior, (), np.zeros(0), np.zeros((0, 0)), evidence, 0, settled=False)
+
+
+def _at(
+    family: PriorFamily, information: Information, parameters: Float[np.ndarray, " parameters"]
+) -> _Point:
+    member = family.at(parameters)
+    posterior = information.posterior(family.prior(member.covariance))
+    value = float(posterior.log_evidence) + family.hyperprior.log_density(parameters)
+    return _Point(parameters, member, posterior, value)
+
+
+def _uphill(
+    family: PriorFamily,
+    information: Information,
+    here: _Point,
+    step: Float[np.ndarray, " parameters"],
+) -> _Point:
+    """The end of a step, or of a half, a quarter, ... of it, if ln p is not lower there."""
+    part = 1.0
+    while part >= SHORTEST:
+        try:
+            there = _at(family, information, here.parameters + part * step)
+        except InputError:  # too far: S has no Cholesky factor there
+            there = None
+        if there is not None and there.value >= here.value - SETTLED / 10.0:
+            return there
+        part /= 2.0
+    raise NotSettled(
+        "the prior's parameters do not settle: ln p falls along its own gradient by rounding"
+    )
+
+
+def _slope(
+    family: PriorFamily, here: _Point, rng: np.random.Generator, n: int
+) -> tuple[Float[np.ndarray, " parameters"], Float[np.ndarray, "parameters parameters"]]:
+    """Gradient of ln p(d, theta), and its expected curvature."""
+    prior, posterior, hyperprior = here.posterior.prior, here.posterior, family.hyperprior
+    unknown = np.asarray(inverse_from_cholesky(posterior.lower))
+    known = np.eye(len(unknown)) - unknown
+    expected = prior.whiten_columns(prior.whiten_columns(known).T)
+    deviation = posterior.white_mean
+    if prior.white_mean is not None:
+        deviation = deviation - prior.white_mean
+    pull = prior.whiten_columns(deviation[None]).T
+    found = here.member.forms(pull)[:, 0] - here.member.traces(expected)
+    root = _root(known)
+    drawn = prior.whiten_columns((root @ rng.standard_normal((len(root), n))).T).T
+    scores = here.member.forms(drawn)
+    scores = scores - scores.mean(1, keepdims=True)
+    curvature = scores @ scores.T / (n - 1.0)
+    curvature[np.diag_indices(len(curvature))] += hyperprior.curvature(here.parameters)
+    return found + hyperprior.gradient(here.parameters), curvature
+
+
+def _root(known: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n k"]:
+    """A root of a covariance with eigenvalues from 0 to 1.
+
+    Of data that are very precise, those near 0 are wrong by more than ``ROUNDING``; then what lies
+    outside of 0 to 1 is left out.
+    """
+    root = cholesky(known + ROUNDING * np.eye(len(known)))
+    if np.isfinite(np.diagonal(root)).all():
+        return np.tril(root)
+    values, vectors = np.linalg.eigh(known)
+    return vectors * np.sqrt(np.clip(values, 0.0, 1.0))
+
+
+def _learned(
+    family: PriorFamily,
+    information: Information,
+    here: _Point,
+    rng: np.random.Generator,
+    steps: int,
+) -> Learned:
+    _, curvature = _slope(family, here, rng, FINAL_SIMULATIONS)
+    covariance = np.linalg.inv(curvature)
+
+    def spread(rows: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, " rows"]:
+        return np.einsum("ij,ij->i", rows @ covariance, rows)
+
+    scores = NormalScores.around(family.hyperprior, here.parameters, covariance)
+    there = family.prior(family.at(family.hyperprior.of_scores(scores.mean)).covariance)
+    evidence = scores.log_evidence(float(information.posterior(there).log_evidence))
+    prior = family.prior(family.averaged(here.parameters, spread))
+    return Learned(prior, family.names, here.parameters, covariance, evidence, steps)
+
+
+# skies that are drawn with the same theta, and the least number of theta where skies are so many
+SHARED, LEAST = 30, 10
+# how often a theta is drawn anew whose S is not positive definite to rounding
+ATTEMPTS = 5
+
+
+def draws_with_parameters(
+    family: PriorFamily, learned: Learned, posterior: Posterior, key: PRNGKeyArray, n: int
+) -> Float[np.ndarray, "draws modes"]:
+    """Draw skies; neighbouring ones have different parameters.
+
+    Parameters
+    ----------
+    family : PriorFamily
+    learned : Learned
+        Its parameters, and how uncertain they are.
+    posterior : Posterior
+        Of the same data under the learned prior.
+    key : PRNG key
+    n : int
+
+    Returns
+    -------
+    (draws, modes) array
+        In K.
+
+    Raises
+    ------
+    InputError
+        If S is not positive definite for five theta in a row.
+    """
+    drawn = np.empty((n, posterior.prior.size))
+    if not n:
+        return drawn
+    information = information_behind(on_host(posterior))
+    root = np.linalg.cholesky(learned.covariance)
+    sets = min(n, max(LEAST, -(-n // SHARED)))
+
+    def some(k: int) -> None:
+        own = jax.random.fold_in(key, k)
+        there = _under_drawn_parameters(family, learned, root, information, own)
+        drawn[k::sets] = there.sample(jax.random.fold_in(own, ATTEMPTS), len(drawn[k::sets]))
+
+    in_threads(some, range(sets))
+    return drawn
+
+
+def information_behind(posterior: Posterior) -> Information:
+    """What the data said, from the posterior that they gave.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Over modes of which each is uncertain under the prior; in NumPy's arrays.
+
+    Returns
+    -------
+    Information
+        About the posterior mean; chi^2, ln|N| and the number of data are not known: NaN.
+    """
+    prior, lower = posterior.prior, np.tril(posterior.lower)
+    known = lower @ lower.T - np.eye(len(lower))
+    if posterior.basis is not None:
+        known = posterior.basis @ known @ posterior.basis.T
+    matrix = prior.whiten_columns(prior.whiten_columns(known).T)
+    expected = prior.white_mean
+    away = posterior.white_mean if expected is None else posterior.white_mean - expected
+    unknown = np.asarray(np.nan)
+    return Information(
+        0.5 * (matrix + matrix.T),
+        # at the mean, data and prior pull the same
+        prior.whiten_columns(away[None])[0],
+        np.asarray(posterior.mean),
+        unknown,
+        unknown,
+        unknown,
+    )
+
+
+def _under_drawn_parameters(
+    family: PriorFamily,
+    learned: Learned,
+    root: Float[np.ndarray, "parameters parameters"],
+    information: Information,
+    key: PRNGKeyArray,
+) -> Posterior:
+    for attempt in range(ATTEMPTS):
+        z = jax.random.normal(jax.random.fold_in(key, attempt), (len(root),), dtype=jnp.float64)
+        parameters = learned.parameters + root @ np.asarray(z)
+        try:
+            prior = family.prior(family.at(parameters).covariance)
+            return information.posterior(prior)
+        except InputError as error:
+            failed = error
+    raise InputError(
+        f"no sky can be drawn with the uncertainty of the prior's parameters: {failed}; use "
+        "prior.model=isotropic"
+    )

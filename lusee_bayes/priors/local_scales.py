@@ -1,0 +1,415 @@
+"""A Gaussian sky whose strength varies from place to place, and is learned.
+
+::
+
+    m = T + s_T x_1 T + s_0 x_0 Y_00 + sum_b f_b s_b y(b) + R sum_j w_j P [sqrt(v_j) n_j]
+
+T is a template; its scale and the monopole are wide. y(b) are point sources of the catalogue. n_j
+is white noise on the sphere, v_j(p) a positive field, P the harmonic analysis, w_j windows in ell
+an octave wide with sum_j w_j^2 = 1, and R = diag(C_ell^1/2). Where all v_j = 1 the last term is an
+isotropic field of spectrum C_ell. Its covariance is R sum_j w_j W(v_j) w_j R, W(v) being the matrix
+of multiplication by v. The logarithm of v_j is a sum of covariates: the template seen with the
+band's resolution, the same where nothing is absorbed, the Galactic plane, a field of a few large
+harmonics, and cells of 15 degrees whose factors have a power-law tail: compact departures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy import sparse
+
+from lusee_bayes.core.checks import require_positive
+from lusee_bayes.core.harmonics import n_modes, per_mode, sum_over_m, synthesis_matrix
+from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.sphere_grid import SphereGrid
+from lusee_bayes.priors.families import Hyperprior, Member, PriorFamily, SpectrumBasis
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource
+from lusee_bayes.sky.prior import PIVOT, DensePrior
+from lusee_bayes.sky.template import EmbeddedTemplate
+
+# frequency in MHz at which the Galaxy is nearly transparent
+TRANSPARENT_MHZ = 50.0
+# fluctuations of the texture relative to the template's mean, where its spectrum is started
+RELATIVE_STRENGTH = 0.05
+# standard deviations of the template's scale, and of the monopole in units of the template's
+SCALE_WIDTH = MONOPOLE_WIDTH = 1.0
+# of ln f^2: whether the catalogue's sources are there at all is left to the data
+SOURCES_WIDTH = 3.0
+# NSIDE at which templates are analysed and smoothed
+TEMPLATE_NSIDE, TEMPLATE_LMAX = 64, 96
+# a template is smoothed to this angle over a band's ell, and to this one, in degrees (FWHM)
+RESOLUTION_DEG, FINEST_DEG = 60.0, 4.0
+# how the texture's variance goes with the template: as its square if fluctuations are relative
+TEMPLATE_POWER, POWER_WIDTH = 2.0, 1.0
+# half width of the plane in degrees, and how much stronger it may be there
+PLANE_DEG, PLANE_WIDTH = 4.0, 1.5
+# how much flatter the spectrum may be where the template is bright, and in the plane
+TILTS_WIDTH = 0.5
+# largest ell of the smooth field of ln v, and its standard deviation for each ell
+FIELD_LMAX, FIELD_WIDTH = 4, 0.4
+# NSIDE of the cells
+CELLS_NSIDE = 4
+N_CELLS = 12 * CELLS_NSIDE**2
+# a band's grid resolves the plane and the cells: exact to twice this degree at least
+LEAST_BAND = 24
+
+
+@dataclass(frozen=True)
+class Band:
+    """A window in ell, and what the strength of the sky in it depends on.
+
+    Attributes
+    ----------
+    window : (ells,) array
+        w_j.
+    grid : SphereGrid
+        Up to the window's last ell.
+    covariates : (points, covariates) array
+    cells : (points, cells) sparse array
+        Interpolation between cells.
+    """
+
+    window: Float[np.ndarray, " ells"]
+    grid: SphereGrid
+    covariates: Float[np.ndarray, "points covariates"]
+    cells: sparse.csr_array
+
+    @classmethod
+    def of(
+        cls,
+        window: Float[np.ndarray, " ells"],
+        template: SmoothedTemplate,
+        transparent: SmoothedTemplate,
+    ) -> Band:
+        """Make the band of a window."""
+        top = int(np.flatnonzero(window)[-1])
+        grid = SphereGrid.of(top, max((3 * top + 1) // 2, LEAST_BAND))
+        theta, phi = grid.directions()
+        fwhm = float(np.hypot(RESOLUTION_DEG / _middle(window), FINEST_DEG))
+        seen, clear = (each.log(fwhm, theta, phi) for each in (template, transparent))
+        latitude = 90.0 - np.degrees(theta)
+        thickness = PLANE_DEG**2 + (fwhm / np.sqrt(8.0 * np.log(2.0))) ** 2
+        plane = np.exp(-0.5 * latitude**2 / thickness)
+        field = synthesis_matrix(theta, phi, FIELD_LMAX)[:, 1:] * np.sqrt(4.0 * np.pi)
+        near, weight = healpy.get_interp_weights(CELLS_NSIDE, theta, phi)
+        at = np.tile(np.arange(len(theta)), 4)
+        cells = sparse.csr_array((weight.ravel(), (at, near.ravel())), (len(theta), N_CELLS))
+        x = np.log((_middle(window) + 1.0) / PIVOT)
+        tilts = x * np.column_stack([seen, plane])
+        covariates = np.column_stack([seen, clear - seen, plane, tilts, field])
+        return cls(window, grid, covariates, cells)
+
+
+def windows(lmax: int) -> Float[np.ndarray, "bands ells"]:
+    """Return windows an octave wide whose squares add up to one for ell > 0, the lowest first.
+
+    Parameters
+    ----------
+    lmax : int
+        Where the last one ends.
+    """
+    ell = np.arange(1.0, lmax + 1.0)
+    n = max(1, int(np.floor(np.log2(lmax / 1.5))) + 1)
+    edges = lmax / 2.0 ** np.arange(n - 1, 0, -1)
+    # the share of each ell that is below an edge, falling over an octave
+    octaves = np.clip(np.log2(ell[None] / edges[:, None]), 0.0, 1.0)
+    below = np.cos(0.5 * np.pi * octaves) ** 2
+    shares = np.diff(np.concatenate([np.zeros((1, lmax)), below, np.ones((1, lmax))]), axis=0)
+    found = np.zeros((n, lmax + 1))
+    found[:, 1:] = np.sqrt(np.where(shares > 1e-12, shares, 0.0))
+    return found
+
+
+def _middle(window: Float[np.ndarray, " ells"]) -> float:
+    """Root mean square ell of a window's modes."""
+    ell = np.arange(len(window))
+    weight = window**2 * (2.0 * ell + 1.0)
+    return float(np.sqrt((weight * ell**2).sum() / weight.sum()))
+
+
+@dataclass(frozen=True)
+class SmoothedTemplate:
+    """A positive template at any resolution.
+
+    Attributes
+    ----------
+    alm : (alms,) array
+        Its complex coefficients, in K.
+    mean_log : float
+        Mean of its logarithm.
+    """
+
+    alm: Complex[np.ndarray, " alms"]
+    mean_log: float
+
+    @classmethod
+    def of(cls, template: EmbeddedTemplate) -> SmoothedTemplate:
+        """Analyse a template."""
+        pixels = template.pixels(TEMPLATE_NSIDE)
+        alm = healpy.map2alm(pixels, lmax=TEMPLATE_LMAX, iter=3)
+        return cls(alm, float(np.log(pixels).mean()))
+
+    def log(
+        self,
+        fwhm_deg: float,
+        theta: Float[np.ndarray, " points"],
+        phi: Float[np.ndarray, " points"],
+    ) -> Float[np.ndarray, " points"]:
+        """ln of the smoothed template less its mean, in given directions."""
+        beam = healpy.gauss_beam(np.radians(fwhm_deg), lmax=TEMPLATE_LMAX)
+        alm = healpy.almxfl(self.alm, beam)
+        smooth = healpy.alm2map(alm, TEMPLATE_NSIDE, lmax=TEMPLATE_LMAX)
+        require_positive("the smoothed template", smooth)
+        return np.log(healpy.get_interp_val(smooth, theta, phi)) - self.mean_log
+
+
+def expected_covariates() -> tuple[
+    Float[np.ndarray, " covariates"], Float[np.ndarray, " covariates"]
+]:
+    """Return centre and width of what is expected of the covariates' coefficients."""
+    ell = np.sqrt(np.arange(1, n_modes(FIELD_LMAX))).astype(int)
+    named = [POWER_WIDTH, POWER_WIDTH, PLANE_WIDTH, TILTS_WIDTH, TILTS_WIDTH]
+    width = np.concatenate([named, FIELD_WIDTH / np.sqrt(2.0 * ell + 1.0)])
+    centre = np.zeros(len(width))
+    centre[0] = TEMPLATE_POWER
+    return centre, width
+
+
+@dataclass(frozen=True)
+class LocalScales(PriorFamily):
+    """The family of priors of the module's equation.
+
+    Attributes
+    ----------
+    mean : (modes,) array
+        T, in K.
+    wide : (modes, 2) array
+        Template and monopole, times their standard deviations, in K.
+    sources : (modes, sources) array
+        Catalogued sources, in K.
+    spectrum : SpectrumBasis
+        C_ell.
+    bands : tuple of Band
+    covariates : (centre, width) arrays
+        What is expected of the coefficients of the bands' bases.
+    """
+
+    mean: Float[np.ndarray, " modes"]
+    wide: Float[np.ndarray, "modes 2"]
+    sources: Float[np.ndarray, "modes sources"]
+    spectrum: SpectrumBasis
+    bands: tuple[Band, ...]
+    covariates: tuple[Float[np.ndarray, " covariates"], Float[np.ndarray, " covariates"]]
+
+    @classmethod
+    def of(
+        cls,
+        template: EmbeddedTemplate,
+        transparent: EmbeddedTemplate,
+        lmax: int,
+        frequency_mhz: float,
+        sources: tuple[PointSource, ...] = BRIGHT_SOURCES,
+    ) -> LocalScales:
+        """Make the family.
+
+        Parameters
+        ----------
+        template : EmbeddedTemplate
+            T.
+        transparent : EmbeddedTemplate
+            The same sky where hardly anything is absorbed.
+        lmax : int
+        frequency_mhz : float
+            Of the sources' fluxes.
+        sources : tuple of PointSource
+            The catalogue.
+        """
+        smoothed = [SmoothedTemplate.of(each) for each in (template, transparent)]
+        bands = tuple(Band.of(window, *smoothed) for window in windows(lmax))
+        mean = template.modes(lmax)
+        monopole = np.zeros_like(mean)
+        monopole[0] = mean[0]
+        strength = RELATIVE_STRENGTH * np.exp(smoothed[0].mean_log)
+        return cls(
+            mean,
+            np.stack([SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole], axis=1),
+            np.reshape(
+                [source.modes(frequency_mhz, lmax) for source in sources], (-1, n_modes(lmax))
+            ).T,
+            SpectrumBasis.around(4.0 * np.pi * strength**2 / 100.0, lmax),
+            bands,
+            expected_covariates(),
+        )
+
+    @property
+    def hyperprior(self) -> Hyperprior:
+        centre, width = self.covariates
+        return Hyperprior(
+            np.concatenate([self.spectrum.centre, [0.0], centre]),
+            np.concatenate([self.spectrum.width, [SOURCES_WIDTH], width]),
+            N_CELLS,
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return SpectrumBasis.names
+
+    def at(self, parameters: Float[np.ndarray, " parameters"]) -> LocalScalesMember:
+        return LocalScalesMember(self, *self._split(parameters))
+
+    def averaged(self, parameters, spread):
+        member = self.at(parameters)
+        ells, flux, covariates, _ = self._split(np.eye(len(parameters)))
+        strengths = []
+        for band, strength in zip(self.bands, member.strengths, strict=True):
+            weight = band.window**2 * (2.0 * np.arange(len(band.window)) + 1.0)
+            spectrum = (weight / weight.sum()) @ self.spectrum.matrix @ ells
+            rows = spectrum[None] + band.covariates @ covariates
+            strengths.append(strength * np.exp(0.5 * spread(rows)))
+        fluxes = float(np.exp(member.fluxes[0] + 0.5 * spread(flux)[0]))
+        return _covariance(self, fluxes, _texture(self, member.spectrum, strengths))
+
+    def prior(self, covariance):
+        return DensePrior.of_covariance(covariance, mean=self.mean)
+
+    def start_from(self, coarse, parameters):
+        power, *others = coarse._split(parameters)
+        more = np.zeros(len(self.spectrum.centre) - len(power))
+        return np.concatenate([power, more, *others])
+
+    def _split(self, parameters: np.ndarray) -> list[np.ndarray]:
+        """Those of the spectrum, of the sources, of the covariates and of the cells."""
+        n_spectrum, n_covariates = len(self.spectrum.centre), len(self.covariates[0])
+        return np.split(parameters, np.cumsum([n_spectrum, 1, n_covariates]))
+
+
+def _covariance(
+    family: LocalScales, flux: float, texture: Float[np.ndarray, "modes modes"]
+) -> Float[np.ndarray, "modes modes"]:
+    sources = flux * (family.sources @ family.sources.T)
+    return family.wide @ family.wide.T + sources + texture
+
+
+def _texture(
+    family: LocalScales,
+    spectrum: Float[np.ndarray, " ells"],
+    strengths: list[Float[np.ndarray, " _"]],
+) -> Float[np.ndarray, "modes modes"]:
+    total = np.zeros((len(family.mean),) * 2)
+    for band, strength in zip(family.bands, strengths, strict=True):
+        scale = _scale(band, spectrum)
+        part = band.grid.product_matrix(strength.reshape(band.grid.shape))
+        total[: len(scale), : len(scale)] += scale[:, None] * part * scale
+    return total
+
+
+def _scale(band: Band, spectrum: Float[np.ndarray, " ells"]) -> Float[np.ndarray, " modes"]:
+    """w_j C_ell^1/2 of every mode up to the band's last."""
+    ells = slice(band.grid.lmax + 1)
+    return per_mode(band.window[ells] * np.sqrt(spectrum[ells]))
+
+
+@dataclass(frozen=True)
+class LocalScalesMember(Member):
+    """One prior of :class:`LocalScales`.
+
+    Attributes
+    ----------
+    family : LocalScales
+    power, fluxes, coefficients, factors : arrays
+        Parameters of the spectrum, the sources, the covariates and the cells.
+    """
+
+    family: LocalScales
+    power: Float[np.ndarray, " spectrum"]
+    fluxes: Float[np.ndarray, "1"]
+    coefficients: Float[np.ndarray, " covariates"]
+    factors: Float[np.ndarray, " cells"]
+
+    @cached_property
+    def spectrum(self) -> Float[np.ndarray, " ells"]:
+        """C_ell, in K^2."""
+        return np.exp(self.family.spectrum.matrix @ self.power)
+
+    @cached_property
+    def strengths(self) -> list[Float[np.ndarray, " _"]]:
+        """v_j of every band."""
+        return [
+            np.exp(band.covariates @ self.coefficients + band.cells @ self.factors)
+            for band in self.family.bands
+        ]
+
+    @cached_property
+    def texture(self) -> Float[np.ndarray, "modes modes"]:
+        """Covariance of the last term of the module's equation, in K^2."""
+        return _texture(self.family, self.spectrum, self.strengths)
+
+    @property
+    def covariance(self):
+        return _covariance(self.family, float(np.exp(self.fluxes[0])), self.texture)
+
+    def traces(self, matrix):
+        family = self.family
+        ells = 0.5 * sum_over_m(np.einsum("ij,ij->i", self.texture, matrix))
+        sources = 0.5 * np.einsum("is,ij,js->", family.sources, matrix, family.sources)
+        fields = []
+        for band in family.bands:
+            scale = _scale(band, self.spectrum)
+            n = len(scale)
+            fields.append(band.grid.diagonal(scale[:, None] * matrix[:n, :n] * scale)[None])
+        return self._gathered(ells[:, None], np.array([sources]), fields)[:, 0]
+
+    def forms(self, columns):
+        family = self.family
+        ells = 0.5 * sum_over_m((columns * (self.texture @ columns)).T).T
+        sources = 0.5 * ((family.sources.T @ columns) ** 2).sum(0)
+        fields = []
+        for band in family.bands:
+            scale = _scale(band, self.spectrum)
+            fields.append(band.grid.synthesise((scale[:, None] * columns[: len(scale)]).T) ** 2)
+        return self._gathered(ells, sources, fields)
+
+    def _gathered(
+        self,
+        ells: Float[np.ndarray, "ells n"],
+        sources: Float[np.ndarray, " n"],
+        fields: list[np.ndarray],
+    ) -> Float[np.ndarray, "parameters n"]:
+        """Derivatives by the parameters, from those by ln C_ell, ln f^2 and the strengths."""
+        family = self.family
+        covariates = np.zeros((len(self.coefficients), len(sources)))
+        cells = np.zeros((N_CELLS, len(sources)))
+        for band, strength, field in zip(family.bands, self.strengths, fields, strict=True):
+            area = 0.5 * np.repeat(np.asarray(band.grid.weights), band.grid.n_phi) * strength
+            by_point = field.reshape(len(field), -1)
+            covariates += (by_point @ (band.covariates * area[:, None])).T
+            cells += band.cells.multiply(area[:, None]).T @ by_point.T
+        return np.concatenate(
+            [
+                family.spectrum.matrix.T @ ells,
+                np.exp(self.fluxes[0]) * sources[None],
+                covariates,
+                cells,
+            ]
+        )
+
+
+def embedded_local_scales(
+    frequency_mhz: float, lmax: int, sources: tuple[PointSource, ...] = BRIGHT_SOURCES
+) -> LocalScales:
+    """Make the family whose template is the embedded diffuse sky.
+
+    Parameters
+    ----------
+    frequency_mhz : float
+    lmax : int
+    sources : tuple of PointSource
+        That may be there.
+    """
+    template = EmbeddedTemplate(frequency_mhz)
+    clear = EmbeddedTemplate(max(TRANSPARENT_MHZ, frequency_mhz))
+    return LocalScales.of(template, clear, lmax, frequency_mhz, sources)

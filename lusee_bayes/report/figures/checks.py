@@ -1,0 +1,367 @@
+"""Figures that judge data: residuals, pointing, unknowns, sessions.
+
+Figures of what diagnostics.nc holds: draws as maps, residuals by product and time.
+
+Which offset of clock and pointing each day would prefer.
+
+Receivers, ground and gain table against frequency.
+
+Flight data: gain states and flags in time, products before and after, gains and noise.
+"""
+
+from __future__ import annotations
+
+import astropy.units as u
+import numpy as np
+import pandas as pd
+import xarray as xr
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from lusee_bayes.flight.gain_model import LETTERS
+from lusee_bayes.flight.reduced import REASONS, USED, Reduced
+from lusee_bayes.instrument.products import all_products, labels
+from lusee_bayes.instrument.times import unannounced_leap_seconds
+from lusee_bayes.judge.chi2 import probability
+from lusee_bayes.report.figures.drawing import (
+    BLUE,
+    DIVERGING,
+    GREY,
+    ORANGE,
+    colour_bar,
+    mollweide,
+    plain_ticks,
+    without_minor_ticks,
+)
+from lusee_bayes.results.cube import CubeUnknowns
+
+# residuals beyond that have the darkest colours
+WIDEST = 4.0
+# p-values are shown down to that
+LEAST_P = 1e-10
+
+
+def draws_of_posterior(found: xr.Dataset) -> Figure:
+    """Draws of the posterior as Galactic maps, on one scale."""
+    maps = found["draws"].values
+    positive = np.percentile(maps[maps > 0], [0.5, 99.8])
+    altitude = found["highest_altitude"].values
+    rows = (len(maps) + 1) // 2
+    figure = Figure(figsize=(12, 3.6 * rows))
+    places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.9, "wspace": 0.02}
+    grid_of_axes = figure.subplots(rows, 2, gridspec_kw=places | {"hspace": 0.12}).ravel()
+    for k, (axes, pixels) in enumerate(zip(grid_of_axes, maps, strict=True)):
+        image = mollweide(axes, pixels, norm=LogNorm(*positive), highest_altitude=altitude)
+        axes.set_title(f"draw {k + 1}")
+    colour_bar(figure, image, figure.axes, label="K", shrink=0.7, extend="both", pad=0.02)
+    figure.suptitle(f"Draws of the posterior at {found.attrs['frequency_mhz']:g} MHz")
+    return figure
+
+
+def residuals_by_product(found: xr.Dataset) -> Figure:
+    """Every datum against the prediction of all others, and what each product's removal mends."""
+    labels, hours, z = found["product"].values, found["hours"].values, found["z"].values
+    figure = Figure(figsize=(12, 4.8))
+    places = {"left": 0.06, "right": 0.98, "bottom": 0.11, "top": 0.82, "wspace": 0.03}
+    left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True, gridspec_kw=places)
+    # samples are not evenly spaced where runs follow one another or nights are left out
+    image = left.pcolormesh(
+        np.append(np.arange(len(hours)), len(hours)) - 0.5,
+        np.arange(len(labels) + 1) - 0.5,
+        z,
+        cmap=DIVERGING,
+        norm=Normalize(-WIDEST, WIDEST),
+        rasterized=True,
+    )
+    ticks = np.linspace(0, len(hours) - 1, 7).astype(int)
+    left.set_xticks(ticks, [f"{hours[k] / 24:.1f}" for k in ticks])
+    left.set_yticks(np.arange(len(labels)), labels)
+    left.invert_yaxis()
+    left.set(xlabel="time [days]", ylabel="product", title="Each datum given all others")
+    left.set_facecolor("0.8")
+    figure.colorbar(
+        image, ax=left, label="standard deviations", extend="both", shrink=0.9, pad=0.02
+    )
+    of_products = found["group_kind"].values == "product"
+    names = found["group_name"].values[of_products]
+    rows = [list(labels).index(name) for name in names]
+    for key, marker, colour, text in (
+        ("group_p", "o", BLUE, "product given all others"),
+        ("group_others_p", "D", ORANGE, "all others without it"),
+    ):
+        p = np.maximum(found[key].values[of_products], LEAST_P)
+        right.semilogx(p, rows, ls="", marker=marker, color=colour, ms=5, label=text)
+    without_minor_ticks(right.xaxis)
+    right.axvline(1.0, color=GREY, lw=0.5)
+    right.set(xlabel=f"p-value (drawn down to {LEAST_P:g})", xlim=(LEAST_P / 3, 3))
+    right.grid(axis="y", lw=0.3)
+    right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, fontsize=8)
+    p = probability(found.attrs["instrument_p"])
+    figure.suptitle(
+        f"Residuals at {found.attrs['frequency_mhz']:g} MHz: p {p} of what no sky explains"
+    )
+    return figure
+
+
+# days whose errors are so many times the median of all are not shown: they would hide the others
+TOO_WIDE = 20.0
+# of the end of an offset's name
+UNITS = {"s": "s", "day": "s/day", "deg": "degrees"}
+
+
+def pointing_by_day(preferred: pd.DataFrame) -> Figure:
+    """Draw the preferred value of every offset for each day, and for all of them together.
+
+    Parameters
+    ----------
+    preferred : DataFrame
+        As :class:`.PointingReport` has it.
+    """
+    names = list(dict.fromkeys(preferred["offset"]))
+    figure = Figure(figsize=(12, 0.6 + 2.1 * len(names)), layout="constrained")
+    panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, name in zip(panels, names, strict=True):
+        mine = preferred[preferred["offset"] == name]
+        days, whole = mine[mine["first_day"] >= 0].dropna(), mine[mine["first_day"] < 0].dropna()
+        days = days[days["std"] < TOO_WIDE * days["std"].median()]
+        middle = (days["first_day"] + days["last_day"] + 1) / 2.0
+        axes.axhline(0.0, color=GREY, lw=0.8)
+        axes.errorbar(
+            middle, days["value"], days["std"], fmt="o", ms=3, color=BLUE, label="each day"
+        )
+        if len(whole):
+            value, std = float(whole["value"].iloc[0]), float(whole["std"].iloc[0])
+            if np.isfinite(std) and std < TOO_WIDE * days["std"].median():
+                axes.axhspan(value - std, value + std, color=ORANGE, alpha=0.3)
+                axes.axhline(value, color=ORANGE, label="all days alike")
+        kind, _, unit = name.rpartition("_")
+        axes.set_ylabel(f"{kind.replace('_', ' ')} [{UNITS.get(unit, unit)}]")
+    panels[0].legend(loc="upper right", ncols=2, frameon=False)
+    panels[-1].set_xlabel("days since the first sample")
+    figure.suptitle("Offset of clock and pointing that the data would prefer besides the model's")
+    return figure
+
+
+PANELS_IN_A_ROW = 4
+# from where on a prior that changes with frequency hides what errors there are
+WIDE = 3.0
+
+
+def unknowns_by_frequency(unknowns: CubeUnknowns) -> Figure:
+    """Draw every unknown of all channels with its error, its prior and, if known, the truth."""
+    table = unknowns.table
+    names = list(dict.fromkeys(table["unknown"]))
+    n_rows = -(-len(names) // PANELS_IN_A_ROW)
+    figure = Figure(figsize=(13, 0.6 + 2.5 * n_rows), layout="constrained")
+    panels = list(figure.subplots(n_rows, PANELS_IN_A_ROW, squeeze=False).flat)
+    for axes, name in zip(panels, names, strict=False):
+        rows = table[table["unknown"] == name]
+        f, value, std, prior, before = (
+            rows[column].to_numpy()
+            for column in ("frequency_mhz", "value", "std", "prior", "prior_std")
+        )
+        axes.fill_between(f, prior - before, prior + before, color=GREY, alpha=0.25, lw=0)
+        axes.errorbar(f, prior, before, color=GREY, fmt="none", lw=4, alpha=0.4, label="prior")
+        axes.errorbar(f, value, std, color=BLUE, fmt=".", ms=5, lw=1.2, label="posterior")
+        if "true" in rows:
+            axes.plot(f, rows["true"].to_numpy(), "x", color=ORANGE, ms=5, label="truth")
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        unit = rows["unit"].iloc[0] or "relative"
+        axes.set(title=name, xlabel="frequency [MHz]", ylabel=unit)
+        if prior.min() > 0.0 and prior.max() > WIDE * prior.min():
+            axes.set_yscale("log")
+    for axes in panels[len(names) :]:
+        axes.set_axis_off()
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
+    return figure
+
+
+# Okabe and Ito's colours, which colour-blind readers tell apart
+LEVEL_COLOURS = {"L": "#56B4E9", "M": "#0072B2", "H": "#CC79A7"}
+PORT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+# columns of pixels of an image of flags
+WATERFALL_COLUMNS = 800
+
+
+def time_line(reduced: Reduced) -> Figure:
+    """Draw the gain of every port and what was flagged, over time."""
+    days = _days(reduced)
+    reasons = [k for k in range(1, len(REASONS)) if (reduced.reason == k).any()]
+    lines = [name for name in ("lines",) if (reduced.lines > 0).any()]
+    names = [REASONS[k] for k in reasons] + (["some channels"] if lines else [])
+    figure = Figure(figsize=(12, 3.4 + 0.25 * len(names)), layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(4, max(len(names), 1)))
+    level = reduced.level[reduced.bin_of]
+    n_ports = level.shape[1]
+    for port in range(n_ports):
+        for letter, colour in LEVEL_COLOURS.items():
+            here = level[:, port] == letter
+            if here.any():
+                top.plot(days[here], np.full(here.sum(), port), "|", ms=9, color=colour)
+    handles = [
+        top.plot([], [], "s", color=colour, label=f"gain {letter}")[0]
+        for letter, colour in LEVEL_COLOURS.items()
+        if (level == letter).any()
+    ]
+    top.legend(handles=handles, loc="upper right", ncols=3, frameon=False)
+    top.set(yticks=range(n_ports), ylabel="port", ylim=(n_ports - 0.5, -1.2))
+    top.set_title("Gain of every port")
+    marks = [(reduced.reason == k).any(axis=0) for k in reasons]
+    if lines:
+        marks.append(((reduced.lines > 0) & (reduced.reason == USED)).any(axis=0))
+    for row, flagged in enumerate(marks):
+        bottom.plot(days[flagged], np.full(flagged.sum(), row), "|", ms=9, color=ORANGE)
+    bottom.set(
+        yticks=range(len(names)),
+        yticklabels=names,
+        ylim=(max(len(names), 1) - 0.5, -0.5),
+        xlabel=f"days since {_first(reduced)} UTC",
+    )
+    bottom.set_title("Flagged in at least one band" if names else "Nothing is flagged")
+    return figure
+
+
+def waterfall(reduced: Reduced, band: int) -> Figure:
+    """Draw the 16 products of a band over time, before and after flags."""
+    figure = Figure(figsize=(13, 9), layout="constrained")
+    panels = figure.subplots(4, 4, sharex=True)
+    first = np.searchsorted(reduced.bin_of, np.arange(reduced.values.shape[2]))
+    days = _days(reduced)[first]
+    n_bins = reduced.values.shape[2]
+    used_in_part = np.bincount(reduced.bin_of, reduced.reason[band] != USED, n_bins) > 0
+    products = {label: k for k, label in enumerate(labels())}
+    for product in all_products():
+        # imaginary parts below the diagonal
+        i, j = (product.i, product.j) if product.part == "R" else (product.j, product.i)
+        axes: Axes = panels[i, j]
+        number = products[product.label]
+        kept = reduced.values[band, number]
+        flagged = ~np.isfinite(kept) | used_in_part
+        axes.plot(days, kept, ".", ms=3, color=BLUE, label="after flags")
+        before = reduced.before[band, number]
+        axes.plot(
+            days[flagged], before[flagged], ".", ms=4, color=ORANGE, label="before, where flagged"
+        )
+        low, high = _range(kept[np.isfinite(kept)])
+        axes.set_ylim(low, high)
+        axes.set_title(product.label, fontsize=9)
+        plain_ticks(axes, 3)
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:.3g}")
+    panels[0, 0].legend(frameon=False, fontsize=8)
+    for axes in panels[-1]:
+        axes.set_xlabel("days")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("V²/Hz")
+    figure.suptitle(
+        f"Products at {reduced.frequencies_mhz[band]:g} MHz since {_first(reduced)} UTC; values "
+        "beyond the frame are flagged"
+    )
+    return figure
+
+
+def calibration(reduced: Reduced) -> Figure:
+    """Draw the gains with their errors, and the noise found over the noise expected.
+
+    Of one band the gains at its frequency are points with error bars, and both kinds of scatter
+    have a place of their own.
+    """
+    figure = Figure(figsize=(12, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _gains(left, reduced)
+    if len(reduced.frequencies_mhz) == 1:
+        _scatter_of_one(right, reduced)
+    else:
+        _scatter(right, reduced)
+    right.axhline(1.0, color=GREY, lw=0.8)
+    right.set_ylabel("scatter over radiometer noise")
+    found = np.concatenate([reduced.line_scatter, reduced.scatter, [1.0]])
+    right.set_ylim(0.0, 1.3 * float(np.nanmax(found)))
+    right.set_title("Noise found over noise expected")
+    return figure
+
+
+def _gains(left: Axes, reduced: Reduced) -> None:
+    curves, alone = reduced.curves, len(reduced.frequencies_mhz) == 1
+    for number, letter in enumerate(LETTERS):
+        for port in range(curves.gain.shape[1]):
+            gain, std = curves.gain[number, port], curves.std[number, port]
+            if not np.isfinite(gain).any():
+                continue
+            label = f"{letter}{port}"
+            (line,) = left.semilogy(
+                curves.frequencies_mhz,
+                gain,
+                color=PORT_COLOURS[port],
+                ls={"L": ":", "M": "-", "H": "--"}[letter],
+                label=label,
+            )
+            low = np.maximum(gain - std, 1e-3 * gain)
+            left.fill_between(
+                curves.frequencies_mhz, low, gain + std, color=line.get_color(), alpha=0.25, lw=0
+            )
+            if alone:
+                f = reduced.frequencies_mhz
+                at, error = (np.interp(f, curves.frequencies_mhz, y) for y in (gain, std))
+                left.errorbar(f, at, error, fmt="o", ms=4, capsize=3, color=line.get_color())
+    for f in reduced.frequencies_mhz:
+        left.axvline(f, color=GREY, lw=0.5, zorder=0)
+    known = bool((curves.std > 0).any())
+    left.set(xlabel="frequency [MHz]", ylabel="counts for 1 nV²/Hz")
+    largest = float(np.nanmax(curves.std / curves.gain)) if known else 0.0
+    told = f"known to {largest:.2g} of themselves or better" if known else "no error is known"
+    left.set_title(f"Gains: {told}")
+    left.legend(frameon=False, ncols=2, fontsize=8)
+
+
+def _scatter(right: Axes, reduced: Reduced) -> None:
+    for values, colour, mark, name in (
+        (reduced.line_scatter, BLUE, "o", "channels about a smooth spectrum"),
+        (reduced.scatter, ORANGE, "s", "spectra about a smooth curve in time"),
+    ):
+        if np.isfinite(values).any():
+            right.plot(
+                reduced.frequencies_mhz, values, mark, color=colour, label=name, fillstyle="none"
+            )
+    right.set_xlabel("frequency [MHz]")
+    if right.get_legend_handles_labels()[0]:
+        right.legend(frameon=False, fontsize=8)
+
+
+def _scatter_of_one(right: Axes, reduced: Reduced) -> None:
+    kinds = (
+        (reduced.line_scatter, BLUE, "o", "channels about\na smooth spectrum"),
+        (reduced.scatter, ORANGE, "s", "spectra about\na smooth curve in time"),
+    )
+    for place, (values, colour, mark, _) in enumerate(kinds):
+        if np.isfinite(values[0]):
+            right.plot([place], values, mark, ms=8, color=colour)
+            right.annotate(
+                f"{values[0]:.3f}", (place, values[0]), (12, 8), textcoords="offset points"
+            )
+        else:
+            right.text(place, 0.5, "not known", ha="center", color=GREY)
+    right.set_xticks(range(len(kinds)), [kind[-1] for kind in kinds])
+    right.set_xlim(-0.6, len(kinds) - 0.4)
+
+
+def _days(reduced: Reduced) -> Float[np.ndarray, " rows"]:
+    times = reduced.observation.times
+    with unannounced_leap_seconds():
+        return np.asarray((times - times[0]).to_value(u.day))
+
+
+def _first(reduced: Reduced) -> str:
+    return str(reduced.observation.times[0].isot)[:16]
+
+
+def _range(values: Float[np.ndarray, " kept"]) -> tuple[float, float]:
+    """Bounds that show what is kept, with a tenth beyond."""
+    if not values.size:
+        return 0.0, 1.0
+    low, high = float(values.min()), float(values.max())
+    edge = 0.1 * (high - low) or max(abs(high), 1e-30)
+    return low - edge, high + edge

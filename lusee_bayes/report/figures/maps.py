@@ -1,0 +1,313 @@
+"""Figures of maps, spectra and fidelity: of a channel, of a cube, of several runs.
+
+Figures of one channel: its data, its beams, its maps and its spectra.
+
+Figures of a run of several frequencies.
+
+Figures of several finished runs: their maps on one scale, their curves in one panel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
+
+from lusee_bayes.core.harmonics import lmax_of
+from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.instrument.beams.fields import HemisphereGrid
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.judge.chi2 import ell_cross
+from lusee_bayes.report.figures.drawing import (
+    BLUE,
+    DIVERGING,
+    GREY,
+    ORANGE,
+    SEQUENTIAL,
+    colour_bar,
+    mollweide,
+    orthographic,
+    seen_range,
+    shown,
+    taper_fwhm_deg,
+    without_minor_ticks,
+)
+from lusee_bayes.results.channel import ChannelResult
+from lusee_bayes.results.cube import CubeResult
+from lusee_bayes.results.finished_runs import FinishedRun
+
+
+def data_vector(data: Visibilities) -> Figure:
+    """The data vector as the paper draws it: products side by side, time running within each."""
+    figure = Figure(figsize=(11, 4))
+    axes = figure.subplots(gridspec_kw={"left": 0.08, "right": 0.99, "bottom": 0.13, "top": 0.91})
+    n_times = data.layout.n_times
+    axes.plot(data.grid().ravel(), color=BLUE, lw=0.7)
+    for k in range(1, data.layout.n_products):
+        axes.axvline(k * n_times, color=GREY, lw=0.4)
+    axes.set_xticks((np.arange(data.layout.n_products) + 0.5) * n_times, data.labels, fontsize=8)
+    axes.tick_params(axis="x", length=0)
+    axes.set(
+        xlabel="product (time runs within each)",
+        ylabel="visibility [K]",
+        xlim=(0, n_times * data.layout.n_products),
+        title=f"Data vector at {data.frequency_mhz:g} MHz, {data.layout.size} samples"
+        + (f", {data.n_missing} missing" if data.n_missing else ""),
+    )
+    return figure
+
+
+def beams(setup: Setup) -> Figure:
+    """An auto and two crosses from above: zenith in the centre, North up, horizon at the rim."""
+    frequency = setup.scenario.frequency_mhz
+    grid = HemisphereGrid.gauss_legendre(48, 120)
+    patterns = np.asarray(setup.beam_source.patterns(frequency, grid))
+    names = {0: "auto 00", 2: "|cross 02|", 1: "|cross 01|"}
+    if not setup.scenario.beam.is_file:
+        names = {0: "auto 00 (North)", 2: "|cross 02| (opposite)", 1: "|cross 01| (perpendicular)"}
+    panels = [(name, patterns[0, k]) for k, name in names.items() if k < len(patterns)]
+    figure = Figure(figsize=(11, 4))
+    places = {"left": 0.01, "right": 0.99, "bottom": 0.02, "top": 0.82, "wspace": 0.04}
+    grid_of_axes = np.atleast_1d(figure.subplots(1, len(panels), gridspec_kw=places))
+    for axes, (title, pattern) in zip(grid_of_axes, panels, strict=True):
+        image = orthographic(axes, grid, pattern)
+        axes.set_title(title)
+    figure.colorbar(image, ax=figure.axes, label="beam / its peak", shrink=0.8, pad=0.02)
+    figure.suptitle(f"Beams at {frequency:g} MHz, zenith at the centre")
+    return figure
+
+
+def sky_maps(channel: ChannelResult) -> Figure:
+    """Truth, posterior mean, residual over the mean temperature, and standard deviation.
+
+    All but the standard deviation are drawn through the beam of :mod:`.drawing`.
+    """
+    sky = mean = shown(channel.mean, channel.nside)
+    level, extra = mean.mean(), {}
+    if channel.truth is not None:
+        sky = shown(channel.truth, channel.nside)
+        percent = 100.0 * (mean - sky) / level
+        span = np.percentile(np.abs(percent), 99.0)
+        extra = {"mean - truth": (percent, Normalize(-span, span), DIVERGING, "% of the mean sky")}
+    positive = np.percentile(sky[sky > 0], [0.05, 99.8])
+    temperature = (LogNorm(*positive), SEQUENTIAL, "K")
+    bounds = LogNorm(*seen_range(channel.pixel_std, channel.highest_altitude))
+    panels = {
+        **({"truth": (sky, *temperature)} if extra else {}),
+        "posterior mean": (mean, *temperature),
+        **extra,
+        "posterior standard deviation": (channel.pixel_std, bounds, SEQUENTIAL, "K"),
+    }
+    rows = (len(panels) + 1) // 2
+    figure = Figure(figsize=(12, 3.6 * rows))
+    places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.88, "wspace": 0.06}
+    grid_of_axes = figure.subplots(rows, 2, gridspec_kw=places | {"hspace": 0.12}).ravel()
+    for axes, (title, (pixels, norm, cmap, unit)) in zip(grid_of_axes, panels.items(), strict=True):
+        image = mollweide(
+            axes, pixels, norm=norm, cmap=cmap, highest_altitude=channel.highest_altitude
+        )
+        colour_bar(figure, image, axes, label=unit, shrink=0.8, extend="both", pad=0.03)
+        axes.set_title(title)
+    figure.suptitle(
+        f"{channel.frequency_mhz:g} MHz, Galactic coordinates; dashed: never above the horizon\n"
+        f"{', '.join(list(panels)[:-1])}: seen through a beam of "
+        f"{taper_fwhm_deg(lmax_of(len(channel.mean))):.1f}° (FWHM)"
+    )
+    return figure
+
+
+def map_fidelity(channel: ChannelResult) -> Figure:
+    """rho_ell and SNR_ell where the truth is known, and how much of each ell the prior supplies."""
+    sky_spectra = channel.spectra()
+    known = "snr" in sky_spectra
+    figure = Figure(figsize=(12 if known else 5, 4))
+    places = {"left": 0.06 if known else 0.14, "right": 0.98, "bottom": 0.13, "top": 0.9}
+    axes = np.atleast_1d(
+        figure.subplots(1, 3 if known else 1, gridspec_kw=places | {"wspace": 0.25})
+    )
+    ell = sky_spectra["ell"][1:]
+    axes[-1].plot(ell, sky_spectra["prior_fraction"][1:], color=BLUE)
+    axes[-1].axhline(0.5, color=GREY, lw=0.8, ls=":")
+    axes[-1].set(ylabel="share of the variance from the prior", ylim=(0, 1.02))
+    if known:
+        axes[0].plot(ell, sky_spectra["rho"][1:], color=BLUE)
+        axes[0].axhline(0.0, color=GREY, lw=0.8)
+        axes[0].set(ylabel=r"correlation with the truth $\rho_\ell$", ylim=(-0.25, 1.05))
+        axes[1].semilogy(ell, sky_spectra["snr"][1:], color=BLUE)
+        axes[1].axhline(1.0, color=GREY, lw=0.8, ls=":")
+        axes[1].set(ylabel=r"$\mathrm{SNR}_\ell$")
+        without_minor_ticks(axes[1].yaxis)
+        cross = ell_cross(sky_spectra["snr"])
+        if cross is not None:
+            axes[1].axvline(cross, color=ORANGE, lw=1, ls="--", label=f"first below 1: {cross}")
+            axes[1].legend(frameon=False)
+    for panel in axes:
+        panel.set(xlabel=r"multipole $\ell$", xlim=(1, ell[-1]))
+    figure.suptitle(f"Fidelity at {channel.frequency_mhz:g} MHz")
+    return figure
+
+
+def sky_spectra(channel: ChannelResult) -> Figure:
+    """C_ell of prior, posterior mean, truth and posterior variance."""
+    columns = channel.spectra()
+    figure = Figure(figsize=(6, 4.5))
+    axes = figure.subplots(gridspec_kw={"left": 0.13, "right": 0.97, "bottom": 0.12, "top": 0.92})
+    ell = columns["ell"]
+    styles = {
+        "cl_prior": ("prior", GREY, "-"),
+        "cl_truth": ("truth", "black", ":"),
+        "cl_mean": ("posterior mean", BLUE, "-"),
+        "cl_posterior_variance": ("posterior variance", ORANGE, "--"),
+    }
+    for name, (label, colour, line) in styles.items():
+        if name in columns:
+            axes.semilogy(ell, columns[name], color=colour, ls=line, label=label)
+    axes.set(xlabel=r"multipole $\ell$", ylabel=r"$C_\ell$ [K$^2$]", xlim=(0, ell[-1]))
+    without_minor_ticks(axes.yaxis)
+    axes.legend(frameon=False)
+    axes.set_title(f"Power at {channel.frequency_mhz:g} MHz")
+    return figure
+
+
+# channels whose maps are drawn
+SHOWN = 3
+
+
+def channel_maps(cube: CubeResult) -> Figure:
+    """Posterior mean and standard deviation of a few channels from the lowest to the highest."""
+    n = len(cube.frequencies_mhz)
+    shown = np.unique(np.linspace(0, n - 1, min(n, SHOWN)).round().astype(int))
+    mean, pixel_std = cube.maps()["mean"], cube.stacked("pixel_std")
+    figure = Figure(figsize=(12, 3.4 * len(shown) + 0.4), layout="constrained")
+    for row, k in enumerate(shown):
+        positive = LogNorm(*np.percentile(mean[k][mean[k] > 0], [0.5, 99.8]))
+        altitude = cube.channels[k].highest_altitude
+        spread = LogNorm(*seen_range(pixel_std[k], altitude))
+        for column, (title, pixels, norm, unit) in enumerate(
+            (
+                ("posterior mean", mean[k], positive, "K"),
+                ("standard deviation", pixel_std[k], spread, "K"),
+            )
+        ):
+            axes = figure.add_subplot(len(shown), 2, 2 * row + column + 1)
+            image = mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
+            colour_bar(figure, image, axes, label=unit, shrink=0.85, extend="both")
+            axes.set_title(f"{cube.frequencies_mhz[k]:g} MHz: {title}")
+    return figure
+
+
+def channel_spectra(cube: CubeResult) -> Figure:
+    """Brightness against frequency in some directions, with one standard deviation."""
+    landmarks = cube.landmarks()
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    for axes, (name, values) in zip(
+        figure.subplots(2, 2, sharex=True).flat, landmarks.items(), strict=True
+    ):
+        f, mean, std = cube.frequencies_mhz, values["mean"], values["std"]
+        axes.errorbar(f, mean, std, color=BLUE, fmt=".", ms=4, lw=1, label="posterior")
+        if "truth" in values:
+            axes.plot(f, values["truth"], color=ORANGE, ls="--", lw=1.2, label="truth")
+        axes.set(title=name, yscale="log", xscale="log", xlim=(0.93 * f[0], 1.07 * f[-1]))
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.set(xlabel="frequency [MHz]", ylabel="brightness temperature [K]")
+    axes.legend(frameon=False)
+    return figure
+
+
+def channel_fidelity(cube: CubeResult) -> Figure:
+    """SNR_ell (or, without a truth, the prior's share) over frequency and ell, and its mean."""
+    snr, alone = cube.snr(), cube.snr(independent=True)
+    known = snr is not None
+    values = snr if known else cube.stacked("prior_fraction")
+    label = r"$\mathrm{SNR}_\ell$" if known else "share of the variance from the prior"
+    norm = LogNorm(0.3, 30.0) if known else Normalize(0.0, 1.0)
+    figure = Figure(figsize=(12, 4.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    ell, channel = np.arange(values.shape[1]), np.arange(values.shape[0])
+    image = left.pcolormesh(
+        ell[1:], channel, values[:, 1:], norm=norm, cmap=SEQUENTIAL, shading="nearest"
+    )
+    shown = np.unique(np.linspace(0, len(channel) - 1, min(len(channel), 8)).round().astype(int))
+    left.set_yticks(shown, [f"{cube.frequencies_mhz[k]:g}" for k in shown])
+    left.set(xlabel=r"multipole $\ell$", ylabel="frequency [MHz]", title=label)
+    figure.colorbar(image, ax=left, label=label, extend="both" if known else "neither")
+    right.plot(ell[1:], values[:, 1:].mean(0), color=BLUE, label="this run")
+    if alone is not None:
+        right.plot(
+            ell[1:], alone[:, 1:].mean(0), color=ORANGE, ls="--", label="every channel on its own"
+        )
+    if known:
+        right.set_yscale("log")
+        right.axhline(1.0, color=GREY, lw=0.8, ls=":")
+    right.set(xlabel=r"multipole $\ell$", ylabel=label, title="mean over channels")
+    right.legend(frameon=False)
+    return figure
+
+
+def chi2(cube: CubeResult) -> Figure:
+    """chi^2 that judges every channel, over its mean if the model holds."""
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axes = figure.subplots()
+    fits = cube.fits()
+    ratio, width = fits.chi2 / fits.degrees, np.sqrt(2.0 / fits.degrees)
+    axes.fill_between(
+        cube.frequencies_mhz, 1 - 2 * width, 1 + 2 * width, color=GREY, alpha=0.3, lw=0
+    )
+    axes.axhline(1.0, color=GREY, lw=0.8)
+    axes.plot(cube.frequencies_mhz, ratio, "o", ms=4, color=BLUE)
+    if np.isfinite(ratio).all() and ratio.max() > 3.0:
+        axes.set_yscale("log")
+    axes.set(xlabel="frequency [MHz]", ylabel=r"$\chi^2$ / its mean if the model holds")
+    return figure
+
+
+# distinct without colour vision (Okabe-Ito), and by their lines
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000")
+LINES = ("-", "--", "-.", ":")
+
+
+def maps_of_runs(runs: Sequence[FinishedRun]) -> Figure:
+    """Posterior mean and standard deviation of every run, each kind on one scale."""
+    means = np.concatenate([run.mean for run in runs])
+    positive = LogNorm(*np.percentile(means[means > 0], [0.5, 99.8]))
+    bounds = [seen_range(run.std, run.diagnostics["highest_altitude"].values) for run in runs]
+    spread = LogNorm(min(low for low, _ in bounds), max(high for _, high in bounds))
+    figure = Figure(figsize=(12, 3.4 * len(runs) + 0.4), layout="constrained")
+    for row, run in enumerate(runs):
+        altitude = run.diagnostics["highest_altitude"].values
+        for column, (title, pixels, norm) in enumerate(
+            (("mean", run.mean, positive), ("standard deviation", run.std, spread))
+        ):
+            axes = figure.add_subplot(len(runs), 2, 2 * row + column + 1)
+            image = mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
+            colour_bar(figure, image, axes, label="K", shrink=0.85, extend="both")
+            axes.set_title(f"{run.name}: {title}")
+    return figure
+
+
+def curves_of_runs(runs: Sequence[FinishedRun]) -> Figure:
+    """rho_ell and SNR_ell where the truth is known, and the prior's share, of every run."""
+    known = all("snr" in run.spectra for run in runs)
+    figure = Figure(figsize=(12 if known else 6, 4.2), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(1, 3 if known else 1))
+    for k, run in enumerate(runs):
+        style = {"color": COLOURS[k % len(COLOURS)], "ls": LINES[k % len(LINES)], "lw": 1.3}
+        ell = run.spectra["ell"][1:]
+        panels[-1].plot(ell, run.spectra["prior_fraction"][1:], label=run.name, **style)
+        if known:
+            panels[0].plot(ell, run.spectra["rho"][1:], **style)
+            panels[1].semilogy(ell, run.spectra["snr"][1:], **style)
+    panels[-1].set(ylabel="share of the variance from the prior", ylim=(0, 1.02))
+    if known:
+        panels[0].set(ylabel=r"correlation with the truth $\rho_\ell$", ylim=(-0.25, 1.05))
+        panels[1].set(ylabel=r"$\mathrm{SNR}_\ell$")
+        panels[1].axhline(1.0, color=GREY, lw=0.8)
+    for axes in panels:
+        axes.set(xlabel=r"multipole $\ell$")
+    panels[-1].legend(frameon=False, fontsize=8)
+    return figure

@@ -1,0 +1,228 @@
+"""Figures of forecasts and of priors side by side.
+
+The figure of a plan: the information in every variation, side by side.
+
+The figure of one data set under several priors: evidence, coverage, errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from lusee_bayes.core.harmonics import power_spectrum
+from lusee_bayes.judge.coverage import LEVELS
+from lusee_bayes.report.figures.drawing import BLUE, GREY, ORANGE
+from lusee_bayes.report.figures.maps import COLOURS, LINES
+from lusee_bayes.results.forecast import AS_GIVEN, Forecast
+from lusee_bayes.results.prior_comparison import PriorComparison
+
+# distinct without colour vision (Okabe-Ito) and by shape; again from the first after four
+STYLES = ((BLUE, "o"), (ORANGE, "s"), ("#009E73", "^"), ("#000000", "D"))
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One number of a forecast: the words of its axis, and its ``value`` (None: there is none)."""
+
+    label: str
+    attribute: str
+
+    def value(self, forecast: Forecast) -> float | int | None:
+        return getattr(forecast, self.attribute)
+
+
+PANELS = (
+    Panel("information about the sky [bits]", "information_bits"),
+    Panel("modes with expected SNR > 1 [number]", "modes"),
+    Panel(r"first $\ell$ with expected SNR$_\ell$ < 1", "ell_cross"),
+)
+
+
+def forecasts(planned: Sequence[Forecast]) -> Figure:
+    """Information, modes with SNR > 1 and ell_cross of every variation, grouped by what differs.
+
+    Dashed: each scenario as given. An open marker beyond lmax: SNR > 1 at every ell.
+    """
+    rows = row_positions(planned)
+    sources = list(dict.fromkeys(f.variation.source for f in planned))
+    height = 1.6 + 0.23 * (max(rows.values()) + 1)
+    figure = Figure(figsize=(11.5, height), layout="constrained")
+    axes = figure.subplots(1, len(PANELS), sharey=True)
+    for number, source in enumerate(sources):
+        mine = [f for f in planned if f.variation.source == source]
+        # beside one another, so that equal values do not hide
+        lower = 0.2 * (number - (len(sources) - 1) / 2)
+        own = {row: y + lower for row, y in rows.items()}
+        for panel, axis in zip(PANELS, axes, strict=True):
+            draw(axis, panel, mine, own, STYLES[number % len(STYLES)], len(sources) == 1)
+    for panel, axis in zip(PANELS, axes, strict=True):
+        axis.set_xlabel(panel.label)
+        axis.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        axis.grid(axis="x", alpha=0.3, lw=0.5)
+        for (_, name), y in rows.items():
+            if name:
+                axis.axhline(y, color=GREY, alpha=0.25, lw=0.5, zorder=0)
+        axis.margins(x=0.14)
+        axis.tick_params(axis="y", length=0)
+        axis.spines[["top", "right", "left"]].set_visible(False)
+    label_rows(axes[0], rows)
+    if len(sources) > 1:
+        figure.legend(
+            *axes[0].get_legend_handles_labels(),
+            loc="outside lower center",
+            ncols=4,
+            frameon=False,
+        )
+    figure.suptitle(title(planned, sources))
+    return figure
+
+
+def row_positions(planned: Sequence[Forecast]) -> dict[tuple[str, str], int]:
+    """The row of every (family, variation) and of each family's own name, (family, "")."""
+    rows: dict[tuple[str, str], int] = {}
+    families = dict.fromkeys(f.variation.family for f in planned)
+    for family in families:
+        names = dict.fromkeys(f.variation.name for f in planned if f.variation.family == family)
+        if family != AS_GIVEN:
+            rows[family, ""] = len(rows)
+        for name in names:
+            rows[family, name] = len(rows)
+    return rows
+
+
+def draw(
+    axes: Axes,
+    panel: Panel,
+    mine: Sequence[Forecast],
+    rows: dict[tuple[str, str], float],
+    style: tuple[str, str],
+    numbers: bool,
+) -> None:
+    """The marks of one scenario in one panel; ``numbers``: with their values beside them."""
+    colour, marker = style
+    for forecast in mine:
+        value = panel.value(forecast)
+        # without a crossing, one ell beyond the last
+        x = len(forecast.snr_squared) if value is None else value
+        y = rows[forecast.variation.family, forecast.variation.name]
+        face = "white" if value is None else colour
+        label = forecast.variation.source if forecast is mine[0] else None
+        axes.plot(x, y, marker, color=colour, mfc=face, ms=6, label=label)
+        if numbers:
+            text = f"> {x - 1}" if value is None else f"{value:.0f}"
+            axes.annotate(
+                text,
+                (x, y),
+                (7, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=8,
+                bbox={"fc": "white", "ec": "none", "pad": 0.8},
+            )
+    reference = panel.value(mine[0])
+    if reference is not None:
+        axes.axvline(reference, color=colour, lw=0.9, ls="--", zorder=0)
+
+
+def label_rows(axes: Axes, rows: dict[tuple[str, str], int]) -> None:
+    """Name every row from the top down; the families' names stand out."""
+    axes.set_yticks(list(rows.values()), [name or family for family, name in rows])
+    axes.set_ylim(max(rows.values()) + 0.7, -0.7)
+    for (_, name), tick in zip(rows, axes.get_yticklabels(), strict=True):
+        tick.set_fontsize(9)
+        if not name:
+            tick.set_fontweight("bold")
+            tick.set_color(GREY)
+
+
+def title(planned: Sequence[Forecast], sources: Sequence[str]) -> str:
+    """What was planned, with frequency and lmax where all have the same."""
+    scenarios = [f.variation.scenario for f in planned]
+    found = ", ".join(sources) if len(sources) == 1 else f"{len(sources)} scenarios"
+    if len({s.frequency_mhz for s in scenarios}) == 1:
+        found += f" at {scenarios[0].frequency_mhz:g} MHz"
+    if len({s.lmax for s in scenarios}) == 1:
+        found += rf", up to $\ell$ = {scenarios[0].lmax}"
+    return f"Information in an observation: {found} (dashed: as given)"
+
+
+# of the interval whose coverage is drawn
+LEVEL = 0.68
+# differences up to that are on a linear scale
+LINEAR = 3.0
+# how each kind of data that is left out is drawn
+MARKERS = {"product": "s", "day": "o"}
+
+
+def priors(result: PriorComparison) -> Figure:
+    """Draw differences of ln evidence and of ln p, coverage by latitude, and spectra of errors."""
+    known = result.known_sky
+    figure = Figure(figsize=(14 if known else 9.5, 4.4), layout="constrained")
+    panels = figure.subplots(1, 3 if known else 2)
+    _evidence(panels[0], result)
+    if known:
+        _coverage(panels[1], result)
+    _errors(panels[-1], result)
+    figure.suptitle(f"{result.scenario.frequency_mhz:g} MHz: one data set under several priors")
+    return figure
+
+
+def _evidence(axes: Axes, result: PriorComparison) -> None:
+    """How far each prior is below the best of each measure."""
+    rows = np.arange(len(result.priors))
+    behind = np.array([result.best.log_evidence - one.log_evidence for one in result.priors])
+    colours = [COLOURS[k % len(COLOURS)] for k in rows]
+    axes.barh(rows, behind, color=colours, alpha=0.6, height=0.6, label="ln evidence (bars)")
+    for j, held in enumerate(result.best.held_out):
+        values = np.array([one.held_out[j].log_density for one in result.priors])
+        label = f"ln p of {held.kind}s left out"
+        axes.plot(
+            values.max() - values, rows, f"k{MARKERS[held.kind]}", mfc="none", ms=7, label=label
+        )
+    axes.set_yticks(rows, [one.name for one in result.priors])
+    axes.invert_yaxis()
+    axes.set_xscale("symlog", linthresh=LINEAR, linscale=0.5)
+    axes.set(xlabel="below the best", xlim=(-0.5, None))
+    axes.legend(frameon=False, fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
+
+
+def _coverage(axes: Axes, result: PriorComparison) -> None:
+    n, k = len(result.priors), LEVELS.index(LEVEL)
+    parts = [part.name for part in result.priors[0].channel.coverage]
+    for j, one in enumerate(result.priors):
+        x = np.arange(len(parts)) + 0.6 * ((j + 0.5) / n - 0.5)
+        held = [100.0 * part.held[k] for part in one.channel.coverage]
+        scatter = [100.0 * part.scatter[k] for part in one.channel.coverage]
+        colour = COLOURS[j % len(COLOURS)]
+        axes.errorbar(x, held, yerr=scatter, fmt="o", color=colour, capsize=3, label=one.name)
+    axes.axhline(100.0 * LEVEL, color=GREY, lw=0.8)
+    axes.set_xticks(np.arange(len(parts)), parts, fontsize=8)
+    axes.set(ylabel=f"pixels that {LEVEL:.0%} intervals hold [%]", ylim=(None, 101.0))
+
+
+def _errors(axes: Axes, result: PriorComparison) -> None:
+    for j, one in enumerate(result.priors):
+        channel = one.channel
+        colour, line = COLOURS[j % len(COLOURS)], LINES[j % len(LINES)]
+        expected = power_spectrum(channel.std)[1:]
+        ell = np.arange(1, len(expected) + 1)
+        if channel.truth is None:
+            axes.semilogy(ell, expected, color=colour, ls=line, lw=1.3, label=one.name)
+            continue
+        axes.semilogy(ell, expected, color=colour, ls=":", lw=1.0)
+        error = power_spectrum(channel.mean - channel.truth)[1:]
+        axes.semilogy(ell, error, color=colour, ls="-", lw=1.3, label=one.name)
+    if result.known_sky:
+        truth = power_spectrum(result.best.channel.truth)[1:]
+        axes.semilogy(ell, truth, color=GREY, lw=1.0, label="true sky")
+        axes.set_title("errors (dotted: what error bars expect)", fontsize=9)
+    else:
+        axes.set_title("expected errors", fontsize=9)
+    axes.set(xlabel=r"multipole $\ell$", ylabel=r"$C_\ell$ [K$^2$]")
+    axes.legend(frameon=False, fontsize=8)

@@ -1,0 +1,284 @@
+"""Figures of chains and draws.
+
+Figures that show whether chains can be trusted: ArviZ's, and the analytic posterior.
+
+Figures of sampled runs and of their validation. Each function returns a matplotlib Figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import arviz_base
+import arviz_plots
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+from matplotlib import pyplot
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+
+from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.judge.chi2 import highest_altitude
+from lusee_bayes.judge.coverage import LEVELS
+from lusee_bayes.report.figures.drawing import (
+    BLUE,
+    DIVERGING,
+    GREY,
+    ORANGE,
+    SEQUENTIAL,
+    colour_bar,
+    mollweide,
+    note,
+    plain_ticks,
+)
+from lusee_bayes.results.sample_result import SampleResult
+from lusee_bayes.sampling.hmc import N_BINS
+from lusee_bayes.sampling.validation import Comparison, Ranks
+from lusee_bayes.systematics.systematic import SKY
+
+# quantities in the figures, the first of a run's list
+N_RANKS, N_PAIRS = 8, 5
+# draws of a chain from which ranks and densities can be estimated
+FEWEST = 4
+TOO_FEW = f"not drawn: a chain has fewer than {FEWEST} draws, or has not moved"
+SIZE = {"layout": "constrained"}
+
+Quantities = dict[str, Float[np.ndarray, "chains draws"]]
+
+
+def ranks(quantities: Quantities) -> Figure:
+    """Ranks of each chain's draws among all: differences of their ECDFs from even ones.
+
+    The grey band holds 99 % of the curves of chains that agree.
+    """
+    title = "Ranks among the draws of all chains, one curve for each chain"
+    chosen = dict(list(quantities.items())[:N_RANKS])
+    if not _vary(chosen.values()):
+        return note(title, TOO_FEW)
+    rows = (len(chosen) + 3) // 4
+    collection = arviz_plots.plot_rank(
+        arviz_base.from_dict({"posterior": chosen}),
+        backend="matplotlib",
+        figure_kwargs={**SIZE, "figsize": (12, 2.6 * rows + 0.4)},
+    )
+    return _figure(collection, title)
+
+
+def energy(statistics: xr.Dataset) -> Figure:
+    """Energies of the draws about their mean, their changes from draw to draw, and BFMI."""
+    title, energies = (
+        "Energies; BFMI below 0.3: chains that move slowly",
+        statistics["energy"],
+    )
+    if not _vary([energies.values]):
+        return note(title, TOO_FEW)
+    tree = arviz_base.from_dict({"sample_stats": {"energy": energies.values}})
+    collection = arviz_plots.plot_energy(
+        tree, backend="matplotlib", figure_kwargs={**SIZE, "figsize": (11, 3.6)}
+    )
+    return _figure(collection, title)
+
+
+def pairs(quantities: Quantities) -> Figure:
+    """Draws of the first quantities against each other."""
+    chosen = dict(list(quantities.items())[:N_PAIRS])
+    if not _vary(chosen.values()):
+        return note("Pairs of quantities", TOO_FEW)
+    side = 2.2 * len(chosen) + 0.6
+    collection = arviz_plots.plot_pair(
+        arviz_base.from_dict({"posterior": chosen}),
+        visuals={"scatter": {"alpha": 0.3}, "divergence": False},
+        backend="matplotlib",
+        figure_kwargs={**SIZE, "figsize": (side, side)},
+    )
+    figure = _figure(collection, "Pairs of quantities")
+    for axes in figure.axes:
+        plain_ticks(axes, 3)
+        axes.tick_params(labelsize=8)
+        for label in (axes.xaxis.label, axes.yaxis.label):
+            label.set(text=label.get_text().replace(" [", "\n["), size=9)
+    return figure
+
+
+def against_analytic(tree: xr.DataTree) -> Figure:
+    """Means and standard deviations of the sky's draws against the analytic posterior."""
+    skies, constants = tree["posterior"][SKY].values, tree["constant_data"]
+    mean, std = constants["analytic_mean"].values, constants["analytic_std"].values
+    flat = skies.reshape(-1, skies.shape[-1])
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    dots = {"ls": "", "marker": ".", "ms": 3, "color": BLUE}
+    left.plot((flat.mean(axis=0) - mean) / std, **dots)
+    left.axhline(0.0, color=GREY, lw=0.8)
+    left.set(xlabel="mode", ylabel="difference [standard deviations]", title="Means")
+    right.plot(flat.std(axis=0, ddof=1) / std, **dots)
+    right.axhline(1.0, color=GREY, lw=0.8)
+    right.set(xlabel="mode", ylabel="draws / analytic", title="Standard deviations")
+    figure.suptitle("Draws against the analytic posterior, mode by mode")
+    return figure
+
+
+def _vary(quantities: Iterable[Float[np.ndarray, "chains draws"]]) -> bool:
+    """Whether there are draws enough for ArviZ's estimates, and not all the same."""
+    return all(
+        draws.shape[1] >= FEWEST and bool((np.ptp(draws, axis=1) > 0).all()) for draws in quantities
+    )
+
+
+def _figure(collection: arviz_plots.PlotCollection, title: str) -> Figure:
+    """The figure of a collection, which pyplot then forgets."""
+    figure = collection.viz["figure"].item()
+    figure.suptitle(title)
+    pyplot.close(figure)
+    return figure
+
+
+# four chains that are distinct without colour vision (Okabe-Ito), again from the first after that
+CHAIN_COLOURS = (BLUE, ORANGE, "#009E73", "#000000")
+
+
+def uncertainty(run: SampleResult) -> Figure:
+    """Mean, standard deviation and 90 % interval of the drawn maps, and how skewed it is."""
+    maps = run.maps
+    chains, draws = run.skies.shape[:2]
+    if chains * draws < 2:
+        return note("Uncertainty of the drawn maps", "not drawn: a single draw has no spread")
+    positive = np.percentile(maps["mean"][maps["mean"] > 0], [0.5, 99.8])
+    level = maps["mean"].mean()
+    width = maps["upper"] - maps["lower"]
+    spread, interval = 100.0 * maps["std"] / level, 100.0 * width / level
+    excess = maps["upper"] + maps["lower"] - 2.0 * maps["mean"]
+    # draws that are all the same have no width, and no asymmetry
+    skewness = np.divide(excess, width, out=np.zeros_like(width), where=width > 0)
+    limit = np.percentile(np.abs(skewness), 99.0)
+    percent = "% of the mean sky"
+    panels = [
+        ("mean of the draws", maps["mean"], LogNorm(*positive), SEQUENTIAL, "K"),
+        ("standard deviation", spread, _range(spread), SEQUENTIAL, percent),
+        ("width of the 90 % interval", interval, _range(interval), SEQUENTIAL, percent),
+        (
+            "asymmetry of the 90 % interval about the mean",
+            skewness,
+            Normalize(-limit, limit),
+            DIVERGING,
+            "of its width (chance alone for a Gaussian)",
+        ),
+    ]
+    nside = run.experiment.scenario.map_nside
+    altitude = highest_altitude(run.experiment.data.observation, nside)
+    figure = Figure(figsize=(12, 7.2), layout="constrained")
+    for position, (title, pixels, norm, cmap, unit) in enumerate(panels):
+        axes = figure.add_subplot(2, 2, position + 1)
+        image = mollweide(axes, pixels, norm=norm, cmap=cmap, highest_altitude=altitude)
+        colour_bar(figure, image, axes, label=unit, shrink=0.85, extend="both")
+        axes.set_title(title)
+    figure.suptitle(
+        f"{chains} x {draws} draws of {run.tree.attrs['program']} at "
+        f"{run.experiment.scenario.frequency_mhz:g} MHz, Galactic coordinates; dashed: never above "
+        "the horizon"
+    )
+    return figure
+
+
+def _range(values: Float[np.ndarray, " pixels"]) -> Normalize:
+    return Normalize(*np.percentile(values, [0.5, 99.5]))
+
+
+def traces(run: SampleResult) -> Figure:
+    """Draws of other sites, of the first modes and of landmarks against time, with histograms."""
+    columns = list(run.quantities().items())[:8]
+    figure = Figure(figsize=(11, 1.7 * len(columns) + 0.8), layout="constrained")
+    grid = figure.subplots(len(columns), 2, width_ratios=(3, 1), squeeze=False)
+    for (left, right), (name, draws) in zip(grid, columns, strict=True):
+        # a range of a few rounding errors cannot be cut into bins
+        moved = np.ptp(draws) > 1e-12 * np.abs(draws).max()
+        bins = np.histogram_bin_edges(draws, 40 if moved else 1)
+        for number, chain in enumerate(draws):
+            colour = CHAIN_COLOURS[number % len(CHAIN_COLOURS)]
+            left.plot(chain, color=colour, lw=0.5, alpha=0.8)
+            right.hist(
+                chain, bins, color=colour, histtype="step", density=True, label=f"chain {number}"
+            )
+        plain_ticks(left)
+        plain_ticks(right)
+        left.set(ylabel=name.replace(" [", "\n["), xlim=(0, draws.shape[1]))
+        left.yaxis.label.set_size(8)
+        right.set(yticks=[])
+        right.tick_params(labelsize=8)
+    grid[0][1].legend(frameon=False, fontsize=7)
+    grid[-1][0].set_xlabel("draw")
+    figure.suptitle(f"Draws of {run.tree.attrs['program']}")
+    return figure
+
+
+def comparison(result: Comparison) -> Figure:
+    """HMC against the analytic posterior: means, variances, covariance, effective sizes."""
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    (means, variances), (covariance, sizes) = figure.subplots(2, 2)
+    ell, _ = mode_numbers(round(np.sqrt(len(result.mean_z))) - 1)
+    limit = result.checks[0].upper
+    dots = {"ls": "", "marker": ".", "ms": 3, "color": BLUE}
+    means.plot(result.mean_z, **dots)
+    for bound in (-limit, limit):
+        means.axhline(bound, color=ORANGE, ls="--", lw=1)
+    means.set(
+        xlabel="mode", ylabel="difference of means [Monte Carlo error]", title="Means of every mode"
+    )
+    variances.errorbar(
+        np.arange(len(ell)), result.variance_ratio, result.variance_error, elinewidth=0.3, **dots
+    )
+    variances.axhline(1.0, color=GREY, lw=0.8)
+    variances.set(xlabel="mode", ylabel="variance: draws / analytic", title="Variances")
+    rank = np.arange(1, len(result.eigenvalues) + 1)
+    covariance.plot(rank, result.eigenvalues, color=BLUE, label="draws")
+    covariance.plot(rank, result.null_eigenvalues, color=ORANGE, ls="--", label="exact chains")
+    covariance.set(
+        xlabel="number, rising",
+        ylabel="generalised eigenvalue",
+        title="Covariance in analytic coordinates",
+    )
+    covariance.legend(frameon=False)
+    sizes.semilogy(result.ess_bulk, label="bulk", **dots)
+    sizes.semilogy(result.ess_tail, label="tail", **(dots | {"color": ORANGE}))
+    sizes.set(xlabel="mode", ylabel="effective sample size", title="Effective sample sizes")
+    sizes.legend(frameon=False)
+    figure.suptitle(
+        f"HMC against the analytic posterior: {'passed' if result.passed else 'FAILED'}"
+    )
+    return figure
+
+
+def rank_statistics(ranks: Ranks) -> Figure:
+    """Rank histograms with the band of 99 % of the bins, and coverage of the regions."""
+    shown = np.unique(np.linspace(0, len(ranks.names) - 1, 11).astype(int))
+    figure = Figure(figsize=(12, 7), layout="constrained")
+    panels = figure.subplots(3, 4).ravel()
+    low, high = ranks.band()
+    centres = (np.arange(N_BINS) + 0.5) / N_BINS
+    histogram, p_values = ranks.histogram(), ranks.p_values()
+    for axes, k in zip(panels, shown, strict=False):
+        axes.bar(centres, histogram[k], 1.0 / N_BINS, color=BLUE, alpha=0.7)
+        axes.axhspan(low, high, color=GREY, alpha=0.25, lw=0)
+        axes.set_title(f"{ranks.names[k]}, p = {p_values[k]:.2g}", fontsize=9)
+        axes.set(xlim=(0, 1), xticks=[0, 0.5, 1])
+    for axes in panels[len(shown) :]:
+        axes.set_axis_off()
+    last = panels[-1]
+    last.set_axis_on()
+    table = ranks.coverage()
+    levels = np.array(LEVELS)
+    for coverage in table.values():
+        last.plot(levels, [coverage[p] - p for p in LEVELS], color=BLUE, lw=0.5, alpha=0.6)
+    error = 3 * np.array([ranks.coverage_error(p) for p in LEVELS])
+    last.fill_between(levels, -error, error, color=GREY, alpha=0.25, lw=0)
+    last.set(xlabel="level", title="coverage - level (band: 3 errors)")
+    last.set_xticks(levels, [f"{p:.0%}" for p in LEVELS], fontsize=7, rotation=45)
+    last.title.set_size(9)
+    figure.supxlabel("rank of the truth among the draws")
+    figure.supylabel("simulations per bin")
+    figure.suptitle(
+        f"Calibration over {ranks.n_simulations} simulations: "
+        f"{'passed' if ranks.passed else 'FAILED'}"
+    )
+    return figure

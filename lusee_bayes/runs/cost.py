@@ -1,0 +1,254 @@
+"""What a run will take, known from its scenario alone: memory, and so much time.
+
+The largest arrays are those of the unknowns, 8 n^2 bytes each, of which a posterior with its
+diagnostics holds eight at its peak, and, where noise couples different times, N and A themselves.
+Factorisations of them take nearly all of the time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import ceil
+
+import numpy as np
+
+from lusee_bayes.core.engine import Demand
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
+from lusee_bayes.experiment.leave_out import ARRAYS, MOST_MEMORY
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.runs.cube import lmax_of_fields
+from lusee_bayes.sampling.validation import BATCH, N_DRAWS
+
+# measured at lmax 12 to 80 and up to 3e5 data (docs/commands.md): what is there before anything is
+# computed, and what each datum takes from reading to the report
+BASE_BYTES, BYTES_A_DATUM = 0.75e9, 450
+# n x n arrays at the peak of a posterior, of one channel or of all together, and floating-point
+# operations in n^3
+SQUARES, JOINT_SQUARES, OPERATIONS = 8, 4, 12
+# of positive joint skies, those that learn the laws of their fields among them
+ROUNDS = 8
+# what learning a prior adds to them: about five steps with all modes
+LEARNING_SQUARES, LEARNING_OPERATIONS = 4, 80
+# what comparing times of flight data adds, in n_data n^2
+COMPARING_OPERATIONS = 40
+# pixels of every map of a report, and of what each is made of
+MAPS = 12
+# arrays of data for each source that is in the model
+SOURCE_ARRAYS = 3
+# seconds of everything that is not linear algebra: of a run, of each channel, of each datum
+OVERHEAD_S, CHANNEL_S, DATUM_S = 8.0, 0.8, 4e-5
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a run will take at its peak, about.
+
+    Attributes
+    ----------
+    n_data, n_unknowns, n_channels : int
+        Data and unknowns of one channel.
+    memory : float
+        Bytes.
+    operations : float
+        Of floating-point numbers, in all.
+    """
+
+    n_data: int
+    n_unknowns: int
+    n_channels: int
+    memory: float
+    operations: float
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock time on this machine, good to a factor of two or three."""
+        each = CHANNEL_S + DATUM_S * self.n_data
+        return OVERHEAD_S + self.n_channels * each + self.operations / _operations_a_second()
+
+    def line(self) -> str:
+        """What a terminal shows."""
+        return f"{self.sizes()} and {duration(self.seconds)}"
+
+    def sizes(self) -> str:
+        """The same without the time, which is another where chains are drawn."""
+        channels = f"{self.n_channels} channels of " if self.n_channels > 1 else ""
+        return (
+            f"  {channels}{self.n_data:,} data, {self.n_unknowns:,} unknowns: about "
+            f"{gigabytes(self.memory)} of memory"
+        )
+
+
+def demand_of(costs: Sequence[Cost]) -> Demand:
+    """What independent posteriors take, one or more."""
+    return Demand(BASE_BYTES, max(cost.memory for cost in costs) - BASE_BYTES)
+
+
+def demand_of_channels(scenario: Scenario) -> Demand:
+    """What the channels of a scenario take, of several frequencies."""
+    demand = demand_of([posterior_cost(scenario.channels()[0])])
+    if not scenario.joint:
+        return demand
+    # sums over channels, of every pair of components, and another one that is added
+    count = scenario.spectral.n_maps(scenario.frequencies_mhz)
+    sums = 16.0 * (count * (count + 1) / 2) * (scenario.lmax + 1) ** 4
+    return replace(demand, task_bytes=demand.task_bytes + sums)
+
+
+def duration(seconds: float) -> str:
+    """Format a time of which two digits at most are known: 20 s, 5 min, 3 h, 2 days."""
+    for unit, length, limit in (("s", 1.0, 100.0), ("min", 60.0, 6000.0), ("h", 3600.0, 172800.0)):
+        if seconds < limit:
+            return f"{float(f'{seconds / length:.2g}'):g} {unit}"
+    return f"{float(f'{seconds / 86400.0:.2g}'):,.0f} days"
+
+
+@lru_cache(maxsize=1)
+def _operations_a_second() -> float:
+    """Of products of matrices on this machine."""
+    matrix = np.ones((1024, 1024))
+    matrix @ matrix
+    start = time.perf_counter()
+    matrix @ matrix
+    return 2.0 * 1024.0**3 / (time.perf_counter() - start)
+
+
+def simulation_cost(scenario: Scenario, n_channels: int = 1) -> Cost:
+    """Work out what the visibilities of a scenario take."""
+    n_data = 16 * scenario.observation.n_samples()
+    n_modes = (scenario.lmax + 1) ** 2
+    memory = BASE_BYTES + n_channels * n_data * BYTES_A_DATUM + 64.0 * n_modes
+    return Cost(n_data, n_modes, n_channels, memory, 100.0 * n_channels * (n_data + n_modes))
+
+
+def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = None) -> Cost:
+    """Work out what the posterior of a scenario takes, with its report.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of one frequency or of several.
+    n_draws : int
+        Draws of the sky that are kept at once, besides those of the scenario's output.
+    n_data : int, optional
+        Of given data; without them, those of the scenario's observation.
+    """
+    n_channels = max(1, len(scenario.frequencies_mhz))
+    n_data = 16 * scenario.observation.n_samples() if n_data is None else n_data
+    n_modes = (scenario.lmax + 1) ** 2
+    n, rounds, squares = n_modes, 1, SQUARES
+    if scenario.joint:
+        n, squares = scenario.spectral.n_maps(scenario.frequencies_mhz) * n_modes, JOINT_SQUARES
+        if scenario.spectral.model == "positive":
+            n, rounds = len(scenario.spectral.fields) * (lmax_of_fields(scenario) + 1) ** 2, ROUNDS
+    squares = float(squares) * float(n) ** 2
+    if scenario.joint:
+        # the normal matrix of every channel is kept
+        squares += n_channels * n_modes**2 / 2.0
+    operations = rounds * OPERATIONS * (float(n) ** 3 + n_channels * float(n_modes) ** 3)
+    if scenario.prior.is_learned and not scenario.joint:
+        squares += LEARNING_SQUARES * float(n_modes) ** 2
+        operations += LEARNING_OPERATIONS * n_channels * float(n_modes) ** 3
+    if scenario.flight is not None and scenario.flight.leave_out:
+        operations += n_channels * COMPARING_OPERATIONS * float(n_data) * float(n_modes) ** 2
+        # without room for it they are not compared
+        squares += min(ARRAYS * float(n_data) * n_modes, MOST_MEMORY * memory_limit() / 8.0)
+    gain = scenario.noise.gain
+    if gain is not None and gain.treatment == "marginalised":
+        # N couples all times, and A is formed
+        squares += 3.0 * n_data**2 + 3.0 * n_data * n_modes
+        operations += n_channels * (float(n_data) ** 3 + 2.0 * n_data * float(n_modes) ** 2)
+    if scenario.sources.treatment != "ignored":
+        n_sources = len(scenario.sources.list)
+        squares += float(SOURCE_ARRAYS * n_data * n_sources)
+        operations += 2.0 * n_channels * n_data * n_sources * (n_modes + n_sources)
+    pixels = 12.0 * scenario.map_nside**2
+    if not scenario.joint:
+        # means, errors and spectra of channels that are finished
+        squares += (n_channels - 1) * (3.0 * pixels + 4.0 * n_modes)
+    kept = 3.0 * (n_draws + scenario.output.draws) * n_modes
+    memory = BASE_BYTES + BYTES_A_DATUM * n_data + 8.0 * (squares + MAPS * pixels + kept)
+    return Cost(n_data, n, n_channels, memory, operations)
+
+
+def require_fits(
+    cost: Cost, scenario: Scenario, n_draws: int = 0, n_data: int | None = None
+) -> None:
+    """Check that a run fits into the memory.
+
+    Parameters
+    ----------
+    cost : Cost
+    scenario : Scenario
+        What it is the cost of.
+    n_draws, n_data : int
+        As in :func:`posterior_cost`.
+
+    Raises
+    ------
+    InputError
+        If it does not; the message says what would.
+    """
+    limit = memory_limit()
+    if cost.memory <= limit:
+        return
+    advice = ""
+    if n_draws and posterior_cost(scenario, 0, n_data).memory <= limit:
+        advice = "; fewer draws would fit"
+    for name, value, smaller in () if advice else _smaller(scenario):
+        if posterior_cost(smaller, n_draws, n_data).memory <= limit:
+            advice = f"; {name}={value} would fit"
+            break
+    raise InputError(
+        f"the run would need about {gigabytes(cost.memory)} of memory for {cost.n_data:,} data and "
+        f"{cost.n_unknowns:,} unknowns; this process may use {gigabytes(limit)}{advice}"
+    )
+
+
+def require_resources(
+    scenario: Scenario, data: Visibilities | None, stages: Stages, n_draws: int = 0
+) -> None:
+    """Say what a posterior will take. InputError as :func:`require_fits`.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    data : Visibilities or None
+        Given data.
+    stages : Stages
+        Told what it will take.
+    n_draws : int
+        As in :func:`posterior_cost`.
+    """
+    n_data = None if data is None else data.layout.size
+    cost = posterior_cost(scenario, n_draws, n_data)
+    require_fits(cost, scenario, n_draws, n_data)
+    if stages.console is not None:
+        stages.say(cost.sizes() if n_draws else cost.line())
+
+
+def _smaller(scenario: Scenario) -> Iterator[tuple[str, float | str, Scenario]]:
+    """The scenario with less of one thing at a time."""
+    if scenario.nside is not None:
+        yield "nside", 64, scenario.model_copy(update={"nside": 64})
+    for draws in (1000, 100, 0):
+        output = scenario.output.model_copy(update={"draws": draws})
+        yield "output.draws", draws, scenario.model_copy(update={"output": output})
+    if scenario.joint:
+        yield "joint", "false", scenario.model_copy(update={"joint": False})
+    for lmax in range(scenario.lmax - 1, 0, -1):
+        yield "lmax", lmax, scenario.model_copy(update={"lmax": lmax})
+    section = scenario.observation
+    for times in range(1, 40):
+        step_s = float(ceil(section.step_s)) * 2.0**times
+        fewer = section.model_copy(update={"step_s": step_s})
+        yield "observation.step_s", step_s, scenario.model_copy(update={"observation": fewer})
+
+
+def demand_of_calibration(scenario: Scenario) -> Demand:
+    """What simulation-based calibration takes, in batches that use all processors."""
+    return replace(demand_of([posterior_cost(scenario, BATCH * N_DRAWS)]), side_by_side=1)

@@ -1,0 +1,609 @@
+"""The channels of a cube, each by itself, tied, or in one posterior.
+
+Positive skies of the channels of a run: their most probable fields.
+
+The joint posterior of the component maps, from the information of every channel.
+
+Channels whose receivers have smooth spectra: each worked out alone, then all tied together.
+
+What port i's power is off by, z_i(f) in prior standard deviations, is a Gaussian process::
+
+    K(f, f') = exp(-(log2 f - log2 f')^2 / (2 smooth_octaves^2)),    ports independent.
+
+A channel alone has z ~ N(0, 1), as its diagonal says. Its posterior of sky m and powers z, with
+means E and covariance V of z, becomes that given all data (:mod:`.amplitudes`) by ::
+
+    mean of m + G (E' - E),    covariance of m + G (V' - V) G^T,    G = Cov(m, z) V^-1,
+
+since m depends on other channels through z alone, and so do ground and gains.
+
+The channels of a cube, each on its own, tied, or in one posterior; a stopped run goes on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import xarray as xr
+from jaxtyping import Float, Int, PRNGKeyArray
+
+from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.data_files import Data, anchored, read_data
+from lusee_bayes.experiment.experiment import build, explained, inform, with_truth
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.sky_terms import is_receiver
+from lusee_bayes.judge.coverage import N_DRAWS
+from lusee_bayes.linear.amplitudes import Amplitudes, Tied, information_given, tie, told_by_others
+from lusee_bayes.linear.joint import channel_sky, component_posterior, paired
+from lusee_bayes.linear.positive_joint import (
+    COARSE_LMAX,
+    MAX_ROUNDS,
+    PositiveMode,
+    find_joint_mode,
+    learn_laws,
+    positive_sky,
+)
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.results.channel import ChannelResult, channel_of_information
+from lusee_bayes.results.cube import Components, CubeResult
+from lusee_bayes.results.draws import deviations, draw_key, posterior_draws
+from lusee_bayes.runs.channel_files import (
+    ChannelFiles,
+    ChannelInformation,
+    ChannelsInFiles,
+    identity_of,
+    names_of,
+)
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
+from lusee_bayes.sky.positive_skies import PositiveSkies
+from lusee_bayes.sky.spectral_prior import SpectralPrior
+from lusee_bayes.sky.template import EmbeddedTemplate, galactic_share
+
+# highest ell of the fields, over that of the map
+FIELDS = 1.5
+# most fields' modes: every round factorises their matrix
+MOST_UNKNOWNS = 10_000
+
+
+def lmax_of_fields(scenario: Scenario, lmax: int | None = None) -> int:
+    """Choose the highest ell of the fields: 1.5 times that of the map, if they can be solved for.
+
+    Structure that a map does not resolve still changes it where the sky is steep.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of positive joint skies.
+    lmax : int, optional
+        Of the map; by default the scenario's.
+
+    Raises
+    ------
+    InputError
+        If fields of the map's own lmax are too many unknowns.
+    """
+    lmax = scenario.lmax if lmax is None else lmax
+    n_fields = len(scenario.spectral.fields)
+    highest = int(np.sqrt(MOST_UNKNOWNS / n_fields)) - 1
+    if highest < lmax:
+        raise InputError(
+            f"positive joint skies of lmax {lmax} have {n_fields * n_modes(lmax)} unknowns, more "
+            f"than the {MOST_UNKNOWNS} of one solution; use lmax={highest}, fewer "
+            "spectral.fields, or spectral.model=components"
+        )
+    return min(round(FIELDS * lmax), highest)
+
+
+def positive_skies(scenario: Scenario) -> PositiveSkies:
+    """The skies of a scenario's channels as functions of the fields.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of positive joint skies.
+
+    Raises
+    ------
+    InputError
+        As :func:`lmax_of_fields`.
+    """
+    section, frequencies, lmax = scenario.spectral, scenario.frequencies_mhz, scenario.lmax
+    sources = None
+    if section.sources:
+        sources = np.array([[s.modes(f, lmax) for s in BRIGHT_SOURCES] for f in frequencies])
+    return PositiveSkies.of(
+        np.array(frequencies),
+        [EmbeddedTemplate(f) for f in frequencies],
+        lmax,
+        section.fields,
+        reference_mhz=section.reference_mhz,
+        turnover_mhz=section.turnover_mhz,
+        sources=sources,
+        weight=galactic_share,
+        lmax_fields=lmax_of_fields(scenario),
+    )
+
+
+def positive_mode(scenario: Scenario, channels: ChannelsInFiles, stages: Stages) -> PositiveMode:
+    """Find the most probable skies of all channels.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of positive joint skies.
+    channels : ChannelsInFiles
+    stages : Stages
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        As :func:`.find_joint_mode`.
+    """
+    with stages("templates"):
+        skies = positive_skies(scenario)
+    silent = replace(channels, stages=Stages())
+    coarse = lmax_of_fields(scenario, min(scenario.lmax, COARSE_LMAX))
+    with stages.progress("laws of the fields", MAX_ROUNDS) as report:
+        laws = learn_laws(skies, silent, lmax_fields=coarse, report=report)
+    with stages.progress("positive skies", MAX_ROUNDS) as report:
+        return find_joint_mode(skies, laws, silent, report=report)
+
+
+def solve_components(
+    scenario: Scenario, files: ChannelFiles, n_draws: int, engine: Engine, stages: Stages
+) -> Components:
+    """Work out the joint posterior from the files of all channels.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of several frequencies.
+    files : ChannelFiles
+        With the information of every channel.
+    n_draws : int
+        Draws of the component maps.
+    engine : Engine
+        What carries out the channels.
+    stages : Stages
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        If data are too precise to be solved for, or positive skies do not settle.
+    """
+    channels = scenario.channels()
+    at_hand = ChannelsInFiles(channels, files, engine, stages)
+    if scenario.spectral.model == "positive":
+        return _positive(scenario, at_hand, n_draws, stages)
+    small = [files.read(channel, "information", ["reference", "sky"]) for channel in channels]
+    reference = np.array([np.asarray(s["reference"]) for s in small])
+    skies = np.array([np.asarray(s["sky"]) for s in small])
+    prior = scenario.spectral.prior(np.array(scenario.frequencies_mhz), skies)
+    return _direct(prior, scenario, at_hand, reference, n_draws, stages)
+
+
+def _positive(
+    scenario: Scenario, channels: ChannelsInFiles, n_draws: int, stages: Stages
+) -> Components:
+    mode = positive_mode(scenario, channels, stages)
+    with stages("joint posterior"):
+        found = _gaussian(mode.prior, mode.posterior, scenario, n_draws, mode.energy)
+    return replace(found, refinement=mode.moved, mode=mode)
+
+
+def _direct(
+    prior: SpectralPrior,
+    scenario: Scenario,
+    channels: ChannelsInFiles,
+    reference: np.ndarray,
+    n_draws: int,
+    stages: Stages,
+) -> Components:
+    information = channels.summed(prior, reference, lambda _, information: information)
+    with stages("joint posterior"):
+        posterior = component_posterior(information, prior)
+        chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
+        return _gaussian(prior, posterior, scenario, n_draws, chi2)
+
+
+def _gaussian(
+    prior: SpectralPrior,
+    posterior: Posterior,
+    scenario: Scenario,
+    n_draws: int,
+    chi2: float,
+) -> Components:
+    components, modes = prior.n_components, posterior.mean.shape[0] // prior.n_components
+    spread = jax.block_until_ready(paired(posterior.covariance(), prior))
+    draws = posterior.sample(draw_key(scenario), n_draws)
+    return Components(
+        prior,
+        posterior.mean.reshape(components, modes),
+        spread,
+        draws.reshape(n_draws, components, modes),
+        chi2,
+        float(posterior.log_evidence),
+        float(posterior.information_bits()),
+        float(posterior.refinement),
+    )
+
+
+# numbers of a channel's own posterior
+NUMBERS = ("log_evidence", "information_bits", "chi2_model", "refinement")
+# what the key of draws is folded with: numbers of channels are smaller
+TIED = 1 << 20
+
+
+@dataclass(frozen=True)
+class ChannelAlone:
+    """A channel's posterior given its own data, as it is kept until all channels are known.
+
+    Attributes
+    ----------
+    known : ChannelInformation
+    mean : (modes,) array
+        In K.
+    covariance : (modes, modes) array
+        In K^2.
+    draws : (n, modes) array
+        Less the mean, in K.
+    compared : (more, modes) array
+        Draws less the mean that coverage is compared with, in K; none where no truth is known.
+    numbers : dict of float
+        ``NUMBERS``, as in :class:`.ChannelResult`.
+    """
+
+    known: ChannelInformation
+    mean: Float[np.ndarray, " modes"]
+    covariance: Float[np.ndarray, "modes modes"]
+    draws: Float[np.ndarray, "n modes"]
+    compared: Float[np.ndarray, "more modes"]
+    numbers: dict[str, float]
+
+    def receivers(self) -> tuple[Float[np.ndarray, " ports"], Float[np.ndarray, "ports ports"]]:
+        """E and V of the receivers' powers, in prior standard deviations."""
+        told, own = self._told(), self._own()
+        return told.mean[own], told.covariance[np.ix_(own, own)]
+
+    def _told(self) -> Amplitudes:
+        return self.known.observed.unknowns.amplitudes.integrated(self.mean, self.covariance)
+
+    def _own(self) -> Int[np.ndarray, " ports"]:
+        """Which unknowns are powers of receivers."""
+        rows = self.known.observed.unknowns.rows
+        return np.flatnonzero([is_receiver(row["unknown"]) for row in rows])
+
+    def tied(
+        self,
+        mean: Float[np.ndarray, " ports"],
+        covariance: Float[np.ndarray, "ports ports"],
+        draws: Float[np.ndarray, "all ports"],
+        key: PRNGKeyArray,
+    ) -> ChannelResult:
+        """The channel given all data.
+
+        Parameters
+        ----------
+        mean, covariance : (ports,) and (ports, ports) array
+            E' and V' of its receivers' powers.
+        draws : (all, ports) array
+            Of these, for ``draws`` and ``compared``.
+        key : PRNG key
+            For the powers that go with the channel's own draws.
+        """
+        told, own = self._told(), self._own()
+        e, v = told.mean[own], told.covariance[np.ix_(own, own)]
+        gain = np.linalg.solve(v, told.with_sky[:, own].T).T
+        moved = self.mean + gain @ (mean - e)
+        left = self.covariance + gain @ (covariance - v) @ gain.T
+        # powers that go with the channel's own draws, less their mean
+        amplitudes = self.known.observed.unknowns.amplitudes
+        inner = amplitudes.covariance[np.ix_(own, own)]
+        deviations = np.concatenate([self.draws, self.compared])
+        normals = np.asarray(jax.random.normal(key, (len(deviations), len(own))))
+        variances, axes = np.linalg.eigh(inner)
+        normals = (normals * np.sqrt(np.maximum(variances, 0.0))) @ axes.T
+        with_them = normals - deviations @ amplitudes.pull[own].T
+        deviations = deviations + (draws - mean - with_them) @ gain.T
+        # what the other channels tell of this one's unknowns
+        n = len(amplitudes.mean)
+        precision, vector = np.zeros((n, n)), np.zeros(n)
+        precision[np.ix_(own, own)], vector[own] = told_by_others(e, v, mean, covariance)
+        unknowns = replace(
+            self.known.observed.unknowns, amplitudes=amplitudes.given(precision, vector)
+        )
+        sky_share = np.linalg.solve(v, (np.linalg.solve(v, v - inner)).T)
+        gained = np.linalg.slogdet(np.eye(len(own)) + (covariance - v) @ sky_share)[1]
+        n_draws = len(self.draws)
+        bits = self.numbers["information_bits"] - 0.5 * gained / np.log(2.0)
+        return channel_of_information(
+            replace(self.known.observed, unknowns=unknowns),
+            information_given(self.known.information, amplitudes, precision, vector),
+            moved,
+            left,
+            moved + deviations[:n_draws],
+            compared=deviations[n_draws:] if len(self.compared) else None,
+            **(self.numbers | {"information_bits": float(bits)}),
+        )
+
+    def to_dataset(self) -> xr.Dataset:
+        """All of it, for :meth:`from_dataset`."""
+        found = self.known.to_dataset()
+        own = xr.Dataset(
+            {
+                "alone_mean": ("mode", self.mean),
+                "alone_covariance": (("mode", "mode_2"), self.covariance),
+                "alone_draws": (("alone_draw", "mode"), self.draws),
+                "alone_compared": (("alone_more", "mode"), self.compared),
+            }
+        )
+        numbers = {f"alone_{name}": self.numbers[name] for name in NUMBERS}
+        return found.merge(own).assign_attrs(found.attrs | numbers)
+
+    @classmethod
+    def from_dataset(cls, dataset: xr.Dataset) -> ChannelAlone:
+        """The inverse of :meth:`to_dataset`."""
+        names = ("mean", "covariance", "draws", "compared")
+        arrays = (np.asarray(dataset[f"alone_{name}"]) for name in names)
+        numbers = {name: float(dataset.attrs[f"alone_{name}"]) for name in NUMBERS}
+        return cls(ChannelInformation.from_dataset(dataset), *arrays, numbers)
+
+
+def kernel(
+    frequencies_mhz: Float[np.ndarray, " channels"], octaves: float
+) -> Float[np.ndarray, "channels channels"]:
+    """K of the module's equations, with a port's values at all frequencies."""
+    x = np.log2(frequencies_mhz) / octaves
+    return np.exp(-0.5 * (x[:, None] - x[None]) ** 2)
+
+
+def tie_receivers(scenario: Scenario, channels: Sequence[Scenario], files: ChannelFiles) -> Tied:
+    """The receivers' powers given the data of all channels, from what is kept of each alone.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of several frequencies.
+    channels : sequence of Scenario
+        That could be mapped.
+    files : ChannelFiles
+
+    Raises
+    ------
+    InputError
+        As :func:`.tie`.
+    """
+    means, covariances, n_draws = [], [], 0
+    for channel in channels:
+        alone = ChannelAlone.from_dataset(files.read(channel, "alone"))
+        mean, covariance = alone.receivers()
+        means.append(mean)
+        covariances.append(covariance)
+        n_draws = len(alone.draws) + len(alone.compared)
+    own = jax.random.fold_in(draw_key(scenario), TIED)
+    normals = np.asarray(jax.random.normal(own, (n_draws, sum(map(len, means)))))
+    frequencies = np.array([channel.frequency_mhz for channel in channels])
+    ties = kernel(frequencies, scenario.noise.receiver.smooth_octaves)
+    return tie(np.stack(means), np.stack(covariances), ties, normals)
+
+
+def write_tied_sky(
+    number: int,
+    channels: Sequence[Scenario],
+    tied: Tied,
+    files: ChannelFiles,
+) -> None:
+    """Write the result of one channel, unless it is there."""
+    channel = channels[number]
+    if files.has(channel, "result"):
+        return
+    alone = ChannelAlone.from_dataset(files.read(channel, "alone"))
+    key = jax.random.fold_in(draw_key(channel), TIED + 1)
+    found = alone.tied(tied.mean[number], tied.covariance[number], tied.draws[:, number], key)
+    files.write(channel, "result", found.to_dataset())
+
+
+def cube_result(
+    scenario: Scenario,
+    folder: Path,
+    *,
+    data: Data | None = None,
+    truth: bool = False,
+    engine: Engine | None = None,
+    stages: Stages | None = None,
+) -> CubeResult:
+    """Work out all channels, going on from what an interrupted run has left in ``folder``.
+
+    Where receivers have smooth spectra, each channel is worked out alone, and then given what the
+    others tell of its receivers (:mod:`.claims`). A channel that cannot be mapped leaves
+    the others as they are: it is named in the result, and a joint posterior is that of the others.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of several frequencies.
+    folder : Path
+        Of the run; unfinished work is kept in it.
+    data : Visibilities, path, or sequence of them, optional
+        Measured; without them the scenario's own are simulated.
+    truth : bool
+        The data are of the scenario's own sky.
+    engine : Engine, optional
+        What carries out the channels; by default this process.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        For a scenario without frequencies, if no channel can be mapped, or if too few of them can
+        for a joint posterior.
+    """
+    engine, stages = engine or ThisProcess(), stages or Stages()
+    engine.work_in(folder)
+    if not scenario.frequencies_mhz:
+        raise InputError("the scenario names no frequencies_mhz; give --frequencies")
+    n_draws = scenario.output.draws
+    # workers may have other folders of their own
+    files = ChannelFiles(folder.resolve(), identity_of(scenario, data, truth, n_draws))
+    channels = tuple(channel.anchored() for channel in scenario.channels())
+    data = None if data is None else anchored(data)
+    names = [names_of((channel,)) for channel in channels]
+    tied = scenario.ties_receivers
+    wanted = "information" if scenario.joint else "alone" if tied else "result"
+
+    def observe(channel: Scenario) -> None:
+        if files.has(channel, wanted):
+            return
+        measured = None if data is None else read_data(data, channel)
+        experiment = build(channel, measured)
+        if truth:
+            experiment = with_truth(experiment)
+        with explained(experiment):
+            information, inference = inform(experiment)
+        known = ChannelInformation.of(experiment, information, inference)
+        if scenario.joint:
+            files.write(channel, wanted, known.to_dataset())
+            return
+        posterior = on_host(inference.posterior)
+        mean, covariance = posterior.mean, posterior.covariance()
+        draws = posterior_draws(experiment, posterior, n_draws)
+        compared = None if known.observed.truth is None else deviations(experiment, posterior)
+        numbers = {
+            "log_evidence": float(posterior.log_evidence),
+            "information_bits": float(posterior.information_bits()),
+            "chi2_model": float(information.chi2(mean) + posterior.prior_chi2()),
+            "refinement": float(posterior.refinement),
+        }
+        if tied:
+            rest = np.zeros((0, len(mean))) if compared is None else compared
+            alone = ChannelAlone(known, mean, covariance, draws - mean, rest, numbers)
+            files.write(channel, wanted, alone.to_dataset())
+            return
+        found = channel_of_information(
+            known.observed,
+            information,
+            mean,
+            covariance,
+            draws,
+            compared=compared,
+            **numbers,
+        )
+        files.write(channel, wanted, found.to_dataset())
+
+    def refusal(channel: Scenario) -> str:
+        try:
+            observe(channel)
+        except InputError as error:
+            return str(error)
+        return ""
+
+    refusals = engine.each(Tasks(refusal, channels, names), stages, "channels")
+    unmapped = {c.frequency_mhz: r for c, r in zip(channels, refusals, strict=True) if r}
+    mapped = tuple(c for c in channels if c.frequency_mhz not in unmapped)
+    if not mapped:
+        raise InputError(f"no channel can be mapped: {_reasons(unmapped)}")
+    components, tie_log_evidence = None, 0.0
+    if tied:
+        receivers = tie_receivers(scenario, mapped, files)
+        tie_log_evidence = receivers.log_evidence
+
+        def write_tied(number: int) -> None:
+            write_tied_sky(number, mapped, receivers, files)
+
+        skies = Tasks(write_tied, range(len(mapped)), [names_of((c,)) for c in mapped])
+        engine.each(skies, stages, "smooth receivers")
+    if scenario.joint:
+        left = _without(unmapped, scenario)
+        # coverage is compared with draws
+        known = data is None or truth
+        n_solved = max(n_draws, N_DRAWS) if known else n_draws
+        components = solve_components(left, files, n_solved, engine, stages)
+        # for workers of other processes
+        shared = on_host(components)
+
+        def write_sky(number: int) -> None:
+            _write_joint_sky(number, mapped, shared, scenario, files, n_draws)
+
+        skies = Tasks(write_sky, range(len(mapped)), [names_of((c,)) for c in mapped])
+        engine.each(skies, stages, "joint skies")
+    found = tuple(ChannelResult.from_dataset(files.read(c, "result")) for c in mapped)
+    return CubeResult(
+        scenario,
+        found,
+        components,
+        stages.seconds,
+        unmapped,
+        tie_log_evidence=tie_log_evidence,
+    )
+
+
+def _without(unmapped: dict[float, str], scenario: Scenario) -> Scenario:
+    """A joint scenario of the channels that can be mapped. InputError if these are too few."""
+    left = tuple(f for f in scenario.frequencies_mhz if f not in unmapped)
+    try:
+        scenario.spectral.require_channels(len(left))
+    except InputError as error:
+        raise InputError(f"{error}; not mapped: {_reasons(unmapped)}") from error
+    return scenario.model_copy(update={"frequencies_mhz": left})
+
+
+def _reasons(unmapped: dict[float, str]) -> str:
+    """Why channels cannot be mapped, each reason once."""
+    alike: dict[str, list[str]] = {}
+    for frequency, reason in unmapped.items():
+        alike.setdefault(reason, []).append(f"{frequency:g}")
+    return "; ".join(f"{', '.join(known)} MHz: {reason}" for reason, known in alike.items())
+
+
+def _write_joint_sky(
+    number: int,
+    channels: tuple[Scenario, ...],
+    components: Components,
+    scenario: Scenario,
+    files: ChannelFiles,
+    n_draws: int,
+) -> None:
+    channel, key = channels[number], draw_key(scenario)
+    if files.has(channel, "result"):
+        return
+    known = ChannelInformation.from_dataset(files.read(channel, "information"))
+    if components.mode is not None:
+        sky = positive_sky(
+            components.mode,
+            number,
+            known.information,
+            np.asarray(components.spread),
+            np.asarray(components.draws),
+            key,
+        )
+    else:
+        sky = channel_sky(
+            components.prior,
+            number,
+            known.information,
+            components.mean,
+            components.spread,
+            components.draws,
+            key,
+        )
+    found = channel_of_information(
+        known.observed,
+        known.information,
+        sky.mean,
+        sky.covariance,
+        sky.draws[:n_draws],
+        compared=np.asarray(sky.draws) - np.asarray(sky.mean),
+        independent=known.information.reference,
+    )
+    files.write(channel, "result", found.to_dataset())

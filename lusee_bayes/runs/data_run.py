@@ -1,0 +1,468 @@
+"""Data: simulated, reduced, averaged.
+
+A simulation: visibilities of a scenario in a file.
+
+Sessions of the spectrometer, reduced to bands and bins of time, in a file.
+
+Sessions of the spectrometer, simulated, in files of luseepy's layout.
+
+Means of data over longer times, in a file, and what they cost.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.files import require_new, transaction, user_path
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.reading import naming
+from lusee_bayes.experiment.data_files import Data, files_of, names_of_data, read_data
+from lusee_bayes.experiment.experiment import Experiment, simulated
+from lusee_bayes.experiment.flight_data import reduce_files
+from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
+from lusee_bayes.experiment.setup import require_fitting, set_up
+from lusee_bayes.flight.clock import Clock
+from lusee_bayes.flight.gain_model import write_gain_table
+from lusee_bayes.flight.reduced import Reduced, write_reduced
+from lusee_bayes.flight.session_files import write_session
+from lusee_bayes.instrument.averaging import averaged, product_live_s
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.instrument.waterfalls import NO_ROOM, write_four_port, write_waterfall
+from lusee_bayes.runs.cost import require_fits, require_resources, simulation_cost
+from lusee_bayes.runs.folder import RunKind, inputs_of, origin_of, run_folder
+from lusee_bayes.runs.forecasting import expected_posterior
+
+
+def run_simulate(
+    scenario: Scenario | str | Path,
+    path: str | Path,
+    *,
+    frequencies_mhz: Sequence[float] = (),
+    replace: bool = False,
+    stages: Stages | None = None,
+) -> list[Visibilities]:
+    """Simulate the visibilities of a scenario, and write them whole or not at all.
+
+    Parameters
+    ----------
+    scenario : Scenario, or its file or name
+    path : path
+        The file: netCDF, or luseepy's waterfall if the name ends in ``.fits``.
+    frequencies_mhz : sequence of float
+        Channels of a waterfall; the noise of each has a seed of its own, one more than that of the
+        channel before. None for the scenario's frequency alone.
+    replace : bool
+        Replace the file if it is there already.
+    stages : Stages, optional
+        Told what is being done.
+
+    Returns
+    -------
+    list of Visibilities
+        One for each channel.
+
+    Raises
+    ------
+    InputError
+        If the file is there already, for several channels in a netCDF file, and for what a
+        waterfall cannot hold.
+    """
+    scenario = load_scenario(scenario)
+    path, channels = user_path(path), (scenario,)
+    stages = stages or Stages()
+    require_new(path, replace=replace, inputs=inputs_of(scenario))
+    if path.suffix == ".fits" and scenario.observation.window != "instant":
+        raise InputError(f"{path}: {NO_ROOM}")
+    require_fits(simulation_cost(scenario, max(1, len(frequencies_mhz))), scenario)
+    if frequencies_mhz:
+        if path.suffix != ".fits":
+            raise InputError(
+                f"'{path}': netCDF files hold one frequency; with --frequencies, give -o a name "
+                "that ends in .fits"
+            )
+        several = scenario.model_copy(update={"frequencies_mhz": tuple(frequencies_mhz)})
+        channels = several.channels()
+    experiments = [
+        simulated(channel, stages=Stages(stages.console, verbose=stages.verbose))
+        for channel in channels
+    ]
+    data = [experiment.data for experiment in experiments]
+    if path.suffix != ".fits":
+        data[0].write(path, {"scenario": scenario.to_yaml()})
+        return data
+    _write_waterfall(path, experiments, scenario)
+    return data
+
+
+def _write_waterfall(path: Path, experiments: Sequence[Experiment], scenario: Scenario) -> None:
+    """In luseepy's layout of four ports where the beams know volts, else in its scalar one."""
+    data = [experiment.data for experiment in experiments]
+    sources = [(e.setup.beam_source, e.scenario.frequency_mhz) for e in experiments]
+    circuits = [circuit for source, f in sources if (circuit := source.circuit(f)) is not None]
+    if circuits:
+        section = scenario.beam
+        write_four_port(
+            path,
+            data,
+            circuits,
+            moon_k=section.moon_temperature_k,
+            antenna_k=section.antenna_temperature_k,
+            interpolation=section.interpolation,
+            response=section.file,
+            scenario=scenario.to_yaml(),
+        )
+        return
+    unknown = complex(np.nan, np.nan)
+    impedance = [source.impedance(f) for source, f in sources]
+    ohm = np.array([unknown if z is None else z for z in impedance])
+    write_waterfall(path, data, ohm, scenario.to_yaml())
+
+
+def reduced_lines(reduced: Reduced) -> list[str]:
+    """What was flagged in each band, and how its noise compares with the radiometer's."""
+    lines = [reduced.description()[0], *reduced.notes()]
+    for band, frequency in enumerate(reduced.frequencies_mhz):
+        noise = reduced.scatter[band]
+        told = "" if np.isnan(noise) else f"; scatter {noise:.2f} times the radiometer's"
+        lines.append(f"{frequency:g} MHz: {reduced.flag_line(band)}{told}")
+        lines += [f"  {text}" for text in reduced.doubts(band)]
+    return lines
+
+
+def run_reduce(
+    scenario: Scenario | str | Path,
+    files: Sequence[str | Path],
+    path: str | Path,
+    *,
+    replace: bool = False,
+    stages: Stages | None = None,
+) -> Reduced:
+    """Reduce sessions to the scenario's frequencies, and write them whole or not at all.
+
+    Parameters
+    ----------
+    scenario : Scenario, or its file or name
+    files : sequence of paths
+        Sessions, in any order.
+    path : path
+        The netCDF file to write.
+    replace : bool
+        Replace a file that is there.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        As :func:`.reduce_files`, if the file would replace a session, if it is there already,
+        unless ``replace``, and if the sessions have no number in any band.
+    """
+    scenario = load_scenario(scenario)
+    stages, path = stages or Stages(), user_path(path)
+    require_new(path, replace=replace, inputs=inputs_of(scenario, files))
+    reduced = reduce_files(files, scenario, stages)
+    if np.isnan(reduced.before).all():
+        raise InputError(
+            f"nothing to reduce: all {len(reduced.bin_of)} spectra of {', '.join(map(str, files))} "
+            "are NaN in every band; check the sessions, and the frequencies of the scenario"
+        )
+    with stages("file"):
+        write_reduced(path, reduced, scenario.to_yaml())
+    return reduced
+
+
+SUFFIX = {"hdf5": "h5", "fits": "fits"}
+GAINS, CLOCK, TRUTH, SCENARIO = "gains.nc", "clock.json", "truth.npz", "scenario.yaml"
+# how long spectra are averaged for a map, where the scenario does not say it
+AVERAGE_S = 7200.0
+FLIGHT = RunKind("simulated sessions", outputs=(), figures={})
+
+
+@dataclass(frozen=True)
+class FlightFiles:
+    """What a simulation has written.
+
+    Attributes
+    ----------
+    sessions : tuple of Path
+    scenario : Path
+        By which they are mapped.
+    n_spectra : int
+    """
+
+    sessions: tuple[Path, ...]
+    scenario: Path
+    n_spectra: int
+
+    @property
+    def command(self) -> str:
+        """The command that maps them."""
+        return f"lusee-bayes map {self.scenario} --data {' '.join(map(str, self.sessions))}"
+
+
+def run_simulate_flight(
+    scenario: Scenario | str | Path,
+    folder: str | Path,
+    *,
+    frequencies_mhz: Sequence[float] = (),
+    replace: bool = False,
+    stages: Stages | None = None,
+) -> FlightFiles:
+    """Simulate sessions, and write them with all that it takes to map them.
+
+    Parameters
+    ----------
+    scenario : Scenario, or its file or name
+        Of one frequency, or several.
+    folder : path
+        Takes ``session_000.h5``, ... , ``truth.npz`` with what is in which spectrum,
+        ``scenario.yaml``, and ``gains.nc`` and ``clock.json`` where the scenario has no gain table
+        and the files no clock.
+    frequencies_mhz : sequence of float
+        In place of the scenario's.
+    replace : bool
+        Replace sessions that are in the folder already.
+    stages : Stages, optional
+        Told how far it is.
+
+    Raises
+    ------
+    InputError
+        As :func:`.simulate_flight`, and if the folder holds sessions already, or cannot be written.
+    """
+    scenario, folder = load_scenario(scenario), user_path(folder)
+    _require_no_sessions(folder, replace)
+    stages = stages or Stages()
+    if frequencies_mhz:
+        scenario = scenario.model_copy(update={"frequencies_mhz": tuple(frequencies_mhz)})
+    origin = origin_of(scenario)
+    inputs = inputs_of(scenario)
+    with run_folder(folder, FLIGHT, origin, replace=replace, inputs=inputs) as place:
+        return _simulated(scenario, place, origin, stages)
+
+
+def _simulated(
+    scenario: Scenario, folder: Path, origin: Mapping[str, str], stages: Stages
+) -> FlightFiles:
+    made = simulate_flight(scenario, stages)
+    suffix = SUFFIX[made.section.kind]
+    names = [f"session_{number:03d}.{suffix}" for number in range(len(made.sessions))]
+    with transaction(folder, FLIGHT.name, origin=origin) as stage:
+        if flight_of(scenario).gain_table is None:
+            write_gain_table(stage / GAINS, made.table)
+        if made.section.clock == "unknown":
+            (stage / CLOCK).write_text(_clock_text(made.clock), encoding="utf-8")
+        np.savez(stage / TRUTH, **_truth(made))
+        (stage / SCENARIO).write_text(
+            _to_be_mapped(made, folder.resolve()).to_yaml(), encoding="utf-8"
+        )
+        with stages.progress("spectra", made.observation.n_times) as done:
+            for name, session in zip(names, made.sessions, strict=True):
+                write_session(
+                    stage / name,
+                    made.rows(session),
+                    _told(made.blocks(session), session.start, done),
+                    kind=made.section.kind,
+                )
+    paths = tuple(folder / name for name in names)
+    return FlightFiles(paths, folder / SCENARIO, made.observation.n_times)
+
+
+def _require_no_sessions(folder: Path, replace: bool) -> None:
+    """InputError where simulated sessions would take the place of others."""
+    found = sorted(path.name for path in folder.glob("session_*"))
+    if found and not replace:
+        raise InputError(
+            f"'{folder}' holds sessions already ({found[0]}); give -o another folder, or --force"
+        )
+
+
+def _told(
+    blocks: Iterator[np.ndarray], start: int, done: Callable[..., None]
+) -> Iterator[np.ndarray]:
+    for block in blocks:
+        yield block
+        start += len(block)
+        done(start)
+
+
+def _to_be_mapped(made: FlightSimulation, folder: Path) -> Scenario:
+    """The scenario, with what the files leave open."""
+    flight, observation = flight_of(made.scenario), made.scenario.observation
+    said = {
+        "gain_table": flight.gain_table or str(folder / GAINS),
+        # a table that is written has its own
+        "component_std": flight.component_std if flight.gain_table else None,
+        "bin_origin": made.origin,
+        "clock": str(folder / CLOCK) if made.section.clock == "unknown" else None,
+        "turntable_deg": made.observation.turntable_deg[0],
+        "site": "file",
+        "simulated": made.section,
+    }
+    average_s = observation.average_s
+    if average_s is None and observation.step_s < AVERAGE_S:
+        average_s = AVERAGE_S
+    times = {"timestamp": "middle", "average_s": average_s}
+    scenario = made.scenario.anchored()
+    return scenario.model_copy(
+        update={
+            "flight": flight.anchored().model_copy(update=said),
+            "observation": scenario.observation.model_copy(update=times),
+        }
+    )
+
+
+def _clock_text(clock: Clock) -> str:
+    record = {
+        "format_version": 1,
+        "reference_event": "simulated",
+        "clock_reference_isot": clock.isot,
+        "time_scale": clock.scale,
+        "clocks": {"spectrometer": {"clock_reference_raw_seconds": clock.raw_s}},
+        "source": "simulated",
+        "assumed": False,
+    }
+    return json.dumps(record, indent=2) + "\n"
+
+
+def _truth(made: FlightSimulation) -> dict[str, np.ndarray]:
+    """What was put into which spectrum, in the order of all sessions."""
+    session = np.repeat(np.arange(len(made.sessions)), [s.stop - s.start for s in made.sessions])
+    return {
+        "session": session,
+        "mjd_utc": made.observation.times.mjd,
+        "frequency_mhz": made.frequencies_mhz,
+        "visibility_v2_hz": made.visibilities,
+        "frames": np.array(made.frames),
+        "gain_error_name": np.array(list(made.gain_errors), dtype=np.str_),
+        "gain_error": np.array(list(made.gain_errors.values())),
+        **made.disturbances.truth(),
+    }
+
+
+@dataclass(frozen=True)
+class Averages:
+    """Data, their averages, and what these cost.
+
+    Attributes
+    ----------
+    data, averaged : Visibilities
+        Before and after.
+    bits : tuple of float, or None
+        Information about the map in both, ``ln|1 + S^1/2 A^T N^-1 A S^1/2| / (2 ln 2)``; None if
+        it was not asked for.
+    """
+
+    data: Visibilities
+    averaged: Visibilities
+    bits: tuple[float, float] | None
+
+    @property
+    def lost_share(self) -> float:
+        """Share of the live time of all products that the rule for flags has left out."""
+        return 1.0 - product_live_s(self.averaged) / product_live_s(self.data)
+
+    @property
+    def lost_bits(self) -> float | None:
+        """Information about the map that the averages lack, in bits; None if it is not known."""
+        return None if self.bits is None else self.bits[0] - self.bits[1]
+
+    def lines(self) -> tuple[str, ...]:
+        """Return what there is to say about it."""
+        before, after = (d.observation for d in (self.data, self.averaged))
+        said = [
+            f"{before.n_times} samples of {before.step_s:g} s -> {after.n_times} of "
+            f"{after.step_s:g} s",
+            f"live time lost where products have different flags: {self.lost_share:.2%}",
+        ]
+        if self.bits is not None:
+            fine, coarse = self.bits
+            said.append(
+                f"information about the map: {fine:.2f} bits -> {coarse:.2f} bits, "
+                f"{self.lost_bits:.2g} lost"
+            )
+        return tuple(said)
+
+
+def run_average(
+    scenario: Scenario | str | Path,
+    data: Data,
+    to_s: float,
+    path: str | Path,
+    *,
+    information: bool = True,
+    replace: bool = False,
+    stages: Stages | None = None,
+) -> Averages:
+    """Average data, write them whole or not at all, and work out what is lost.
+
+    Parameters
+    ----------
+    scenario : Scenario, or its file or name
+        How to read the data, and what the information is worked out with; ``average_s`` does not
+        count.
+    data : Visibilities or path
+        With windows.
+    to_s : float
+        Length of the averages, in seconds.
+    path : path
+        The netCDF file to write.
+    information : bool
+        Work out the information about the map, in the data and in their averages.
+    replace : bool
+        Replace a file that is there.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        As :func:`.read_data` and :func:`.averaged`, for a scenario that the data do not fit or that
+        needs more memory than there is, and if the file is there already, unless ``replace``.
+    """
+    scenario = load_scenario(scenario)
+    stages, path = stages or Stages(), user_path(path)
+    if path.suffix == ".fits":
+        raise InputError(
+            f"'{path}': averages have windows, for which luseepy's waterfalls have no room; give "
+            "-o a name that does not end in .fits"
+        )
+    if path.resolve() in [file.resolve() for file in files_of(data)]:
+        raise InputError(
+            f"'{path}': the averages would replace the data that they are made of; give -o "
+            "another name"
+        )
+    require_new(path, replace=replace, inputs=inputs_of(scenario, data))
+    if scenario.frequencies_mhz:
+        raise InputError(
+            "averages are of one frequency; give a scenario with frequency_mhz and without "
+            "frequencies_mhz"
+        )
+    section = scenario.observation.model_copy(update={"average_s": None})
+    scenario = scenario.model_copy(update={"observation": section})
+    with stages("data"):
+        fine = read_data(data, scenario)
+        with naming(names_of_data(data)[0]):
+            coarse = averaged(fine, to_s)
+    if information:
+        require_fitting(fine, scenario)
+        require_resources(scenario, fine, stages)
+    coarse.write(path)
+    bits = None
+    if information:
+        with stages("information of the data"):
+            before = _bits(scenario, fine)
+        with stages("and of the averages"):
+            bits = (before, _bits(scenario, coarse))
+    return Averages(fine, coarse, bits)
+
+
+def _bits(scenario: Scenario, data: Visibilities) -> float:
+    return float(expected_posterior(set_up(scenario, data)).information_bits())

@@ -1,0 +1,591 @@
+"""A log-normal sky as a program samples it.
+
+The prior of a positive sky, its C_ell known or not: what the program ``log_normal`` samples.
+
+Coordinates in which the posterior of a log-normal sky is straight, for the program of that name.
+
+The data know some combinations of the map to 1e-6 of what the prior allows. In the logarithm s of
+the sky these are curved surfaces: what the data leave open moves the map by s + s^2 / 2 + ..., and
+the second term alone is hundreds of standard deviations of what they know. With the white unknowns
+u of :class:`.LogNormalSky`, the information of the data and ::
+
+    E(u) = chi^2(m(u)) / 2 + |u|^2 / 2,    H = J^T M J + 1,    J = dm/du,
+
+the mode u* is found by steps -(H + damping)^-1 grad E, halved until they lead downwards. H leaves
+out the second derivative of m, which the residuals multiply. Where steps are too long for that, as
+for sources of which there is less than catalogued, they are damped: what the data know is not, so
+that they stay where chi^2 is low. With H = V diag(w) V^T there, and directions V_g in groups of
+rising w, x is made u by ::
+
+    u = u* + V_0 x_0 + sum_g V_g (k_g x_g + D_g(x_0, ..., x_g-1)),
+
+where D_g keeps what the data know of the map, J^T M (m - m*) along all stiffer directions, as it is
+at the mode. What D_g depends on are softer coordinates only, so that the determinant is one (that
+of the scales k, which are not one where C_ell is sampled), however well D_g does its work. A
+correction gains a factor of about the rms of what the data leave open of s, so that one is enough
+where groups differ by as much.
+
+Where A and the tilt of C_ell are sampled, the mode is that of the most probable ones. With
+r = d ln C^(1/2) / d theta, ::
+
+    d ln p(d) / d theta = sum_i r_i (u_i^2 + (H^-1)_ii - 1),
+    F = 2 sum_ij r_i (1 - H^-1)_ij^2 r_j
+
+are the slope of the evidence (the prior's own slope, averaged over a Gaussian posterior) and the
+Fisher information of data about theta. Steps F^-1 times the slope find where it is zero; how it
+changes there says how well the data know theta.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import block_diag
+
+from lusee_bayes.core.arrays import Array, on_device, on_host
+from lusee_bayes.core.checks import Described, number, require_positive, require_shape
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.lazy import dist, numpyro
+from lusee_bayes.core.linalg import (
+    checked_cholesky,
+    inverse_from_cholesky,
+    solve_lower,
+    symmetric_product,
+)
+from lusee_bayes.linear.information import Information
+from lusee_bayes.sampling.hmc import Whitening
+from lusee_bayes.sky.log_normal import LogNormalSky
+from lusee_bayes.systematics.systematic import SKY, Chart
+
+# the sites: white unknowns of the sky, and what C_ell of its logarithm is made of
+STRUCTURE, AMPLITUDE, TILT = "structure", "amplitude", "tilt"
+
+
+class LogNormalPrior(Described, eqx.Module):
+    """A log-normal sky with C_ell = A^2 ((ell + 1) / 10)^tilt of its logarithm.
+
+    ln A and the tilt are known, or Gaussian about these values.
+
+    Attributes
+    ----------
+    sky : LogNormalSky
+        With C_ell of ``amplitude`` and ``tilt``.
+    amplitude, tilt : () array
+        A and the tilt; their medians, if they are not known.
+    log_amplitude_std, tilt_std : () array or None
+        Standard deviations of ln A and of the tilt; None, both, if they are known.
+
+    Raises
+    ------
+    InputError
+        If A or a standard deviation is not positive.
+    """
+
+    sky: LogNormalSky
+    amplitude: Float[Array, ""]
+    tilt: Float[Array, ""]
+    log_amplitude_std: Float[Array, ""] | None = None
+    tilt_std: Float[Array, ""] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        sky: LogNormalSky,
+        amplitude: float,
+        tilt: float,
+        uncertain: tuple[float, float] | None = None,
+    ) -> LogNormalPrior:
+        """Make it.
+
+        Parameters
+        ----------
+        sky : LogNormalSky
+            Its C_ell beyond ell = 0 is replaced.
+        amplitude, tilt : float
+        uncertain : (float, float), optional
+            Standard deviations of ln A and of the tilt, if they are not known.
+        """
+        stds = () if uncertain is None else tuple(np.asarray(float(std)) for std in uncertain)
+        return cls(
+            sky.with_power_law(amplitude, tilt),
+            np.asarray(float(amplitude)),
+            np.asarray(float(tilt)),
+            *stds,
+        )
+
+    def __check_init__(self):
+        require_positive("the amplitude of the logarithm of the sky", self.amplitude)
+        if self.log_amplitude_std is not None:
+            require_positive("the standard deviation of ln A", self.log_amplitude_std)
+            require_positive("the standard deviation of the tilt", self.tilt_std)
+
+    def description(self) -> tuple[str, ...]:
+        known = "known" if self.log_amplitude_std is None else "not known"
+        return (
+            f"log-normal sky, A = {number(self.amplitude, '.4g')} and tilt = "
+            f"{number(self.tilt, '.4g')} {known}",
+            *self.sky.description(),
+        )
+
+    @property
+    def samples_spectrum(self) -> bool:
+        """Whether A and the tilt are unknowns."""
+        return self.log_amplitude_std is not None
+
+    @property
+    def sites(self) -> tuple[str, ...]:
+        """The sites that are sampled."""
+        return (AMPLITUDE, TILT, STRUCTURE) if self.samples_spectrum else (STRUCTURE,)
+
+    def sampled(self) -> Float[Array, " modes"]:
+        """Sample the sky inside a NumPyro program.
+
+        The sites are ``structure``, white unknowns; where C_ell is not known, ``amplitude`` and
+        ``tilt``; and, following from these, ``sky``.
+
+        Returns
+        -------
+        (modes,) array
+            m, in K.
+        """
+        sky = self.sky
+        if self.samples_spectrum:
+            median = jnp.log(self.amplitude)
+            amplitude = numpyro.sample(AMPLITUDE, dist.LogNormal(median, self.log_amplitude_std))
+            tilt = numpyro.sample(TILT, dist.Normal(self.tilt, self.tilt_std))
+            sky = sky.with_power_law(amplitude, tilt)
+        white = dist.Normal(jnp.zeros(sky.size), 1.0).to_event(1)
+        return numpyro.deterministic(SKY, sky.modes(numpyro.sample(STRUCTURE, white)))
+
+
+# the mode is found when a step is shorter than this, in standard deviations, all unknowns together
+SETTLED = 1e-3
+# ... or than that after so many steps: where the curvature is far from H, the last ones are slow
+ROUGH, PATIENCE = 0.1, 40
+# a step of less than one standard deviation is taken as it is: what it gains may be rounding
+SHORT = 1.0
+MAX_STEPS, HALVINGS = 100, 20
+# factor by which steps are damped more, after one that gains less than this part of what H
+# promises, or less, after one that gains more; near the mode not much less than what helped. What
+# a step gains is told from rounding if so much is promised
+DAMPING, POOR, GOOD, ROUNDING = 4.0, 0.25, 0.75, 1e-5
+# A and the tilt are found when a step is shorter than this, in standard deviations
+SPECTRUM_SETTLED = 0.02
+SPECTRUM_STEPS = 30
+# steps of ln A and of the tilt up to which the slope is nearly straight, and longest step
+NEAR, REACH = 0.2, 3.0
+# curvature from which on directions are made straight; the prior's is one
+STIFF = 1.5
+# a correction gains the rms of s that is left open times this: with 1.25, the energy of 2304
+# unknowns differs from that of a Gaussian by 0.8 +- 1.1, with 0.4 by 3.2 +- 2.5
+GAIN = 1.25
+# least ln of the factor between groups: where the data leave s open, corrections gain nothing
+LEAST = 1.0
+
+
+class StraightSky(Chart):
+    """The coordinates of the module's equations; without C_ell as unknowns, or with them.
+
+    Attributes
+    ----------
+    sky : LogNormalSky
+        With the reference C_ell.
+    white : (unknowns,) array
+        u* of the mode.
+    modes : (modes,) array
+        m* of the mode, in K.
+    across : (unknowns, directions) array
+        V of the stiff directions, the softest first.
+    down : (directions, modes) array
+        (w - 1)^-1 V^T J^T M: the inverse of J V on its span, in 1/K.
+    bounds : tuple of int
+        Where each group of directions begins, and where the last ends.
+    """
+
+    sky: LogNormalSky
+    white: Float[Array, " unknowns"]
+    modes: Float[Array, " modes"]
+    across: Float[Array, "unknowns directions"]
+    down: Float[Array, "directions modes"]
+    bounds: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (STRUCTURE, AMPLITUDE, TILT)
+
+    def to_values(self, x):
+        sky, scales, along, white = self._begun(x)
+        for group in self._groups():
+            push = self._correction(sky, white, scales, group)
+            push = push.at[: group.stop - group.start].add((scales * along)[group])
+            white = white + self.across[:, group.start :] @ push
+        return {**x, STRUCTURE: white}, jnp.log(scales).sum()
+
+    def from_values(self, values):
+        sky, scales, along, white = self._begun(values)
+        shift = self.across.T @ (white - self.white)
+        found = jnp.zeros_like(along)
+        for group in self._groups():
+            push = self._correction(sky, white, scales, group)
+            shift = shift.at[group.start :].add(push)
+            own = (along - shift)[group]
+            found = found.at[group].set(own / scales[group])
+            push = push.at[: group.stop - group.start].add(own)
+            white = white + self.across[:, group.start :] @ push
+        return {**values, STRUCTURE: values[STRUCTURE] + self.across @ (found - along)}
+
+    def _groups(self) -> list[slice]:
+        return [slice(first, end) for first, end in pairwise(self.bounds)]
+
+    def _begun(
+        self, values: dict[str, Array]
+    ) -> tuple[
+        LogNormalSky,
+        Float[Array, " directions"],
+        Float[Array, " directions"],
+        Float[Array, " unknowns"],
+    ]:
+        """The sky with the sites' C_ell, k, V^T (x - u*), and u* + V_0 x_0.
+
+        Where C_ell is not that of the mode, u* is what keeps the logarithm as it is there.
+        """
+        linear = values[STRUCTURE] - self.white
+        along = self.across.T @ linear
+        if AMPLITUDE not in values:
+            scales, kept = jnp.ones_like(along), -along
+            sky = self.sky
+        else:
+            sky = self.sky.with_power_law(jnp.exp(values[AMPLITUDE]), values[TILT])
+            ratio = sky.root() / self.sky.root()
+            scales = 1.0 / (ratio @ self.across**2)
+            kept = self.across.T @ ((1.0 / ratio - 1.0) * self.white) - along
+        return sky, scales, along, self.white + linear + self.across @ kept
+
+    def _correction(
+        self,
+        sky: LogNormalSky,
+        white: Float[Array, " unknowns"],
+        scales: Float[Array, " directions"],
+        group: slice,
+    ) -> Float[Array, " free"]:
+        """Steps along a group and all stiffer ones that bring the map nearer to the mode's."""
+        off = sky.modes(white) - self.modes
+        return -scales[group.start :] * (self.down[group.start :] @ off)
+
+
+@dataclass(frozen=True)
+class LogNormalMode:
+    """The likeliest sky, and the curvature there.
+
+    Attributes
+    ----------
+    sky : LogNormalSky
+    information : Information
+        Of the data; its reference is the sky of the mode.
+    white : (unknowns,) array
+        u of the mode.
+    jacobian : (modes, unknowns) array
+        J there, in K.
+    lower : (unknowns, unknowns) array
+        L of H = L L^T.
+    """
+
+    sky: LogNormalSky
+    information: Information
+    white: Float[np.ndarray, " unknowns"]
+    jacobian: Float[np.ndarray, "modes unknowns"]
+    lower: Float[np.ndarray, "unknowns unknowns"]
+
+    @property
+    def modes(self) -> Float[np.ndarray, " modes"]:
+        """The sky of the mode: real packed coefficients, Galactic, in K."""
+        return np.asarray(self.information.reference)
+
+
+def find_mode(
+    sky: LogNormalSky,
+    information: Information,
+    start: Float[np.ndarray, " unknowns"] | None = None,
+) -> LogNormalMode:
+    """Climb to the mode of p(u | d).
+
+    Parameters
+    ----------
+    sky : LogNormalSky
+        The prior.
+    information : Information
+        Of the data.
+    start : (unknowns,) array, optional
+        u to begin from; by default zero, the template itself.
+
+    Returns
+    -------
+    LogNormalMode
+        In NumPy's arrays.
+
+    Raises
+    ------
+    InputError
+        If the information is of another lmax, or no mode is found in 100 steps.
+    """
+    sky, information = on_host((sky, information))
+    require_shape("the information", information.matrix, (sky.n_modes, sky.n_modes))
+    white = np.zeros(sky.size) if start is None else np.array(start, dtype=np.float64)
+    require_shape("the start", white, (sky.size,))
+    here, moved, damping, least = information.recentred(sky.modes(white)), np.inf, 0.0, 0.0
+    for steps in range(MAX_STEPS + 1):
+        jacobian = sky.jacobian(white)
+        curvature = _curvature(here, jacobian)
+        lower = checked_cholesky("the curvature of the posterior", curvature)
+        slope = white - jacobian.T @ here.vector
+        half = solve_lower(lower, slope[:, None], transpose=False)
+        moved = float(np.linalg.norm(half))
+        if moved < (SETTLED if steps < PATIENCE else ROUGH):
+            return LogNormalMode(sky, here, white, jacobian, lower)
+        if damping:
+            damped = curvature + damping * np.eye(sky.size)
+            lower = checked_cholesky("the damped curvature", damped)
+            half = solve_lower(lower, slope[:, None], transpose=False)
+        step, energy = solve_lower(lower, half, transpose=True)[:, 0], _energy(here, white)
+        white, here = _descended(sky, here, white, step, moved < SHORT)
+        promised = float(2.0 * step @ slope - step @ curvature @ step)
+        gained = (energy - _energy(here, white)) / max(promised, ROUNDING)
+        if promised > ROUNDING and gained < POOR:
+            damping = max(DAMPING * damping, 1.0)
+            least = damping if moved < SHORT else least
+        elif promised > ROUNDING and gained > GOOD:
+            damping, least = max(damping / DAMPING if damping > 1.0 else 0.0, least), 0.7 * least
+    raise InputError(
+        f"no mode of the log-normal sky was found in {MAX_STEPS} steps (the last moved by "
+        f"{moved:.2g} standard deviations); the data are far from anything that the template "
+        "allows: check their scale, or raise log_normal.scale_std"
+    )
+
+
+def _curvature(
+    information: Information, jacobian: Float[np.ndarray, "modes unknowns"]
+) -> Float[np.ndarray, "unknowns unknowns"]:
+    curvature = symmetric_product(jacobian.T @ information.matrix, jacobian)
+    curvature[np.diag_indices(len(curvature))] += 1.0
+    return curvature
+
+
+def _energy(information: Information, white: Float[np.ndarray, " unknowns"]) -> float:
+    """2 E, at the sky that the information is about."""
+    return float(information.misfit) + float(white @ white)
+
+
+def _descended(
+    sky: LogNormalSky,
+    here: Information,
+    white: Float[np.ndarray, " unknowns"],
+    step: Float[np.ndarray, " unknowns"],
+    short: bool,
+) -> tuple[Float[np.ndarray, " unknowns"], Information]:
+    """The unknowns behind a step, and the information about their sky."""
+    energy = _energy(here, white)
+    for _ in range(HALVINGS):
+        trial = white - step
+        # far from the mode the sky may leave the range of numbers, which no energy is below
+        with np.errstate(over="ignore", invalid="ignore"):
+            there = here.recentred(sky.modes(trial))
+            if short or _energy(there, trial) < energy:
+                return trial, there
+        step = 0.5 * step
+    return white, here
+
+
+@dataclass(frozen=True)
+class LearnedSpectrum:
+    """C_ell of maximum evidence, and the mode there.
+
+    Attributes
+    ----------
+    power_law : (2,) array
+        ln A and the tilt.
+    covariance : (2, 2) array
+        Of these.
+    mode : LogNormalMode
+    """
+
+    power_law: Float[np.ndarray, "2"]
+    covariance: Float[np.ndarray, "2 2"]
+    mode: LogNormalMode
+
+
+def learn_spectrum(prior: LogNormalPrior, information: Information) -> LearnedSpectrum:
+    """Maximise p(d | A, tilt) p(A, tilt).
+
+    Parameters
+    ----------
+    prior : LogNormalPrior
+        With A and tilt not known.
+    information : Information
+        Of the data.
+
+    Raises
+    ------
+    InputError
+        If no maximum is found in 30 steps, or for one of them no mode.
+    """
+    sky, start, last = prior.sky, None, None
+    centre = np.array([np.log(prior.amplitude), prior.tilt])
+    narrow = np.array([prior.log_amplitude_std, prior.tilt_std], dtype=float) ** -2.0
+    theta, bend = centre, np.zeros((2, 2))
+    for _ in range(SPECTRUM_STEPS + 1):
+        sky = sky.with_power_law(np.exp(theta[0]), theta[1])
+        mode = find_mode(sky, information, start)
+        slope, fisher = _slope_and_fisher(mode)
+        slope, fisher = slope - narrow * (theta - centre), fisher + np.diag(narrow)
+        if np.sqrt(slope @ np.linalg.solve(fisher, slope)) < SPECTRUM_SETTLED:
+            covariance = _covariance(theta, mode, np.linalg.inv(fisher), narrow)
+            return LearnedSpectrum(theta, covariance, mode)
+        if last is not None:  # what the Fisher information of the last step did not foresee
+            moved = theta - last[0]
+            bend = np.outer(last[1] - slope - last[2] @ moved, moved) / (moved @ moved)
+        step = np.linalg.solve(fisher + bend, slope)
+        if np.abs(step).max() > NEAR or step @ slope <= 0:
+            step, bend = _matched(mode, centre - theta, narrow), np.zeros((2, 2))
+        last = theta, slope, fisher
+        # near by, the logarithm stays as it is: the data know it
+        theta = theta + step
+        ratio = sky.root() / sky.with_power_law(np.exp(theta[0]), theta[1]).root()
+        start = mode.white * ratio if np.abs(step).max() < NEAR else None
+    raise InputError(
+        f"no maximum of the evidence was found in {SPECTRUM_STEPS} steps: A = "
+        f"{np.exp(theta[0]):.3g}, tilt = {theta[1]:.3g}; give log_normal.amplitude and "
+        "log_normal.tilt"
+    )
+
+
+def _covariance(
+    theta: Float[np.ndarray, "2"],
+    mode: LogNormalMode,
+    expected: Float[np.ndarray, "2 2"],
+    narrow: Float[np.ndarray, "2"],
+) -> Float[np.ndarray, "2 2"]:
+    """That of ln A and the tilt, from slopes one expected standard deviation away."""
+    moves, rows = np.linalg.cholesky(expected).T, []
+    for move in moves:
+        slopes = []
+        for sign in (1.0, -1.0):
+            there = theta + sign * move
+            sky = mode.sky.with_power_law(np.exp(there[0]), there[1])
+            start = mode.white * mode.sky.root() / sky.root()
+            slopes.append(_slope_and_fisher(find_mode(sky, mode.information, start))[0])
+        rows.append(0.5 * (slopes[1] - slopes[0]))
+    curvature = np.linalg.solve(moves, np.array(rows))
+    curvature = 0.5 * (curvature + curvature.T) + np.diag(narrow)
+    if np.linalg.eigvalsh(curvature).min() <= 0:
+        raise InputError(
+            f"the evidence has no maximum near A = {np.exp(theta[0]):.3g}, tilt = {theta[1]:.3g}: "
+            "the data do not tell them; give log_normal.amplitude and log_normal.tilt"
+        )
+    return np.linalg.inv(curvature)
+
+
+def _slope_and_fisher(
+    mode: LogNormalMode,
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
+    sky, slopes = mode.sky, mode.sky.power_law_slopes()
+    left = inverse_from_cholesky(mode.lower)[: sky.n_modes, : sky.n_modes]
+    slope = slopes @ (mode.white[: sky.n_modes] ** 2 + np.diagonal(left) - 1.0)
+    known = np.eye(sky.n_modes) - left
+    return slope, 2.0 * slopes @ (known**2 @ slopes.T)
+
+
+def _matched(
+    mode: LogNormalMode, centre: Float[np.ndarray, "2"], narrow: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "2"]:
+    """The step after which the modes have as much power as they should, each for itself.
+
+    u_i^2 is 1 - (H^-1)_ii on average where theta is right. This goes far where a slope does not.
+    """
+    sky = mode.sky
+    left = np.diagonal(inverse_from_cholesky(mode.lower))[: sky.n_modes]
+    slopes, known, power = sky.power_law_slopes(), 1.0 - left, mode.white[: sky.n_modes] ** 2
+    step = np.zeros(2)
+    for _ in range(SPECTRUM_STEPS):
+        expected = known * np.exp(2.0 * (step @ slopes))
+        slope = slopes @ (known * (power / expected - 1.0)) + narrow * (centre - step)
+        fisher = 2.0 * (slopes * np.maximum(known, power * known / expected)) @ slopes.T
+        step = step + np.linalg.solve(fisher + np.diag(narrow), slope)
+    return np.clip(step, -REACH, REACH)
+
+
+def coordinates_of(prior: LogNormalPrior, information: Information) -> Whitening:
+    """Make the coordinates of the posterior under a prior.
+
+    Parameters
+    ----------
+    prior : LogNormalPrior
+    information : Information
+        Of the data.
+
+    Raises
+    ------
+    InputError
+        As :func:`find_mode` and :func:`learn_spectrum`.
+    """
+    prior = on_host(prior)
+    if not prior.samples_spectrum:
+        return straight_coordinates(find_mode(prior.sky, information))
+    found = learn_spectrum(prior, information)
+    return straight_coordinates(found.mode, found.power_law, found.covariance)
+
+
+def straight_coordinates(
+    mode: LogNormalMode,
+    power_law: Float[np.ndarray, "2"] | None = None,
+    covariance: Float[np.ndarray, "2 2"] | None = None,
+) -> Whitening:
+    """Make the coordinates about a mode.
+
+    Parameters
+    ----------
+    mode : LogNormalMode
+    power_law : (2,) array, optional
+        ln A and the tilt of the mode's C_ell, where they are unknowns as well.
+    covariance : (2, 2) array, optional
+        Of these.
+
+    Returns
+    -------
+    Whitening
+        Of the site ``structure``, behind ``amplitude`` and ``tilt`` where they are unknowns; in
+        JAX's arrays.
+    """
+    strength, vectors = np.linalg.eigh(mode.lower @ mode.lower.T)
+    stiff = slice(int(np.searchsorted(strength, STIFF)), None)
+    across = np.ascontiguousarray(vectors[:, stiff])
+    pulled = (across.T @ mode.jacobian.T) @ mode.information.matrix
+    down = pulled / (strength[stiff] - 1.0)[:, None]
+    root = vectors / np.sqrt(strength)[None]
+    left_open = ((mode.sky.root()[:, None] * root)[: mode.sky.n_modes] ** 2).sum() / (4.0 * np.pi)
+    if covariance is not None:  # C_ell moves the logarithm, too, where it is not known
+        slopes = mode.sky.power_law_slopes()[:, 1:]
+        left_open += np.einsum("im,ij,jm->m", slopes, covariance, slopes).max()
+    bounds = _bounds(strength[stiff], GAIN**2 * left_open)
+    chart = StraightSky(mode.sky, mode.white, mode.modes, across, down, bounds)
+    log_det, mean = -np.log(np.diagonal(mode.lower)).sum(), mode.white
+    sites: tuple[tuple[str, tuple[int, ...]], ...] = ((STRUCTURE, (mode.sky.size,)),)
+    if power_law is not None:
+        own = np.linalg.cholesky(covariance)
+        log_det = log_det + np.log(np.diagonal(own)).sum()
+        mean, root = np.concatenate([power_law, mean]), block_diag(own, root)
+        sites = ((AMPLITUDE, ()), (TILT, ()), *sites)
+    return on_device(Whitening(mean, root, np.asarray(log_det), sites, chart))
+
+
+def _bounds(strength: Float[np.ndarray, " directions"], gain: float) -> tuple[int, ...]:
+    """Where groups begin in which curvatures differ by less than the squared gain."""
+    if not len(strength):
+        return (0,)
+    group = np.floor(np.log(strength / STIFF) / max(np.log(1.0 / gain), LEAST)).astype(int)
+    first = np.flatnonzero(np.diff(group, prepend=-1))
+    return (*first.tolist(), len(strength))

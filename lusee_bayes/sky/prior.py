@@ -1,0 +1,708 @@
+"""S as a square root: what every prior answers, and its kinds.
+
+The protocol of priors on the sky, m ~ N(mu, S) through a square root S = G G^T.
+
+Everything downstream works with the whitened sky u = G^-1 m ~ N(G^-1 mu, 1). S itself is never
+inverted, so a mode without variance is one that is known to be zero, not an error.
+
+A Gaussian sky whose coefficients are correlated: S = G G^T as a matrix.
+
+Priors of independent unknowns: S = diag(root^2).
+
+An isotropic Gaussian sky in real harmonic coefficients: S = diag(C_ell).
+
+An isotropic Gaussian sky in HEALPix pixels: S = Y diag(C_ell) Y^T.
+
+What a prior can be read from: C_ell in a text file, and a mean sky in a FITS map.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from pathlib import Path
+from typing import NoReturn
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.checks import (
+    Described,
+    extent,
+    is_traced,
+    require_finite,
+    require_float64,
+    require_shape,
+    require_whole,
+)
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import LARGEST_LMAX, n_modes, per_mode, pixel_matrix
+from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.core.linalg import (
+    cholesky,
+    outer_sandwich,
+    sandwich,
+    scaled,
+    solve_lower,
+    times_lower,
+)
+from lusee_bayes.core.reading import read_text, require_file
+from lusee_bayes.sky.sky_source import read_sky_file
+
+# ell + 1 at which the amplitude is that of the spectrum
+PIVOT = 10.0
+
+
+class Prior(Described, eqx.Module):
+    """N(mu, S) over the sky's unknowns, as m = G u of independent normals u of unit variance."""
+
+    def description(self) -> tuple[str, ...]:
+        return (f"{self.size} unknowns of {self.rank} independent normals",)
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """Number of unknowns in m."""
+
+    @property
+    @abstractmethod
+    def rank(self) -> int:
+        """Number of independent normals behind them."""
+
+    @property
+    @abstractmethod
+    def invertible(self) -> bool:
+        """Whether m tells u, but for unknowns without variance: :meth:`whiten` needs it."""
+
+    @property
+    @abstractmethod
+    def independent(self) -> bool:
+        """Whether S is diagonal; it may save work."""
+
+    @abstractmethod
+    def colour(self, u: Float[Array, "*batch white"]) -> Float[Array, "*batch unknowns"]:
+        """Compute G u, on the last axis."""
+
+    @abstractmethod
+    def colour_columns(self, a: Float[Array, "rows unknowns"]) -> Float[Array, "rows white"]:
+        """Compute A G: the columns of A in units of the prior."""
+
+    @abstractmethod
+    def whiten(self, m: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch white"]:
+        """Compute G^-1 m, on the last axis; zero for unknowns without variance.
+
+        Raises
+        ------
+        InputError
+            If G has no inverse (:attr:`invertible`).
+        """
+
+    @abstractmethod
+    def whiten_columns(self, a: Float[Array, "rows white"]) -> Float[Array, "rows unknowns"]:
+        """Compute A G^-1, the inverse of :meth:`colour_columns`; as :meth:`whiten`."""
+
+    @abstractmethod
+    def sandwich(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, "white white"]:
+        """Compute G^T M G of a symmetric M, which may be an information about m: that about u."""
+
+    def colour_covariance(
+        self, white: Float[Array, "white white"]
+    ) -> Float[Array, "unknowns unknowns"]:
+        """Compute G C G^T of a symmetric C, such as the covariance of u: that of m.
+
+        NumPy's C may be overwritten.
+        """
+        return self.colour(self.colour(white).T)
+
+    @abstractmethod
+    def variance(self) -> Float[Array, " unknowns"]:
+        """Return the diagonal of S, in K^2."""
+
+    @abstractmethod
+    def covariance(self) -> Float[Array, "unknowns unknowns"]:
+        """Return S as a matrix, in K^2."""
+
+    @abstractmethod
+    def widened(self, factor: float) -> Prior:
+        """Return the prior about the same mean whose standard deviations are multiplied."""
+
+    @abstractmethod
+    def log_det(self) -> Float[Array, ""]:
+        """Compute ``ln|det G|``, for G in K.
+
+        Raises
+        ------
+        InputError
+            As :meth:`require_density`.
+        """
+
+    @abstractmethod
+    def require_density(self) -> None:
+        """Raise an InputError if S is singular, so that m has no density."""
+
+    @property
+    def white_mean(self) -> Float[Array, " white"] | None:
+        """Mean of u; None for zero."""
+        return None
+
+    def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
+        """Draw skies from the prior.
+
+        Parameters
+        ----------
+        key : PRNG key
+            For the draw.
+        n : int, optional
+            How many; by default one.
+
+        Returns
+        -------
+        (unknowns,) or (n, unknowns) array
+            In K.
+        """
+        shape = (self.rank,) if n is None else (n, self.rank)
+        u = jax.random.normal(key, shape, dtype=jnp.float64)
+        if self.white_mean is not None:
+            u = u + self.white_mean.reshape(*(1,) * (u.ndim - 1), -1)
+        return self.colour(u)
+
+
+# largest difference of S_ij and S_ji, in prior standard deviations of both
+ASYMMETRY = 1e-10
+
+
+class DensePrior(Prior):
+    """S = G G^T over correlated modes, with G lower triangular, about a mean sky.
+
+    Attributes
+    ----------
+    root : (modes, modes) array
+        G, lower triangular with a positive diagonal, in K.
+    mean : (modes,) array or None
+        The prior mean, in K, Galactic, real packed; None for zero.
+
+    Raises
+    ------
+    InputError
+        If they are not float64 or not finite, have other shapes, or G is not lower triangular or
+        has a diagonal that is not positive.
+    """
+
+    root: Float[Array, "modes white"]
+    mean: Float[Array, " unknowns"] | None = eqx.field(default=None, kw_only=True)
+
+    def __check_init__(self):
+        require_float64("the root of the prior", self.root)
+        require_shape("the root of the prior", self.root, (self.size, self.size))
+        require_finite("the root of the prior", self.root)
+        if self.mean is not None:
+            require_float64("the prior mean", self.mean)
+            require_shape("the prior mean", self.mean, (self.size,))
+            require_finite("the prior mean", self.mean)
+        if is_traced(self.root):
+            return
+        root = np.asarray(self.root)
+        above = any(row[k + 1 :].any() for k, row in enumerate(root))
+        if above or not (np.diagonal(root) > 0).all():
+            raise InputError(
+                "the root of the prior must be lower triangular with a positive diagonal; use "
+                "DensePrior.of_covariance(S)"
+            )
+
+    @classmethod
+    def of_covariance(
+        cls,
+        covariance: Float[Array, "modes columns"],
+        mean: Float[Array, " unknowns"] | None = None,
+    ) -> DensePrior:
+        """Make the prior of a covariance.
+
+        Parameters
+        ----------
+        covariance : (modes, modes) array
+            S, in K^2.
+        mean : (modes,) array, optional
+            In K.
+
+        Returns
+        -------
+        DensePrior
+
+        Raises
+        ------
+        InputError
+            If S is not float64, not finite, not symmetric or not positive definite.
+        """
+        require_float64("the prior covariance", covariance)
+        require_finite("the prior covariance", covariance)
+        require_shape("the prior covariance", covariance, (len(covariance), len(covariance)))
+        lower = cholesky(covariance)
+        if not is_traced(lower):
+            _require_covariance(np.asarray(covariance), np.asarray(lower))
+        return cls(lower, mean=mean)
+
+    def description(self) -> tuple[str, ...]:
+        about = "zero" if self.mean is None else "a mean sky"
+        width = extent(namespace(self).sqrt(self.variance()), "K")
+        return (
+            f"correlated coefficients about {about}, {self.size} modes, Galactic",
+            f"standard deviations {width}",
+        )
+
+    @property
+    def size(self) -> int:
+        return self.root.shape[0]
+
+    @property
+    def rank(self) -> int:
+        return self.size
+
+    @property
+    def invertible(self) -> bool:
+        return True
+
+    @property
+    def independent(self) -> bool:
+        return False
+
+    @property
+    def white_mean(self) -> Float[Array, " white"] | None:
+        return None if self.mean is None else self.whiten(self.mean)
+
+    def colour(self, u):
+        return times_lower(u.reshape(-1, self.size), self.root, transpose=True).reshape(u.shape)
+
+    def colour_columns(self, a):
+        return times_lower(a, self.root, transpose=False)
+
+    def whiten(self, m):
+        flat = m.reshape(-1, self.size)
+        return solve_lower(self.root, flat.T, transpose=False).T.reshape(m.shape)
+
+    def whiten_columns(self, a):
+        return solve_lower(self.root, a.T, transpose=True).T
+
+    def sandwich(self, matrix):
+        return sandwich(matrix, self.root)
+
+    def colour_covariance(self, white):
+        return outer_sandwich(white, self.root)
+
+    def widened(self, factor):
+        return DensePrior(self.root * factor, mean=self.mean)
+
+    def variance(self):
+        xp = namespace(self)
+        return xp.einsum("ij,ij->i", self.root, self.root)
+
+    def covariance(self):
+        product = times_lower(self.root, self.root, transpose=True)
+        return (product + product.T) / 2.0
+
+    def log_det(self):
+        xp = namespace(self)
+        return xp.asarray(xp.log(xp.diagonal(self.root)).sum())
+
+    def require_density(self) -> None:
+        """G has an inverse."""
+
+
+def _require_covariance(
+    covariance: Float[np.ndarray, "modes modes"], lower: Float[np.ndarray, "modes modes"]
+) -> None:
+    width = np.sqrt(np.abs(np.diagonal(covariance)))
+    uneven = np.abs(covariance - covariance.T)
+    if (uneven > ASYMMETRY * width[:, None] * width[None]).any():
+        i, j = np.unravel_index(int(np.argmax(uneven)), uneven.shape)
+        raise InputError(
+            f"the prior covariance is not symmetric: S[{i}, {j}] = {covariance[i, j]:.6g}, "
+            f"S[{j}, {i}] = {covariance[j, i]:.6g} K^2; give (S + S^T) / 2"
+        )
+    if not np.isfinite(lower).all():
+        lowest = np.linalg.eigvalsh(covariance)[0]
+        raise InputError(
+            f"the prior covariance is not positive definite: its lowest eigenvalue is "
+            f"{lowest:.3g} K^2 (largest variance {width.max() ** 2:.3g} K^2); give every mode a "
+            "variance of its own"
+        )
+
+
+class DiagonalPrior(Prior):
+    """A prior whose G is diagonal."""
+
+    @property
+    @abstractmethod
+    def widths(self) -> Float[Array, " unknowns"]:
+        """The diagonal of G: prior standard deviations, each in its unknown's unit."""
+
+    @property
+    def size(self) -> int:
+        return self.widths.shape[0]
+
+    @property
+    def rank(self) -> int:
+        return self.size
+
+    @property
+    def invertible(self) -> bool:
+        return True
+
+    @property
+    def independent(self) -> bool:
+        return True
+
+    def colour(self, u):
+        return u * self.widths.reshape(*(1,) * (u.ndim - 1), -1)
+
+    def colour_columns(self, a):
+        return self.colour(a)
+
+    def whiten(self, m):
+        xp, root = namespace(m, self), self.widths.reshape(*(1,) * (m.ndim - 1), -1)
+        power = root != 0
+        return xp.where(power, m / xp.where(power, root, 1.0), 0.0)
+
+    def whiten_columns(self, a):
+        return self.whiten(a)
+
+    def sandwich(self, matrix):
+        return scaled(matrix, self.widths)
+
+    def colour_covariance(self, white):
+        return scaled(white, self.widths, overwrite=True)
+
+    def variance(self):
+        return self.widths**2
+
+    def covariance(self):
+        return namespace(self).diag(self.variance())
+
+    def log_det(self):
+        self.require_density()
+        xp = namespace(self)
+        return xp.asarray(xp.log(xp.abs(self.widths)).sum())
+
+    def require_density(self) -> None:
+        if not is_traced(self.widths) and not np.asarray(self.widths).all():
+            zero = int(np.argmin(np.abs(np.asarray(self.widths))))
+            raise InputError(f"unknown {zero} has no prior variance and no density; drop it")
+
+
+class IndependentPrior(DiagonalPrior):
+    """Independent unknowns of any kind, such as sky modes and source fluxes: S = diag(root^2).
+
+    Attributes
+    ----------
+    root : (unknowns,) array
+        Prior standard deviations, each in its unknown's unit.
+
+    Raises
+    ------
+    InputError
+        If they are not float64 or not finite.
+    """
+
+    root: Float[Array, " unknowns"]
+
+    def __check_init__(self):
+        require_float64("the prior's standard deviations", self.root)
+        require_finite("the prior's standard deviations", self.root)
+
+    @property
+    def widths(self) -> Float[Array, " unknowns"]:
+        return self.root
+
+    def widened(self, factor):
+        return IndependentPrior(self.root * factor)
+
+
+def require_spectrum(spectrum: Float[Array, " ells"]) -> None:
+    """Raise an InputError unless C_ell is float64, finite and not negative."""
+    require_float64("the prior spectrum", spectrum)
+    require_finite("the prior spectrum", spectrum)
+    if is_traced(spectrum):
+        return
+    negative = np.asarray(spectrum) < 0
+    if negative.any():
+        ell = int(np.argmax(negative))
+        raise InputError(
+            f"the prior spectrum is negative at ell = {ell}: C_ell = {float(spectrum[ell]):.3g}; "
+            "a variance cannot be"
+        )
+
+
+class HarmonicPrior(DiagonalPrior):
+    """S = diag(C_ell): an isotropic Gaussian sky in real harmonic coefficients, about a mean sky.
+
+    Attributes
+    ----------
+    spectrum : (ells,) array
+        C_ell in K^2 for ell = 0..lmax; C_0 is the prior variance of the monopole.
+    mean : (modes,) array or None
+        The prior mean, in K, Galactic, real packed; None for zero.
+
+    Raises
+    ------
+    InputError
+        If the spectrum or the mean is not float64 or not finite, the spectrum is negative, or the
+        mean has another lmax, or power at an ell where the spectrum has none.
+    """
+
+    spectrum: Float[Array, " ells"]
+    mean: Float[Array, " modes"] | None = eqx.field(default=None, kw_only=True)
+
+    def __check_init__(self):
+        require_spectrum(self.spectrum)
+        if self.mean is None:
+            return
+        require_float64("the prior mean", self.mean)
+        require_shape("the prior mean", self.mean, (self.size,))
+        require_finite("the prior mean", self.mean)
+        if is_traced(self.spectrum, self.mean):
+            return
+        fixed = np.flatnonzero((np.asarray(self.mean) != 0.0) & ~(np.asarray(self.variance()) > 0))
+        if fixed.size:
+            raise InputError(
+                f"the prior mean has power at ell = {int(np.sqrt(fixed[0]))}, where C_ell is zero; "
+                "give that ell a variance"
+            )
+
+    def description(self) -> tuple[str, ...]:
+        about = "zero" if self.mean is None else "a mean sky"
+        return (
+            f"independent coefficients about {about}, lmax = {self.spectrum.shape[0] - 1}",
+            f"{self.size} real coefficients, Galactic; C_ell {extent(self.spectrum, 'K^2')}",
+        )
+
+    @property
+    def white_mean(self) -> Float[Array, " white"] | None:
+        return None if self.mean is None else self.whiten(self.mean)
+
+    @property
+    def widths(self) -> Float[Array, " modes"]:
+        # the derivative of sqrt at an ell without power is zero here, not infinite
+        xp, power = namespace(self.spectrum), self.spectrum > 0
+        root = xp.sqrt(xp.where(power, self.spectrum, 1.0))
+        return per_mode(xp.where(power, root, 0.0))
+
+    @property
+    def size(self) -> int:
+        return n_modes(self.spectrum.shape[0] - 1)
+
+    def widened(self, factor):
+        return HarmonicPrior(self.spectrum * factor**2, mean=self.mean)
+
+    def variance(self):
+        return per_mode(self.spectrum)
+
+    def require_density(self) -> None:
+        if not is_traced(self.spectrum) and not np.asarray(self.spectrum).all():
+            ell = int(np.argmin(np.asarray(self.spectrum)))
+            raise InputError(
+                f"the prior spectrum is zero at ell = {ell} and has no density; drop that ell"
+            )
+
+
+class PixelPrior(Prior):
+    """The same isotropic sky in HEALPix RING pixels: m = Y a, S = Y diag(C_ell) Y^T.
+
+    S has rank (lmax + 1)^2 at most. Use it with :meth:`coupling`, which turns a harmonic A into
+    one that acts on pixels.
+
+    Parameters
+    ----------
+    spectrum : (ells,) array
+        C_ell in K^2 for ell = 0..lmax.
+    nside : int
+        NSIDE of the pixels.
+
+    Attributes
+    ----------
+    spectrum : (ells,) array
+        C_ell in K^2.
+    synthesis : (pixels, modes) array
+        Y.
+
+    Raises
+    ------
+    InputError
+        If the pixels are fewer than the modes, or the spectrum cannot be one.
+    """
+
+    spectrum: Float[Array, " ells"]
+    synthesis: Float[Array, "pixels modes"]
+
+    def __init__(self, spectrum: Float[Array, " ells"], nside: int):
+        require_spectrum(spectrum)
+        lmax = spectrum.shape[0] - 1
+        if 12 * nside**2 < n_modes(lmax):
+            raise InputError(
+                f"NSIDE {nside} has {12 * nside**2} pixels, too few for the {n_modes(lmax)} modes "
+                f"of lmax = {lmax}; raise NSIDE or lower lmax"
+            )
+        self.spectrum = spectrum
+        self.synthesis = jnp.asarray(pixel_matrix(nside, lmax))
+
+    @property
+    def size(self) -> int:
+        return self.synthesis.shape[0]
+
+    @property
+    def rank(self) -> int:
+        return self.synthesis.shape[1]
+
+    @property
+    def invertible(self) -> bool:
+        return False
+
+    @property
+    def independent(self) -> bool:
+        return False
+
+    def colour(self, u):
+        return HarmonicPrior(self.spectrum).colour(u) @ self.synthesis.T
+
+    def colour_columns(self, a):
+        return HarmonicPrior(self.spectrum).colour_columns(a @ self.synthesis)
+
+    def whiten(self, m):
+        self._refuse()
+
+    def whiten_columns(self, a):
+        self._refuse()
+
+    def sandwich(self, matrix):
+        return self.colour_columns(self.colour_columns(matrix).T)
+
+    def widened(self, factor):
+        return eqx.tree_at(lambda prior: prior.spectrum, self, self.spectrum * factor**2)
+
+    def variance(self):
+        return self.synthesis**2 @ per_mode(self.spectrum)
+
+    def covariance(self):
+        root = self.colour(jnp.eye(self.rank))
+        return root.T @ root
+
+    def log_det(self):
+        self.require_density()
+
+    def require_density(self) -> None:
+        self._refuse()
+
+    def _refuse(self) -> NoReturn:
+        raise InputError(
+            "a prior over pixels is singular: it has no density, and pixels do not tell their "
+            "coefficients; use a prior over harmonic coefficients"
+        )
+
+    def coupling(self, harmonic: Float[Array, "data modes"]) -> Float[Array, "data pixels"]:
+        """Turn A into one that acts on pixels.
+
+        A_pix = A Y^+, so that A_pix Y a = A a for every band-limited sky.
+
+        Parameters
+        ----------
+        harmonic : (data, modes) array
+            A.
+        """
+        return harmonic @ jnp.asarray(np.linalg.pinv(np.asarray(self.synthesis)))
+
+
+SPECTRUM = Layout(
+    "text file of ell and C_ell in K^2",
+    {
+        "ell": Variable(("line",), "integer", low=0.0, grows=True),
+        "C_ell": Variable(("line",), low=0.0),
+    },
+)
+
+
+def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:
+    """Read C_ell from a text file.
+
+    Each line has ell and C_ell, divided by spaces or a comma; the rest of a line after # is a
+    comment, and so is a first line of names.
+
+    Parameters
+    ----------
+    path : str or Path
+    lmax : int
+        Highest ell; the file may have more.
+
+    Returns
+    -------
+    (ells,) array
+        C_ell in K^2 for ell = 0..lmax.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, a line is not two numbers, C_ell is negative or not finite, or
+        zero at every ell, or an ell is missing or not in its place.
+    """
+    rows: list[list[float]] = []
+    named = False
+    require_whole("lmax", lmax, 0, LARGEST_LMAX)
+    text = read_text(path, SPECTRUM.what, "check prior.spectrum_file")
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            row = [float(word) for word in words]
+        except ValueError as error:
+            if not rows and not named:
+                named = True
+                continue
+            raise InputError(f"{path}: line {number} is '{line.strip()}', no numbers") from error
+        if len(row) != 2 or not row[0].is_integer():
+            raise InputError(
+                f"{path}: line {number} is '{line.strip()}', expected ell and C_ell in K^2"
+            )
+        rows.append(row)
+    if not rows:
+        raise InputError(f"{path} holds no numbers; expected {SPECTRUM.what}")
+    table = np.array(rows)
+    columns = {"ell": table[:, 0].astype(np.int64), "C_ell": table[:, 1]}
+    found = SPECTRUM.checked(path, columns, {}).arrays
+    there = set(found["ell"].tolist())
+    missing = [ell for ell in range(lmax + 1) if ell not in there]
+    if missing:
+        several = f" and {len(missing) - 1} more up to lmax = {lmax}" if len(missing) > 1 else ""
+        raise InputError(
+            f"{path} has no C_ell at ell = {missing[0]}{several}; give every ell from 0 to lmax, "
+            "or lower lmax"
+        )
+    spectrum = found["C_ell"][: lmax + 1]
+    if not spectrum.any():
+        raise InputError(f"{path}: C_ell is zero at every ell up to {lmax}; a prior needs variance")
+    return spectrum
+
+
+def read_mean(path: str | Path, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
+    """Read a prior's mean sky: a HEALPix FITS map, or any other file of skies.
+
+    Parameters
+    ----------
+    path : str or Path
+    frequency_mhz : float
+        For files that say their frequencies.
+    lmax : int
+        Highest ell of the map's coefficients that are used.
+
+    Returns
+    -------
+    (modes,) array
+        Galactic, real packed, in K.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used, or is too coarse.
+    """
+    path = require_file(path, "mean map of the prior", "check prior.mean_file")
+    return read_sky_file(path).modes_at(frequency_mhz, lmax)
