@@ -42,6 +42,13 @@ def posterior(a, s, n, d, offset=0.0) -> Answer:
     return Answer(mean, s - gain @ a @ s, float(log_prob))
 
 
+def resolution_rows(posterior, directions) -> np.ndarray:
+    """y^T R of linear combinations y of the modes, one a row: R = 1 - C S^-1."""
+    prior, y = posterior.prior, np.asarray(directions)
+    root = np.asarray(prior.colour(np.eye(prior.rank))).T
+    return y - np.linalg.solve(root @ root.T, np.asarray(posterior.covariance()) @ y.T).T
+
+
 def posterior_by_precision(a, s, n, d) -> Answer:
     """The other textbook form: Lambda = A^T N^-1 A + S^-1, and the evidence written with it."""
     a, s, n, d = (np.asarray(x, dtype=np.float64) for x in (a, s, n, d))

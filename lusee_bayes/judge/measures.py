@@ -1,11 +1,6 @@
-"""Degrees of freedom, point-spread functions, score tests, and the sky's strength.
+"""Degrees of freedom of each datum, score tests, and the sky's strength.
 
-How many degrees of freedom of sky and templates each datum determines.
-
-Rows of the resolution matrix: the point-spread functions of a map.
-
-On average over noise the posterior mean is R m, R = C A^T N^-1 A = 1 - C S^-1. A pixel in direction
-p is y_p^T R m: an integral of the sky with the kernel R(p, q) = y_p^T R y_q over directions q.
+Degrees of freedom are those of sky and templates together.
 
 What the data would prefer of something that the model leaves out: score tests of templates.
 
@@ -32,8 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, compiled, namespace, on_host
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.arrays import Array, compiled, on_host
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import solve_lower
@@ -86,34 +80,6 @@ def data_freedom(
         freedom += (seen * weighted).sum(1)
         solved = solved - weighted @ (seen.T @ weighted_columns)
     return freedom + (columns * solved).sum(1)
-
-
-def resolution_rows(
-    posterior: Posterior, directions: Float[Array, "n modes"]
-) -> Float[Array, "n modes"]:
-    """Compute y^T R for linear combinations y of the modes.
-
-    Parameters
-    ----------
-    posterior : Posterior
-        Over harmonic coefficients.
-    directions : (n, modes) array
-        One y a row, for example of ``harmonics.pixel_matrix``.
-
-    Returns
-    -------
-    (n, modes) array
-        Rows of y^T R. Their values in a direction q, ``rows @ y_q``, are per steradian. Columns of
-        modes without prior variance are zero, as those modes are in the map.
-
-    Raises
-    ------
-    InputError
-        If the prior is not over harmonic coefficients.
-    """
-    if not posterior.prior.invertible:
-        raise InputError("resolution needs a prior over harmonic coefficients")
-    return _rows(posterior, namespace(posterior).asarray(directions))
 
 
 @compiled

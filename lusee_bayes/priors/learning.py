@@ -36,7 +36,6 @@ each S(theta).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -210,7 +209,6 @@ def learn(
     information: Information,
     start: Float[np.ndarray, " parameters"] | None = None,
     seed: int = 1,
-    report: Callable[[int, float], None] | None = None,
 ) -> Learned:
     """Find the most probable parameters of a family, and the prior that they give.
 
@@ -223,8 +221,6 @@ def learn(
         Where to begin; by default with the most probable ones before there are data.
     seed : int
         Of the simulated data.
-    report : callable, optional
-        Told the number of every step and ln p(d, theta).
 
     Raises
     ------
@@ -236,8 +232,6 @@ def learn(
     rng, information = np.random.default_rng(seed), on_host(information)
     here = _at(family, information, family.hyperprior.start() if start is None else start)
     for steps in range(MAX_STEPS + 1):
-        if report is not None:
-            report(steps, here.value)
         gradient, curvature = _slope(family, here, rng, SIMULATIONS)
         step = np.linalg.solve(curvature, gradient)
         gain = 0.5 * float(gradient @ step)

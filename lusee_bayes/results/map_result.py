@@ -164,8 +164,6 @@ class MapResult(Described):
     experiment : Experiment
     inference : Inference
         The model and its posterior, given all data.
-    judged : Inference
-        The model that predicts the data: given the earlier ones, where there are any.
     channel : ChannelResult
     diagnostics : xarray.Dataset
         What a report shows beyond the map (:func:`.diagnostics`).
@@ -187,7 +185,6 @@ class MapResult(Described):
 
     experiment: Experiment
     inference: Inference
-    judged: Inference
     channel: ChannelResult
     diagnostics: xr.Dataset
     fluxes: pd.DataFrame | None
@@ -361,7 +358,6 @@ def map_result(
     return MapResult(
         experiment,
         found,
-        judged,
         channel,
         page,
         fluxes,

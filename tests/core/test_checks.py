@@ -17,10 +17,6 @@ from lusee_bayes.core.checks import (
 from lusee_bayes.core.errors import InputError, nearest
 
 
-def test_input_error_is_a_value_error():
-    assert issubclass(InputError, ValueError)
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.int64, np.complex128, bool])
 def test_only_float64_is_accepted(dtype):
     name = np.dtype(dtype).name
@@ -85,11 +81,6 @@ def test_positive_refuses_zero_negative_and_non_finite(bad):
         InputError, match=r"step must be positive, fails at 1 of 3 entries, .*\(2,\)"
     ):
         require_positive("step", np.array([1.0, 2.0, bad]))
-
-
-def test_good_values_pass():
-    require_finite("x", np.array([-1.0, 0.0]))
-    require_positive("x", np.array([1e-300, 1e300]))
 
 
 def test_inside_a_transformation_values_pass_and_dtypes_do_not():

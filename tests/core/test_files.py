@@ -199,14 +199,6 @@ def test_own_files_stay_and_those_of_the_earlier_run_go(folder):
     assert content(folder).keys() == {*OWN, *NEW, MANIFEST}
 
 
-def test_unfinished_work_is_removed_with_the_commit(folder):
-    write(folder, WORK)
-    with transaction(folder, "test", ["chains"]) as stage:
-        write(stage, NEW)
-        assert content(folder / "chains").keys() == {"chunk-1.npz", "run.json"}
-    assert not (folder / "chains").exists()
-
-
 def test_scratch_folders_of_the_dead_go_and_of_the_living_stay(folder):
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
@@ -252,24 +244,6 @@ def test_signals_wait_until_the_results_are_in_place(number, folder, monkeypatch
         signal.signal(number, earlier)
     # the rename, each file and the manifest
     assert heard == [{*OWN, *NEW, MANIFEST}] * (len(NEW) + 2)
-
-
-def test_an_interrupt_during_the_commit_comes_behind_it(folder, monkeypatch):
-    replace = os.replace
-
-    def interrupted(*paths):
-        signal.raise_signal(signal.SIGINT)
-        replace(*paths)
-
-    earlier = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt), transaction(folder, "test") as stage:
-            write(stage, NEW)
-            monkeypatch.setattr(os, "replace", interrupted)
-    finally:
-        monkeypatch.undo()
-        signal.signal(signal.SIGINT, earlier)
-    assert content(folder).keys() == {*OWN, *NEW, MANIFEST}
 
 
 def test_a_thread_commits_too(folder):

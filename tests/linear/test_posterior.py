@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference_linear import assert_draws_follow, posterior, random_covariance
+from reference_linear import assert_draws_follow, posterior, random_covariance, resolution_rows
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
@@ -26,7 +26,6 @@ from lusee_bayes.judge.chi2 import (
     prior_fraction_per_ell,
     signal_to_noise,
 )
-from lusee_bayes.judge.measures import resolution_rows
 from lusee_bayes.linear import posterior as posterior_module
 from lusee_bayes.linear.model import LinearGaussian, deviation_model, updated
 from lusee_bayes.linear.solver import FORMS

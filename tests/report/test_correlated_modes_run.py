@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import xarray as xr
 from page_in_node import NODE, run_page
+from reference_linear import resolution_rows
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
-from lusee_bayes.judge.measures import resolution_rows
 from lusee_bayes.report.explorer import KERNEL_NSIDE
 from lusee_bayes.results.diagnostics import read_diagnostics
 from lusee_bayes.results.updatable import read_updatable

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from page_in_node import NODE, run_page
+from reference_linear import resolution_rows
 
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
 from lusee_bayes.core.lazy import healpy as lazy_healpy
-from lusee_bayes.judge.measures import resolution_rows
 from lusee_bayes.report.explorer import KERNEL_NSIDE, std_scale
 from lusee_bayes.results.diagnostics import packed_resolution, read_diagnostics
 from lusee_bayes.sky.prior import IndependentPrior

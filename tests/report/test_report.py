@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from reference_linear import resolution_rows
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.judge.measures import resolution_rows
 from lusee_bayes.report.pages import write_report
 from lusee_bayes.results.diagnostics import read_diagnostics, region_of
 from lusee_bayes.runs.map_run import run_map
@@ -219,7 +219,7 @@ def test_a_page_without_groups(tmp_path, monkeypatch):
     assert found.sizes["group"] == 0 and np.isnan(found["z"]).all()
     assert found.attrs["verdict"] == run.result.verdict()
     # the rest is judged as ever: chi^2 of all data under the model, by matrices
-    model, data = run.result.judged.model, run.result.experiment.data.data
+    model, data = run.result.inference.model, run.result.experiment.data.data
     a = np.asarray(model.coupling.dense())
     k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
     expected = np.asarray(data) @ np.linalg.solve(k, np.asarray(data))
