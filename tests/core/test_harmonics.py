@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import healpy
 import jax.numpy as jnp
 import numpy as np
@@ -6,6 +8,8 @@ from reference import real_harmonics
 
 from lusee_bayes.core import harmonics as h
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
+from lusee_bayes.core.sphere_grid import SphereGrid
 
 LMAX = 9
 
@@ -101,13 +105,6 @@ def test_harmonics_are_orthonormal():
     np.testing.assert_allclose((y.T * weight) @ y, np.eye(h.n_modes(16)), rtol=0, atol=1e-12)
 
 
-def test_parseval():
-    a = np.random.default_rng(3).standard_normal(h.n_modes(12))
-    theta, phi, weight = sphere(12)
-    f = h.synthesis_matrix(theta, phi, 12) @ a
-    np.testing.assert_allclose(np.sum(weight * f**2), np.sum(a**2), rtol=1e-12)
-
-
 def test_a_map_gives_back_its_coefficients():
     alm = random_alm(np.random.default_rng(4), LMAX)
     modes = h.map_to_modes(healpy.alm2map(alm, 16, lmax=LMAX), LMAX)
@@ -165,3 +162,31 @@ def test_addition_theorem():
 def test_bad_maps_are_refused(pixels, lmax, message):
     with pytest.raises(InputError, match=message):
         h.map_to_modes(pixels, lmax)
+
+
+HIGHEST, LMAX, OF_FIELD = 7, 4, 3
+
+
+def field(theta, phi):
+    """A field of degree 3."""
+    coefficients = np.random.default_rng(1).normal(size=n_modes(OF_FIELD))
+    return synthesis_matrix(theta, phi, OF_FIELD) @ coefficients
+
+
+@pytest.mark.parametrize("lmax", [LMAX, HIGHEST])
+def test_a_product_matrix_is_an_integral(lmax):
+    grid = SphereGrid.of(HIGHEST, HIGHEST + OF_FIELD)
+    found = grid.product_matrix(field(*grid.directions()).reshape(grid.shape), lmax)
+    # another rule: equal steps in azimuth from elsewhere, and many more rings
+    x, weights = np.polynomial.legendre.leggauss(40)
+    phi = 0.1 + 2.0 * np.pi * np.arange(50) / 50
+    theta, phi = (a.ravel() for a in np.meshgrid(np.arccos(x), phi, indexing="ij"))
+    area = np.repeat(weights, 50) * 2.0 * np.pi / 50
+    y = synthesis_matrix(theta, phi, HIGHEST)
+    expected = (y * (area * field(theta, phi))[:, None]).T @ y
+    np.testing.assert_allclose(found, expected[: n_modes(lmax)], atol=1e-13)
+
+
+def test_values_of_another_grid_are_refused():
+    with pytest.raises(InputError, match="the field has shape"):
+        SphereGrid.of(3, 6).product_matrix(np.ones((3, 4)))

@@ -102,18 +102,9 @@ def maps_of(lmax, step_s, cycles, to_s):
     )
 
 
-# lmax, length of the fine samples, cycles, and length of the averages
-QUICK = [(8, 60.0, 0.1, 2 * HOUR), (8, 60.0, 0.1, 12 * HOUR)]
-FULL = [(16, 30.0, 1.0, 2 * HOUR), (16, 30.0, 1.0, 12 * HOUR)]
-
-
-@pytest.fixture(
-    scope="module",
-    params=[*QUICK, *(pytest.param(size, marks=pytest.mark.long) for size in FULL)],
-    ids=lambda size: f"{size[1]:g} s to {size[3] / HOUR:g} h, lmax {size[0]}",
-)
+@pytest.fixture(scope="module", params=[2, 12], ids=lambda hours: f"60 s to {hours} h")
 def maps(request):
-    return maps_of(*request.param)
+    return maps_of(8, 60.0, 0.1, request.param * HOUR)
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build, infer
 from lusee_bayes.experiment.flight_data import per_kelvin_of, reduce_files
 from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.instrument.products import auto_indices, labels
 from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.results.unknowns import unknowns_report
@@ -115,7 +116,7 @@ def test_the_known_sky_is_within_the_error_bars(mapped):
 def test_gains_that_are_off_are_found_and_the_map_holds(flight, monkeypatch):
     """Gains of every level of every port off by 1 %: the map is within wider error bars."""
     drawn = 1.0 + 0.01 * np.random.default_rng(4).standard_normal((3, 4))
-    original = gain_model.read_gain_table
+    original = read_gain_table
 
     def off(path, model="quadratic"):
         table = original(path, model)

@@ -253,14 +253,6 @@ def test_a_tone_that_no_bin_holds_is_refused():
         drawn(1003)
 
 
-@pytest.mark.parametrize(
-    "change", ["navgf=5", "levels=MMMX", "levels=MMM", "kind=netcdf", "saturated_share=0.9"]
-)
-def test_impossible_states_are_refused(change):
-    with pytest.raises(InputError):
-        load_scenario("fiducial", [*SMALL, "flight.simulated={}", f"flight.simulated.{change}"])
-
-
 def test_gains_are_off_as_they_are_said_to_be(tmp_path):
     """By the table the values are those of gains that are off by what the truth says."""
     off = "flight.gain_std=0.02", "flight.component_std=[0.01, 0.02]", "noise.gain_table={}"

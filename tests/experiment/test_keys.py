@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 
 import pytest
+from assertions import refused
 
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.keys import keys_as_markdown, scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
@@ -68,20 +68,43 @@ def test_a_default_changes_nothing(plain, key):
     assert changed == load_scenario(plain, before)
 
 
-BOUNDED = [(k, re.search(r"number, (\S+) to (\S+)$", k.choices)) for k in KEYS]
+RECEIVER = "beam={model: response, file: x, receiver: {model: %s, file: x}}"
+OF_KIND = {name: f"beam={{model: {name}, file: x}}" for name in ("luseepy", "response", "sampled")}
+OF_KIND |= {name: f"prior.model={name}" for name in ("isotropic", "local_scales")}
+OF_KIND |= {name: (RECEIVER % name).replace(", file: x}}", "}}") for name in ("jfet", "capacitor")}
 
 
-@pytest.mark.parametrize(
-    "key, bounds", [(k, b) for k, b in BOUNDED if b], ids=lambda key: getattr(key, "path", "")
-)
-def test_bounds_are_those_that_are_enforced(key, bounds):
-    if key.kind not in ("", "monopole", "galaxy") or not key.unit or "list" in key.choices:
-        pytest.skip("needs a file or an entry of a list")
+def of_kind(key):
+    """Overrides by which the section of a key is there, of its kind."""
     before = [text for name, text in WITHIN.items() if key.path.startswith(f"{name}.")]
-    low, high = (float(bound) for bound in bounds.groups())
-    for value in (low - 1.0, high + 1.0):
-        with pytest.raises(InputError):
-            load_scenario("fiducial", [*before, f"{key.path}={value}"])
+    if key.kind == "file":
+        before += ["sky={model: file, file: x}" if key.path[0] == "s" else RECEIVER % "file"]
+    return before + ([OF_KIND[key.kind]] if key.kind in OF_KIND else [])
+
+
+def outside(choices):
+    """Values that a key does not take, by the words for those that it takes."""
+    numbers = re.search(r"(?:number|integer), (.*)", choices)
+    if numbers is None:
+        of_words = re.fullmatch(r"(list of: )?\w+(, \w+)+", choices)
+        return ["neither"] if of_words else []
+    if " to " in numbers[1]:
+        low, high = map(float, numbers[1].split(" to "))
+        return [low - 1.0, high + 1.0]
+    beside = {">": 0.0, "<": 0.0, ">=": -1.0, "<=": 1.0}
+    found = re.findall(r"([<>]=?) ([^,]+)", numbers[1])
+    return [float(bound) + beside[sign] for sign, bound in found]
+
+
+@pytest.mark.parametrize("key", [k for k in KEYS if outside(k.choices)], ids=lambda key: key.path)
+def test_what_is_listed_of_a_key_is_enforced_and_the_key_is_named(key):
+    for value in outside(key.choices):
+        if key.choices.startswith("list of"):
+            value = f"[{value}, {value}, {value}, {value}]"
+        elif key.choices.startswith("name: "):
+            value = f"{{clock_s: {value}, length_m: {value}}}"
+        with refused(rf"{re.escape(key.path)}(\.\w+)? is "):
+            load_scenario("fiducial", [*of_kind(key), f"{key.path}={value}"])
 
 
 def test_units_are_those_of_the_names():
@@ -100,7 +123,7 @@ def test_units_are_those_of_the_names():
 def test_a_section_is_listed_alone_and_a_wrong_one_is_corrected():
     assert {key.path.split(".")[1] for key in scenario_keys("noise.gain")} == {"gain"}
     assert [key.path for key in scenario_keys("lmax")] == ["lmax"]
-    with pytest.raises(InputError, match=r"no key 'noise\.gane'; did you mean 'noise\.gain'\?"):
+    with refused("no key 'noise.gane'; did you mean 'noise.gain'?"):
         scenario_keys("noise.gane")
 
 

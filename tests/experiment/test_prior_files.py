@@ -99,12 +99,3 @@ def test_missing_and_coarse_files_are_refused(files):
     healpy.write_map("coarse.fits", np.ones(12), coord="G", dtype=np.float64)
     with pytest.raises(InputError, match="too large for a map of NSIDE 1"):
         small_scenario("prior.mean_file=coarse.fits").prior.prior(sky)
-
-
-def test_many_frequencies_need_the_files_frequency():
-    with pytest.raises(InputError, match="say which in prior.file_frequency_mhz"):
-        small_scenario("prior.spectrum_file=a.txt", "frequencies_mhz=[10, 20]")
-    with pytest.raises(InputError, match="joint takes the spectral prior"):
-        small_scenario(
-            "prior.spectrum_file=a.txt", "frequencies_mhz=[10, 15, 20, 30]", "joint=true"
-        )

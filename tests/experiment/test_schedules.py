@@ -87,21 +87,6 @@ def test_half_duty_in_the_schedule_is_half_duty_of_the_receivers(given, path):
     assert said["1"].days == pytest.approx(2.0 * said["0.5"].days, rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("observation.start=2027-01-16T00:00:00", "says when data are taken, and so does start"),
-        ("observation.runs.0.cycles=2", "and so does runs; leave out one of them"),
-        ("observation.runs.0.night_only=true", "and so does runs"),
-        ("observation.fixed_axis=true", "add window: instant"),
-        ("observation.schedule=12", "observation.schedule"),
-    ],
-)
-def test_dates_are_given_once(given, override, message):
-    with pytest.raises(InputError, match=message):
-        load_scenario("fiducial", [*given, override])
-
-
 def test_what_is_wrong_with_the_file_is_said(given, path):
     path.write_text(TABLE.replace("2027-01-18,", "2028-01-18,"))
     with pytest.raises(InputError, match=r"nights.csv, line 3: the interval from .* begins"):

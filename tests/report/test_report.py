@@ -22,6 +22,7 @@ from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.judge import residuals as residuals_module
 from lusee_bayes.report.pages import write_report
 from lusee_bayes.results.diagnostics import read_diagnostics, region_of
 from lusee_bayes.runs.map_run import run_map
