@@ -40,8 +40,7 @@ noise: {radiometer: {form: paper, bandwidth_hz: 1000000.0, duty_cycle: 1.0, fact
   log_factor_std: null, temperature: model}, gain: null, beam: null}
 sources: {list: [], treatment: marginalised}
 spectral: {model: components, components: [power_law, curvature, turnover], index: -2.5,
-  reference_mhz: 20.0, turnover_mhz: 5.0, length: 1.0, residual: null, solver: auto,
-  tolerance: 1.0e-07, iterations: 500}
+  reference_mhz: 20.0, turnover_mhz: 5.0, length: 1.0, residual: null}
 seed: 1
 """
 
