@@ -89,7 +89,7 @@ def test_half_duty_in_the_schedule_is_half_duty_of_the_receivers(given, path):
 
 def test_what_is_wrong_with_the_file_is_said(given, path):
     path.write_text(TABLE.replace("2027-01-18,", "2028-01-18,"))
-    with pytest.raises(InputError, match=r"nights.csv, line 3: the interval from .* begins"):
+    with pytest.raises(InputError, match=r"nights.csv, row 2: the interval from .* begins"):
         build(load_scenario("fiducial", given))
     path.unlink()
     with pytest.raises(InputError, match="no schedule, a table in CSV or .* at '"):

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from experiments import small_experiment
-from reference_linear import assert_draws_follow
 
 from lusee_bayes.experiment import model as model_module
 from lusee_bayes.experiment.experiment import build
@@ -143,18 +142,6 @@ def test_simulated_data_hold_it_whatever_its_treatment(registered):
     )
     other = np.asarray(simulate(reseeded).data - simulate(bare).data)
     assert np.abs(other - added["ignored"]).max() > 1.0
-
-
-def test_its_draws_have_its_covariance(registered):
-    """2000 seeds: the amplitudes are independent unit normals."""
-    setup, root = setup_with(sigma_k=100.0), patterns(96, 100.0)
-    nothing = jnp.zeros((16, setup.observation.n_times))
-    keys = jax.random.split(jax.random.key(7), 2000)
-    drawn = jax.vmap(lambda key: TERM.distort(nothing, setup, {}, key))(keys)
-    noise = np.asarray(jax.vmap(setup.layout.gather)(drawn))
-    amplitudes = noise @ np.linalg.pinv(root).T
-    np.testing.assert_allclose(amplitudes @ root.T, noise, rtol=0, atol=1e-11 * np.abs(noise).max())
-    assert_draws_follow(amplitudes, np.zeros(3), np.eye(3))
 
 
 def test_a_whole_experiment_knows_its_noise(registered):

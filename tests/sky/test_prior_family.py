@@ -14,16 +14,21 @@ from lusee_bayes.priors.local_scales import embedded_local_scales, windows
 LMAX = 5
 
 
-def families() -> dict[str, PriorFamily]:
-    return {
-        "isotropic": IsotropicFamily.around(2e4, LMAX),
-        "local scales": embedded_local_scales(25.0, LMAX),
-    }
+MAKE = {
+    "isotropic": lambda lmax: IsotropicFamily.around(2e4, lmax),
+    "local scales": lambda lmax: embedded_local_scales(25.0, lmax),
+}
 
 
-@pytest.fixture(scope="module", params=["isotropic", "local scales"])
-def family(request):
-    return families()[request.param]
+@pytest.fixture(scope="module", params=MAKE)
+def made(request):
+    """A family, and the same of a lower lmax."""
+    return MAKE[request.param](LMAX), MAKE[request.param](3)
+
+
+@pytest.fixture(scope="module")
+def family(made):
+    return made[0]
 
 
 def somewhere(family: PriorFamily) -> np.ndarray:
@@ -140,11 +145,8 @@ def test_the_hyperprior_is_a_density():
     assert (both.curvature(at) > 0.0).all()
 
 
-def test_a_coarse_start_keeps_what_both_have(family):
-    coarse = {
-        "IsotropicFamily": lambda: IsotropicFamily.around(2e4, 3),
-        "LocalScales": lambda: embedded_local_scales(25.0, 3),
-    }[type(family).__name__]()
+def test_a_coarse_start_keeps_what_both_have(made):
+    family, coarse = made
     found = family.start_from(coarse, coarse.hyperprior.start() + 0.1)
     assert len(found) == family.hyperprior.size
     moved = found - family.hyperprior.start()

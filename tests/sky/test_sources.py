@@ -14,9 +14,10 @@ from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 SOURCES = {source.name: source for source in BRIGHT_SOURCES}
 
 
-def test_all_nine_are_there():
-    names = {"Cas A", "Cyg A", "Vir A", "Tau A", "Cen A", "For A", "Her A", "Hyd A", "Pic A"}
-    assert set(SOURCES) == names and len(BRIGHT_SOURCES) == 9
+@pytest.mark.parametrize("bad", [0.0, -3.0, float("nan")])
+def test_frequencies_are_positive(bad):
+    with pytest.raises(InputError, match="expected positive"):
+        SOURCES["Cyg A"].flux_jy(bad)
 
 
 @pytest.mark.parametrize(
@@ -94,11 +95,3 @@ def test_kelvin_steradian_is_the_rayleigh_jeans_law():
     assert source.kelvin_steradian(30.0) == pytest.approx(0.01, rel=1e-12)
     # Cyg A at 38 MHz, 25.5 kJy: lambda = 7.889 m gives 574.8 K sr; its flux is held to 1 %.
     assert SOURCES["Cyg A"].kelvin_steradian(38.0) == pytest.approx(574.8, rel=0.01)
-
-
-def test_frozen_and_refuses_bad_frequencies():
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        SOURCES["Cyg A"].ra_deg = 0.0
-    for bad in (0.0, -3.0, float("nan")):
-        with pytest.raises(InputError, match="expected positive"):
-            SOURCES["Cyg A"].flux_jy(bad)
