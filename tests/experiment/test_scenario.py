@@ -1,14 +1,32 @@
-"""Scenarios: defaults, overrides, round trip, and errors that help."""
+"""Scenarios: keys, defaults, overrides, round trip, sections in kinds, and errors that help."""
+
+from __future__ import annotations
 
 import re
+from pathlib import Path
 
+import numpy as np
 import pytest
 from assertions import refused
+from fits_files import write_images
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.keys import scenario_keys
+from lusee_bayes.core.reading import as_yaml, parse_yaml
+from lusee_bayes.experiment.instrument_sections import (
+    MonopoleBeamSection,
+    ResponseSection,
+    ScalarBeamSection,
+    section_of_file,
+)
+from lusee_bayes.experiment.keys import keys_as_markdown, scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario, scenario_names
 from lusee_bayes.experiment.section import FILES
+from lusee_bayes.experiment.sky_sections import (
+    FileSkySection,
+    GalaxySection,
+    IsotropicPriorSection,
+    LocalScalesPriorSection,
+)
 
 
 def test_the_fiducial_scenario_is_the_papers():
@@ -196,3 +214,285 @@ def test_shipped_scenarios_are_what_their_names_say():
     assert {"fiducial", *SHIPPED} <= set(scenario_names())
     for name, change in SHIPPED.items():
         assert load_scenario(name) == load_scenario("fiducial", [change]), name
+
+
+# all keys, as a resolved scenario was written before sections came in kinds
+OLD = """
+frequency_mhz: 25.0
+frequencies_mhz: []
+joint: false
+lmax: 47
+nside: null
+observation: {lon_deg: 182.258, lat_deg: -23.814, start: '2027-01-15T00:00:00', step_s: 7200.0,
+  runs: [{cycles: 1.0, turntable_deg: 0.0, night_only: false}], fixed_axis: false}
+beam: {model: monopole, length_m: 3.0, zenith_angle_deg: 75.0, height_m: 2.0,
+  surface_permittivity: 3.7, deep_permittivity: 6.1, loss_tangent: 0.01, turntable_offset_deg: 0.0,
+  file: null, taper: true, quadrature: exact, receiver: jfet, moon_temperature_k: 0.0,
+  antenna_temperature_k: 0.0, rotations_deg: [0.0, 90.0, 180.0, 270.0]}
+sky: {model: galaxy, seed: 1, sources: false, file: null, dataset: null, file_frequency_mhz: null,
+  spectral_index: -2.5}
+prior: {spectrum: sky, scale: 1.0, log_amplitude_std: null, tilt_std: null, band_edges: [],
+  log_band_std: 1.0}
+noise: {radiometer: {form: paper, bandwidth_hz: 1000000.0, duty_cycle: 1.0, factor: 1.0,
+  log_factor_std: null, temperature: model}, gain: null, beam: null}
+sources: {list: [], treatment: marginalised}
+spectral: {model: components, components: [power_law, curvature, turnover], index: -2.5,
+  reference_mhz: 20.0, turnover_mhz: 5.0, length: 1.0, residual: null}
+seed: 1
+"""
+
+
+def old_scenario(path, **changes):
+    """The scenario of the old text with some sections' entries changed."""
+    tree = parse_yaml(OLD, "the file")
+    for section, entries in changes.items():
+        tree[section] |= entries
+    path.write_text(as_yaml(tree))
+    return load_scenario(path)
+
+
+@pytest.fixture
+def response(tmp_path):
+    """A file that is known as a four-port response by its images."""
+    return str(write_images(tmp_path / "ports.fits", {"h_theta_real": np.zeros((1, 1))}, {}))
+
+
+@pytest.fixture
+def scalar(tmp_path):
+    """A FITS file that is none."""
+    return str(write_images(tmp_path / "arm.fits", {"Etheta_real": np.zeros((1, 1))}, {}))
+
+
+# --- scenarios that were written before -----------------------------------------------------------
+
+
+def test_the_old_fiducial_scenario_is_the_fiducial_scenario(tmp_path):
+    found = old_scenario(tmp_path / "old.yaml")
+    # it says of which visibilities the noise level is that, which has since been left open
+    assert found == load_scenario("fiducial", ["noise.radiometer.temperature=model"])
+    assert found.prior == IsotropicPriorSection(spectrum="sky")
+    # written again, it has no key of another kind
+    tree = parse_yaml(found.to_yaml(), "the file")
+    assert set(tree["beam"]) == set(MonopoleBeamSection.model_fields)
+    assert set(tree["sky"]) == set(GalaxySection.model_fields)
+    assert tree["prior"]["spectrum"] == "sky"
+
+
+def test_what_an_old_scenario_says_of_the_embedded_antennas_is_kept(tmp_path):
+    beam = {"length_m": 2.5, "loss_tangent": 0.02, "turntable_offset_deg": 3.0}
+    found = old_scenario(tmp_path / "old.yaml", beam=beam, prior={"scale": 2.0, "tilt_std": 0.5})
+    assert found.beam == MonopoleBeamSection(**beam)
+    assert found.prior == IsotropicPriorSection(scale=2.0, tilt_std=0.5)
+
+
+def test_an_old_scenario_with_a_scalar_beam(tmp_path, scalar):
+    beam = {
+        "file": scalar,
+        "taper": False,
+        "quadrature": "luseepy",
+        "moon_temperature_k": 250.0,
+        "rotations_deg": [0.0, 90.0],
+        "turntable_offset_deg": 7.0,
+    }
+    found = old_scenario(tmp_path / "old.yaml", beam=beam)
+    assert found.beam == ScalarBeamSection(**beam)
+    assert found.beam.n_ports == 2
+    (tmp_path / "again.yaml").write_text(found.to_yaml())
+    assert load_scenario(tmp_path / "again.yaml") == found
+
+
+def test_an_old_scenario_with_a_response(tmp_path, response):
+    beam = {"file": response, "receiver": "open", "antenna_temperature_k": 300.0}
+    found = old_scenario(tmp_path / "old.yaml", beam=beam)
+    assert found.beam == ResponseSection(**beam)
+    assert found.beam.n_ports == 4
+
+
+def test_an_old_scenario_with_a_sky_from_a_file(tmp_path):
+    """``sources`` were said there, too, without effect; sources beside the map may be."""
+    sky = {"file": "x.hdf5", "dataset": "map", "file_frequency_mhz": 10.0, "sources": True}
+    beside = {"list": [{"name": "Cas A"}]}
+    found = old_scenario(tmp_path / "old.yaml", sky=sky, sources=beside)
+    assert found.sky == FileSkySection(file="x.hdf5", dataset="map", file_frequency_mhz=10.0)
+    assert not found.sky.sources
+    assert [source.name for source in found.sources.list] == ["Cas A"]
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("sky: {file: x.fits}", FileSkySection),
+        ("sky: {model: galaxy, file: x.fits}", FileSkySection),
+        ("sky: {model: galaxy, file: null}", GalaxySection),
+        ("sky: {seed: 3}", GalaxySection),
+    ],
+)
+def test_the_sky_of_a_short_file(tmp_path, text, kind):
+    path = tmp_path / "short.yaml"
+    path.write_text(text)
+    assert type(load_scenario(path).sky) is kind
+
+
+def test_a_prior_takes_the_place_of_another(tmp_path):
+    """``--set`` leaves the keys of the kind that was there, which the other kind drops."""
+    found = load_scenario("fiducial", ["prior.model=local_scales", "prior.sources=false"])
+    assert found.prior == LocalScalesPriorSection(sources=False)
+    (tmp_path / "again.yaml").write_text(found.to_yaml())
+    assert load_scenario(tmp_path / "again.yaml") == found
+    plain = load_scenario("fiducial", ["prior.model=local_scales"])
+    (tmp_path / "plain.yaml").write_text(plain.to_yaml())
+    back = load_scenario(tmp_path / "plain.yaml", ["prior.model=isotropic"])
+    assert back == load_scenario("fiducial", ["prior.spectrum=learned"])
+    (tmp_path / "short.yaml").write_text("prior: {tilt_std: 0.5}")
+    assert load_scenario(tmp_path / "short.yaml").prior == IsotropicPriorSection(tilt_std=0.5)
+
+
+def test_the_file_tells_which_beams_they_are(tmp_path, response, scalar):
+    path = tmp_path / "short.yaml"
+    for file, kind in [(response, ResponseSection), (scalar, ScalarBeamSection)]:
+        path.write_text(f"beam: {{file: {file}}}\n")
+        assert load_scenario(path).beam == kind(file=file)
+        assert load_scenario("fiducial", [f"beam.file={file}"]).beam == kind(file=file)
+
+
+# --- the section of another file ------------------------------------------------------------------
+
+
+def test_the_section_of_another_file_is_put_up_alike(response, scalar):
+    arm = ScalarBeamSection(
+        file="own.fits",
+        taper=False,
+        rotations_deg=(0.0, 120.0),
+        turntable_offset_deg=7.0,
+        quadrature="luseepy",
+        moon_temperature_k=250.0,
+    )
+    assert section_of_file(scalar, arm) == arm.model_copy(update={"file": scalar})
+    shared = {"turntable_offset_deg": 7.0, "quadrature": "luseepy", "moon_temperature_k": 250.0}
+    assert section_of_file(response, arm) == ResponseSection(file=response, **shared)
+    ports = ResponseSection(file="own.fits", receiver="open", **shared)
+    assert section_of_file(scalar, ports) == ScalarBeamSection(file=scalar, **shared)
+    embedded = MonopoleBeamSection(turntable_offset_deg=7.0, length_m=2.0)
+    assert section_of_file(scalar, embedded) == ScalarBeamSection(
+        file=scalar, turntable_offset_deg=7.0
+    )
+
+
+KEYS = scenario_keys()
+PAGE = Path(__file__).parents[2] / "docs" / "keys.md"
+# how sections and lists that are empty by default come to be there
+WITHIN = {
+    "noise.gain": "noise.gain={}",
+    "noise.beam": "noise.beam={shift_mhz: 4}",
+    "noise.pointing": "noise.pointing={clock_s: 60}",
+    "noise.receiver": "noise.receiver={power_k: 100}",
+    "noise.regolith": "noise.regolith={std_k: 20}",
+    "noise.gain_table": "noise.gain_table={std: 0.01}",
+    "sources.list.0": "sources.list=[{name: Cas A}]",
+    "flight": "flight={}",
+    "flight.simulated": "flight.simulated={}",
+}
+
+
+def leaves(tree, prefix=""):
+    for name, value in tree.items():
+        yield prefix + name
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{name}.")
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            yield from leaves(value[0], f"{prefix}{name}.0.")
+
+
+def test_every_key_of_a_written_scenario_is_listed_and_explained():
+    scenario = load_scenario("fiducial", [*WITHIN.values(), "sky.sources=false"])
+    written = set(leaves(parse_yaml(scenario.to_yaml(), "the file")))
+    listed = {key.path for key in KEYS}
+    parents = {path for path in written if any(p.startswith(f"{path}.") for p in listed)}
+    assert written - parents <= listed
+    assert [key.path for key in KEYS if not key.meaning] == []
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A scenario of the schema's defaults alone."""
+    path = tmp_path_factory.mktemp("plain") / "plain.yaml"
+    path.write_text(Scenario(sky={"sources": False}).to_yaml())
+    return str(path)
+
+
+DEFAULTS = [
+    k for k in KEYS
+    if k.default not in ("required", "none") and k.kind in ("", "monopole", "galaxy", "isotropic")
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("key", DEFAULTS, ids=lambda key: key.path)
+def test_a_default_changes_nothing(plain, key):
+    before = [text for name, text in WITHIN.items() if key.path.startswith(f"{name}.")]
+    value = "false" if key.path == "sky.sources" else key.default
+    changed = load_scenario(plain, [*before, f"{key.path}={value}"])
+    assert changed == load_scenario(plain, before)
+
+
+RECEIVER = "beam={model: response, file: x, receiver: {model: %s, file: x}}"
+OF_KIND = {name: f"beam={{model: {name}, file: x}}" for name in ("luseepy", "response", "sampled")}
+OF_KIND |= {name: f"prior.model={name}" for name in ("isotropic", "local_scales")}
+OF_KIND |= {name: (RECEIVER % name).replace(", file: x}}", "}}") for name in ("jfet", "capacitor")}
+
+
+def of_kind(key):
+    """Overrides by which the section of a key is there, of its kind."""
+    before = [text for name, text in WITHIN.items() if key.path.startswith(f"{name}.")]
+    if key.kind == "file":
+        before += ["sky={model: file, file: x}" if key.path[0] == "s" else RECEIVER % "file"]
+    return before + ([OF_KIND[key.kind]] if key.kind in OF_KIND else [])
+
+
+def outside(choices):
+    """Values that a key does not take, by the words for those that it takes."""
+    numbers = re.search(r"(?:number|integer), (.*)", choices)
+    if numbers is None:
+        of_words = re.fullmatch(r"(list of: )?\w+(, \w+)+", choices)
+        return ["neither"] if of_words else []
+    if " to " in numbers[1]:
+        low, high = map(float, numbers[1].split(" to "))
+        return [low - 1.0, high + 1.0]
+    beside = {">": 0.0, "<": 0.0, ">=": -1.0, "<=": 1.0}
+    found = re.findall(r"([<>]=?) ([^,]+)", numbers[1])
+    return [float(bound) + beside[sign] for sign, bound in found]
+
+
+@pytest.mark.parametrize("key", [k for k in KEYS if outside(k.choices)], ids=lambda key: key.path)
+def test_what_is_listed_of_a_key_is_enforced_and_the_key_is_named(key):
+    for value in outside(key.choices):
+        if key.choices.startswith("list of"):
+            value = f"[{value}, {value}, {value}, {value}]"
+        elif key.choices.startswith("name: "):
+            value = f"{{clock_s: {value}, length_m: {value}}}"
+        with refused(rf"{re.escape(key.path)}(\.\w+)? is "):
+            load_scenario("fiducial", [*of_kind(key), f"{key.path}={value}"])
+
+
+def test_units_are_those_of_the_names():
+    units = {
+        "v2_hz" if key.path.endswith("_v2_hz") else key.path.rsplit("_", 1)[-1]: key.unit
+        for key in KEYS
+        if key.unit
+    }
+    assert units == {
+        "mhz": "MHz", "hz": "Hz", "deg": "degrees", "m": "m", "s": "s", "h": "h", "k": "K",
+        "day": "s/day", "v2_hz": "V²/Hz",
+        "jy": "Jy", "pf": "pF", "nh": "nH", "ohm": "Ohm",
+    }  # fmt: skip
+
+
+def test_a_section_is_listed_alone_and_a_wrong_one_is_corrected():
+    assert {key.path.split(".")[1] for key in scenario_keys("noise.gain")} == {"gain"}
+    assert [key.path for key in scenario_keys("lmax")] == ["lmax"]
+    with refused("no key 'noise.gane'; did you mean 'noise.gain'?"):
+        scenario_keys("noise.gane")
+
+
+def test_the_page_of_keys_is_up_to_date():
+    # lusee-bayes keys --markdown writes the table
+    assert PAGE.read_text().endswith("\n\n" + keys_as_markdown(KEYS))

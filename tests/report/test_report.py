@@ -23,7 +23,6 @@ from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.judge import residuals as residuals_module
-from lusee_bayes.report.pages import write_report
 from lusee_bayes.results.diagnostics import read_diagnostics, region_of
 from lusee_bayes.runs.map_run import run_map
 from lusee_bayes.runs.sample_run import run_sample
@@ -84,12 +83,12 @@ class Outline(HTMLParser):
 
 
 # a map run with all its figures takes half a minute
-
 FOLDER = pytest.param("folder", marks=[pytest.mark.long, pytest.mark.essential])
 SAMPLED = pytest.param("sampled", marks=pytest.mark.long)
+CUBE = pytest.param("cube", marks=pytest.mark.long)
 
 
-@pytest.mark.parametrize("which", [FOLDER, pytest.param("cube", marks=pytest.mark.long), SAMPLED])
+@pytest.mark.parametrize("which", [FOLDER, CUBE, SAMPLED])
 def test_pages_are_whole_and_need_nothing_else(which, request):
     page = (request.getfixturevalue(which) / "report.html").read_text()
     outline = Outline()
@@ -150,33 +149,19 @@ def test_the_point_spread_function_is_what_injected_sources_give(small_map):
         assert kernels[0, source] == pytest.approx(expected, abs=1e-6 * kernels.max())
 
 
-@pytest.mark.long
-@pytest.mark.essential
+@pytest.mark.parametrize("which", [FOLDER, CUBE, SAMPLED])
 @pytest.mark.parametrize("manifest", [True, False], ids=["manifest", "an older folder without"])
-def test_report_makes_it_anew(folder, manifest, tmp_path, capsys):
+def test_report_makes_a_page_anew(which, manifest, request, tmp_path, capsys):
     # the title is the folder's name
-    mine = shutil.copytree(folder, tmp_path / folder.name)
-    page = (mine / "report.html").read_text()
-    (mine / "report.html").unlink()
-    if not manifest:
-        (mine / "manifest.json").unlink()
-    assert main(["report", str(mine)]) == 0
-    assert capsys.readouterr().out.split() == ["look", "at", f"{mine}/report.html"]
-    assert (mine / "report.html").read_text() == page
-    assert not list(mine.glob(".*"))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("which", ["cube", "sampled"])
-@pytest.mark.parametrize("manifest", [True, False], ids=["manifest", "an older folder without"])
-def test_the_other_pages_are_made_anew(which, manifest, request, tmp_path):
     folder = request.getfixturevalue(which)
     mine = shutil.copytree(folder, tmp_path / folder.name)
     (mine / "report.html").unlink()
     if not manifest:
         (mine / "manifest.json").unlink()
-    assert write_report(mine) == mine / "report.html"
+    assert main(["report", str(mine)]) == 0
+    assert capsys.readouterr().out.split() == ["look", "at", f"{mine}/report.html"]
     assert (mine / "report.html").read_text() == (folder / "report.html").read_text()
+    assert not list(mine.glob(".*"))
 
 
 def test_what_has_no_report_is_told(tmp_path, capsys):

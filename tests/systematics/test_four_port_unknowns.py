@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arviz_stats.base import array_stats
 from assertions import refused, within
 from experiments import density, four_ports, program_arguments
-from reference_linear import white_posterior, z_of
+from reference_linear import white_posterior
 from scipy.optimize import least_squares
 from scipy.stats import norm
 
@@ -507,42 +506,6 @@ def test_beside_what_is_sampled_it_is_marginalised_in_its_place(response_file):
     expected = white_posterior(np.concatenate([a, t], axis=1), prior, noise, rest).log_prob
     expected += norm.logpdf([0.0, 0.25, 0.5, 0.75]).sum() - 4 * np.log(200.0)
     assert got == pytest.approx(expected, rel=1e-7)
-
-
-@pytest.mark.long
-def test_sampled_and_marginalised_tell_the_same(response_file):
-    """All three by HMC, against the Gaussian of the rounds: means and variances.
-
-    Noise of 1e-3: what the Gaussian leaves out is of the size of the gains' errors after the data,
-    0.5 % of a standard deviation, a third of the Monte Carlo error of some 4000 draws.
-    """
-    loud = "noise.radiometer.factor=1e4"
-    e = lb.build(four_ports(response_file, *UNKNOWN, loud, "seed=7"))
-    found = lb.infer(e)
-    columns = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
-    told = template_amplitudes(found.model, found.posterior, e.data.data, columns)
-    centre = told.mean + np.append(np.zeros(5), found.systematics[-1].expected)
-    tree = e.scenario.model_dump()
-    for name in ("receiver", "regolith", "gain_table"):
-        tree["noise"][name]["treatment"] = "sampled"
-    e = replace(e, setup=replace(e.setup, scenario=type(e.scenario).model_validate(tree)))
-    program = lb.load_program("systematics")
-    arguments = program_arguments(program, e)
-    approximation = lb.laplace_approximation(program.model, arguments)
-    assert bool(approximation.converged)
-    sampler = lb.Sampler(draws=1500, seed=3)
-    chains = lb.sample(program.model, arguments, sampler, approximation.whitening)
-    assert not chains.statistics["diverging"].any()
-    powers = [(chains.sites[f"receiver_{port}_k"] - 2000.0) / 200.0 for port in range(4)]
-    ground = (chains.sites["regolith_k"] - 250.0) / 30.0
-    draws = [*powers, ground, *np.moveaxis(chains.sites["gain_table"], -1, 0)]
-    limit = z_of(2 * len(draws))
-    for values, mean, std in zip(draws, centre, told.std, strict=True):
-        z = (values - mean) / std
-        for moment, expected in [(z, 0.0), (z**2, 1.0)]:
-            ess = array_stats.ess(moment, chain_axis=0, draw_axis=1, method="mean")
-            assert ess > 1000
-            assert abs(moment.mean() - expected) < limit * moment.std() / np.sqrt(ess)
 
 
 # --- refused --------------------------------------------------------------------------------------

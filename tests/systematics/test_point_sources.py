@@ -234,19 +234,6 @@ def test_a_source_below_the_horizon_is_known_from_its_prior_only():
     assert result.lines()[2:] == [*lines, result.headline(), RULE]
 
 
-@pytest.mark.long
-def test_ignored_sources_have_no_fluxes():
-    result = map_result(experiment("ignored"))
-    assert result.fluxes is None
-    lines = result.lines()
-    # sources that the model ignores are not what it sees: causes follow the verdict
-    causes = result.diagnosis.sentences()
-    assert lines[: 1 + len(causes)] == [result.verdict(), *causes]
-    prior, *others = lines[1 + len(causes) :]
-    assert prior.startswith("Prior isotropic, C_ell of the")
-    assert others == [result.headline(), RULE]
-
-
 # --- sampled --------------------------------------------------------------------------------------
 
 
@@ -294,14 +281,6 @@ def test_simulated_data_hold_the_drawn_fluxes():
         assert misfit(other) > high
     z = (flux - priors()[0]) / priors()[1]
     assert np.abs(z).max() < 5.0 and len(set(z)) == 5
-
-
-def test_the_seed_decides_the_fluxes():
-    first, again, other = (true_values(setup_of(seed=s)) for s in (1, 1, 2))
-    assert set(first) == set(SITES)
-    for site in SITES:
-        np.testing.assert_array_equal(first[site], again[site])
-        assert (np.asarray(first[site]) != np.asarray(other[site])).all()
 
 
 def test_the_treatment_changes_the_model_only():
