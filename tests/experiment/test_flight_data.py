@@ -1,4 +1,4 @@
-"""Data of the spectrometer: from a sky to counts and back, and maps of files against those of data in K."""
+"""Data of the spectrometer: from a sky to counts and back; maps of files against those of kelvin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Polynomials over the channels of a band, and flags: what is injected is found, and what is noise is not."""
+"""Polynomials over the channels of a band; and flags, which find what is injected and no noise."""
 
 import numpy as np
 import pytest

@@ -25,11 +25,10 @@ import lusee_bayes
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import LOCK
-from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
+from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import Experiment, build, infer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.results import sample_result as results
-from lusee_bayes.results.channel import channel_of_posterior
 from lusee_bayes.runs import validate_run
 from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling import hmc
@@ -332,27 +331,6 @@ def test_the_maps_are_those_of_the_draws(runs, tree):
     np.testing.assert_allclose(upper, high, rtol=1e-8)
     header = dict(healpy.read_map(runs[0] / "lower.fits", h=True)[1])
     assert (header["COORDSYS"], header["ORDERING"], header["TUNIT1"]) == ("G", "RING", "K")
-
-
-def test_the_maps_agree_with_the_analytic_ones_to_monte_carlo_error(runs, tree, experiment):
-    """What lusee-bayes map writes beside what sample does, pixel by pixel; ESS by ArviZ."""
-    mean, std = maps_of(runs[0], "mean", "std")
-    inference = infer(experiment)
-    covariance = np.asarray(inference.posterior.covariance())
-    analytic = channel_of_posterior(experiment, inference, covariance).maps()
-    analytic_mean, analytic_std = analytic["mean"], analytic["std"]
-    values = tree["posterior"]["sky"].values @ pixel_matrix(NSIDE, 6).T
-    scaled = (values - analytic_mean) / analytic_std
-    # ESS itself scatters by a tenth at this length
-    limit = 1.1 * z_of(len(mean))
-    ess = array_stats.ess(scaled, chain_axis=0, draw_axis=1, method="mean")
-    assert np.abs((mean - analytic_mean) / analytic_std * np.sqrt(ess)).max() < limit
-    ess = array_stats.ess(scaled**2, chain_axis=0, draw_axis=1, method="mean")
-    assert ess.min() > 400
-    # a Gaussian's variance scatters by sqrt(2 / ess), its root by half of that
-    assert (np.abs(std / analytic_std - 1) * np.sqrt(2 * ess)).max() < limit
-    # a tenth too wide would not pass anywhere
-    assert (0.1 * np.sqrt(2 * ess)).min() > 0.5 * limit
 
 
 def test_the_samples_hold_the_analytic_posterior_and_what_they_are(runs, tree, experiment, capsys):

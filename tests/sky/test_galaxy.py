@@ -1,4 +1,4 @@
-"""The embedded sky: against ULSA itself, naive integration and physics; its sources, against catalogues."""
+"""The embedded sky: against ULSA itself, naive integration, physics and catalogues of sources."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Priors on the sky: S = diag(C_ell) in coefficients, Y diag(C_ell) Y^T in pixels; means; families."""
+"""Priors on the sky: S in coefficients and in pixels, priors with a mean, and families of priors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Levels and spectra that are not known, noise with a covariance of its own, and the general program.
+"""Levels and spectra that are not known, noise of one's own kind, and the general program.
 
 Small dense models against scipy; a scenario's own, of condition 1e12, against decimal arithmetic.
 """
