@@ -73,8 +73,7 @@ ESSENTIAL = [pytest.mark.long, pytest.mark.essential]
 
 
 @pytest.mark.parametrize(
-    "term",
-    [pytest.param(t, marks=[] if t in ("radiometer", "beam") else ESSENTIAL) for t in TERMS],
+    "term", [pytest.param(t, marks=[] if t in ("radiometer", "beam") else ESSENTIAL) for t in TERMS]
 )
 def test_the_errors_are_what_is_claimed(term):
     scenario = wrong_data.scenario(LMAX, *TERMS[term])

@@ -189,7 +189,7 @@ def test_every_entry_that_names_a_file_is_known():
     keys = {entry.path.split(".")[-1] for entry in scenario_keys()}
     files = {key for key in keys if key == "file" or key.endswith("_file")}
     assert files <= set(FILES) and set(FILES) - files == {
-        *("schedule", "clock", "gain_table", "lines"),
+        *("schedule", "clock", "gain_table", "lines")
     }
 
 
