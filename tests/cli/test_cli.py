@@ -108,16 +108,6 @@ def test_headers_say_where_the_numbers_come_from(folder):
 
 
 @pytest.mark.long
-def test_the_resolved_scenario_gives_the_same_numbers(folder, tmp_path):
-    assert run("map", folder / "scenario.yaml", "-o", tmp_path, "-q") == 0
-    first, again = (
-        xr.open_dataset(f / "posterior.nc", engine="h5netcdf")["mean"].values
-        for f in (folder, tmp_path)
-    )
-    np.testing.assert_array_equal(first, again)
-
-
-@pytest.mark.long
 @pytest.mark.essential
 def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
     data, scenario = tmp_path / "data.nc", folder / "scenario.yaml"

@@ -122,8 +122,6 @@ def test_a_file_that_says_it_is_believed_whatever_is_simulated(tmp_path, window)
 @pytest.mark.parametrize(
     ("window", "timestamp", "words"),
     [
-        (None, None, "neither time_bounds nor the attribute window = 'instant'"),
-        (None, None, "tens to hundreds of standard deviations"),
         (None, None, "use --set observation.timestamp=start (or middle, end, instant)"),
         ("instant", "start", "says that its samples are instants, the scenario that their times"),
         ("mean", "start", "says that its samples are means over windows"),

@@ -15,9 +15,9 @@ import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import map_to_modes
 from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.model import full_model, radiometer, simulate
+from lusee_bayes.experiment.model import full_model, simulate
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.experiment.term import Around, measured_visibilities
+from lusee_bayes.experiment.term import measured_visibilities
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
@@ -117,22 +117,6 @@ def test_measured_temperatures(small_experiment):
     flags[0] = True
     with pytest.raises(InputError, match="auto 00R is absent .* use noise.radiometer"):
         measured_visibilities(flagged(data, flags), setup.signal)
-
-
-def test_the_radiometer_is_built_around_measured_temperatures_if_asked(tiny_experiment):
-    """Paper's form: sigma_ij^2 = d_ii d_jj / (bandwidth x time), so autos follow d^2."""
-    scenario = small_scenario("noise.radiometer.temperature=measured")
-    setup = replace(tiny_experiment.setup, scenario=scenario)
-    data = replace(tiny_experiment.data, data=2.0 * tiny_experiment.data.data)
-    autos = [0, 7, 12, 15]
-    measured = np.asarray(radiometer(setup, Around(data)).diagonal()).reshape(16, -1)[autos]
-    modelled = np.asarray(radiometer(setup).diagonal()).reshape(16, -1)[autos]
-    signal = np.asarray(setup.signal)[autos]
-    expected = modelled * (np.asarray(data.data).reshape(16, -1)[autos] / signal) ** 2
-    np.testing.assert_allclose(measured, expected, rtol=1e-12)
-    np.testing.assert_array_equal(
-        full_model(setup, Around(data)).noise.diagonal(), radiometer(setup, Around(data)).diagonal()
-    )
 
 
 def test_data_of_another_frequency_are_refused(small_experiment):

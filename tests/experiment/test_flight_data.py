@@ -1,4 +1,4 @@
-"""Data of the spectrometer: from a sky to counts and back; maps of files against those of kelvin."""
+"""Data of the spectrometer: from a sky to counts and back; maps of files and of data in kelvin."""
 
 from __future__ import annotations
 

@@ -278,34 +278,22 @@ def test_the_old_fiducial_scenario_is_the_fiducial_scenario(tmp_path):
     assert tree["prior"]["spectrum"] == "sky"
 
 
-def test_what_an_old_scenario_says_of_the_embedded_antennas_is_kept(tmp_path):
-    beam = {"length_m": 2.5, "loss_tangent": 0.02, "turntable_offset_deg": 3.0}
-    found = old_scenario(tmp_path / "old.yaml", beam=beam, prior={"scale": 2.0, "tilt_std": 0.5})
-    assert found.beam == MonopoleBeamSection(**beam)
-    assert found.prior == IsotropicPriorSection(scale=2.0, tilt_std=0.5)
-
-
-def test_an_old_scenario_with_a_scalar_beam(tmp_path, scalar):
-    beam = {
-        "file": scalar,
-        "taper": False,
-        "quadrature": "luseepy",
-        "moon_temperature_k": 250.0,
-        "rotations_deg": [0.0, 90.0],
-        "turntable_offset_deg": 7.0,
-    }
-    found = old_scenario(tmp_path / "old.yaml", beam=beam)
-    assert found.beam == ScalarBeamSection(**beam)
-    assert found.beam.n_ports == 2
-    (tmp_path / "again.yaml").write_text(found.to_yaml())
-    assert load_scenario(tmp_path / "again.yaml") == found
-
-
-def test_an_old_scenario_with_a_response(tmp_path, response):
-    beam = {"file": response, "receiver": "open", "antenna_temperature_k": 300.0}
-    found = old_scenario(tmp_path / "old.yaml", beam=beam)
-    assert found.beam == ResponseSection(**beam)
-    assert found.beam.n_ports == 4
+def test_what_an_old_scenario_says_of_beams_is_kept(tmp_path, scalar, response):
+    embedded = {"length_m": 2.5, "loss_tangent": 0.02, "turntable_offset_deg": 3.0}
+    of_files = {"quadrature": "luseepy", "moon_temperature_k": 250.0, "turntable_offset_deg": 7.0}
+    arm = {"file": scalar, "taper": False, "rotations_deg": [0.0, 90.0], **of_files}
+    ports = {"file": response, "receiver": "open", "antenna_temperature_k": 300.0}
+    for beam, kind, n_ports in (
+        (embedded, MonopoleBeamSection, 4),
+        (arm, ScalarBeamSection, 2),
+        (ports, ResponseSection, 4),
+    ):
+        prior = {"scale": 2.0, "tilt_std": 0.5}
+        found = old_scenario(tmp_path / "old.yaml", beam=beam, prior=prior)
+        assert found.beam == kind(**beam) and found.beam.n_ports == n_ports
+        assert found.prior == IsotropicPriorSection(**prior)
+        (tmp_path / "again.yaml").write_text(found.to_yaml())
+        assert load_scenario(tmp_path / "again.yaml") == found
 
 
 def test_an_old_scenario_with_a_sky_from_a_file(tmp_path):

@@ -22,8 +22,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
 from lusee_bayes.core.lazy import healpy as lazy_healpy
 from lusee_bayes.report.explorer import BUDGET, KERNEL_NSIDE, nside_of_page, std_scale
-from lusee_bayes.results.diagnostics import packed_resolution, read_diagnostics
-from lusee_bayes.sky.prior import IndependentPrior
+from lusee_bayes.results.diagnostics import read_diagnostics
 
 NODE = shutil.which("node")
 # elements that remember; a canvas whose context keeps the last image
@@ -117,21 +116,6 @@ def test_point_spread_functions_are_those_of_the_posterior(which, most, request,
     assert (np.abs(kernels - expected) < 6 * np.sqrt(2 * variance) + 1e-6 * expected.max()).all()
     # and that is little
     assert np.abs(kernels - expected).max() < most * np.abs(expected).max()
-
-
-def test_the_resolution_matrix_is_packed_by_its_definition():
-    rng = np.random.default_rng(1)
-    prior = np.array([50.0, *rng.uniform(1, 2, 8)])
-    root = rng.standard_normal((9, 9)) * 0.1
-    covariance = root @ root.T
-    packed, steps = packed_resolution(covariance, IndependentPrior(prior))
-    ell, _ = mode_numbers(2)
-    white = packed * steps[np.ix_(ell, ell)]
-    r = np.diag(prior) @ white @ np.diag(1 / prior)
-    exact = np.eye(9) - covariance / prior[None, :] ** 2
-    half = 0.5 * steps[np.ix_(ell, ell)] * prior[:, None] / prior[None, :]
-    assert (np.abs(r - exact) <= half * (1 + 1e-9)).all()
-    np.testing.assert_array_equal(packed, packed.T)
 
 
 @needs_node

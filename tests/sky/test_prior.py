@@ -1,4 +1,4 @@
-"""Priors on the sky: S in coefficients and in pixels, priors with a mean, and families of priors."""
+"""Priors on the sky: S in coefficients and in pixels, priors with a mean, families of priors."""
 
 from __future__ import annotations
 

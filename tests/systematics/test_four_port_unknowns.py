@@ -18,7 +18,6 @@ from lusee_bayes.experiment.model import (
     full_model,
     radiometer,
     simulate,
-    systematics,
     true_signal,
     true_values,
 )
@@ -446,20 +445,6 @@ def test_clock_and_pointing_beside_it_settle_in_the_same_rounds(response_file):
     assert abs(turntable - truth) < 4 * std[25]
     # it is told from none
     assert truth > 10 * std[25]
-
-
-def test_what_n_holds_of_the_others_is_seen_through_the_gains(response_file):
-    setup = set_up(four_ports(response_file, *UNKNOWN, "noise.pointing={turntable_deg: 1}"))
-    values = {"gain_0": 0.02}
-    factors = per_port(np.array([2.0, 0, 0, 0]))
-    for (_, found), (_, bare) in zip(
-        systematics(setup, Around(values=values)), systematics(setup), strict=True
-    ):
-        if "gain_0" in found.names:
-            np.testing.assert_allclose(found.centre, [2.0, 0.0, 0.0, 0.0], rtol=1e-12)
-        else:
-            expected = np.asarray(bare.columns) * factors[:, None]
-            np.testing.assert_allclose(found.columns, expected, rtol=1e-9, atol=1e-9)
 
 
 # --- sampled --------------------------------------------------------------------------------------

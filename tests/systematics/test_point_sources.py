@@ -32,9 +32,8 @@ from lusee_bayes.experiment.model import (
 from lusee_bayes.experiment.setup import Setup, source_responses
 from lusee_bayes.experiment.sky_terms import point_sources
 from lusee_bayes.experiment.term import Around
-from lusee_bayes.judge.chi2 import RULE
-from lusee_bayes.results.map_result import flux_lines, flux_table, map_result
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galactic_unit_vector
+from lusee_bayes.results.map_result import flux_table
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.testing.cases import small_scenario
 
 # Cas A is up, For A has an amplitude for every two of the six samples, and the last lies near the
@@ -199,26 +198,6 @@ def test_the_table_is_in_jansky():
     # data without a truth have no such column
     real = replace(experiment(), data=replace(data(), truth=None))
     assert "true_jy" not in flux_table(real, lb.infer(real))
-
-
-@pytest.mark.long
-def test_a_source_below_the_horizon_is_known_from_its_prior_only():
-    e = experiment()
-    polaris = galactic_unit_vector(270.0, 66.5)
-    assert (e.setup.observation.zenith_galactic() @ polaris).max() < -0.35
-    result = map_result(e)
-    row = result.fluxes.iloc[4]
-    assert not row["above_horizon"]
-    assert row["flux_jy"] == row["prior_jy"]
-    # its column of Lambda is that of the unit matrix, exactly
-    assert row["std_jy"] == pytest.approx(row["prior_std_jy"], rel=1e-15)
-    lines = flux_lines(result.fluxes)
-    assert len(lines) == 5
-    said = ["never above the horizon" in line for line in lines]
-    assert said == [False, False, False, False, True]
-    assert lines[4].startswith("Polaris: 2e+04 +- 1e+04 Jy")
-    assert [line.split(":")[0] for line in lines[1:4]] == ["For A", "For A (1)", "For A (2)"]
-    assert result.lines()[2:] == [*lines, result.headline(), RULE]
 
 
 # --- sampled --------------------------------------------------------------------------------------
