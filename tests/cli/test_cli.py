@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 import xarray as xr
 from astropy.io import fits
+from commands import content, posterior_of, run
 
 import lusee_bayes
-from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
 from lusee_bayes.experiment.section import OutputSection
 from lusee_bayes.results.map_result import MapResult
@@ -32,10 +32,6 @@ SMALL = [
     for override in ["lmax=6", "observation.runs.0.cycles=0.1"]
     for argument in ("--set", override)
 ]
-
-
-def run(*arguments) -> int:
-    return main([str(a) for a in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +52,7 @@ def test_map_writes_what_it_promises(folder):
 
 
 def test_the_files_agree_with_each_other(folder):
-    posterior = xr.open_dataset(folder / "posterior.nc", engine="h5netcdf")
+    posterior = posterior_of(folder)
     mean, std = posterior["mean"].values, posterior["std"].values
     np.testing.assert_array_equal(
         posterior["ell"].values ** 2 + posterior["ell"].values + posterior["m"].values,
@@ -121,9 +117,7 @@ def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
     for path in (tmp_path / "out").rglob("*"):
         assert path.is_dir() or path.name == "manifest.json" or str(path) in said
     assert said.strip().splitlines()[-1] == f"look at {tmp_path}/out/report.html"
-    first, again = (
-        xr.open_dataset(f / "posterior.nc", engine="h5netcdf") for f in (folder, tmp_path / "out")
-    )
+    first, again = posterior_of(folder), posterior_of(tmp_path / "out")
     np.testing.assert_array_equal(first["mean"].values, again["mean"].values)
     np.testing.assert_array_equal(first["truth"].values, again["truth"].values)
     assert again.sizes["draw"] == 3 and "covariance" in first and "covariance" not in again
@@ -180,43 +174,6 @@ def test_data_without_truth(folder, tmp_path):
     assert not (out / "truth.fits").exists()
     assert json.loads((out / "summary.json").read_text())["ell_cross"] is None
     assert "rho" not in (out / "spectra.csv").read_text()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["map", "nonsense"], "no scenario 'nonsense'"),
-        (["map", "fiducial", "--set", "sky.file=gone.fits"], "no sky map at 'gone.fits'"),
-        (["map", "fiducial", "--data", "gone.nc"], "no data at 'gone.nc'; make some"),
-        (["map", "fiducial", "--set", "observation.start=2051-01-01"], "outside the ephemeris"),
-        (["map", "fiducial", "--set", "observation.start=soon"], "'soon' is not a date"),
-        (["map", "fiducial", "--set", "observation.runs.0.cycles=0.0001"], "holds no sample"),
-        (["map", "three_cycle.yaml"], "no scenario file at 'three_cycle.yaml'; check the path"),
-        (["map", "three/cycles"], "no scenario file at 'three/cycles'; check the path"),
-        (["map", "three_cycle"], "did you mean 'three_cycles'"),
-        (["info", "gone.fits"], "no file at 'gone.fits'"),
-        (["info", "[red]x[/red].nc"], "no file at '[red]x[/red].nc'"),
-        (["info", "x\udcff.nc"], r"no file at 'x\udcff.nc'"),
-        (["map", "fiducial", "--data", "x\udcff.nc"], r"no data at 'x\udcff.nc'"),
-        (["mapp", "fiducial"], "mapp"),
-        (["map"], "scenario"),
-        (["map", "fiducial", "--draws", "many"], "many"),
-    ],
-)
-def test_bad_input_is_one_sentence_and_exit_code_2(tmp_path, capsys, arguments, message):
-    out = tmp_path / "out"
-    if arguments[0] == "map" and len(arguments) > 1:
-        arguments = [*arguments, "-o", str(out)]
-    assert run(*arguments) == 2
-    error = capsys.readouterr().err.strip()
-    assert message in error
-    assert error.startswith("lusee-bayes: ")
-    assert "\n" not in error and "Section" not in error
-    assert not out.exists()
-
-
-def content(folder):
-    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def test_an_interrupted_write_leaves_the_previous_result_whole(

@@ -132,14 +132,6 @@ def test_bad_input_is_a_sentence(path, tmp_path, monkeypatch, capsys, arguments,
     assert [p.name for p in tmp_path.iterdir()] == ["data.nc"]
 
 
-def test_instants_have_no_average(tmp_path):
-    instants = build(small_scenario(lmax=2, cycles=0.01)).data
-    assert instants.observation.windows is None
-    path = instants.write(tmp_path / "data.nc")
-    with pytest.raises(InputError, match=r"data\.nc: the samples are instants"):
-        run_average(scenario(), path, 14400.0, tmp_path / "a.nc")
-
-
 @pytest.mark.parametrize(
     ("text", "seconds"),
     [("30s", 30.0), ("10min", 600.0), ("2h", 7200.0), ("1d", 86400.0), (" 1.5 h", 5400.0),

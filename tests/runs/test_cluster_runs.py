@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from commands import posterior_of
 
 from lusee_bayes.core.engine import ThisProcess
 from lusee_bayes.experiment.scenario import load_scenario
@@ -103,10 +104,6 @@ def cluster(tmp_path):
     found.add()
     yield found
     found.close()
-
-
-def posterior_of(folder: Path) -> xr.Dataset:
-    return xr.load_dataset(folder / "posterior.nc", engine="h5netcdf").drop_attrs()
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from astropy.io import fits
+from commands import posterior_of, run
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core import engines as engine_module
@@ -32,14 +33,6 @@ SMALL = ["--set", "lmax=4", "--set", "observation.runs.0.cycles=0.1"]
 THREE = ["--frequencies", "20:30:5", *SMALL]
 # two components for three channels
 JOINT = [*THREE, "--joint", "--set", "spectral.components=[power_law, curvature]"]
-
-
-def run(*arguments) -> int:
-    return main([str(a) for a in arguments])
-
-
-def posterior_of(folder) -> xr.Dataset:
-    return xr.load_dataset(folder / "posterior.nc", engine="h5netcdf")
 
 
 def assert_equal(got, expected, sigma):
@@ -263,24 +256,6 @@ def test_a_run_with_a_channel_that_cannot_be_mapped_goes_on(
     assert made == [20]
     result = run_map(three(), tmp_path, data=gap).result
     assert made == [20, 30] and list(result.unmapped) == [25.0]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--frequencies", "20,10"], "expected growing MHz"),
-        (["--joint"], "joint needs frequencies_mhz"),
-        (["--workers", "2"], "give --frequencies"),
-        (["--cluster", "tcp://127.0.0.1:1"], "give --frequencies"),
-        (["--frequencies", "20,25", "--covariance"], "--covariance is for a single frequency"),
-        (["--frequencies", "20,25", "--onto", "x"], "--onto is for a single frequency"),
-        (["--frequencies", "20,25", "--joint"], "need at least as many channels, got 2"),
-    ],
-    ids=str,
-)
-def test_bad_input_is_one_sentence(arguments, message, tmp_path, capsys):
-    assert run("map", "fiducial", *SMALL, *arguments, "-o", tmp_path / "x", "-q") == 2
-    assert message in capsys.readouterr().err
 
 
 @pytest.mark.long

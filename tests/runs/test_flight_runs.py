@@ -83,12 +83,6 @@ def test_fits_and_a_gain_table_of_ones_own(tmp_path):
     assert "session_000.fits" not in names and {"clock.json", "gains.nc"} <= set(names)
 
 
-def test_without_its_gain_table_nothing_is_simulated(tmp_path, capsys):
-    assert simulate(tmp_path / "a", "flight.gain_table=nowhere.nc") == 2
-    assert "nowhere.nc" in capsys.readouterr().err
-    assert not (tmp_path / "a").exists() or not list((tmp_path / "a").iterdir())
-
-
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory):
     """The folder of a session; to be read only."""

@@ -15,8 +15,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from commands import content
 
-from lusee_bayes.core.files import LOCK, MANIFEST, SCRATCH, recover
+from lusee_bayes.core.files import MANIFEST, SCRATCH, recover
 
 pytestmark = pytest.mark.long
 
@@ -111,12 +112,6 @@ class Command:
         process = self.start(folder, *self.resumed(folder))
         errors = process.communicate(timeout=600)[1]
         return process.returncode, errors
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    """Of all files but the lock, which nobody holds once its process is killed."""
-    found = (path for path in folder.rglob("*") if path.is_file() and path.name != LOCK)
-    return {str(path.relative_to(folder)): path.read_bytes() for path in found}
 
 
 def numbers(folder: Path) -> dict[str, np.ndarray]:

@@ -19,10 +19,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from arviz_stats.base import array_stats
+from commands import content, run
 from reference_linear import z_of
 
 import lusee_bayes
-from lusee_bayes.cli.main import main
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import LOCK
 from lusee_bayes.core.harmonics import modes_to_map
@@ -49,10 +49,6 @@ GROUPS = {
     "posterior", "sample_stats", "prior", "prior_predictive", "posterior_predictive",
     "observed_data", "constant_data",
 }  # fmt: skip
-
-
-def run(*arguments) -> int:
-    return main([str(a) for a in arguments])
 
 
 def start(folder, *extra, settings=SETTINGS):
@@ -137,14 +133,6 @@ def no_sampling(runs, monkeypatch):
         raise AssertionError("it began to sample")
 
     monkeypatch.setattr(results, "sample", fail)
-
-
-def content(folder):
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file() and path.name != LOCK
-    }
 
 
 def assert_one_sentence(capsys, *words):
