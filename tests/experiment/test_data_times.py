@@ -375,17 +375,6 @@ def draws(maps):
     return found
 
 
-def test_averages_of_the_fine_samples_are_what_a_with_windows_says(maps):
-    sigma = np.sqrt(np.asarray(maps.windows.model.noise.diagonal()))
-    expected = maps.average(maps.fine.model.coupling @ maps.sky)
-    off = (np.asarray(maps.windows.model.coupling @ maps.sky) - expected) / sigma
-    # instants for the fine samples: (lmax w step / 2)^2 / 6 of the part of V that varies, below
-    # 1e5 sigma of an average
-    assert np.abs(off).max() < 1e-2
-    instants = (np.asarray(maps.instants.model.coupling @ maps.sky) - expected) / sigma
-    assert np.abs(instants).max() > (0.5 if maps.to_s < 4 * HOUR else 10.0)
-
-
 def test_as_much_is_lost_as_the_planner_says(maps):
     ratios = eigh(maps.windows.covariance, maps.fine.covariance, eigvals_only=True)
     # N of averages has the squares of mean autos, which are smaller than the mean squares

@@ -6,9 +6,9 @@ import json
 from typing import Any, get_args
 
 import pytest
+from changes import SCALE, require_answer
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from outcomes import SCALE, require_answer
 from pydantic import BaseModel
 
 from lusee_bayes.cli.options import parse_frequencies
