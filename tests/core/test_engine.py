@@ -1,4 +1,4 @@
-"""Tasks in threads of this process: order, progress, failures, the tree of a sum, and what is shared."""
+"""Tasks in threads: order, progress, failures, the tree of a sum, and what is shared."""
 
 from __future__ import annotations
 

@@ -299,11 +299,6 @@ class Map:
             found = found + self.covariance @ (gradient - found / model.prior.variance())
         return found
 
-    def chi2(self, data):
-        """Of data under the model, any sky of the prior being possible."""
-        mean = self.mean(data)
-        return float(self.model.chi2(mean, data) + (mean**2 / self.model.prior.variance()).sum())
-
     def squared(self, shift):
         """Square of a shift of the map in standard deviations, correlations counted."""
         return float(shift @ np.linalg.solve(self.covariance, shift))
@@ -411,16 +406,3 @@ def test_maps_of_averages_are_right_and_of_instants_wrong(maps, draws):
     assert low < right < high < wrong
     low, high = stats.chi2(DRAWS * n_data).interval(1 - 1e-4)
     assert low < sum(maps.windows.chi2(coarse) for *_, coarse in draws) < high
-
-
-def test_how_wrong_instants_are_and_what_chi2_shows_of_it(maps):
-    """A mean smooths the sky along the Moon's turn, which another sky explains as well."""
-    signal = maps.average(maps.fine.model.coupling @ maps.sky)
-    unexplained = signal - np.asarray(maps.instants.model.coupling @ maps.sky)
-    off = np.sqrt(maps.instants.squared(maps.instants.mean(unexplained)))
-    shown = maps.instants.chi2(unexplained) / np.sqrt(2.0 * len(unexplained))
-    if maps.to_s < 4 * HOUR:
-        assert off > 3.0
-        assert shown < 0.1
-    else:
-        assert off > 100.0
