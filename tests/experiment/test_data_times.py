@@ -138,13 +138,10 @@ def test_what_is_unclear_or_contradicts_is_refused(tmp_path, window, timestamp, 
     assert "\n" not in str(caught.value)
 
 
-def test_no_experiment_of_data_with_unclear_times(tmp_path):
+def test_no_experiment_of_data_with_unclear_times_or_a_fixed_axis_in_windows(tmp_path):
     data = read_visibilities(file_of(tmp_path, None)[0])
     with pytest.raises(InputError, match="do not say what their times are; use data.stamped"):
         set_up(scenario(), data)
-
-
-def test_no_fixed_axis_of_data_with_windows(tmp_path):
     data = read_visibilities(file_of(tmp_path, "mean")[0])
     with pytest.raises(InputError, match="means over windows.*leave out observation.fixed_axis"):
         set_up(scenario("observation.fixed_axis=true"), data)

@@ -424,19 +424,11 @@ def test_nothing_is_counted_twice(program, overrides, section):
 
 def test_what_the_scenario_does_not_have():
     bare = small_experiment()
-    for ask, message in (
-        (
-            lambda: program_arguments(lb.load_program("gains"), bare),
-            "the scenario has no noise.gain",
-        ),
-        (lambda: program_arguments(lb.load_program("sources"), bare), "has no sources.list"),
-        (lambda: point_sources(bare.setup), "the scenario has no sources.list"),
-    ):
-        with refused(message):
-            ask()
-
-
-def test_pieces_of_an_experiment_need_one():
+    for program, section in (("gains", "noise.gain"), ("sources", "sources.list")):
+        with refused(f"the scenario has no {section}"):
+            program_arguments(lb.load_program(program), bare)
+    with refused("the scenario has no sources.list"):
+        point_sources(bare.setup)
     with refused("asks for 'gaussian', a piece of an experiment"):
         lb.load_program("systematics").arguments(base_model(with_cas_a()))
 
