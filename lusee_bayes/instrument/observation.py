@@ -354,17 +354,7 @@ class Observation(Described):
         return np.degrees(np.arcsin(height))
 
 
-BODIES = (
-    "Sun",
-    "Mercury",
-    "Venus",
-    "Earth",
-    "Mars",
-    "Jupiter",
-    "Saturn",
-    "Uranus",
-    "Neptune",
-)
+BODIES = ("Sun", "Mercury", "Venus", "Earth", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")
 
 MOON_RADIUS_KM = 1737.4  # IAU mean radius
 LIGHT_KM_PER_S = c.to_value(u.km / u.s)
@@ -395,19 +385,6 @@ def body_direction(body: str, observation: Observation) -> Float[np.ndarray, "ti
     InputError
         If the body is unknown.
     """
-    vector = _from_lander_km(body, observation)
-    return vector / np.linalg.norm(vector, axis=1, keepdims=True)
-
-
-def body_distance_au(body: str, observation: Observation) -> Float[np.ndarray, " times"]:
-    """Return the distance in au that the light of a body has travelled to the lander.
-
-    Parameters and errors as of :func:`body_direction`.
-    """
-    return (np.linalg.norm(_from_lander_km(body, observation), axis=1) * u.km).to_value(u.au)
-
-
-def _from_lander_km(body: str, observation: Observation) -> Float[np.ndarray, "times 3"]:
     known = {name.lower(): name for name in BODIES}
     if body.lower() not in known:
         hint = nearest(body.capitalize(), BODIES)
@@ -420,7 +397,7 @@ def _from_lander_km(body: str, observation: Observation) -> Float[np.ndarray, "t
         departure = arrival - TimeDelta(light_time, format="sec", scale="tdb")
         vector = _barycentric_km(body.lower(), departure) - lander
         light_time = np.linalg.norm(vector, axis=1) / LIGHT_KM_PER_S
-    return vector
+    return vector / np.linalg.norm(vector, axis=1, keepdims=True)
 
 
 def _barycentric_km(body: str, times: Time) -> Float[np.ndarray, "times 3"]:

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -35,7 +34,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float
 from numpyro.infer import HMC, NUTS
 from numpyro.infer.hmc import HMCState
 
@@ -386,14 +385,6 @@ class Checkpoints:
             for name in (kept[0] if kept else {})
         }
 
-    def remove(self) -> None:
-        """Delete the folder. If that is interrupted, no half of it is left under its name."""
-        doomed = self.folder.with_name(f".{self.folder.name}-removed")
-        shutil.rmtree(doomed, ignore_errors=True)
-        if self.folder.exists():
-            os.replace(self.folder, doomed)
-            shutil.rmtree(doomed)
-
 
 def _iteration(path: Path) -> int:
     return int(path.stem.removeprefix("chunk-"))
@@ -567,55 +558,6 @@ def sample(
         {name: values for name, values in merged.items() if name not in STATISTICS},
         {name: merged[name] for name in STATISTICS},
     )
-
-
-@numpyro_promotion()
-def draw_within(
-    program: Callable,
-    arguments: Mapping[str, Any],
-    key: PRNGKeyArray,
-    sampler: Sampler,
-    whitening: Whitening | None = None,
-    thin: int = 1,
-) -> dict[str, Array]:
-    """Draw one chain inside a JAX program.
-
-    It can be mapped over many data sets (``jax.vmap``), as in simulation-based calibration;
-    nothing is kept on disk.
-
-    Parameters
-    ----------
-    program : callable
-        A NumPyro model.
-    arguments : mapping
-        Its arguments, with the data.
-    key : PRNG key
-        Of the chain.
-    sampler : Sampler
-        How to sample; its ``chains`` and ``seed`` are not used.
-    whitening : Whitening, optional
-        Coordinates of some of the program's sites.
-    thin : int
-        Keep every ``thin``-th draw.
-
-    Returns
-    -------
-    dict of (draws, ...) array
-        Draws by site.
-    """
-    run = _Run(program, dict(arguments), sampler, whitening)
-    kernel, inputs = run.kernel, (run.dynamic,)
-    state = kernel.init(key, sampler.warmup, None, inputs, {})
-
-    def iterate(n, state):
-        return jax.lax.fori_loop(0, n, lambda _, s: kernel.sample(s, inputs, {}), state)
-
-    def step(state, _):
-        state = iterate(thin, state)
-        return state, state.z
-
-    _, z = jax.lax.scan(step, iterate(sampler.warmup, state), None, length=sampler.draws)
-    return _without_auxiliary(jax.vmap(kernel.postprocess_fn(inputs, {}))(z))
 
 
 NOT_FINITE = (

@@ -408,6 +408,12 @@ def _nodes() -> tuple[np.ndarray, np.ndarray]:
 class Slabs:
     """Lines of sight in slabs of constant emission and absorption, the nearest first.
 
+    Each quadrature node stands for a slab of constant j and kappa, for which the transfer equation
+    is solved exactly: it adds j/kappa (1 - exp(-dtau)) exp(-tau). So a transparent slab adds j ds
+    to the order of the quadrature, and an opaque one the source function. The error, against
+    200 000 steps, is below 1 % at 1 MHz and 0.1 % at 10 MHz; 3 % and 1 % towards the opaque Vela
+    shell, whose near side falls inside a slab.
+
     Attributes
     ----------
     emitted : (slabs, lines) array
@@ -495,35 +501,6 @@ class Slabs:
             transmission *= 1.0 - absorbed
             depth += slab
         return synchrotron, depth
-
-
-def line_of_sight(
-    lon_deg: np.ndarray, lat_deg: np.ndarray, frequency_mhz: float, electrons: float = 1.0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the Galactic synchrotron emission and the total optical depth.
-
-    Each quadrature node stands for a slab of constant j and kappa, for which the transfer
-    equation is solved exactly: it adds j/kappa (1 - exp(-dtau)) exp(-tau). So a transparent
-    slab adds j ds to the order of the quadrature, and an opaque one the source function. The
-    error, against 200 000 steps, is below 1 % at 1 MHz and 0.1 % at 10 MHz; 3 %
-    and 1 % towards the opaque Vela shell, whose near side falls inside a slab.
-
-    Parameters
-    ----------
-    lon_deg, lat_deg : (n,) array
-        Galactic directions in degrees; the sign of the latitude is ignored.
-    frequency_mhz : float
-        Frequency in MHz.
-    electrons : float
-        Factor of <n_e^2> everywhere; 0 makes the Galaxy transparent.
-
-    Returns
-    -------
-    synchrotron, depth : (2, n) array
-        Brightness temperature in K, and the optical depth. Row 0 is at ``+|latitude|``, row 1 at
-        ``-|latitude|``: only the local gas differs.
-    """
-    return Slabs.towards(lon_deg, lat_deg).synchrotron(frequency_mhz, electrons)
 
 
 def brightness(synchrotron: np.ndarray, depth: np.ndarray, frequency_mhz: float) -> np.ndarray:

@@ -28,7 +28,6 @@ from lusee_bayes.core.checks import (
 )
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import per_mode, power_spectrum
-from lusee_bayes.sky.prior import HarmonicPrior
 
 # spectra over the power law: x is frequency / reference, y frequency / turnover; ionised gas takes
 # 1 - exp(-tau) away, and tau goes as nu^-2.1 (Altenhoff et al. 1960)
@@ -262,13 +261,6 @@ class SpectralPrior(Described, eqx.Module):
         if self.residual is None:
             return None
         return namespace(self).sqrt(per_mode(self.residual[channel]))
-
-    def of_channel(self, channel: int) -> HarmonicPrior:
-        """Return the prior of one channel by itself."""
-        spectrum = self.mixing[channel] ** 2 @ self.spectra
-        if self.residual is not None:
-            spectrum = spectrum + self.residual[channel]
-        return HarmonicPrior(spectrum)
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, "channels modes"]:
         """Draw skies of all channels from the prior, in K."""

@@ -11,9 +11,10 @@ import pytest
 import xarray as xr
 from assertions import close, refused
 from astropy.io import fits
+from reference import unit_vectors
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings, unit_vectors, wavenumber
+from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings, wavenumber
 from lusee_bayes.instrument.beams.monopoles import Monopoles
 from lusee_bayes.instrument.beams.sampled import (
     SampledFileBeams,

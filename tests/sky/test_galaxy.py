@@ -74,7 +74,7 @@ def n_squared(s, lon_deg, lat_deg):
 
 def one_line(lon_deg, lat_deg, frequency_mhz, electrons=1.0):
     lon, lat = np.array([float(lon_deg)]), np.array([float(lat_deg)])
-    synchrotron, depth = galaxy.line_of_sight(lon, lat, frequency_mhz, electrons)
+    synchrotron, depth = galaxy.Slabs.towards(lon, lat).synchrotron(frequency_mhz, electrons)
     row = 0 if lat_deg >= 0 else 1
     return synchrotron[row, 0], depth[row, 0]
 
@@ -147,7 +147,7 @@ def test_with_electrons_the_integral_is_that_of_tiny_steps(
     lon_deg, lat_deg, frequency_mhz, tolerance
 ):
     # Slabs of constant j and kappa: second order in the depth of one, which is 100 times less
-    # at 10 MHz than at 1 MHz. Tolerances: see the measured errors in line_of_sight.
+    # at 10 MHz than at 1 MHz. Tolerances: see the measured errors of Slabs.
     steps = 100_000
     s, ds = (np.arange(steps) + 0.5) * 50.0 / steps, 50.0 / steps
     kappa = 1e3 * galaxy.absorption_per_emission_measure(frequency_mhz)
@@ -202,7 +202,7 @@ def test_an_isothermal_slab_between_two_emitters_has_the_closed_form(tau):
 def test_brightness_solves_the_equation_of_transfer(lon_deg, lat_deg):
     # dT/ds = j - kappa (T - T_e), marched from the background to the Sun by the trapezoidal rule,
     # whose error, (kappa ds)^2 tau / 12, is 2e-4 through the Vela shell at most. The tolerance is
-    # the quadrature's at 10 MHz (line_of_sight).
+    # the quadrature's at 10 MHz (Slabs).
     frequency_mhz, steps = 25.0, 100_000
     s, ds = (np.arange(steps) + 0.5) * 50.0 / steps, 50.0 / steps
     kappa = 1e3 * galaxy.absorption_per_emission_measure(frequency_mhz)

@@ -80,7 +80,8 @@ def test_unmeasured_turnovers_are_those_of_the_embedded_electrons(name):
     # Rounded to 0.1 MHz of 1.2: 4 % in nu_t, 9 % in depth; the nu^-2.1 law adds up to 7 %.
     source = SOURCES[name]
     lon_deg, lat_deg = source.galactic()
-    _, depth = galaxy.line_of_sight(np.array([lon_deg]), np.array([lat_deg]), source.turnover_mhz)
+    slabs = galaxy.Slabs.towards(np.array([lon_deg]), np.array([lat_deg]))
+    _, depth = slabs.synchrotron(source.turnover_mhz)
     assert depth[0 if lat_deg > 0 else 1, 0] == pytest.approx(1.0, rel=0.16)
 
 

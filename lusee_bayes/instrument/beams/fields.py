@@ -197,46 +197,6 @@ class AntennaFields(Described, eqx.Module):
         return self.e_theta.shape[0]
 
 
-def unit_vectors(grid: HemisphereGrid) -> Float[np.ndarray, "3 theta phi"]:
-    """East, North and up components of every direction of the grid."""
-    sin, cos = np.sin(grid.theta)[:, None], np.cos(grid.theta)[:, None]
-    ones = np.ones((1, grid.n_phi))
-    return np.stack([sin * np.cos(grid.phi), sin * np.sin(grid.phi), cos * ones])
-
-
-def displaced(
-    one: AntennaFields, positions_m: Float[np.ndarray, "antennas 3"], frequency_mhz: float
-) -> AntennaFields:
-    """Put identical copies of one antenna at several places; nothing couples them.
-
-    E_i = E exp(i k n.r_i), so that V_ij is the interferometer's integral of
-    B I exp(i k n.(r_i - r_j)).
-
-    Parameters
-    ----------
-    one : AntennaFields
-        Of one antenna.
-    positions_m : (antennas, 3) array
-        East, North, up, in metres.
-    frequency_mhz : float
-
-    Returns
-    -------
-    AntennaFields
-
-    Raises
-    ------
-    InputError
-        If ``one`` has more than one antenna.
-    """
-    if one.n_antennas != 1:
-        raise InputError(f"give the pattern of one antenna, got {one.n_antennas}")
-    require_shape("positions_m", positions_m, (None, 3))
-    path = np.einsum("ac,ctp->atp", positions_m, unit_vectors(one.grid))
-    phase = phasor(wavenumber(frequency_mhz) * path)
-    return AntennaFields(one.e_theta * phase, one.e_phi * phase, one.grid)
-
-
 # between the frequencies of a file: luseepy's rule, straight lines between products of fields and
 # between impedances, or cubic splines through fields and impedances
 Interpolation = Literal["linear", "spline"]
@@ -286,7 +246,7 @@ def at_frequency(
     known_mhz: Float[np.ndarray, " frequencies"],
     frequency_mhz: float,
     *parts: np.ndarray,
-    interpolation: Interpolation = "linear",
+    rule: Interpolation = "linear",
 ) -> list[np.ndarray]:
     """Interpolate arrays in frequency.
 
@@ -298,7 +258,7 @@ def at_frequency(
         Growing.
     frequency_mhz : float
     *parts : (frequencies, ...) array
-    interpolation : {"linear", "spline"}
+    rule : {"linear", "spline"}
 
     Returns
     -------
@@ -314,7 +274,7 @@ def at_frequency(
     places = neighbours(path, known_mhz, frequency_mhz)
     if len(places) == 1:
         return [np.asarray(part[places[0][0]]) for part in parts]
-    if interpolation == "linear":
+    if rule == "linear":
         return [np.asarray(sum(weight * part[k] for k, weight in places)) for part in parts]
     degree = min(3, len(known_mhz) - 1)
     splines = [scipy.interpolate.make_interp_spline(known_mhz, part, k=degree) for part in parts]

@@ -297,16 +297,8 @@ class SampledBeams(Described):
             raise InputError(
                 f"{self.path} has beams of products, not the E fields of antennas, which this needs"
             )
-        e_theta, e_phi = at_frequency(
-            self.path,
-            self.frequencies_mhz,
-            frequency_mhz,
-            self.e_theta,
-            self.e_phi,
-            interpolation="spline",
-        )
-        fields = self.directions.vectors_on(e_theta, e_phi, grid, turn_deg)
-        return AntennaFields(*fields, grid)
+        parts = self._at(frequency_mhz, self.e_theta, self.e_phi)
+        return AntennaFields(*self.directions.vectors_on(*parts, grid, turn_deg), grid)
 
     def patterns(
         self, frequency_mhz: float, grid: HemisphereGrid, turn_deg: float = 0.0
@@ -320,10 +312,11 @@ class SampledBeams(Described):
         """
         if self.products is None:
             return np.asarray(stokes_beam(self.fields(frequency_mhz, grid, turn_deg)))
-        (beams,) = at_frequency(
-            self.path, self.frequencies_mhz, frequency_mhz, self.products, interpolation="spline"
-        )
+        (beams,) = self._at(frequency_mhz, self.products)
         return to_matrix(self.directions.scalars_on(beams, grid, turn_deg))
+
+    def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
+        return at_frequency(self.path, self.frequencies_mhz, frequency_mhz, *parts, rule="spline")
 
     def beams(
         self,
@@ -626,10 +619,6 @@ class SampledFileBeams(BeamSource):
     def n_ports(self) -> int:
         return self.sampled.n_ports
 
-    @property
-    def emits(self) -> bool:
-        return False
-
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         return self.sampled.fields(frequency_mhz, grid, self.turntable_offset_deg)
 
@@ -639,15 +628,8 @@ class SampledFileBeams(BeamSource):
         return self.sampled.patterns(frequency_mhz, grid, self.turntable_offset_deg)
 
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
-        return self.sampled.beams(
-            frequency_mhz,
-            lmax,
-            turn_deg=self.turntable_offset_deg,
-            normalise=self.normalise,
-        )
-
-    def background(self, frequency_mhz: float) -> Float[Array, " products"]:
-        return np.zeros(self.n_ports**2)
+        turn_deg, normalise = self.turntable_offset_deg, self.normalise
+        return self.sampled.beams(frequency_mhz, lmax, turn_deg=turn_deg, normalise=normalise)
 
 
 def is_uvbeam_file(path: str | Path) -> bool:
