@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.checks import require_positive, require_shape

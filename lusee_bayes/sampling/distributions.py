@@ -48,10 +48,10 @@ class SkyPrior(dist.Distribution):
     support = dist.constraints.real_vector
     pytree_data_fields = ("prior",)
 
-    def __init__(self, prior: Prior, *, validate_args: bool | None = None):
+    def __init__(self, prior: Prior):
         prior.require_density()
         self.prior = prior
-        super().__init__(event_shape=(prior.size,), validate_args=validate_args)
+        super().__init__(event_shape=(prior.size,))
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Skies of the prior, ``(*sample_shape, unknowns)``, in K."""
@@ -96,16 +96,10 @@ class CorrelatedNormal(Prediction):
     support = dist.constraints.real_vector
     pytree_data_fields = ("factor", "loc")
 
-    def __init__(
-        self,
-        loc: Float[Array, " data"],
-        noise: Covariance | Factor,
-        *,
-        validate_args: bool | None = None,
-    ):
+    def __init__(self, loc: Float[Array, " data"], noise: Covariance | Factor):
         self.loc = loc
         self.factor = noise.factor() if isinstance(noise, Covariance) else noise
-        super().__init__(event_shape=loc.shape, validate_args=validate_args)
+        super().__init__(event_shape=loc.shape)
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Data vectors, ``(*sample_shape, data)``, in K."""
@@ -204,8 +198,6 @@ class TimesStudentT(Prediction):
         noise: Covariance | Factor,
         layout: DataLayout,
         nu: float | Float[Array, ""],
-        *,
-        validate_args: bool | None = None,
     ):
         require_positive("nu of the Student-t", nu)
         if layout.size != loc.shape[0]:
@@ -220,7 +212,7 @@ class TimesStudentT(Prediction):
         self.loc = loc
         self.layout = layout
         self.nu = nu
-        super().__init__(event_shape=loc.shape, validate_args=validate_args)
+        super().__init__(event_shape=loc.shape)
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Data vectors, ``(*sample_shape, data)``, in K."""
@@ -284,9 +276,9 @@ class Marginal(dist.Distribution):
     support = dist.constraints.real_vector
     pytree_data_fields = ("model",)
 
-    def __init__(self, model: LinearGaussian, *, validate_args: bool | None = None):
+    def __init__(self, model: LinearGaussian):
         self.model = model
-        super().__init__(event_shape=(model.n_data,), validate_args=validate_args)
+        super().__init__(event_shape=(model.n_data,))
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Data vectors of skies of the prior, ``(*sample_shape, data)``, in K."""

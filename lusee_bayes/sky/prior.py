@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from pathlib import Path
-from typing import NoReturn
+from typing import ClassVar, NoReturn
 
 import equinox as eqx
 import jax
@@ -57,7 +57,18 @@ PIVOT = 10.0
 
 
 class Prior(Described, eqx.Module):
-    """N(mu, S) over the sky's unknowns, as m = G u of independent normals u of unit variance."""
+    """N(mu, S) over the sky's unknowns, as m = G u of independent normals u of unit variance.
+
+    Attributes
+    ----------
+    invertible : bool
+        Whether m tells u, but for unknowns without variance: :meth:`whiten` needs it.
+    independent : bool
+        Whether S is diagonal; it may save work.
+    """
+
+    invertible: ClassVar[bool] = True
+    independent: ClassVar[bool] = False
 
     def description(self) -> tuple[str, ...]:
         return (f"{self.size} unknowns of {self.rank} independent normals",)
@@ -68,19 +79,9 @@ class Prior(Described, eqx.Module):
         """Number of unknowns in m."""
 
     @property
-    @abstractmethod
     def rank(self) -> int:
         """Number of independent normals behind them."""
-
-    @property
-    @abstractmethod
-    def invertible(self) -> bool:
-        """Whether m tells u, but for unknowns without variance: :meth:`whiten` needs it."""
-
-    @property
-    @abstractmethod
-    def independent(self) -> bool:
-        """Whether S is diagonal; it may save work."""
+        return self.size
 
     @abstractmethod
     def colour(self, u: Float[Array, "*batch white"]) -> Float[Array, "*batch unknowns"]:
@@ -257,18 +258,6 @@ class DensePrior(Prior):
         return self.root.shape[0]
 
     @property
-    def rank(self) -> int:
-        return self.size
-
-    @property
-    def invertible(self) -> bool:
-        return True
-
-    @property
-    def independent(self) -> bool:
-        return False
-
-    @property
     def white_mean(self) -> Float[Array, " white"] | None:
         return None if self.mean is None else self.whiten(self.mean)
 
@@ -333,6 +322,8 @@ def _require_covariance(
 class DiagonalPrior(Prior):
     """A prior whose G is diagonal."""
 
+    independent: ClassVar[bool] = True
+
     @property
     @abstractmethod
     def widths(self) -> Float[Array, " unknowns"]:
@@ -341,18 +332,6 @@ class DiagonalPrior(Prior):
     @property
     def size(self) -> int:
         return self.widths.shape[0]
-
-    @property
-    def rank(self) -> int:
-        return self.size
-
-    @property
-    def invertible(self) -> bool:
-        return True
-
-    @property
-    def independent(self) -> bool:
-        return True
 
     def colour(self, u):
         return u * self.widths.reshape(*(1,) * (u.ndim - 1), -1)
@@ -532,6 +511,8 @@ class PixelPrior(Prior):
         If the pixels are fewer than the modes, or the spectrum cannot be one.
     """
 
+    invertible: ClassVar[bool] = False
+
     spectrum: Float[Array, " ells"]
     synthesis: Float[Array, "pixels modes"]
 
@@ -553,14 +534,6 @@ class PixelPrior(Prior):
     @property
     def rank(self) -> int:
         return self.synthesis.shape[1]
-
-    @property
-    def invertible(self) -> bool:
-        return False
-
-    @property
-    def independent(self) -> bool:
-        return False
 
     def colour(self, u):
         return HarmonicPrior(self.spectrum).colour(u) @ self.synthesis.T

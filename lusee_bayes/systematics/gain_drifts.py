@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -56,6 +57,8 @@ class GainDrifts(Systematic):
     log_sigma_std, log_correlation_std : () array, optional
         Prior standard deviations of the natural logarithms of the two; None where known.
     """
+
+    needs_sky: ClassVar[bool] = True
 
     drift: GainDrift
     visibilities: Float[Array, "products times"]
@@ -115,10 +118,6 @@ class GainDrifts(Systematic):
             log_sigma_std,
             log_correlation_std,
         )
-
-    @property
-    def needs_sky(self) -> bool:
-        return True
 
     @property
     def n_antennas(self) -> int:

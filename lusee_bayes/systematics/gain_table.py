@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -114,6 +115,8 @@ class GainTable(Expanded):
         Whether z_0 and v_0 are those that the data tell, found in rounds.
     """
 
+    changes_coupling: ClassVar[bool] = False
+
     errors: TableErrors
     centre: Float[Array, " errors"]
     seen: Float[Array, " data"]
@@ -157,10 +160,6 @@ class GainTable(Expanded):
 
     def behind(self, response: Float[Array, " data"]) -> Systematic:
         return self
-
-    @property
-    def changes_coupling(self) -> bool:
-        return False
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Multiply by F(z_0), add T T^T to N and T (expected - z_0) to the mean."""

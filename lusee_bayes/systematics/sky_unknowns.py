@@ -8,6 +8,7 @@ The sky's prior power spectrum, up to a few unknown factors.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -90,12 +91,10 @@ class PointSources(Systematic):
         Gains that they are seen through in N; None for ones.
     """
 
+    changes_coupling: ClassVar[bool] = False
+
     sources: tuple[Source, ...]
     response: Float[Array, " data"] | None = None
-
-    @property
-    def changes_coupling(self) -> bool:
-        return False
 
     def columns(self) -> Float[Array, "data amplitudes"]:
         """Return the responses of all sources and blocks side by side, in K per K sr."""

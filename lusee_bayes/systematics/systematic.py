@@ -18,6 +18,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
 from statistics import NormalDist
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -38,17 +39,19 @@ class Chart(eqx.Module):
 
     Values are unconstrained (numpyro's ``biject_to``). Sites that are not among :attr:`names` are
     handed on as they are.
+
+    Attributes
+    ----------
+    factorises : bool
+        Whether it factorises matrices at every evaluation.
     """
+
+    factorises: ClassVar[bool] = False
 
     @property
     @abstractmethod
     def names(self) -> tuple[str, ...]:
         """The sites whose coordinates it changes or needs."""
-
-    @property
-    def factorises(self) -> bool:
-        """Whether it factorises matrices at every evaluation."""
-        return False
 
     @abstractmethod
     def to_values(
@@ -88,17 +91,17 @@ class Systematic(eqx.Module):
 
     Both methods take a ``LinearGaussian`` and return one, so that systematics are applied one
     after the other.
+
+    Attributes
+    ----------
+    needs_sky : bool
+        Whether it has so many unknowns that the sky has to be sampled together with them.
+    changes_coupling : bool
+        Whether A depends on it: if not, A is made dense once and for all.
     """
 
-    @property
-    def needs_sky(self) -> bool:
-        """Whether it has so many unknowns that the sky has to be sampled together with them."""
-        return False
-
-    @property
-    def changes_coupling(self) -> bool:
-        """Whether A depends on it: if not, A is made dense once and for all."""
-        return True
+    needs_sky: ClassVar[bool] = False
+    changes_coupling: ClassVar[bool] = True
 
     def chart(self, model: LinearGaussian) -> Chart | None:
         """Return coordinates of its sites, and of the sky's, in which ridges are straight.
@@ -169,6 +172,8 @@ class AdditiveNoise(Systematic):
         The data that the covariance is over.
     """
 
+    changes_coupling: ClassVar[bool] = False
+
     name: str = eqx.field(static=True)
     layout: DataLayout
 
@@ -179,10 +184,6 @@ class AdditiveNoise(Systematic):
     @property
     def needs_sky(self) -> bool:
         return self.covariance().rank > MOST_COLLAPSED
-
-    @property
-    def changes_coupling(self) -> bool:
-        return False
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         return replace(model, noise=model.noise + self.covariance())
@@ -235,9 +236,7 @@ class Marginalised(Systematic):
 class Scale(Systematic):
     """A systematic without a Gaussian term: marginalised, it stays at its median."""
 
-    @property
-    def changes_coupling(self) -> bool:
-        return False
+    changes_coupling: ClassVar[bool] = False
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Return the model as it is."""
@@ -382,15 +381,13 @@ class LinearUnknowns(Templated):
         Gains that the templates are seen through in N; None for ones.
     """
 
+    changes_coupling: ClassVar[bool] = False
+
     names: tuple[str, ...] = eqx.field(static=True)
     means: Float[Array, " unknowns"]
     stds: Float[Array, " unknowns"]
     templates: Float[Array, "data unknowns"]
     response: Float[Array, " data"] | None = None
-
-    @property
-    def changes_coupling(self) -> bool:
-        return False
 
     @property
     def unit(self) -> str:
