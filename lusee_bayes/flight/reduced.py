@@ -26,7 +26,7 @@ from lusee_bayes.flight.session import AUTOS, N_PRODUCTS, NO_LEVEL, PORTS
 from lusee_bayes.instrument.averaging import binned
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import DataLayout, all_products, labels
+from lusee_bayes.instrument.products import DataLayout, all_products, labels, runs_of
 from lusee_bayes.instrument.times import JD_SCALES, Windows, utc_of_jd
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
 
@@ -389,17 +389,8 @@ def _mean_abs(bend: Float[np.ndarray, "ports bins"]) -> float:
 def _one_run_an_angle(observation: Observation) -> Observation:
     """The same with a run for each stretch of one turntable angle, whatever the gains were."""
     angles = np.array(observation.turntable_deg)[observation.run]
-    run = np.concatenate([[0], np.cumsum(np.diff(angles) != 0.0)]).astype(np.int64)
-    first = np.searchsorted(run, np.arange(run[-1] + 1))
-    return Observation(
-        observation.lon_deg,
-        observation.lat_deg,
-        observation.times,
-        run,
-        tuple(angles[first].tolist()),
-        observation.step_s,
-        windows=observation.windows,
-    )
+    run, turntable_deg = runs_of(angles, observation.n_times)
+    return replace(observation, run=run, turntable_deg=turntable_deg)
 
 
 HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."

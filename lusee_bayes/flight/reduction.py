@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import astropy.units as u
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
@@ -59,7 +58,7 @@ from lusee_bayes.flight.session import (
     channel_mhz,
 )
 from lusee_bayes.instrument.averaging import by_the_rule
-from lusee_bayes.instrument.times import unannounced_leap_seconds
+from lusee_bayes.instrument.times import seconds_from
 
 # spectra that are worked on at once, and at least how many make a piece between two bins
 SLAB, PIECE = 128, 1024
@@ -411,9 +410,8 @@ def _finish(
 
 def _flag_bursts(spectra: Reduced, false_alarm: float, number: int) -> Float[np.ndarray, " spans"]:
     """Flag spectra that do not fit those before and after; the scatter over the noise, by span."""
-    with unannounced_leap_seconds():
-        times = spectra.observation.times
-        seconds = (times - times[0]).to_value(u.s)
+    times = spectra.observation.times
+    seconds = seconds_from(times[0], times)
     autos, noise = spectra.values[number, AUTOS].T, spectra.noise(number).T
     # what is absent neither stands out nor tells
     there = np.isfinite(autos)

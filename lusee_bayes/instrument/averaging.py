@@ -35,7 +35,6 @@ from __future__ import annotations
 from dataclasses import replace
 from math import factorial, lgamma
 
-import astropy.units as u
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from threadpoolctl import threadpool_limits
@@ -45,7 +44,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import tilt_powers
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.instrument.times import ROUNDING_S, Windows, unannounced_leap_seconds
+from lusee_bayes.instrument.times import ROUNDING_S, Windows, seconds_from, shifted
 from lusee_bayes.instrument.visibilities import Visibilities
 
 # of what is left out of any sample, relative to its visibility if what a beam sees of the sky falls
@@ -299,7 +298,7 @@ def bins_of(
             f"the data are to be averaged over {to_s:g} s, {to_s / 86400.0:g} days; give at most "
             f"{LONGEST_S / 86400.0:g} days, in which the Moon turns once"
         )
-    seconds = _seconds(observation)
+    seconds = seconds_from(observation.times[0], observation.times)
     start, end = seconds + bounds_s[:, 0], seconds + bounds_s[:, 1]
     origin = start[np.searchsorted(observation.run, observation.run)]
     place = np.floor((start - origin + ROUNDING_S) / to_s)
@@ -312,11 +311,6 @@ def bins_of(
         else:
             bin_of[k], begins = bin_of[k - 1] + 1, k
     return bin_of
-
-
-def _seconds(observation: Observation) -> Float[np.ndarray, " times"]:
-    with unannounced_leap_seconds():
-        return (observation.times - observation.times[0]).to_value(u.s)
 
 
 def by_the_rule(
@@ -367,7 +361,8 @@ def binned(
     keep = np.isin(np.arange(observation.n_times), left)
     here = observation.select(keep)
     windows = here.windows
-    offset = _seconds(here)[windows.sample]
+    seconds = seconds_from(here.times[0], here.times)
+    offset = seconds[windows.sample]
     start, end = windows.start_s + offset, windows.end_s + offset
     bin_of_piece, share = bin_of_left[windows.sample], windows.live_s / (end - start)
     gap = start[1:] - end[:-1]
@@ -383,8 +378,7 @@ def binned(
     begin = np.searchsorted(bin_of_piece, np.arange(len(first)))
     last = np.append(begin[1:], len(start)) - 1
     middle = (start[begin] + end[last]) / 2.0
-    with unannounced_leap_seconds():
-        times = here.times[first] + (middle - _seconds(here)[first]) * u.s
+    times = shifted(here.times[first], middle - seconds[first])
     offset = middle[bin_of_piece]
     return replace(
         here,

@@ -41,7 +41,13 @@ from lusee_bayes.instrument.schedule import (
     sun_direction,
     topocentric_from_mcmf,
 )
-from lusee_bayes.instrument.times import Windows, require_ephemeris, unannounced_leap_seconds
+from lusee_bayes.instrument.times import (
+    Windows,
+    require_ephemeris,
+    seconds_from,
+    shifted,
+    unannounced_leap_seconds,
+)
 
 ONE_CYCLE = (Run(),)
 
@@ -99,8 +105,7 @@ class Observation(Described):
                 f"times {self.times.shape} and run {self.run.shape} must be two lists of the "
                 "same length, with at least one sample"
             )
-        with unannounced_leap_seconds():
-            back = np.flatnonzero(~((self.times[1:] - self.times[:-1]).to_value(u.s) > 0.0))
+        back = np.flatnonzero(~(seconds_from(self.times[:-1], self.times[1:]) > 0.0))
         if back.size:
             before, after = self.times[back[0]].isot, self.times[back[0] + 1].isot
             raise InputError(
@@ -248,8 +253,7 @@ class Observation(Described):
         dark = self.sun_altitude_deg() < 0.0
         if throughout and self.windows is not None:
             for offset_s in self.windows.bounds_s.T:
-                with unannounced_leap_seconds():
-                    times = self.times + offset_s * u.s
+                times = shifted(self.times, offset_s)
                 dark &= replace(self, times=times, windows=None).sun_altitude_deg() < 0.0
         return dark
 
@@ -311,8 +315,7 @@ class Observation(Described):
         if self.windows is None:
             return self, np.arange(self.n_times), np.ones(self.n_times)
         sample, offset_s, weight = self.windows.nodes(n)
-        with unannounced_leap_seconds():
-            times = self.times[sample] + offset_s * u.s
+        times = shifted(self.times[sample], offset_s)
         instants = replace(self, times=times, run=self.run[sample], windows=None)
         return instants, sample, weight
 

@@ -26,7 +26,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 
-import astropy.units as u
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -38,7 +37,7 @@ from lusee_bayes.core.harmonics import Rotation
 from lusee_bayes.instrument.averaging import sufficient_nodes, windowed
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.schedule import CYCLE_DAYS
-from lusee_bayes.instrument.times import Windows, unannounced_leap_seconds
+from lusee_bayes.instrument.times import Windows, shifted
 
 # bound on the relative error of a mode at lmax, and least order for any lmax
 TILT_TOLERANCE = 1e-7
@@ -300,8 +299,7 @@ def with_offsets(observation: Observation, values: Values) -> Observation:
     drift = given.get("clock_drift_s_per_day", 0.0)
     stretch = 1.0 + drift / 86400.0
     late = given.get("clock_s", 0.0) + drift * observation.hours / 24.0
-    with unannounced_leap_seconds():
-        times = observation.times + late * u.s
+    times = shifted(observation.times, late)
     angles = zip(observation.turntable_deg, _of_runs(observation.n_runs), strict=True)
     windows = observation.windows
     if windows is not None:

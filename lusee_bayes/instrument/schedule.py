@@ -46,6 +46,8 @@ from lusee_bayes.instrument.times import (
     ROUNDING_S,
     Windows,
     require_ephemeris,
+    seconds_from,
+    shifted,
     unannounced_leap_seconds,
     utc_from_text,
 )
@@ -189,8 +191,7 @@ class Interval:
     @cached_property
     def length_s(self) -> float:
         """Length in seconds, the time without integration among them."""
-        with unannounced_leap_seconds():
-            return float((self._date("end", self.end) - self.start_time).to_value(u.s))
+        return float(seconds_from(self.start_time, self._date("end", self.end)))
 
     def n_samples(self, step_s: float) -> int:
         """Count the samples of a step, by day and night; the last one may be shorter."""
@@ -266,8 +267,7 @@ class Cuts:
                 "samples that are instants have no duty cycle; take windows "
                 "(observation.window=mean), or leave out the schedule's duty_cycle"
             )
-        with unannounced_leap_seconds():
-            return self.t0 + seconds * u.s, windows
+        return shifted(self.t0, seconds), windows
 
     def by_night(self, dark: Bool[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
         """Return the samples that are left where nights alone are wanted.
@@ -347,7 +347,7 @@ def cut_intervals(intervals: Sequence[Interval], step_s: float) -> Cuts:
         n = interval.n_samples(step_s)
         begins = step_s * np.arange(n)
         length = np.diff(begins, append=interval.length_s)
-        starts.append(_seconds_between(t0, interval.start_time) + begins)
+        starts.append(seconds_from(t0, interval.start_time) + begins)
         lengths.append(length)
         live.append(interval.duty_cycle * length)
         numbers.append(np.full(n, number))
@@ -385,7 +385,7 @@ def require_sequence(intervals: Sequence[Interval]) -> None:
     names = _names(intervals)
     for number, after in enumerate(intervals[1:]):
         before = intervals[number]
-        ahead = _seconds_between(before.start_time, after.start_time)
+        ahead = seconds_from(before.start_time, after.start_time)
         if ahead < 0.0:
             raise InputError(
                 f"{names[number + 1]}: the interval from {after.start} begins before the one that "
@@ -397,11 +397,6 @@ def require_sequence(intervals: Sequence[Interval]) -> None:
                 f"{names[number + 1]}: the interval from {after.start} begins {overlap:g} s before "
                 f"the one that precedes it ends, {before.end}; give each stretch of time once"
             )
-
-
-def _seconds_between(first: Time, second: Time) -> float:
-    with unannounced_leap_seconds():
-        return float((second - first).to_value(u.s))
 
 
 WHAT = "a schedule, a table in CSV or OpSim's in YAML"

@@ -52,6 +52,18 @@ def unannounced_leap_seconds() -> Iterator[None]:
         yield
 
 
+def seconds_from(origin: Time, times: Time) -> Any:
+    """Return the seconds from one time, or several, to others; leap seconds are counted."""
+    with unannounced_leap_seconds():
+        return (times - origin).to_value(u.s)
+
+
+def shifted(times: Time, seconds: Any) -> Time:
+    """Return the times so many seconds later."""
+    with unannounced_leap_seconds():
+        return times + seconds * u.s
+
+
 def utc_from_text(name: str, text: str) -> Time:
     """Return the time of an ISO date in UTC.
 
@@ -205,8 +217,7 @@ def step_of(times: Time, step_s: float | None) -> float:
         return float(step_s)
     if len(times) < 2:
         raise InputError("the integration time of a single sample is not known; give step_s")
-    with unannounced_leap_seconds():
-        return float(np.median(np.abs((times[1:] - times[:-1]).to_value(u.s))))
+    return float(np.median(np.abs(seconds_from(times[:-1], times[1:]))))
 
 
 # times of a Julian date in two parts are exact to less than a nanosecond, others to a few of them
@@ -348,9 +359,7 @@ class Windows(Described):
                 f"the window of sample {longest} lasts {length[longest]:g} s, longer than the step "
                 f"of {step_s:g} s from sample to sample; check the bounds, or give the step"
             )
-        with unannounced_leap_seconds():
-            seconds = (times - times[0]).to_value(u.s)
-        gaps = np.diff(seconds) + bounds[1:, 0] - bounds[:-1, 1]
+        gaps = np.diff(seconds_from(times[0], times)) + bounds[1:, 0] - bounds[:-1, 1]
         if (gaps < -ROUNDING_S).any():
             first = int(np.argmax(gaps < -ROUNDING_S))
             raise InputError(
@@ -439,11 +448,9 @@ def stamped(
         raise InputError(
             f"unknown timestamp '{timestamp}'; {nearest(timestamp, [*TO_MIDDLE, 'instant'])}"
         )
-    with unannounced_leap_seconds():
-        middles = times + TO_MIDDLE[timestamp] * step_s * u.s
-        seconds = (times - times[0]).to_value(u.s)
-    half = np.full(len(seconds), step_s / 2.0)
-    return middles, _windows(seconds, -half, half, step_s, live_s)
+    middles = shifted(times, TO_MIDDLE[timestamp] * step_s)
+    half = np.full(len(times), step_s / 2.0)
+    return middles, _windows(seconds_from(times[0], times), -half, half, step_s, live_s)
 
 
 def bounded(
@@ -471,11 +478,9 @@ def bounded(
         For a time outside its bounds, without a step for a single sample, and as
         :class:`.Windows`.
     """
-    with unannounced_leap_seconds():
-        start = (bounds[:, 0] - times).to_value(u.s)
-        end = (bounds[:, 1] - times).to_value(u.s)
-        middles = times + (start + end) / 2.0 * u.s
-        seconds = (middles - middles[0]).to_value(u.s)
+    start, end = (seconds_from(times, bounds[:, k]) for k in (0, 1))
+    middles = shifted(times, (start + end) / 2.0)
+    seconds = seconds_from(middles[0], middles)
     length = end - start
     step = step_of(times, float(length[0]) if step_s is None and len(times) == 1 else step_s)
     rounding = _rounding(step)

@@ -24,7 +24,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import astropy.units as u
 import numpy as np
 import xarray as xr
 from astropy.time import Time
@@ -63,9 +62,10 @@ from lusee_bayes.instrument.times import (
     JD_SCALES,
     Windows,
     bounded,
+    seconds_from,
+    shifted,
     stamped,
     step_of,
-    unannounced_leap_seconds,
     utc_bounds,
     utc_of_datetimes,
     utc_of_jd,
@@ -97,8 +97,7 @@ def window_variables(observation: Observation) -> dict[str, tuple[Any, ...]]:
     windows = observation.windows
     if windows is None:
         return {}
-    with unannounced_leap_seconds():
-        bounds = observation.times[:, None] + windows.bounds_s * u.s
+    bounds = shifted(observation.times[:, None], windows.bounds_s)
     values = (windows.sample, windows.start_s, windows.end_s, windows.live_s)
     return {
         "time_bounds": (("time", "bounds"), _datetimes(bounds), {}, ENCODING),
@@ -174,9 +173,7 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, boo
 
 
 def _require_same(windows: Windows, times: Time, there: np.ndarray) -> None:
-    bounds = utc_of_datetimes(there)
-    with unannounced_leap_seconds():
-        seconds = (bounds - times[:, None]).to_value(u.s)
+    seconds = seconds_from(times[:, None], utc_of_datetimes(there))
     if windows.n_samples != len(times):
         return  # an Observation says so
     off = np.abs(seconds - windows.bounds_s).max(axis=1)

@@ -44,7 +44,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import astropy.units as u
 import numpy as np
 from astropy.io import fits
 from astropy.time import Time
@@ -71,7 +70,8 @@ from lusee_bayes.instrument.products import (
 from lusee_bayes.instrument.times import (
     require_ephemeris,
     scale_of,
-    unannounced_leap_seconds,
+    seconds_from,
+    shifted,
     utc_from_text,
     utc_of,
 )
@@ -315,8 +315,7 @@ def _scalar_observation(path: Path, said: dict[str, Any], n_times: int) -> Obser
     with naming(path):
         first = start_of(said["LUNAR_DAY"])
         require_ephemeris(first.jd + np.array([(n_times - 1) * said["DELTAT_SEC"] / 86400.0]))
-        with unannounced_leap_seconds():
-            times = first + said["DELTAT_SEC"] * np.arange(n_times) * u.s
+        times = shifted(first, said["DELTAT_SEC"] * np.arange(n_times))
         return Observation(
             said["LUN_LONG_DEG"],
             said["LUN_LAT_DEG"],
@@ -498,8 +497,7 @@ def write_waterfall(
             "--frequencies, or write netCDF (a name that does not end in .fits)"
         )
     grid = grid_of(path, channels)
-    with unannounced_leap_seconds():
-        seconds = (first.times - first.times[0]).to_value(u.s)
+    seconds = seconds_from(first.times[0], first.times)
     # the time of a Julian date in two parts is exact to less than a nanosecond
     if np.abs(seconds - first.step_s * np.arange(first.n_times)).max() > 1e-6:
         raise InputError(
@@ -550,9 +548,8 @@ def grid_of(
 
 def site_and_times(observation: Observation) -> dict[str, Any]:
     """Return the words of the header that say where and when."""
-    with unannounced_leap_seconds():
-        # luseepy counts steps up to the end: half a step less leaves no room for rounding
-        end = observation.times[-1] - 0.5 * observation.step_s * u.s
+    # luseepy counts steps up to the end: half a step less leaves no room for rounding
+    end = shifted(observation.times[-1], -0.5 * observation.step_s)
     return {
         "LUNAR_DAY": f"{_written(observation.times[0])} to {_written(end)}",
         "LUN_LAT_DEG": observation.lat_deg,
