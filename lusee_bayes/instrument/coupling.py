@@ -42,7 +42,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lusee_bayes.core.arrays import Array, compiled, namespace
-from lusee_bayes.core.checks import Described, require_finite, require_float64, require_shape
+from lusee_bayes.core.checks import Described, require_array, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import (
     lmax_of,
@@ -181,9 +181,7 @@ class Coupling(Described, eqx.Module):
         InputError
             If ``factors`` is not float64, not finite, or of another length.
         """
-        require_float64("the response", factors)
-        require_shape("the response", factors, (self.shape[0],))
-        require_finite("the response", factors)
+        require_array("the response", factors, (self.shape[0],))
         factors = factors if self.response is None else self.response * factors
         return replace(self, response=factors)
 
@@ -264,9 +262,7 @@ class DenseCoupling(Coupling):
         *,
         response: Float[Array, " data"] | None = None,
     ):
-        require_float64("the coupling matrix", matrix)
-        require_shape("the coupling matrix", matrix, (None, None))
-        require_finite("the coupling matrix", matrix)
+        require_array("the coupling matrix", matrix, (None, None))
         self.matrix = jnp.asarray(matrix)
         self.response = response
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
+from lusee_bayes.core.checks import is_traced, require_array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
 from lusee_bayes.instrument.observation import Observation
@@ -41,9 +41,7 @@ def antenna_directions(
     InputError
         Unless ``galactic`` is a finite float64 array of such a shape.
     """
-    require_float64("galactic", galactic)
-    require_shape("galactic", galactic, (3,) if galactic.ndim == 1 else (observation.n_times, 3))
-    require_finite("galactic", galactic)
+    require_array("galactic", galactic, (3,) if galactic.ndim == 1 else (observation.n_times, 3))
     vectors = np.broadcast_to(galactic, (observation.n_times, 3))
     mcmf = np.einsum("tij,tj->ti", observation.mcmf_from_galactic(), vectors)
     topocentric_from_mcmf = observation.topocentric_from_mcmf()

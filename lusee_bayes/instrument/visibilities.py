@@ -35,8 +35,8 @@ from lusee_bayes.core.checks import (
     Described,
     extent,
     listed,
+    require_array,
     require_finite,
-    require_float64,
     require_positive,
     require_shape,
 )
@@ -276,9 +276,7 @@ class Visibilities(Described):
     calibration: Calibration | None = None
 
     def __post_init__(self):
-        require_float64("the data", self.data)
-        require_shape("the data", self.data, (self.layout.size,))
-        require_finite("the data", self.data)
+        require_array("the data", self.data, (self.layout.size,))
         if self.layout.n_times != self.observation.n_times:
             raise InputError(
                 f"the data have {self.layout.n_times} times, the observation "

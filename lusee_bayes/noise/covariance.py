@@ -50,6 +50,7 @@ from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import (
     Described,
     is_traced,
+    require_array,
     require_finite,
     require_float64,
     require_positive,
@@ -249,9 +250,7 @@ class DenseCovariance(Covariance):
     name: str = eqx.field(static=True, default="the dense covariance")
 
     def __check_init__(self):
-        require_float64(self.name, self.matrix)
-        require_shape(self.name, self.matrix, (self.matrix.shape[0],) * 2)
-        require_finite(self.name, self.matrix)
+        require_array(self.name, self.matrix, (self.matrix.shape[0],) * 2)
         require_symmetric(self.name, self.matrix)
 
     @property
@@ -376,9 +375,7 @@ class LowRankCovariance(Covariance):
     name: str = eqx.field(static=True, default="the low-rank term")
 
     def __check_init__(self):
-        require_float64(self.name, self.root)
-        require_shape(self.name, self.root, (None, None))
-        require_finite(self.name, self.root)
+        require_array(self.name, self.root, (None, None))
 
     @property
     def size(self) -> int:

@@ -36,6 +36,7 @@ from jaxtyping import Float, PRNGKeyArray
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import (
     is_traced,
+    require_array,
     require_finite,
     require_float64,
     require_positive,
@@ -77,9 +78,7 @@ def template_noise(
     InputError
         For templates of the wrong length, and for a P that is not positive definite.
     """
-    require_float64("the templates", templates)
-    require_shape("the templates", templates, (layout.size, None))
-    require_finite("the templates", templates)
+    require_array("the templates", templates, (layout.size, None))
     require_float64("the templates' prior", prior)
     n = templates.shape[1]
     if prior.ndim == 1:
@@ -167,9 +166,7 @@ class GainDrift(eqx.Module):
         InputError
             If shapes do not fit, visibilities are not finite or times do not grow.
         """
-        require_float64("the visibilities", visibilities)
-        require_shape("the visibilities", visibilities, (layout.n_products, layout.n_times))
-        require_finite("the visibilities", visibilities)
+        require_array("the visibilities", visibilities, (layout.n_products, layout.n_times))
         require_shape("hours", hours, (layout.n_times,))
         if not is_traced(hours) and not (np.diff(hours) > 0).all():
             raise InputError("the sample times (hours) must grow from one to the next")

@@ -29,15 +29,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import (
-    Described,
-    extent,
-    is_traced,
-    require_finite,
-    require_float64,
-    require_shape,
-    require_whole,
-)
+from lusee_bayes.core.checks import Described, extent, is_traced, require_array, require_whole
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import LARGEST_LMAX, n_modes, per_mode, pixel_matrix
 from lusee_bayes.core.layouts import Layout, Variable
@@ -196,13 +188,9 @@ class DensePrior(Prior):
     mean: Float[Array, " unknowns"] | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
-        require_float64("the root of the prior", self.root)
-        require_shape("the root of the prior", self.root, (self.size, self.size))
-        require_finite("the root of the prior", self.root)
+        require_array("the root of the prior", self.root, (self.size, self.size))
         if self.mean is not None:
-            require_float64("the prior mean", self.mean)
-            require_shape("the prior mean", self.mean, (self.size,))
-            require_finite("the prior mean", self.mean)
+            require_array("the prior mean", self.mean, (self.size,))
         if is_traced(self.root):
             return
         root = np.asarray(self.root)
@@ -237,9 +225,7 @@ class DensePrior(Prior):
         InputError
             If S is not float64, not finite, not symmetric or not positive definite.
         """
-        require_float64("the prior covariance", covariance)
-        require_finite("the prior covariance", covariance)
-        require_shape("the prior covariance", covariance, (len(covariance), len(covariance)))
+        require_array("the prior covariance", covariance, (len(covariance), len(covariance)))
         lower = cholesky(covariance)
         if not is_traced(lower):
             _require_covariance(np.asarray(covariance), np.asarray(lower))
@@ -387,8 +373,7 @@ class IndependentPrior(DiagonalPrior):
     root: Float[Array, " unknowns"]
 
     def __check_init__(self):
-        require_float64("the prior's standard deviations", self.root)
-        require_finite("the prior's standard deviations", self.root)
+        require_array("the prior's standard deviations", self.root)
 
     @property
     def widths(self) -> Float[Array, " unknowns"]:
@@ -400,8 +385,7 @@ class IndependentPrior(DiagonalPrior):
 
 def require_spectrum(spectrum: Float[Array, " ells"]) -> None:
     """Raise an InputError unless C_ell is float64, finite and not negative."""
-    require_float64("the prior spectrum", spectrum)
-    require_finite("the prior spectrum", spectrum)
+    require_array("the prior spectrum", spectrum)
     if is_traced(spectrum):
         return
     negative = np.asarray(spectrum) < 0
@@ -437,9 +421,7 @@ class HarmonicPrior(DiagonalPrior):
         require_spectrum(self.spectrum)
         if self.mean is None:
             return
-        require_float64("the prior mean", self.mean)
-        require_shape("the prior mean", self.mean, (self.size,))
-        require_finite("the prior mean", self.mean)
+        require_array("the prior mean", self.mean, (self.size,))
         if is_traced(self.spectrum, self.mean):
             return
         fixed = np.flatnonzero((np.asarray(self.mean) != 0.0) & ~(np.asarray(self.variance()) > 0))

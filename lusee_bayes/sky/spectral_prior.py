@@ -21,7 +21,7 @@ from lusee_bayes.core.checks import (
     Described,
     extent,
     listed,
-    require_finite,
+    require_array,
     require_float64,
     require_positive,
     require_shape,
@@ -107,9 +107,7 @@ class SpectralPrior(Described, eqx.Module):
             ("the mixing", self.mixing, (None, None)),
             ("the components' spectra", self.spectra, (components, None)),
         ):
-            require_float64(name, values)
-            require_shape(name, values, shape)
-            require_finite(name, values)
+            require_array(name, values, shape)
         require_positive("the components' C_ell", self.spectra)
         if self.residual is not None:
             require_float64("the residual spectra", self.residual)

@@ -42,13 +42,7 @@ from jaxtyping import Complex, Float
 from scipy.constants import Boltzmann
 
 from lusee_bayes.core.arrays import Array, as_complex, compiled, namespace
-from lusee_bayes.core.checks import (
-    is_traced,
-    require_finite,
-    require_float64,
-    require_positive,
-    require_shape,
-)
+from lusee_bayes.core.checks import is_traced, require_array, require_finite, require_positive
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.layouts import Layout, Variable
@@ -648,9 +642,7 @@ def beams_towards(
         parameter.
     """
     require_positive("frequency_mhz", frequency_mhz)
-    require_shape("directions", directions, (None, 3))
-    require_float64("directions", directions)
-    require_finite("directions", directions)
+    require_array("directions", directions, (None, 3))
     _require_unit(directions)
     monopoles = Monopoles() if monopoles is None else monopoles
     # an array: one compilation for all frequencies
