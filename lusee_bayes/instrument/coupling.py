@@ -469,15 +469,55 @@ class CouplingMatrix(Coupling):
             blocks.append(self._block(run, times)[product[here], position])
         return namespace(*blocks).concatenate(blocks)[np.argsort(np.concatenate(places))]
 
+    @compiled
     def dense(self) -> Float[Array, "data modes"]:
         """A as a matrix (96 MB for 5232 x 2304)."""
-        return _dense(self)
+        blocks = [self._block(run, span) for run, span in self.pointing.runs()]
+        rows = self.layout.gather(namespace(*blocks).concatenate(blocks, axis=1))
+        return rows if self.response is None else rows * self.response[:, None]
 
-    def _forward(self, sky):
-        return _forward(self, sky)
+    @compiled
+    def _forward(self, sky: Float[Array, " modes"]) -> Float[Array, " data"]:
+        n_products, n_functions = self.body_beams.shape[1:3]
+        pairs = _pairs(self.pointing.pole_from_galactic(sky), self.lmax)
+        plus, minus = pairs[: self.lmax + 1], pairs[self.lmax + 1 :]
+        xp = namespace(self, sky)
+        zero_order = np.arange(self.lmax + 1)[None] == 0
+        crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
+        both = xp.stack([pairs.T, crossed.T], axis=-1)
+        cosine, sine = _phases(self.pointing, self.lmax)
+        functions = self.pointing.functions
+        grids = []
+        for run, span in self.pointing.runs():
+            x_and_y = self.by_order[run] @ both
+            over_time = cosine[span] @ x_and_y[..., 0] + sine[span] @ x_and_y[..., 1]
+            over_time = over_time.reshape(-1, n_products, n_functions)
+            grids.append((over_time * functions[span][:, None]).sum(-1).T)
+        data = self.layout.gather(xp.concatenate(grids, axis=1))
+        return data if self.response is None else data * self.response
 
-    def _backward(self, data):
-        return _backward(self, data)
+    @compiled
+    def _backward(self, data: Float[Array, " data"]) -> Float[Array, " modes"]:
+        """The transpose of :func:`_forward`, step by step."""
+        n = self.lmax + 1
+        data = data if self.response is None else data * self.response
+        grid = self.layout.scatter(data)
+        cosine, sine = _phases(self.pointing, self.lmax)
+        functions = self.pointing.functions
+        both = 0.0
+        for run, span in self.pointing.runs():
+            weighted = grid[:, span].T[:, :, None] * functions[span][:, None]
+            weighted = weighted.reshape(weighted.shape[0], -1)
+            x_and_y = namespace(weighted).stack(
+                [cosine[span].T @ weighted, sine[span].T @ weighted], axis=-1
+            )
+            both = both + self.by_order[run].swapaxes(1, 2) @ x_and_y
+        # (orders, degrees): of pairs, and of what they are crossed to
+        straight, crossed = both[..., 0], both[..., 1]
+        plus, minus = straight[:, :n] - crossed[:, n:], straight[:, n:] + crossed[:, :n]
+        ell, m = mode_numbers(self.lmax)
+        packed = namespace(both).where(m >= 0, plus[np.abs(m), ell], minus[np.abs(m), ell])
+        return self.pointing.pole_from_galactic.T(packed)
 
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:
         """Rows of all products for some samples of one run; times: a slice or numbers."""
@@ -513,13 +553,6 @@ def turned_about_pole(
     return beams * cosine[None, :, np.abs(m)] - mirrored * signed[None]
 
 
-@compiled
-def _dense(coupling: CouplingMatrix) -> Float[Array, "data modes"]:
-    blocks = [coupling._block(run, span) for run, span in coupling.pointing.runs()]
-    rows = coupling.layout.gather(namespace(*blocks).concatenate(blocks, axis=1))
-    return rows if coupling.response is None else rows * coupling.response[:, None]
-
-
 def _phases(pointing: Pointing, lmax: int) -> tuple[Array, Array]:
     """cos m phi(t) and sin m phi(t), each (times, orders)."""
     xp = namespace(pointing.azimuth)
@@ -549,51 +582,6 @@ def _pairs(modes: Float[Array, "*batch modes"], lmax: int) -> Float[Array, "*bat
     inside = (ell >= m) & (m > 0)
     minus = xp.where(inside, modes[..., np.where(inside, centre - m, 0)], 0.0)
     return xp.concatenate([plus, minus], axis=-2)
-
-
-@compiled
-def _forward(coupling: CouplingMatrix, sky: Float[Array, " modes"]) -> Float[Array, " data"]:
-    n_products, n_functions = coupling.body_beams.shape[1:3]
-    pairs = _pairs(coupling.pointing.pole_from_galactic(sky), coupling.lmax)
-    plus, minus = pairs[: coupling.lmax + 1], pairs[coupling.lmax + 1 :]
-    xp = namespace(coupling, sky)
-    zero_order = np.arange(coupling.lmax + 1)[None] == 0
-    crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
-    both = xp.stack([pairs.T, crossed.T], axis=-1)
-    cosine, sine = _phases(coupling.pointing, coupling.lmax)
-    functions = coupling.pointing.functions
-    grids = []
-    for run, span in coupling.pointing.runs():
-        x_and_y = coupling.by_order[run] @ both
-        over_time = cosine[span] @ x_and_y[..., 0] + sine[span] @ x_and_y[..., 1]
-        over_time = over_time.reshape(-1, n_products, n_functions)
-        grids.append((over_time * functions[span][:, None]).sum(-1).T)
-    data = coupling.layout.gather(xp.concatenate(grids, axis=1))
-    return data if coupling.response is None else data * coupling.response
-
-
-@compiled
-def _backward(coupling: CouplingMatrix, data: Float[Array, " data"]) -> Float[Array, " modes"]:
-    """The transpose of :func:`_forward`, step by step."""
-    n = coupling.lmax + 1
-    data = data if coupling.response is None else data * coupling.response
-    grid = coupling.layout.scatter(data)
-    cosine, sine = _phases(coupling.pointing, coupling.lmax)
-    functions = coupling.pointing.functions
-    both = 0.0
-    for run, span in coupling.pointing.runs():
-        weighted = grid[:, span].T[:, :, None] * functions[span][:, None]
-        weighted = weighted.reshape(weighted.shape[0], -1)
-        x_and_y = namespace(weighted).stack(
-            [cosine[span].T @ weighted, sine[span].T @ weighted], axis=-1
-        )
-        both = both + coupling.by_order[run].swapaxes(1, 2) @ x_and_y
-    # (orders, degrees): of pairs, and of what they are crossed to
-    straight, crossed = both[..., 0], both[..., 1]
-    plus, minus = straight[:, :n] - crossed[:, n:], straight[:, n:] + crossed[:, :n]
-    ell, m = mode_numbers(coupling.lmax)
-    packed = namespace(both).where(m >= 0, plus[np.abs(m), ell], minus[np.abs(m), ell])
-    return coupling.pointing.pole_from_galactic.T(packed)
 
 
 # unit beams that are rotated at once

@@ -47,7 +47,7 @@ from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Variable, require_mhz
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
-from lusee_bayes.instrument.beams.monopoles import MeasuredReceiver
+from lusee_bayes.instrument.beams.monopoles import MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import (
     N_ANTENNAS,
@@ -73,23 +73,10 @@ from lusee_bayes.instrument.times import (
 )
 
 PIECES = ("piece_sample", "piece_start_s", "piece_end_s", "piece_live_s")
-VARIABLES = {
-    "time_bounds": Variable(("time", 2), "time", optional=True),
-    "live_time": Variable(("time",), optional=True),
-    "piece_sample": Variable(("piece",), "integer", low=0.0, optional=True),
-    **{name: Variable(("piece",), optional=True) for name in PIECES[1:]},
-}
-ATTRIBUTES = {"window": Attribute("text", choices=("mean", "instant"), optional=True)}
 # times for people are written to the millisecond
 EYE = {"units": "milliseconds since 1970-01-01", "calendar": "proleptic_gregorian"}
 ENCODING = EYE | {"dtype": "int64"}
 EYE_S = 0.01
-
-
-def coordinate(observation: Observation) -> tuple[Any, ...]:
-    """Return the coordinate ``time`` of a Dataset, for the reader's eye."""
-    attrs = {} if observation.windows is None else {"bounds": "time_bounds"}
-    return ("time",), _datetimes(observation.times), attrs, ENCODING
 
 
 def window_variables(observation: Observation) -> dict[str, tuple[Any, ...]]:
@@ -114,18 +101,13 @@ def _datetimes(times: Time) -> np.ndarray:
     return times.isot.astype("datetime64[ms]")
 
 
-def attributes(observation: Observation) -> dict[str, str]:
-    """Return the attribute of a file that says whether its samples are means or instants."""
-    return {"window": "instant" if observation.windows is None else "mean"}
-
-
 def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, bool]:
     """Return what a file says of the windows of its samples.
 
     Parameters
     ----------
     found : Content
-        Of a layout with ``VARIABLES`` and ``ATTRIBUTES``, and an attribute ``step_s``.
+        Of :data:`LAYOUT`.
     times : (times,) Time
         Of its samples.
 
@@ -461,19 +443,20 @@ class Visibilities(Described):
         # two parts keep the times exact
         variables["jd1"] = (("time",), observation.times.jd1, {"scale": "utc"})
         variables["jd2"] = (("time",), observation.times.jd2, {"scale": "utc"})
+        instants = observation.windows is None
+        for_eyes = {} if instants else {"bounds": "time_bounds"}
+        time = (("time",), _datetimes(observation.times), for_eyes, ENCODING)
+        said = {"window": "instant" if instants else "mean"} if self.says_window else {}
         return xr.Dataset(
             variables,
-            coords={
-                "product": list(self.labels),
-                "time": coordinate(observation),
-            },
+            coords={"product": list(self.labels), "time": time},
             attrs={
                 "format": formats.VISIBILITIES,
                 "frequency_mhz": self.frequency_mhz,
                 "lon_deg": observation.lon_deg,
                 "lat_deg": observation.lat_deg,
                 "step_s": observation.step_s,
-                **(attributes(observation) if self.says_window else {}),
+                **said,
                 "lusee_bayes_version": __version__,
             },
         )
@@ -507,7 +490,10 @@ LAYOUT = Layout(
         "jd2": Variable(("time",)),
         "run": Variable(("time",), "integer", low=0.0),
         "turntable_deg": Variable(("run_number",)),
-        **VARIABLES,
+        "time_bounds": Variable(("time", 2), "time", optional=True),
+        "live_time": Variable(("time",), optional=True),
+        "piece_sample": Variable(("piece",), "integer", low=0.0, optional=True),
+        **{name: Variable(("piece",), optional=True) for name in PIECES[1:]},
         "truth": Variable(("mode",), optional=True, unit="K"),
         # the receivers' loads ZL, where they are known
         "load_frequency_mhz": Variable(
@@ -520,7 +506,7 @@ LAYOUT = Layout(
         "lon_deg": Attribute(low=-360.0, high=360.0),
         "lat_deg": Attribute(low=-90.0, high=90.0),
         "step_s": Attribute(low=0.0),
-        **ATTRIBUTES,
+        "window": Attribute("text", choices=("mean", "instant"), optional=True),
         **JD_SCALES,
     },
 )
@@ -578,14 +564,6 @@ def read_visibilities(path: str | Path) -> Visibilities:
             observation,
             found.values["frequency_mhz"],
             here.get("truth"),
-            _receiver(path, here),
+            receiver_of(path, here, "load_frequency_mhz", *LOADS),
             says_window,
         )
-
-
-def _receiver(path: str | Path, here: dict[str, np.ndarray]) -> MeasuredReceiver | None:
-    names = ("load_frequency_mhz", *LOADS)
-    if not set(names) <= set(here):
-        return None
-    frequencies, real, imaginary = (here[name] for name in names)
-    return MeasuredReceiver(str(path), frequencies, real + 1j * imaginary)

@@ -57,7 +57,7 @@ from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ, Interpolation
-from lusee_bayes.instrument.beams.monopoles import LOADS, Circuit, MeasuredReceiver
+from lusee_bayes.instrument.beams.monopoles import LOADS, Circuit, MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation, body_direction
 from lusee_bayes.instrument.products import (
     N_ANTENNAS,
@@ -292,9 +292,7 @@ def read_scalar(path: Path) -> Waterfall:
     grid = np.full((len(places), len(data), len(frequencies)), np.nan)
     for column, (product, sign) in enumerate(columns):
         grid[places[product]] = sign * data[:, column]
-    return Waterfall(
-        str(path), grid, frequencies, _scalar_observation(path, found.values, len(data))
-    )
+    return Waterfall(str(path), grid, frequencies, _observation(path, found.values, len(data)))
 
 
 def _columns(path: Path, combinations: Int[np.ndarray, "pairs 2"]) -> list[tuple[Product, float]]:
@@ -311,19 +309,19 @@ def _columns(path: Path, combinations: Int[np.ndarray, "pairs 2"]) -> list[tuple
     return columns
 
 
-def _scalar_observation(path: Path, said: dict[str, Any], n_times: int) -> Observation:
+def _observation(
+    path: Path, said: dict[str, Any], n_times: int, jd: Float[np.ndarray, "times 2"] | None = None
+) -> Observation:
+    """Samples of a file: at the times that it gives, or in steps from the first one."""
     with naming(path):
-        first = start_of(said["LUNAR_DAY"])
-        require_ephemeris(first.jd + np.array([(n_times - 1) * said["DELTAT_SEC"] / 86400.0]))
-        times = shifted(first, said["DELTAT_SEC"] * np.arange(n_times))
-        return Observation(
-            said["LUN_LONG_DEG"],
-            said["LUN_LAT_DEG"],
-            times,
-            np.zeros(n_times, dtype=int),
-            (0.0,),
-            said["DELTAT_SEC"],
-        )
+        if jd is not None:
+            times = utc_of(jd[:, 0], jd[:, 1], scale_of("TIMESYS", said.get("TIMESYS", "UTC")))
+        else:
+            first, step_s = start_of(said["LUNAR_DAY"]), said["DELTAT_SEC"]
+            require_ephemeris(first.jd + np.array([(n_times - 1) * step_s / 86400.0]))
+            times = shifted(first, step_s * np.arange(n_times))
+        site, zeros = (said["LUN_LONG_DEG"], said["LUN_LAT_DEG"]), np.zeros(n_times, dtype=int)
+        return Observation(*site, times, zeros, (0.0,), said["DELTAT_SEC"])
 
 
 UNIT = "V^2/Hz"
@@ -388,20 +386,13 @@ def read_four_port(path: Path) -> Waterfall:
         str(path),
         grid,
         frequencies,
-        _four_port_observation(path, said, images["time"]),
+        _observation(path, said, len(data), images["time"]),
         per_kelvin,
         said["TMOON_K"],
         said.get("TANT_K", 0.0),
-        _receiver(path, images),
+        receiver_of(path, images, "freq", *LOADS),
         said.get("FREQINT"),
     )
-
-
-def _receiver(path: Path, images: dict[str, np.ndarray]) -> MeasuredReceiver | None:
-    if not set(LOADS) <= set(images):
-        return None
-    real, imaginary = (images[name] for name in LOADS)
-    return MeasuredReceiver(str(path), images["freq"], real + 1j * imaginary)
 
 
 def _places(path: Path, products: np.ndarray) -> list[int]:
@@ -415,21 +406,6 @@ def _places(path: Path, products: np.ndarray) -> list[int]:
     if len(set(named)) < len(named):
         raise InputError(f"{path}: products names the same product twice")
     return [known.index(label) for label in named]
-
-
-def _four_port_observation(
-    path: Path, said: dict[str, Any], times: Float[np.ndarray, "times 2"]
-) -> Observation:
-    with naming(path):
-        scale = scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
-        return Observation(
-            said["LUN_LONG_DEG"],
-            said["LUN_LAT_DEG"],
-            utc_of(times[:, 0], times[:, 1], scale),
-            np.zeros(len(times), dtype=int),
-            (0.0,),
-            said["DELTAT_SEC"],
-        )
 
 
 def read_waterfall(path: str | Path) -> Waterfall:
@@ -678,13 +654,14 @@ def write_four_port(
     ratio = np.divide(eigenvalues[..., 0], largest, out=np.zeros_like(largest), where=largest > 0)
     # visibilities are real products of a Hermitian matrix
     none = np.zeros_like(ratio)
+    parameters = json.dumps(receiver.luseepy_parameters(), sort_keys=True)
     hdus += [
         _image("loading_condition_number", condition, "1"),
         _image("covariance_antihermitian_absolute", none, UNIT),
         _image("covariance_antihermitian_relative", none, "1"),
         _image("covariance_eigenvalues", eigenvalues, UNIT),
         _image("covariance_minimum_eigenvalue_ratio", ratio, "1"),
-        _image("receiver_params", _bytes(receiver.luseepy_parameters()), "1"),
+        _image("receiver_params", np.frombuffer(parameters.encode(), dtype=np.uint8), "1"),
     ]
     header = {
         "VERSION": 3,
@@ -731,8 +708,3 @@ def _eigenvalues(
     values = np.full((*complete.shape, covariance.shape[-1]), np.nan)
     values[complete] = np.linalg.eigvalsh(covariance[complete])
     return values
-
-
-def _bytes(parameters: dict[str, tuple[float, ...]]) -> np.ndarray:
-    text = json.dumps({name: list(values) for name, values in parameters.items()}, sort_keys=True)
-    return np.frombuffer(text.encode(), dtype=np.uint8)

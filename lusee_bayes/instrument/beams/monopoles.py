@@ -63,7 +63,7 @@ N_LAYERS = 8
 DEPTH_M = 100.0
 
 
-def _scalar(x) -> Float[Array, ""]:
+def _array(x) -> Float[Array, "..."]:
     return namespace(x).asarray(x, dtype=np.float64)
 
 
@@ -90,9 +90,9 @@ class Regolith(eqx.Module):
     Grimm 2018, fits to the surface electrical properties experiment of Apollo 17.
     """
 
-    surface_permittivity: Float[Array, ""] = eqx.field(default=3.7, converter=_scalar)
-    deep_permittivity: Float[Array, ""] = eqx.field(default=6.1, converter=_scalar)
-    loss_tangent: Float[Array, ""] = eqx.field(default=0.01, converter=_scalar)
+    surface_permittivity: Float[Array, ""] = eqx.field(default=3.7, converter=_array)
+    deep_permittivity: Float[Array, ""] = eqx.field(default=6.1, converter=_array)
+    loss_tangent: Float[Array, ""] = eqx.field(default=0.01, converter=_array)
 
     def __check_init__(self):
         require_positive("surface_permittivity", self.surface_permittivity)
@@ -141,7 +141,8 @@ class Regolith(eqx.Module):
         sin2 = 1.0 - cosine**2
         eps = [xp.ones((), dtype=np.complex128), *self.permittivities()]
         # vertical wave numbers over k; the root with Im <= 0 decays downwards under exp(+i w t)
-        vertical = [cosine] + [_decaying_root(e - sin2) for e in eps[1:]]
+        roots = [xp.sqrt(e - sin2) for e in eps[1:]]
+        vertical = [cosine] + [xp.where(root.imag > 0, -root, root) for root in roots]
         s, p = xp.zeros_like(vertical[0]), xp.zeros_like(vertical[0])
         for upper in range(N_LAYERS - 1, -1, -1):
             q0, q1 = vertical[upper], vertical[upper + 1]
@@ -156,19 +157,8 @@ class Regolith(eqx.Module):
         return s, p
 
 
-def _decaying_root(z: Complex[Array, " theta"]) -> Complex[Array, " theta"]:
-    """The root with Im <= 0, which decays downwards under exp(+i w t)."""
-    xp = namespace(z)
-    root = xp.sqrt(z)
-    return xp.where(root.imag > 0, -root, root)
-
-
 # ports 0, 1, 2, 3 point North, East, South, West; phi counts from East towards North
 PORT_AZIMUTHS_DEG = (90.0, 0.0, -90.0, 180.0)
-
-
-def _array(x) -> Float[Array, "..."]:
-    return namespace(x).asarray(x, dtype=np.float64)
 
 
 class Monopoles(eqx.Module):
@@ -520,6 +510,15 @@ class MeasuredReceiver(Receiver):
         return {}
 
 
+def receiver_of(
+    path: str | Path, arrays: Mapping[str, np.ndarray], mhz: str, real: str, imaginary: str
+) -> MeasuredReceiver | None:
+    """Return the loads of a file's arrays with these names; None where it has none."""
+    if not {mhz, real, imaginary} <= set(arrays):
+        return None
+    return MeasuredReceiver(str(path), arrays[mhz], arrays[real] + 1j * arrays[imaginary])
+
+
 def read_receiver(path: str | Path) -> MeasuredReceiver:
     """Read loads from a FITS file with the images ``freq`` (MHz), ``ZL_real``, ``ZL_imag`` (Ohm).
 
@@ -538,7 +537,7 @@ def read_receiver(path: str | Path) -> MeasuredReceiver:
         For a missing or damaged file, or one that has no such images.
     """
     images = read_fits(path, LAYOUT, "check beam.receiver").arrays
-    return MeasuredReceiver(str(path), images["freq"], images["ZL_real"] + 1j * images["ZL_imag"])
+    return receiver_of(path, images, "freq", *LOADS)
 
 
 @dataclass(frozen=True)
