@@ -26,21 +26,12 @@ from astropy.constants import c
 from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_body_barycentric
 from astropy.time import Time, TimeDelta
 from jaxtyping import Bool, Float, Int
+from lunarsky import MCMF
+from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.core.checks import Described, listed, require_finite, require_positive
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.instrument.schedule import (
-    Cuts,
-    Interval,
-    Run,
-    about_fixed_axis,
-    cut_intervals,
-    cut_runs,
-    lean,
-    mcmf_from_galactic,
-    sun_direction,
-    topocentric_from_mcmf,
-)
+from lusee_bayes.instrument.schedule import Cuts, Interval, Run, cut_intervals, cut_runs
 from lusee_bayes.instrument.times import (
     Windows,
     require_ephemeris,
@@ -50,6 +41,8 @@ from lusee_bayes.instrument.times import (
 )
 
 ONE_CYCLE = (Run(),)
+# period after which the sky repeats itself in luseepy's engine croissant
+LUSEEPY_MONTH_HOURS = 655.72
 
 
 @dataclass(frozen=True, repr=False)
@@ -333,7 +326,9 @@ class Observation(Described):
     @cached_property
     def _mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
         if self.fixed_axis:
-            rotations = about_fixed_axis(self.times, self.hours)
+            angle = 2.0 * np.pi * self.hours / LUSEEPY_MONTH_HOURS
+            about_z = SpatialRotation.from_rotvec(np.outer(-angle, [0.0, 0.0, 1.0])).as_matrix()
+            rotations = about_z @ mcmf_from_galactic(self.times[:1])[0]
         else:
             rotations = mcmf_from_galactic(self.times)
         rotations.setflags(write=False)  # all channels share them
@@ -341,11 +336,20 @@ class Observation(Described):
 
     def topocentric_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from MCMF to the East, North and up of the site, its rows."""
-        return topocentric_from_mcmf(self.lon_deg, self.lat_deg)
+        lon, lat = np.radians(self.lon_deg), np.radians(self.lat_deg)
+        up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+        east = np.array([-np.sin(lon), np.cos(lon), 0.0])
+        return np.array([east, np.cross(up, east), up])
 
     def lander_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
-        """Return the rotation from MCMF to the lander's axes: East, North and up if it is level."""
-        return lean(self.tilt_deg) @ self.topocentric_from_mcmf()
+        """Return the rotation from MCMF to the lander's axes: East, North and up if it is level.
+
+        It leans first towards North, about East, then towards East, about North.
+        """
+        east, north = np.radians(self.tilt_deg)
+        turned = SpatialRotation.from_rotvec([0.0, east, 0.0])
+        turned *= SpatialRotation.from_rotvec([-north, 0.0, 0.0])
+        return turned.inv().as_matrix() @ self.topocentric_from_mcmf()
 
     def zenith_galactic(self) -> Float[np.ndarray, "times 3"]:
         """Return the Galactic unit vector of the zenith at every time."""
@@ -355,6 +359,29 @@ class Observation(Described):
         """Return the geometric altitude of the Sun's centre above the horizon in degrees."""
         height = np.einsum("ti,ti->t", self.zenith_galactic(), sun_direction(self.times))
         return np.degrees(np.arcsin(height))
+
+
+def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:
+    """Return the rotations that take Galactic unit vectors to MCMF ones.
+
+    The three Galactic axes go through lunarsky's ICRS -> MCMF transformation in one call.
+    """
+    axes = Galactic(CartesianRepresentation(np.eye(3)[:, :, None])).transform_to(ICRS())
+    icrs = ICRS(CartesianRepresentation(axes.cartesian.xyz.value))
+    with unannounced_leap_seconds():
+        turned = icrs.transform_to(MCMF(obstime=times))
+    return np.moveaxis(turned.cartesian.xyz.value, 2, 0)
+
+
+def sun_direction(times: Time) -> Float[np.ndarray, "times 3"]:
+    """Return Galactic unit vectors from the Moon's centre to where the Sun's is at the time."""
+    with unannounced_leap_seconds():
+        sun = get_body_barycentric("sun", times, ephemeris="builtin")
+        moon = get_body_barycentric("moon", times, ephemeris="builtin")
+    direction = (sun - moon).xyz.to_value(u.km)
+    galactic = ICRS(CartesianRepresentation(direction)).transform_to(Galactic())
+    vector = galactic.cartesian.xyz.value
+    return (vector / np.linalg.norm(vector, axis=0)).T
 
 
 BODIES = ("Sun", "Mercury", "Venus", "Earth", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")
