@@ -74,9 +74,7 @@ def mode_numbers(lmax: int) -> tuple[np.ndarray, np.ndarray]:
     return ell, m
 
 
-def from_healpy(
-    alm: Complex[np.ndarray, "*batch alms"],
-) -> Float[np.ndarray, "*batch modes"]:
+def from_healpy(alm: Complex[np.ndarray, "*batch alms"]) -> Float[np.ndarray, "*batch modes"]:
     """Convert complex coefficients in healpy's packing (m >= 0, m-major) to real packed ones."""
     lmax = healpy.Alm.getlmax(alm.shape[-1])
     ell, m = mode_numbers(lmax)

@@ -221,10 +221,7 @@ def comb_bins(averaging: Averaging) -> Bool[np.ndarray, " bins"]:
 
 
 def comb_strength(
-    autos: Spectra,
-    frames: Rows,
-    averaging: Averaging,
-    middles_mhz: Float[np.ndarray, " channels"],
+    autos: Spectra, frames: Rows, averaging: Averaging, middles_mhz: Float[np.ndarray, " channels"]
 ) -> Rows:
     """Return by how many standard deviations the comb's channels differ from their neighbours.
 
@@ -399,13 +396,7 @@ def _from_neighbours(z: Distances, good: Span) -> Float[np.ndarray, " ports"]:
     return np.array([robust_scale(port[None], both) for port in steps])
 
 
-def _without_the_highest(
-    values: OneRow,
-    sigma: OneRow,
-    good: Span,
-    x: Terms,
-    limit: float,
-) -> Span:
+def _without_the_highest(values: OneRow, sigma: OneRow, good: Span, x: Terms, limit: float) -> Span:
     """Good spectra but those above the curve, which bursts pull up when they are long."""
     kept = good.copy()
     for _ in range(MAX_ROUNDS):

@@ -98,14 +98,7 @@ def channel_mhz(origin: BinOrigin) -> Float[np.ndarray, " channels"]:
 
 
 # what the gain table asks of the telemetry
-TELEMETRY = (
-    "THERM_FPGA",
-    "SPE_ADC0_T",
-    "SPE_ADC1_T",
-    "SPE_1VAD8_V",
-    "VMON_1V2D",
-    "SPE_1VAD8_C",
-)
+TELEMETRY = ("THERM_FPGA", "SPE_ADC0_T", "SPE_ADC1_T", "SPE_1VAD8_V", "VMON_1V2D", "SPE_1VAD8_C")
 # counts of spectra [first:last] of all products and channels
 Read = Callable[[int, int], Float32[np.ndarray, "rows products channels"]]
 

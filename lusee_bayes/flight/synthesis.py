@@ -375,10 +375,7 @@ class Disturbances:
         )
 
     def add(
-        self,
-        t: Complex[np.ndarray, "antennas antennas rows channels"],
-        rows: slice,
-        frames: float,
+        self, t: Complex[np.ndarray, "antennas antennas rows channels"], rows: slice, frames: float
     ) -> None:
         """Add tones, comb and bursts to the covariance of the voltages of some spectra, in place.
 

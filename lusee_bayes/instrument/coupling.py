@@ -318,10 +318,7 @@ class CouplingMatrix(Coupling):
 
     @classmethod
     def build(
-        cls,
-        beams: ProductBeams,
-        pointing: Pointing,
-        layout: DataLayout | None = None,
+        cls, beams: ProductBeams, pointing: Pointing, layout: DataLayout | None = None
     ) -> CouplingMatrix:
         """Build A from beams and orientations.
 
@@ -357,10 +354,7 @@ class CouplingMatrix(Coupling):
 
     @classmethod
     def of_modes(
-        cls,
-        modes: Float[Array, "beams modes"],
-        pointing: Pointing,
-        layout: DataLayout,
+        cls, modes: Float[Array, "beams modes"], pointing: Pointing, layout: DataLayout
     ) -> CouplingMatrix:
         """Build A of any number of beams from their coefficients; nothing is checked.
 

@@ -232,11 +232,7 @@ class Observation(Described):
         """Of samples by night alone where asked for, at their times or from end to end."""
         times, windows = cuts.samples(window)
         observation = cls(
-            times=times,
-            run=cuts.run,
-            turntable_deg=cuts.turntable_deg,
-            windows=windows,
-            **others,
+            times=times, run=cuts.run, turntable_deg=cuts.turntable_deg, windows=windows, **others
         )
         if not any(cuts.night_only):
             return observation

@@ -314,10 +314,7 @@ def with_offsets(observation: Observation, values: Values) -> Observation:
         turntable_deg=tuple(angle + given.get(name, 0.0) for angle, name in angles),
         step_s=observation.step_s * stretch,
         windows=windows,
-        tilt_deg=(
-            east + given.get("tilt_east_deg", 0.0),
-            north + given.get("tilt_north_deg", 0.0),
-        ),
+        tilt_deg=(east + given.get("tilt_east_deg", 0.0), north + given.get("tilt_north_deg", 0.0)),
     )
 
 

@@ -105,11 +105,7 @@ NAME = re.compile(r"\s*(\d)\s*[-_x, ]?\s*(\d)\s*([RI]?)\s*", re.IGNORECASE)
 
 
 def real_products(
-    data: Any,
-    products: Any,
-    flags: Any,
-    convention: str,
-    n_antennas: int,
+    data: Any, products: Any, flags: Any, convention: str, n_antennas: int
 ) -> tuple[Float[np.ndarray, "products times"], Bool[np.ndarray, "products times"]]:
     """Return the real products of arrays of correlations in the package's order.
 

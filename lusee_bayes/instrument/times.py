@@ -408,10 +408,7 @@ ROUNDED_S, ROUNDED_SHARE = 1e-3, 1e-4
 
 
 def stamped(
-    times: Time,
-    timestamp: str,
-    step_s: float,
-    live_s: Float[np.ndarray, " times"] | None = None,
+    times: Time, timestamp: str, step_s: float, live_s: Float[np.ndarray, " times"] | None = None
 ) -> tuple[Time, Windows | None]:
     """Return the middles and the windows of samples that last for a step each.
 

@@ -167,9 +167,7 @@ def radiometer_noise(
     return TimeBlockCovariance(exact_blocks(visibilities) * scale[:, None, None], layout)
 
 
-def paper_variance(
-    visibilities: Float[Array, "products times"],
-) -> Float[Array, "products times"]:
+def paper_variance(visibilities: Float[Array, "products times"]) -> Float[Array, "products times"]:
     """Return (T_ii T_jj + V_k^2) / 2 in K^2, to be divided by df dt."""
     n = round(np.sqrt(visibilities.shape[0]))
     autos = visibilities[auto_indices(n)]

@@ -20,12 +20,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling.hmc import Chains
-from lusee_bayes.sampling.programs import (
-    Program,
-    collapsed_draws,
-    is_collapsed,
-    numpyro_promotion,
-)
+from lusee_bayes.sampling.programs import Program, collapsed_draws, is_collapsed, numpyro_promotion
 from lusee_bayes.systematics.systematic import SKY
 
 DATA = "data"

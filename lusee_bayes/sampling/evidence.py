@@ -165,11 +165,7 @@ def _pointwise(
 
 
 def with_log_likelihood(
-    tree: xr.DataTree,
-    program: Program,
-    arguments: Mapping[str, Any],
-    *,
-    most: int = 400,
+    tree: xr.DataTree, program: Program, arguments: Mapping[str, Any], *, most: int = 400
 ) -> xr.DataTree:
     """Make a tree of some of the draws, with a group log_likelihood (chain, draw, datum).
 

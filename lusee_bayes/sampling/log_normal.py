@@ -308,9 +308,7 @@ class LogNormalMode:
 
 
 def find_mode(
-    sky: LogNormalSky,
-    information: Information,
-    start: Float[np.ndarray, " unknowns"] | None = None,
+    sky: LogNormalSky, information: Information, start: Float[np.ndarray, " unknowns"] | None = None
 ) -> LogNormalMode:
     """Climb to the mode of p(u | d).
 

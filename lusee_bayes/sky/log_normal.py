@@ -116,10 +116,7 @@ class LogNormalSky(Described, eqx.Module):
         require_positive("the template", level, "a log-normal sky is a positive template times exp")
         modes = [source.modes(frequency_mhz, lmax) for source in sources]
         return cls(
-            np.asarray(spectrum),
-            grid,
-            level,
-            np.reshape(modes, (len(sources), n_modes(lmax))),
+            np.asarray(spectrum), grid, level, np.reshape(modes, (len(sources), n_modes(lmax)))
         )
 
     def description(self) -> tuple[str, ...]:

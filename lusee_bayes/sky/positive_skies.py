@@ -310,17 +310,11 @@ class FieldLaws:
         fields = len(self.means)
         spectra[:fields, 0] = 4.0 * np.pi * self.means**2
         return SpectralPrior(
-            skies.frequencies_mhz,
-            skies.mixing,
-            spectra[:fields],
-            spectra[fields:],
-            skies.names,
+            skies.frequencies_mhz, skies.mixing, spectra[:fields], spectra[fields:], skies.names
         )
 
     def matched(
-        self,
-        found: Float[np.ndarray, "laws ells"],
-        known: Float[np.ndarray, "laws ells"],
+        self, found: Float[np.ndarray, "laws ells"], known: Float[np.ndarray, "laws ells"]
     ) -> FieldLaws:
         """Compute the parameters under which the fields have as much power as they should.
 

@@ -101,11 +101,7 @@ class GainDrifts(Systematic):
             factor = float(np.exp(CORRELATION_REACH * log_correlation_std))
         longest = GainDrift(drift.sigma, middle * max(factor, FACTOR))
         grid = white_grid(
-            hours,
-            middle / factor,
-            middle * factor,
-            per_correlation=PER_CORRELATION,
-            margin=MARGIN,
+            hours, middle / factor, middle * factor, per_correlation=PER_CORRELATION, margin=MARGIN
         )
         return cls(
             drift,

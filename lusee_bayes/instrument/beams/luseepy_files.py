@@ -336,11 +336,7 @@ class PortResponse(LuseepyBeam):
         return self.circuit(frequency_mhz).per_kelvin.diagonal().real
 
     def fields(
-        self,
-        frequency_mhz: float,
-        *,
-        grid: HemisphereGrid | None = None,
-        turn_deg: float = 0.0,
+        self, frequency_mhz: float, *, grid: HemisphereGrid | None = None, turn_deg: float = 0.0
     ) -> AntennaFields:
         """Return the fields of the ports; their products are beams in K per K and sr.
 

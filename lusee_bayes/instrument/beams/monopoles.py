@@ -109,9 +109,7 @@ class Regolith(eqx.Module):
         return as_complex(real, -real * self.loss_tangent)
 
     def reflection(
-        self,
-        cos_theta: Float[Array, " theta"],
-        frequency_mhz: float | Float[Array, ""],
+        self, cos_theta: Float[Array, " theta"], frequency_mhz: float | Float[Array, ""]
     ) -> tuple[Complex[Array, " theta"], Complex[Array, " theta"]]:
         """Return the reflection coefficients for waves that arrive at zenith angle theta.
 

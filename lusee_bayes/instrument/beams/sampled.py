@@ -467,10 +467,7 @@ def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
         "theta_deg": Variable(("theta",), low=0.0, high=180.0, grows=True, unit="deg"),
         "phi_deg": Variable(("phi",), low=0.0, high=360.0, grows=True, unit="deg"),
     }
-    attributes = {
-        "absolute": Attribute("boolean"),
-        "products": Attribute("text", optional=fields),
-    }
+    attributes = {"absolute": Attribute("boolean"), "products": Attribute("text", optional=fields)}
     return Layout(
         WHAT,
         {
