@@ -35,10 +35,10 @@ from lusee_bayes.priors.local_scales import embedded_local_scales
 from lusee_bayes.sampling.log_normal import LogNormalPrior
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
-from lusee_bayes.sky.positive_skies import check_fields
+from lusee_bayes.sky.positive_skies import FIELDS, FIELDS_OF
 from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_mean, read_spectrum
 from lusee_bayes.sky.sky_source import FileSource, GalaxySource, Sky, SkySource
-from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components
+from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components, require_names
 from lusee_bayes.sky.template import EmbeddedTemplate
 
 
@@ -470,7 +470,7 @@ class SpectralSection(Section):
         if self.model == "components":
             check_components(self.components, n, self.residual)
         if self.model == "positive":
-            check_fields(self.fields, n)
+            require_names("field", FIELDS_OF, self.fields, FIELDS, n)
 
     def n_maps(self, frequencies_mhz: tuple[float, ...]) -> int:
         """How many maps the skies of these channels are made of."""

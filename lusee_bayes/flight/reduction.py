@@ -291,7 +291,9 @@ def _slab(
     telemetry = {name: values[here] for name, values in session.telemetry.items()}
     notched = np.zeros(len(counts), dtype=bool)
     if session.notch is not None:
-        notched = _notched(session.notch[here])
+        # the mean of the comb's channels is subtracted, unless bit 4 says that it is not
+        notch = session.notch[here]
+        notched = ((notch & 0b111) > 0) & ((notch & 0b10000) == 0)
     try:
         strengths = state.strengths(telemetry, len(counts))
     except InputError as error:
@@ -299,11 +301,6 @@ def _slab(
     frames = session.frames[here]
     lines = state.lines(counts, frames, notched)
     return partial(_calibrate, state, counts, frames, strengths, lines, session.saturated[here])
-
-
-def _notched(notch: Int[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
-    """Whether the mean of the comb's channels is subtracted: bit 4 says that it is not."""
-    return ((notch & 0b111) > 0) & ((notch & 0b10000) == 0)
 
 
 def _calibrate(

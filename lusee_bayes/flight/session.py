@@ -328,6 +328,7 @@ def session_of(
             f"({n}, 16, {N_CHANNELS}) real numbers"
         )
     none = np.zeros((n, PORTS), dtype=np.int64)
+    said = found.values.get("session_invariants.software_version", "unknown")
     shift2 = rows[f"{META}/Navg2_shift"]
     share = np.ones(n)
     if (weight := rows.get(f"{META}/weight")) is not None:
@@ -353,15 +354,11 @@ def session_of(
         clock=clock,
         lon_deg=found.values["constants.lun_long_deg"],
         lat_deg=found.values["constants.lun_lat_deg"],
-        software=_version(found.values.get("session_invariants.software_version", "unknown")),
+        # as versions of the flight software are written: 0x307 for the number 775
+        software=f"{int(said):#x}" if said.isascii() and said.isdigit() else said,
         opener=opener,
         unused=unused or {},
     )
-
-
-def _version(text: str) -> str:
-    """A version of the flight software as it is written: 0x307 for the number 775."""
-    return f"{int(text):#x}" if text.isascii() and text.isdigit() else text
 
 
 def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> Shaped[np.ndarray, "rows ports"]:

@@ -97,26 +97,6 @@ class Instrument(eqx.Module):
         antennas = placed(self.monopoles, values or {})
         return monopole_beams(self.frequency_mhz, self.lmax, antennas, nodes=self.nodes)
 
-    def coupling(self, values: Mapping[str, Float[Array, ""]] | None = None) -> CouplingMatrix:
-        """Compute A with its structure in time.
-
-        Parameters
-        ----------
-        values : mapping of str to () array, optional
-            Values of some parameters (``beams.PARAMETERS``); the others keep theirs.
-
-        Returns
-        -------
-        CouplingMatrix
-            Differentiable in the values.
-
-        Raises
-        ------
-        InputError
-            If there is no parameter of that name.
-        """
-        return self.coupling_of(self.beams(values))
-
     def dense(self, values: Mapping[str, Float[Array, ""]]) -> Float[Array, "data modes"]:
         """Compute A as a matrix, of a :meth:`prepared` instrument.
 

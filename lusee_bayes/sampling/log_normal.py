@@ -48,7 +48,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 
 from lusee_bayes.core.arrays import Array, on_device, on_host
-from lusee_bayes.core.checks import Described, number, require_positive, require_shape
+from lusee_bayes.core.checks import require_positive, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.linalg import (
@@ -66,7 +66,7 @@ from lusee_bayes.systematics.systematic import SKY, Chart
 STRUCTURE, AMPLITUDE, TILT = "structure", "amplitude", "tilt"
 
 
-class LogNormalPrior(Described, eqx.Module):
+class LogNormalPrior(eqx.Module):
     """A log-normal sky with C_ell = A^2 ((ell + 1) / 10)^tilt of its logarithm.
 
     ln A and the tilt are known, or Gaussian about these values.
@@ -123,14 +123,6 @@ class LogNormalPrior(Described, eqx.Module):
         if self.log_amplitude_std is not None:
             require_positive("the standard deviation of ln A", self.log_amplitude_std)
             require_positive("the standard deviation of the tilt", self.tilt_std)
-
-    def description(self) -> tuple[str, ...]:
-        known = "known" if self.log_amplitude_std is None else "not known"
-        return (
-            f"log-normal sky, A = {number(self.amplitude, '.4g')} and tilt = "
-            f"{number(self.tilt, '.4g')} {known}",
-            *self.sky.description(),
-        )
 
     @property
     def samples_spectrum(self) -> bool:
@@ -338,7 +330,8 @@ def find_mode(
     here, moved, damping, least = information.recentred(sky.modes(white)), np.inf, 0.0, 0.0
     for steps in range(MAX_STEPS + 1):
         jacobian = sky.jacobian(white)
-        curvature = _curvature(here, jacobian)
+        curvature = symmetric_product(jacobian.T @ here.matrix, jacobian)
+        curvature[np.diag_indices(len(curvature))] += 1.0
         lower = checked_cholesky("the curvature of the posterior", curvature)
         slope = white - jacobian.T @ here.vector
         half = solve_lower(lower, slope[:, None], transpose=False)
@@ -363,14 +356,6 @@ def find_mode(
         f"{moved:.2g} standard deviations); the data are far from anything that the template "
         "allows: check their scale, or raise log_normal.scale_std"
     )
-
-
-def _curvature(
-    information: Information, jacobian: Float[np.ndarray, "modes unknowns"]
-) -> Float[np.ndarray, "unknowns unknowns"]:
-    curvature = symmetric_product(jacobian.T @ information.matrix, jacobian)
-    curvature[np.diag_indices(len(curvature))] += 1.0
-    return curvature
 
 
 def _energy(information: Information, white: Float[np.ndarray, " unknowns"]) -> float:

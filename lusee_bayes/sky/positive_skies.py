@@ -34,13 +34,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import Described, extent, listed, require_positive, require_shape
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.checks import require_positive, require_shape
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.sky.galaxy import FREE_FREE_SLOPE
 from lusee_bayes.sky.prior import PIVOT
-from lusee_bayes.sky.spectral_prior import SpectralPrior
+from lusee_bayes.sky.spectral_prior import SpectralPrior, require_names
 from lusee_bayes.sky.template import Template
 
 # how fields enter the logarithm: x is frequency / reference, y frequency / turnover
@@ -50,36 +50,14 @@ FIELDS = {
     "curvature": lambda x, y: np.log(x) ** 2,
     "absorption": lambda x, y: -(y**FREE_FREE_SLOPE),
 }
+# what they are, for messages
+FIELDS_OF = "fields of the logarithm"
 # band limit of the grid: this many times that of the exponents, and at least so much: what the grid
 # does not resolve of a template folds back into the map, at 96 by 5 % of it in the plane
 GRID, LEAST_GRID = 3, 192
 
 
-def check_fields(names: tuple[str, ...], n_channels: int) -> None:
-    """Refuse fields that so many channels cannot tell apart.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Keys of ``FIELDS``.
-    n_channels : int
-
-    Raises
-    ------
-    InputError
-        For unknown names, and for fewer channels than fields.
-    """
-    for name in names:
-        if name not in FIELDS:
-            raise InputError(f"unknown field '{name}'; {nearest(name, FIELDS)}")
-    if not names or n_channels < len(names):
-        raise InputError(
-            f"{len(names)} fields of the logarithm need at least as many channels, got "
-            f"{n_channels}; name fewer in spectral.fields, or give more frequencies"
-        )
-
-
-class PositiveSkies(Described, eqx.Module):
+class PositiveSkies(eqx.Module):
     """Skies of all channels as functions of their exponents; see the module's equations.
 
     Attributes
@@ -155,7 +133,7 @@ class PositiveSkies(Described, eqx.Module):
             frequencies, and templates or weights that are not positive everywhere.
         """
         frequencies = np.asarray(frequencies_mhz, dtype=np.float64)
-        check_fields(names, len(frequencies))
+        require_names("field", FIELDS_OF, names, FIELDS, len(frequencies))
         if len(templates) != len(frequencies):
             raise InputError(
                 f"there are {len(templates)} templates for {len(frequencies)} frequencies; give "
@@ -197,14 +175,6 @@ class PositiveSkies(Described, eqx.Module):
             self.sources[:, :, : n_modes(lmax)],
             lmax,
             self.names,
-        )
-
-    def description(self) -> tuple[str, ...]:
-        return (
-            f"{len(self.levels)} channels, {extent(self.frequencies_mhz, 'MHz')}, "
-            f"lmax = {self.lmax}",
-            f"templates times the exponential of {len(self.names)} fields ({listed(self.names)}) "
-            "and of a residual in each",
         )
 
     @property

@@ -10,6 +10,8 @@ its turnover, or the principal ones of a kernel in ln frequency; the residual is
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -40,6 +42,34 @@ SPECTRA = {
 KERNEL_TOLERANCE = 1e-10
 
 
+def require_names(
+    kind: str, several: str, names: tuple[str, ...], known: Mapping[str, Callable], n_channels: int
+) -> None:
+    """Refuse names that are not known, and more of them than channels.
+
+    Parameters
+    ----------
+    kind, several : str
+        What they name, one and many; for the message.
+    names : tuple of str
+    known : mapping
+        By name.
+    n_channels : int
+
+    Raises
+    ------
+    InputError
+    """
+    for name in names:
+        if name not in known:
+            raise InputError(f"unknown {kind} '{name}'; {nearest(name, known)}")
+    if not names or n_channels < len(names):
+        raise InputError(
+            f"{len(names)} {several} need at least as many channels, got {n_channels}; name fewer "
+            f"in spectral.{kind}s, or give more frequencies"
+        )
+
+
 def check_components(names: tuple[str, ...], n_channels: int, residual: float | None) -> None:
     """Refuse spectral components that so many channels cannot tell apart.
 
@@ -56,14 +86,7 @@ def check_components(names: tuple[str, ...], n_channels: int, residual: float | 
     InputError
         For unknown names, and for fewer channels than the components need.
     """
-    for name in names:
-        if name not in SPECTRA:
-            raise InputError(f"unknown component '{name}'; {nearest(name, SPECTRA)}")
-    if not names or n_channels < len(names):
-        raise InputError(
-            f"{len(names)} spectral components need at least as many channels, got {n_channels}; "
-            "name fewer in spectral.components, or give more frequencies"
-        )
+    require_names("component", "spectral components", names, SPECTRA, n_channels)
     if residual is None and n_channels == len(names):
         raise InputError(
             f"{len(names)} spectral components fit the skies of {n_channels} channels "
