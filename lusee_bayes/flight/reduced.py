@@ -22,11 +22,11 @@ from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.version import __version__
 from lusee_bayes.flight.gain_model import LETTERS, N_COMPONENTS, Curves
-from lusee_bayes.flight.session import AUTOS, N_PRODUCTS, NO_LEVEL, PORTS
+from lusee_bayes.flight.session import AUTOS, FIRST_PORT, N_PRODUCTS, NO_LEVEL, PORTS, SECOND_PORT
 from lusee_bayes.instrument.averaging import binned
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import DataLayout, all_products, labels, runs_of
+from lusee_bayes.instrument.products import DataLayout, labels, runs_of
 from lusee_bayes.instrument.times import JD_SCALES, Windows, utc_of_jd
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
 
@@ -323,8 +323,7 @@ class Reduced(Described):
             observation = self.observation.select(keep)
         else:
             observation = binned(self.observation, left, bin_of_left, self.average_s)
-        products = all_products()
-        scale = np.sqrt([per_kelvin[p.i] * per_kelvin[p.j] for p in products])
+        scale = np.sqrt(per_kelvin[FIRST_PORT] * per_kelvin[SECOND_PORT])
         values = np.where(present, self.values[band], 0.0)[:, bins] / scale[:, None]
         layout = DataLayout.from_flags(~present[:, bins])
         return Visibilities(

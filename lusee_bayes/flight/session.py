@@ -21,7 +21,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Attribute, Content, Unread, Variable
 from lusee_bayes.core.reading import reading
 from lusee_bayes.flight.clock import Clock
-from lusee_bayes.instrument.products import all_products, auto_indices, labels
+from lusee_bayes.instrument.products import auto_indices, labels, ports
 
 N_CHANNELS = 2048
 CHANNEL_MHZ = 0.025
@@ -42,9 +42,7 @@ N_PRODUCTS = len(FLIGHT_PRODUCTS)
 # where the products of the package's order are in the spectrometer's, and what each of them is
 OF_FLIGHT = np.array([FLIGHT_PRODUCTS.index(label) for label in labels()])
 AUTOS = auto_indices()
-FIRST_PORT = np.array([p.i for p in all_products()])
-SECOND_PORT = np.array([p.j for p in all_products()])
-IMAGINARY = np.array([p.part == "I" for p in all_products()])
+FIRST_PORT, SECOND_PORT, IMAGINARY = ports()
 
 BinOrigin = Literal["centre", "edge"]
 

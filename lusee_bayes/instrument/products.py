@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import re
 from functools import lru_cache
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -68,11 +69,17 @@ def auto_indices(n_antennas: int = N_ANTENNAS) -> np.ndarray:
     return np.array([k for k, p in enumerate(all_products(n_antennas)) if p.i == p.j])
 
 
+@lru_cache
+def ports(n_antennas: int = N_ANTENNAS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the two ports of every product, and whether it is an imaginary part."""
+    i, j, part = zip(*all_products(n_antennas), strict=True)
+    return np.array(i), np.array(j), np.array(part) == "I"
+
+
 def to_real(matrix: Complex[Array, "antennas antennas *rest"]) -> Float[Array, "products *rest"]:
     """Return the products of a Hermitian matrix V_ij (first two axes), in luseepy's order."""
-    products = all_products(matrix.shape[0])
-    picked = matrix[np.array([p.i for p in products]), np.array([p.j for p in products])]
-    imaginary = np.array([p.part == "I" for p in products])
+    i, j, imaginary = ports(matrix.shape[0])
+    picked = matrix[i, j]
     imaginary = imaginary.reshape(-1, *(1,) * (picked.ndim - 1))
     return namespace(matrix).where(imaginary, picked.imag, picked.real)
 
@@ -395,11 +402,8 @@ class DataLayout(Described, eqx.Module):
         InputError
             If it does not.
         """
-        same = (self.n_products, self.n_times, self.size) == (
-            other.n_products,
-            other.n_times,
-            other.size,
-        )
+        sizes = attrgetter("n_products", "n_times", "size")
+        same = sizes(self) == sizes(other)
         if same and self.index is not None and other.index is not None:
             same = is_traced(self.index, other.index) or np.array_equal(self.index, other.index)
         if not same:

@@ -65,6 +65,7 @@ from lusee_bayes.instrument.products import (
     Product,
     all_products,
     labels,
+    ports,
     to_matrix,
 )
 from lusee_bayes.instrument.times import (
@@ -626,7 +627,7 @@ def write_four_port(
     kelvin = grid_of(path, channels)
     enclosure = np.array([circuit.per_kelvin for circuit in circuits])
     root = np.sqrt(enclosure.diagonal(axis1=1, axis2=2).real)
-    i, j = (np.array([getattr(p, end) for p in all_products()]) for end in ("i", "j"))
+    i, j, _ = ports()
     data = kelvin * (root[:, i] * root[:, j]).T
     matrices = {
         "ZA": [c.antenna_ohm for c in circuits],

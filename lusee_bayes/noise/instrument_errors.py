@@ -48,7 +48,7 @@ from lusee_bayes.core.linalg import checked_cholesky
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, placed
 from lusee_bayes.instrument.coupling import Coupling
-from lusee_bayes.instrument.products import DataLayout, Product, all_products
+from lusee_bayes.instrument.products import DataLayout, ports
 from lusee_bayes.noise.covariance import LowRankCovariance, TimeBandedCovariance
 from lusee_bayes.sky.prior import Prior
 
@@ -182,8 +182,8 @@ class GainDrift(eqx.Module):
 
     def mean_response(self, n_products: int) -> Float[Array, " products"]:
         """Return the mean factor of each product: 1 + sigma_g^2 for autos, 1 for crosses."""
-        products = all_products(round(np.sqrt(n_products)))
-        auto = jnp.asarray([1.0 if p.i == p.j else 0.0 for p in products])
+        i, j, _ = ports(round(np.sqrt(n_products)))
+        auto = jnp.asarray(i == j, dtype=jnp.float64)
         return 1.0 + self.sigma**2 * auto
 
     def sample(
@@ -260,25 +260,15 @@ def with_gains(
     visibilities: Float[Array, "products times"], gains: Float[Array, "antennas times"]
 ) -> Float[Array, "products times"]:
     """Return (1 + g_i)(1 + g_j) V_ij, exactly, for every product."""
-    products = all_products(gains.shape[0])
-    i, j = np.array([p.i for p in products]), np.array([p.j for p in products])
+    i, j, _ = ports(gains.shape[0])
     return (1.0 + gains[i]) * (1.0 + gains[j]) * visibilities
 
 
 def shared_antennas(n_products: int) -> tuple[np.ndarray, np.ndarray]:
     """Return (dik + dil + djk + djl) and (dik djl + dil djk) for every pair of products."""
-    products = all_products(round(np.sqrt(n_products)))
-
-    def linear(p: Product, q: Product) -> int:
-        return (p.i == q.i) + (p.i == q.j) + (p.j == q.i) + (p.j == q.j)
-
-    def quadratic(p: Product, q: Product) -> int:
-        return (p.i == q.i) * (p.j == q.j) + (p.i == q.j) * (p.j == q.i)
-
-    return tuple(
-        np.array([[float(f(p, q)) for q in products] for p in products])
-        for f in (linear, quadratic)
-    )
+    i, j, _ = ports(round(np.sqrt(n_products)))
+    ii, ij, ji, jj = (np.equal.outer(a, b).astype(np.float64) for a in (i, j) for b in (i, j))
+    return ii + ij + ji + jj, ii * jj + ij * ji
 
 
 @eqx.filter_jit

@@ -32,7 +32,7 @@ from lusee_bayes.core.checks import (
     require_shape,
 )
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.instrument.products import DataLayout, all_products, auto_indices, to_matrix
+from lusee_bayes.instrument.products import DataLayout, auto_indices, ports, to_matrix
 from lusee_bayes.instrument.schedule import without_gaps
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, TimeBlockCovariance
 
@@ -171,10 +171,8 @@ def paper_variance(visibilities: Float[Array, "products times"]) -> Float[Array,
     """Return (T_ii T_jj + V_k^2) / 2 in K^2, to be divided by df dt."""
     n = round(np.sqrt(visibilities.shape[0]))
     autos = visibilities[auto_indices(n)]
-    products = all_products(n)
-    t_ii = autos[np.array([p.i for p in products])]
-    t_jj = autos[np.array([p.j for p in products])]
-    return (t_ii * t_jj + visibilities**2) / 2.0
+    i, j, _ = ports(n)
+    return (autos[i] * autos[j] + visibilities**2) / 2.0
 
 
 @compiled
@@ -187,11 +185,8 @@ def exact_blocks(
 
         Cov[k, l] = Re( c_k conj(c_l) E[dV dV'*] + c_k c_l E[dV dV'] ) / 2.
     """
-    n = round(np.sqrt(visibilities.shape[0]))
-    products = all_products(n)
-    i = np.array([p.i for p in products])
-    j = np.array([p.j for p in products])
-    part = np.array([1.0 + 0j if p.part == "R" else -1j for p in products])
+    i, j, imaginary = ports(round(np.sqrt(visibilities.shape[0])))
+    part = np.where(imaginary, -1j, 1.0 + 0j)
     t = namespace(visibilities).moveaxis(to_matrix(visibilities), 2, 0)
     hermitian = t[:, i[:, None], i[None]] * t[:, j[:, None], j[None]].conj()
     pseudo = t[:, i[:, None], j[None]] * t[:, j[:, None], i[None]].conj()

@@ -35,7 +35,7 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.lazy import dist, numpyro
-from lusee_bayes.instrument.products import DataLayout, all_products
+from lusee_bayes.instrument.products import DataLayout, ports
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankCovariance
 from lusee_bayes.systematics.systematic import Expanded, Systematic, multiplied, with_added
@@ -94,8 +94,7 @@ class TableErrors(eqx.Module):
     def _gains(self, z: Float[Array, " errors"]) -> tuple[np.ndarray, np.ndarray, Array]:
         """The two ports of every product, and the power gains (ports, times)."""
         own = self._own.astype(np.float64)
-        products = all_products(len(own))
-        first, second = (np.array([p[k] for p in products]) for k in (0, 1))
+        first, second, _ = ports(len(own))
         return first, second, 1.0 + own @ (z[:, None] * self.slope)
 
 
