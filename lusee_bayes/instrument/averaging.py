@@ -1,7 +1,6 @@
 """Averages over longer times, of data and of what the model predicts.
 
-What A knows of time: the fewest functions that give every sample's mean over its window.
-
+**What A knows of time** are the fewest functions that give every sample's mean over its window.
 With W_p the tilted copies of a beam (``rotations.tilts``), a row of A at one instant is the sum
 over p and the orders m of e_p(t) exp(i m phi(t)) W_p,m. Its mean over a window, where phi is
 phi_mean + delta, has the factors ::
@@ -17,9 +16,8 @@ The beams take up G, and time enters A through u_j(t) and exp(i m phi_mean) alon
 one length the first function stands for the mean over a turn about a fixed axis, which is a factor
 for each order m; others for the wandering of the axis, and for windows that are partly filled.
 
-Means of data over longer times.
-
-A is exact for a mean if all products of a sample have the same window. In each bin:
+**Means of data over longer times.** A is exact for a mean if all products of a sample have the same
+window. In each bin:
 
 1. samples in which every product is flagged are left out;
 2. a product that is present for less than half of the live time of the others is left out: it is

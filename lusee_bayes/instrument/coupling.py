@@ -1,19 +1,12 @@
 """A, of any kind: A m, A^T d, and what is made of them.
 
-The protocol that every coupling matrix A obeys.
-
 A new kind is one file: implement the abstract methods here. ``lusee_bayes.testing.check_coupling``
 tells whether it keeps the contract.
 
-Beams on the Moon: turned by the turntable, leaning with the lander, tilted with the pole.
-
-A coupling matrix that is given as an array of numbers.
-
-A of the beams of an observation: from sky coefficients to visibilities.
-
-With b_rk the coefficients of product k in run r, turned into the Moon-fixed frame, and W_j what the
-pointing's function of time u_j has of its tilted copies (:mod:`.averaging`), a visibility, the
-mean over its window, is ::
+**A of an observation** takes sky coefficients to visibilities. Its beams are turned by the
+turntable, lean with the lander and are tilted with the pole. With b_rk the coefficients of product
+k in run r, turned into the Moon-fixed frame, and W_j what the pointing's function of time u_j has
+of its tilted copies (:mod:`.averaging`), a visibility, the mean over its window, is ::
 
     V_k(t) = [ D_z(-phi(t)) sum_j u_j(t) W_j ] . a             (a: the sky in the mean-pole frame)
            = sum_j u_j(t) sum_m ( cos m phi(t) X_jm + sin m phi(t) Y_jm ),
@@ -22,13 +15,10 @@ mean over its window, is ::
 Time enters only through exp(i m phi) and the slow scalars u_j, beams only through b: a product of
 A with a vector never forms A, and nothing in it but the last sum grows with the number of times.
 
-The coupling matrix A, from sky coefficients to visibilities: one protocol, two kinds.
-
-A as a linear function of the beams, for fixed orientations and beams that change.
-
-Row t of product k is b_k R(t), with R(t) block diagonal in ell: one rotation matrix for each ell
-and sample, computed once. Then A costs 16 products with (2 ell + 1)^2 numbers per ell and sample,
-and derivatives cost no more.
+**A as a linear function of the beams**, for fixed orientations and beams that change
+(:class:`BeamOperator`): row t of product k is b_k R(t), with R(t) block diagonal in ell: one
+rotation matrix for each ell and sample, computed once. Then A costs 16 products with (2 ell + 1)^2
+numbers per ell and sample, and derivatives cost no more.
 """
 
 from __future__ import annotations

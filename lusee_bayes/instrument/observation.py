@@ -1,16 +1,13 @@
 """An observation: where the sky stands in the antennas' frame at every time.
 
-Site, times, windows and turntable angles of an observation.
-
 Frames: Galactic (of the sky), MCMF (fixed to the Moon, from lunarsky), topocentric (x East,
 y North, z up). Orientations come from lunarsky's own coordinate transformation at every time:
 nothing assumes that the Moon turns about a fixed axis, unless ``fixed_axis`` asks for it.
 
-Directions and distances of the Sun, the Earth and the planets, seen from the lander.
-
-Positions come from ERFA's analytical series (astropy's ``builtin``; nothing is downloaded): the
-Earth to 1e-7 au and the Moon to 10 arcseconds, the Sun as good as the Earth, Jupiter, Saturn and
-Uranus to 90 arcseconds, the other planets to 20 (notes of erfa.epv00, moon98 and plan94).
+Where the Sun, the Earth and the planets stand, seen from the lander, comes from ERFA's analytical
+series (astropy's ``builtin``; nothing is downloaded): the Earth to 1e-7 au and the Moon to 10
+arcseconds, the Sun as good as the Earth, Jupiter, Saturn and Uranus to 90 arcseconds, the other
+planets to 20 (notes of erfa.epv00, moon98 and plan94).
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Pointing: turntable, tilt, azimuth and clock, and how far each may be off.
 
-The orientation of the lander at every time, split so that time enters only through scalars.
-
-In the frame P whose z axis is the mean pole of the Moon over the samples, the rotation to the
+The orientation of the lander at every time is split so that time enters only through scalars. In
+the frame P whose z axis is the mean pole of the Moon over the samples, the rotation to the
 Moon-fixed frame is a turn phi(t) about z followed by a small tilt, exactly::
 
     MCMF <- P  at t  =  exp(ex(t) K_x + ey(t) K_y)  exp(phi(t) K_z).
@@ -11,9 +10,8 @@ The pole wanders by 0.04 degrees over one cycle, so the tilt is expanded in powe
 order is chosen such that the largest neglected term is below ``TILT_TOLERANCE`` of any mode.
 Means over windows, and what of all this depends on time, are left to :mod:`.averaging`.
 
-Offsets of clock and pointing: by what times, turntable angles and the site may be off.
-
-Each is what has to be added to the value that data or scenario say. They shift an observation
+**Offsets** of clock and pointing are by what times, turntable angles and the site may be off. Each
+is what has to be added to the value that data or scenario say. They shift an observation
 exactly (:func:`with_offsets`: times, turntable angles, site and lean of the lander), or a pointing
 inside a compiled function (:func:`turned_by_offsets`), where the Moon turns at a constant rate
 about a pole that does not wander within the clock's offset: that errs by less than 1e-3 of what

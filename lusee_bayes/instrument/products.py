@@ -1,20 +1,16 @@
 """Products of pairs of antennas, their correlations, and the layout of data.
 
-The correlation products of n antennas: their order and their labels.
-
 Voltages s_i give V_ij = <s_i conj(s_j)>: one real number for each antenna (auto), two for
 each pair (Re, Im). They are ordered and labelled as in luseepy:
 ``00R, 01R, 01I, 02R, 02I, 03R, 03I, 11R, 12R, ... 33R``, n^2 real products in all.
 
-Arrays of measured correlations, as instruments and their software have them.
+Arrays of measured correlations come as instruments and their software have them: names of products,
+signs of imaginary parts, sites and angles are said in many ways, which
+:meth:`.Visibilities.from_arrays` takes through the functions of this module.
 
-Names of products, signs of imaginary parts, sites and angles are said in many ways;
-:meth:`.Visibilities.from_arrays` takes them through the functions of this module.
-
-Where each entry of the data vector d belongs: which product, which time.
-
-d is stacked product by product with time running fastest. Samples that are flagged or were
-never taken are not in d at all, so the positions are explicit.
+A :class:`DataLayout` says where each entry of the data vector d belongs: which product, which time.
+d is stacked product by product with time running fastest. Samples that are flagged or were never
+taken are not in d at all, so the positions are explicit.
 """
 
 from __future__ import annotations

@@ -1,21 +1,14 @@
-"""When is observed: runs, cuts, gaps and schedules in files.
-
-Orientations of the Moon, from lunarsky's own coordinate transformation, and on it; the Sun.
-
-Stretches of observing and the samples that they are cut into.
+"""When is observed: runs, the intervals of a schedule, and the samples that they are cut into.
 
 Runs follow one another and are told by their length; the intervals of a schedule have dates, and
-time may pass between them.
-
-Schedules in files: tables of intervals in CSV, and command tables of LuSEE-Night's OpSim.
+time may pass between them. Schedules are tables of intervals in CSV, or command tables of
+LuSEE-Night's OpSim.
 
 OpSim (https://github.com/lusee-night/opsim) has its schedules in YAML: ``config/comtable-*.yml``,
 and the same with the states of battery and storage in the logs of its simulator. An entry holds a
 ``start`` (MJD, UTC) and a ``mode`` of the spacecraft, which lasts until the start of the next
 entry. In one mode alone, ``science``, the spectrometer takes data (``config/modes.yml`` and
 ``devices.yml`` there). Such a table knows of no turntable.
-
-Visibilities on the full grid, where some samples are absent and noise levels are needed.
 """
 
 from __future__ import annotations

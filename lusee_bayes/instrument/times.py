@@ -1,19 +1,17 @@
 """Times of data: leap seconds, the ephemeris' reach, windows and what a stamp stands for.
 
-Times in UTC, of whatever kind files and users give them.
+Times are in UTC, of whatever kind files and users give them.
 
-The windows over which samples were integrated: what a visibility is the mean of.
+**Windows** are what samples were integrated over: what a visibility is the mean of. A sample has
+one or more pieces, within each of which its live time is spread evenly: one piece where the
+spectrometer integrated without a gap, or with a duty cycle far faster than the sky turns; several
+where something was left out. The mean over a window is that over its pieces, each with the weight
+of its live time.
 
-A sample has one or more pieces, within each of which its live time is spread evenly: one piece
-where the spectrometer integrated without a gap, or with a duty cycle far faster than the sky turns;
-several where something was left out. The mean over a window is that over its pieces, each with the
-weight of its live time.
-
-What the times of samples are: starts, middles or ends of their windows, or instants.
-
-Times and bounds that were rounded, such as single-precision seconds or Julian dates in one number,
-make windows overlap by as much. Such overlaps are halved between the two samples, and a live time
-that is longer than its window by as little is that of the window.
+The times of samples are starts, middles or ends of their windows, or instants. Times and bounds
+that were rounded, such as single-precision seconds or Julian dates in one number, make windows
+overlap by as much. Such overlaps are halved between the two samples, and a live time that is longer
+than its window by as little is that of the window.
 """
 
 from __future__ import annotations

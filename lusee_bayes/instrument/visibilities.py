@@ -1,20 +1,14 @@
-"""Visibilities: data of all products and times, calibration, and their file.
+"""Visibilities: the data set d of one frequency with its times, products and flags, and its file.
 
-Windows of samples in netCDF files, and what files without them say of their times.
+The file is netCDF. Of the windows of samples, ``time_bounds`` is that of the CF conventions, for
+people and other software, and ``live_time`` goes with it. The pieces are exact: seconds from the
+time of their sample. Instants are declared by the attribute ``window``. A file with none of these
+does not say what its times are.
 
-``time_bounds`` is that of the CF conventions, for people and other software, and ``live_time`` goes
-with it. The pieces are exact: seconds from the time of their sample. Instants are declared by the
-attribute ``window``. A file with none of these does not say what its times are.
-
-What is left of a spectrometer's spectra in their averages: how many samples, and which gains.
-
-An average over channels and spectra has the radiometer noise of the independent samples of the
-voltages that it is the mean of; its gain is off by the errors of the gain table, which all spectra
-of one level of one port share.
-
-The data set d: visibilities of one frequency with their times, products and flags.
-
-Read the package's own files of visibilities.
+A :class:`Calibration` is what is left of a spectrometer's spectra in their averages. An average
+over channels and spectra has the radiometer noise of the independent samples of the voltages that
+it is the mean of; its gain is off by the errors of the gain table, which all spectra of one level
+of one port share.
 """
 
 from __future__ import annotations

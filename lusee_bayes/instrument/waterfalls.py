@@ -1,38 +1,25 @@
 """luseepy's waterfalls: files of many frequencies, read and written.
 
-Visibilities of several frequencies, as files hold them.
+They hold visibilities of all times, products and frequencies.
 
-Where luseepy's ranges of time begin: the word LUNAR_DAY of its waterfalls.
+**LUNAR_DAY** says where luseepy's ranges of time begin. It is "UTC to UTC"; a calendar year, CY2026
+or CY26, which luseepy begins at one o'clock on the first of January; a fiscal year, FY2026 or FY26,
+from the first of October of the year before; or the number of a lunar day: 2603 is the fourth of
+those that begin in 2026. A lunar day begins when the Sun is highest at 180 degrees of longitude on
+the Moon's equator. luseepy finds that to a few seconds, and so does this module.
 
-It is "UTC to UTC"; a calendar year, CY2026 or CY26, which luseepy begins at one o'clock on the
-first of January; a fiscal year, FY2026 or FY26, from the first of October of the year before; or
-the number of a lunar day: 2603 is the fourth of those that begin in 2026. A lunar day begins when
-the Sun is highest at 180 degrees of longitude on the Moon's equator. luseepy finds that to a few
-seconds, and so does this module.
+**Those of its scalar simulator** are in K. FITS: image ``data`` (time, product, frequency),
+``freq`` in MHz, ``combinations`` (pairs of ports; an auto has one column, a cross two, Re and Im).
+Header: LUNAR_DAY, DELTAT_SEC, LUN_LAT_DEG, LUN_LONG_DEG; times are start + k DELTAT_SEC. Impedances
+of the ports in Ohm, ZRe_i and ZIm_i, are there for luseepy's conversion to V^2/Hz.
 
-Waterfalls of luseepy's scalar simulator: visibilities in K.
-
-FITS: image ``data`` (time, product, frequency), ``freq`` in MHz, ``combinations`` (pairs of ports;
-an auto has one column, a cross two, Re and Im). Header: LUNAR_DAY (:mod:`.waterfalls`), DELTAT_SEC,
-LUN_LAT_DEG, LUN_LONG_DEG; times are start + k DELTAT_SEC. Impedances of the ports in Ohm, ZRe_i and
-ZIm_i, are there for luseepy's conversion to V^2/Hz.
-
-Waterfalls of luseepy's four-port simulator: covariances at the receivers' inputs, in V^2/Hz.
-
-FITS version 3: image ``data`` (time, product, frequency); ``freq`` in MHz; ``time`` (JD1, JD2) in
+**Those of its four-port simulator** are covariances at the receivers' inputs, in V^2/Hz. FITS
+version 3: image ``data`` (time, product, frequency); ``freq`` in MHz; ``time`` (JD1, JD2) in
 the scale TIMESYS; table ``products`` with a column ``label``; U (frequency, port, port), the
 covariance that an enclosure of 1 K makes, as ``blackbody_normalization``; the receivers' loads ZL
 (frequency, port, port) in Ohm. Header: LUN_LAT_DEG, LUN_LONG_DEG, DELTAT_SEC, TMOON_K, TANT_K and
 FREQINT, the interpolation of the response between its frequencies. Divided by sqrt(U_aa U_bb),
 visibilities are in K.
-
-Read the waterfalls of luseepy, scalar or four-port.
-
-Write waterfalls in luseepy's layouts: what its scalar and its four-port files share.
-
-Write waterfalls as luseepy's four-port simulator does.
-
-Waterfalls in luseepy's layouts: visibilities of all times, products and frequencies.
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
 """N: what every kind of covariance of the noise answers, and the kinds.
 
-The protocol of all covariances.
-
 A :class:`Covariance` describes N by its product with a vector, its dense form and its diagonal.
 :meth:`Covariance.factor` does the expensive part once and returns a :class:`Factor`, a square root
 N = L L^T that whitens vectors (L^-1 x), colours them (L z) and solves with N.
@@ -9,30 +7,22 @@ N = L L^T that whitens vectors (L^-1 x), colours them (L z) and solves with N.
 A new structure is one file: implement the abstract methods here, and ``absorb`` for the sums that
 keep the structure. ``a + b`` tries whether either side can absorb the other.
 
-Noise without any structure: N is a full matrix.
+N may be a full matrix, or diagonal.
 
-Independent noise: N = diag(variance).
-
-Noise along a few directions: templates with prior variances, beam errors.
-
-U U^T alone is singular; added to any other covariance N_0 it gives N_0 + U U^T, which is solved
-through the small matrix C = 1 + V^T V, V = L_0^-1 U (Woodbury). With C = R R^T, ::
+**Noise along a few directions**, such as templates with prior variances or beam errors: U U^T alone
+is singular; added to any other covariance N_0 it gives N_0 + U U^T, which is solved through the
+small matrix C = 1 + V^T V, V = L_0^-1 U (Woodbury). With C = R R^T, ::
 
     B = 1 - V R^-T (R + 1)^-1 V^T     satisfies     B B^T = (1 + V V^T)^-1,
 
 so that L = L_0 B^-T is a square root of the sum, applied by products with V. Nothing is subtracted
 from N_0^-1, which would leave a small difference of large numbers.
 
-Noise that couples the products of one time, but no two times: a block for each time.
-
-Noise that is correlated in time: blocks couple times up to some number of samples apart.
-
-The matrix is banded where the products of one time stand together. Its Cholesky factor fills only
-the band, so that factorising costs O(times x bandwidth^2). Several times make up one block row,
-large enough for matrix products to run at full speed and small enough to follow the edge of the
-band.
-
-Noise covariances: one protocol, one file for each structure, composed with ``+``.
+**Noise that couples the products of one time** has a block for each time. **Noise that is
+correlated in time** has blocks for times up to some number of samples apart. The matrix is banded
+where the products of one time stand together. Its Cholesky factor fills only the band, so that
+factorising costs O(times x bandwidth^2). Several times make up one block row, large enough for
+matrix products to run at full speed and small enough to follow the edge of the band.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """Errors of gains and beams as terms of N.
 
-Noise along templates of the user: T P T^T.
+Besides, noise along templates of the user, T P T^T.
 
-Gain drifts: Gaussian processes g_i(t), one per antenna, that multiply the visibilities.
-
-::
+**Gain drifts** are Gaussian processes g_i(t), one per antenna, that multiply the visibilities, ::
 
     V_ij -> (1 + g_i)(1 + g_j) V_ij,    <g_i(t) g_j(t')> = delta_ij C_g(t, t'),
     C_g = sigma_g^2 exp(-(t - t')^2 / (2 sigma_t^2))
@@ -17,12 +15,11 @@ Marginalised over g, the error is a noise term with (paper, appendix A) ::
 and with the mean sigma_g^2 d_ii in the autos. The quadratic part is not negligible: at sigma_g =
 0.01 it is 1e-4 of the signal, ten times the radiometer noise.
 
-Errors of the beams in A: N_beam = dA (S + mu mu^T) dA^T along known directions dA.
-
-If the true coupling matrix is A + dA, the data hold dA m besides A m; over skies of the prior, that
-is noise of covariance dA S dA^T (paper, section on beam precision). Directions: the
-difference to another beam (a frequency shift, another file), or the derivative with respect to a
-parameter of the embedded beam times its standard deviation.
+**Errors of the beams** in A: N_beam = dA (S + mu mu^T) dA^T along known directions dA. If the true
+coupling matrix is A + dA, the data hold dA m besides A m; over skies of the prior, that is noise of
+covariance dA S dA^T (paper, section on beam precision). Directions: the difference to another beam
+(a frequency shift, another file), or the derivative with respect to a parameter of the embedded
+beam times its standard deviation.
 """
 
 from __future__ import annotations

@@ -1,15 +1,12 @@
 """Radiometer noise: its variances, and covariances between products.
 
-Sample covariances of complex Gaussian voltages, for as many samples as a spectrum averages.
-
-The mean of v v* over N independent samples of covariance T = L L* is T + L H L* / sqrt(N), where H
-is Hermitian and for large N Gaussian: real numbers of variance one on its diagonal, complex ones of
+**Sample covariances** of complex Gaussian voltages, for as many samples as a spectrum averages: the
+mean of v v* over N independent samples of covariance T = L L* is T + L H L* / sqrt(N), where H is
+Hermitian and for large N Gaussian: real numbers of variance one on its diagonal, complex ones of
 mean square one beside it. Its covariances are those of :func:`.exact_blocks`, divided by N.
 
-Radiometer noise, in two forms.
-
-With T_ij(t) the visibilities of the antennas in K, bandwidth df and integration time dt (times the
-duty cycle)::
+**N has two forms.** With T_ij(t) the visibilities of the antennas in K, bandwidth df and
+integration time dt (times the duty cycle)::
 
     paper   sigma_k^2 = (T_ii T_jj + V_k^2) / (2 df dt), independent;
     exact   the voltages are complex Gaussian with covariance T(t), so

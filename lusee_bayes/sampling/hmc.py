@@ -1,23 +1,13 @@
-"""Hamiltonian Monte Carlo: chains that survive a kill.
+"""Hamiltonian Monte Carlo of any NumPyro program: chains side by side that survive a kill.
 
-Draws of chains side by side, and statistics of every draw.
+Programs are sampled in coordinates in which their posterior is nearly round, if such are known:
+those of the sky's analytic posterior, or of :mod:`lusee_bayes.sampling.mode`. They change the speed
+of sampling, not its density, which is the program's own: ``whitened(program, whitening)`` samples m
+through z, m = mean + R z.
 
-Coordinates in which posteriors are round: they change the speed of sampling, not its density.
-
-whitened(program, whitening)    samples m through z, m = mean + R z
-
-Draws on disk as they come: a run that is killed at any moment goes on where it stopped.
-
+Draws are kept on disk as they come: a run that is killed at any moment goes on where it stopped.
 One file a chunk: the draws of that chunk and the state of the chains behind it, written whole or
 not at all. The last file is the place to go on from; nothing else needs to be consistent with it.
-
-Hamiltonian Monte Carlo of any NumPyro program: chains side by side, draws kept as they come.
-
-Programs are sampled in coordinates in which their posterior is nearly round, if such are known
-(:mod:`lusee_bayes.sampling.hmc`: those of the sky's analytic posterior, or of
-:mod:`lusee_bayes.sampling.mode`); the density is the program's own.
-
-The least numbers of draws and simulations that checks need; asked before any work begins.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """A log-normal sky as a program samples it.
 
-The prior of a positive sky, its C_ell known or not: what the program ``log_normal`` samples.
-
-Coordinates in which the posterior of a log-normal sky is straight, for the program of that name.
+The program ``log_normal`` samples a positive sky whose C_ell are known or not, in coordinates in
+which its posterior is straight.
 
 The data know some combinations of the map to 1e-6 of what the prior allows. In the logarithm s of
 the sky these are curved surfaces: what the data leave open moves the map by s + s^2 / 2 + ..., and

@@ -1,18 +1,14 @@
 """The mode of a program, the curvature there, and how uncertain quantities are.
 
-Minus the log posterior of a program, its gradient and its curvature.
+Mode and curvature say where sampling is to begin, and in which coordinates. The curvature is the
+Hessian where few sites are sampled (the sky integrated out). Where a program predicts the data at a
+site CorrelatedNormal, as d ~ N(f(x), N), it is that of Gauss and Newton, J^T N^-1 J plus that of
+the prior, J the derivative of f: for the sky and thousands of other unknowns at once. At a site
+TimesStudentT every time has its weight in N^-1. Both only serve as coordinates; the density sampled
+is the program's own.
 
-The mode of a program's posterior and its curvature there: where to begin, in which coordinates.
-
-The curvature is the Hessian where few sites are sampled (the sky integrated out). Where a
-program predicts the data at a site CorrelatedNormal, as d ~ N(f(x), N), it is that of Gauss and
-Newton, J^T N^-1 J plus that of the prior, J the derivative of f: for the sky and thousands of
-other unknowns at once. At a site TimesStudentT every time has its weight in N^-1. Both only serve
-as coordinates; the density sampled is the program's own.
-
-Maps of draws of the sky: standard deviations, intervals, which region is brighter.
-
-Skies are draws (chains, draws, modes) of Galactic harmonic coefficients in K, by HMC or
+Of draws of the sky there are maps of standard deviations and intervals, and which region is
+brighter. Skies are draws (chains, draws, modes) of Galactic harmonic coefficients in K, by HMC or
 :meth:`Posterior.sample`; maps are HEALPix RING, Galactic, in K.
 """
 

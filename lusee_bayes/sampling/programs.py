@@ -1,10 +1,7 @@
-"""NumPyro programs: what a program is given, and what it says.
+"""NumPyro programs: files with a ``model``, what they can ask for, and what their sites are.
 
-NumPyro under strict rules of JAX.
-
-Probabilistic programs: files with a NumPyro ``model``, and what they can ask for.
-
-The sites of a NumPyro program: which are sampled, which observed, which predict.
+NumPyro runs under JAX's standard rules of types and ranks, the package under strict ones
+(:func:`numpyro_promotion`).
 """
 
 from __future__ import annotations
@@ -77,7 +74,7 @@ class Program:
     """A NumPyro model whose arguments are ``data`` and pieces of a model or an experiment.
 
     Called with ``data=None`` it is the prior predictive. If it returns a LinearGaussian, it has
-    integrated the sky out; :func:`collapsed_skies` then draws it.
+    integrated the sky out; :func:`collapsed_draws` then draws it.
 
     Attributes
     ----------

@@ -1,16 +1,14 @@
 """HMC and simulated data against the posterior in closed form.
 
-Simulation-based calibration: does a posterior mean what it says, over many data sets?
-
+**Simulation-based calibration** asks whether a posterior means what it says, over many data sets.
 Draw a truth from the prior, data from the truth, draws from the posterior given the data; the rank
 of the truth among the draws is uniform if and only if the posterior is right (Talts et al. 2018).
 What is ranked is a *quantity* of the unknowns, which may depend on the data too: the likelihood
 catches posteriors that leave data unused, which single modes cannot (Modrak et al. 2023).
 
-HMC as an independent check of the analytic posterior: mean, variances and covariance.
-
-Every threshold is what exact draws of the analytic posterior would exceed once in ``1 /
-FALSE_ALARM`` runs, given how many draws there are and how they hang together in time:
+**HMC checks the analytic posterior**: mean, variances and covariance. Every threshold is what exact
+draws of the analytic posterior would exceed once in ``1 / FALSE_ALARM`` runs, given how many draws
+there are and how they hang together in time:
 
 * means: the largest of the modes' deviations in units of their Monte Carlo errors;
 * variances: the same for chi^2 of each mode's sample variance, with its own effective sample size;

@@ -1,36 +1,29 @@
 """The embedded Galaxy: synchrotron, absorption, bright sources.
 
-Free-free absorption and emission of the warm ionised gas of the Galaxy.
-
-The absorption coefficient at frequency nu is k(nu) <n_e^2>. <n_e^2> follows NE2001 (Cordes &
-Lazio 2002, astro-ph/0207156), reduced to what a degree-scale sky below 50 MHz shows: the thick
-disc, the annular thin disc, the low-density regions around the Sun, and the one nearby HII shell
-that is opaque at 10 MHz. Its spiral arms are left out: the sky agrees with ULSA without them.
+**Ionised gas.** The absorption coefficient at frequency nu is k(nu) <n_e^2>. <n_e^2> follows NE2001
+(Cordes & Lazio 2002, astro-ph/0207156), reduced to what a degree-scale sky below 50 MHz shows: the
+thick disc, the annular thin disc, the low-density regions around the Sun, and the one nearby HII
+shell that is opaque at 10 MHz. Its spiral arms are left out: the sky agrees with ULSA without them.
 
 Positions are in kpc, Galactocentric, NE2001's axes: x towards l = 90 degrees, y from the centre
 towards the Sun, z towards the north Galactic pole; the Sun is at (0, 8.5, 0).
 
-Directions whose brightness summaries and spectra show.
-
-The brightest discrete sources of the low-frequency sky: positions and spectra.
-
-Spectra are log-polynomials where they were measured. Below, no flux scale exists: the power law
-of the last two octaves is carried on, through a turnover exp(-(nu/nu_t)^-2.1) by free-free
-absorption on the way, ::
+**The brightest discrete sources.** Spectra are log-polynomials where they were measured. Below, no
+flux scale exists: the power law of the last two octaves is carried on, through a turnover
+exp(-(nu/nu_t)^-2.1) by free-free absorption on the way, ::
 
     S(nu) = S(nu_0) (nu/nu_0)^alpha exp(-(nu/nu_t)^-2.1 + (nu_0/nu_t)^-2.1),   nu < nu_0.
 
 Expect 10 % at 50 MHz, 20 % at 20 MHz and no more than the order of magnitude below 10 MHz.
 
-The embedded diffuse sky: an ULSA-like model of the Galaxy between 1 and 50 MHz.
-
-Cong et al. 2021 (arXiv:2104.03170): synchrotron emissivity of an axisymmetric Galaxy, integrated
+**The diffuse sky** is an ULSA-like model of the Galaxy between 1 and 50 MHz (Cong et al. 2021,
+arXiv:2104.03170): synchrotron emissivity of an axisymmetric Galaxy, integrated
 along every line of sight through ionised gas, in front of an isotropic background, ::
 
     T(l, b) = int [j(s) + kappa(s) T_e] exp(-tau(s)) ds + T_bg exp(-tau(inf)),
     tau(s) = int_0^s kappa ds'.
 
-The emissivity and the background are theirs. The electrons are in :mod:`.galaxy`; their thermal
+The emissivity and the background are theirs. The electrons' thermal
 emission kappa T_e, which ULSA leaves out, and the random component are ours. No file is read: the
 map is computed.
 """

@@ -1,6 +1,4 @@
-"""Skies that are positive everywhere, at several frequencies.
-
-Positive skies of several frequencies: templates times the exponential of few fields.
+"""Positive skies of several frequencies: templates times the exponential of few fields.
 
 ::
 
@@ -15,9 +13,7 @@ exponent of a channel is linear in them, its sky is positive. About any exponent
 
     dm_f = W d(phi),    W_ij = int y_i w T_f exp(w phi) y_j dOmega.
 
-C_ell of the fields in the logarithm of skies: a power law in ell for each.
-
-::
+C_ell of the fields are power laws in ell, ::
 
     C_ell = A^2 ((ell + 1) / 10)^tilt
 

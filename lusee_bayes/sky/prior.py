@@ -1,19 +1,12 @@
-"""S as a square root: what every prior answers, and its kinds.
+"""S as a square root: what every prior on the sky answers, and its kinds.
 
-The protocol of priors on the sky, m ~ N(mu, S) through a square root S = G G^T.
+m ~ N(mu, S) goes through a square root S = G G^T. Everything downstream works with the whitened sky
+u = G^-1 m ~ N(G^-1 mu, 1). S itself is never inverted, so a mode without variance is one that is
+known to be zero, not an error.
 
-Everything downstream works with the whitened sky u = G^-1 m ~ N(G^-1 mu, 1). S itself is never
-inverted, so a mode without variance is one that is known to be zero, not an error.
-
-A Gaussian sky whose coefficients are correlated: S = G G^T as a matrix.
-
-Priors of independent unknowns: S = diag(root^2).
-
-An isotropic Gaussian sky in real harmonic coefficients: S = diag(C_ell).
-
-An isotropic Gaussian sky in HEALPix pixels: S = Y diag(C_ell) Y^T.
-
-What a prior can be read from: C_ell in a text file, and a mean sky in a FITS map.
+Kinds: correlated coefficients, S = G G^T as a matrix; independent unknowns, S = diag(root^2); an
+isotropic Gaussian sky in real harmonic coefficients, S = diag(C_ell), or in HEALPix pixels,
+S = Y diag(C_ell) Y^T. C_ell can be read from a text file, a mean sky from a FITS map.
 """
 
 from __future__ import annotations

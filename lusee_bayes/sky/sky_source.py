@@ -1,8 +1,6 @@
-"""The sky at a frequency, and what can tell it.
+"""A sky at one frequency, and what can tell it: the embedded Galaxy, or a file.
 
-A sky at one frequency, as real harmonic coefficients in Galactic coordinates.
-
-Where skies come from: the embedded Galaxy, or a file.
+Skies are real harmonic coefficients in Galactic coordinates, in K.
 """
 
 from __future__ import annotations

@@ -1,18 +1,13 @@
 """Unknowns of the instrument: its beams, its pointing, the level of its noise.
 
-The antennas and the ground under them: parameters of the embedded beam that are not known.
-
-Clock and pointing that are not known: templates of first order, or A as it is with offsets.
-
-About the values z_0 of the offsets (in prior standard deviations) and a sky m_0, the data are ::
+**Clock and pointing** are templates of first order, or A as it is with offsets. About the values
+z_0 of the offsets (in prior standard deviations) and a sky m_0, the data are ::
 
     d = A(z) m + n = A(z_0) m + T (z - z_0) + n,    T = dA/dz m_0,    z ~ N(0, 1),
 
 to first order in z - z_0 and in their product with m - m_0: N gets T T^T and the mean -T z_0. Where
 z_0 and m_0 are those that the data tell, this is the Gaussian about the joint mode of sky and
 offsets (Gauss and Newton), with the term that couples z - z_0 and m - m_0 left out.
-
-How much noise there is: a factor of the radiometer's variance.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Unknowns of the sky: point sources, and the prior's spectrum.
 
-Point sources of known place and unknown flux: columns of A with a prior of their own.
-
-The sky's prior power spectrum, up to a few unknown factors.
+Sources of known place and unknown flux are columns of A with a prior of their own. The prior's
+power spectrum may be known up to a few factors.
 """
 
 from __future__ import annotations

@@ -1,15 +1,12 @@
 """What is not known of instrument and sky: marginalised into N, or sampled.
 
-Coordinates of several sites in which a posterior's ridges are straight.
+Every systematic is a term of the noise covariance, and sites of a NumPyro program; a :class:`Chart`
+has coordinates of several sites in which a posterior's ridges are straight.
 
-What every systematic offers: a term of the noise covariance, and sites of a NumPyro program.
-
-Unknowns whose part in the data is linear, or taken to first order: columns of N's square root.
-
+Unknowns whose part in the data is linear, or taken to first order, are columns of N's square root:
 N gets T T^T, a column of T for each unknown: what one prior standard deviation of it does to the
 data. Where gains multiply what the data are of (:meth:`Templated.behind`), they multiply T, too.
-
-Powers and temperatures that add to the data in proportion: d = A m + T (x - mean) / std + n.
+Powers and temperatures add to the data in proportion: d = A m + T (x - mean) / std + n.
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
 """Small scenarios and skies that tests share.
 
-Small scenarios that tests share.
-
-Skies that no prior of the package draws: one too smooth for it, and one too spotty.
-
-Error bars have to hold for them, too. Both are positive, of about the Galaxy's brightness, and
+No prior of the package draws these skies: one is too smooth for it, and one too spotty. Error bars
+have to hold for them, too. Both are positive, of about the Galaxy's brightness, and
 have the same pattern at all frequencies.
 """
 

@@ -1,25 +1,16 @@
 """Fields of antennas on the sphere, and the beams of products made of them.
 
-Quadrature over the hemisphere above the horizon.
+**Quadrature.** A beam ends at the horizon. Gauss-Legendre nodes in cos theta over [0, 1] never see
+the cut, so harmonic coefficients converge exponentially where pixel sums ring. Azimuth is uniform:
+a Fourier sum there is exact up to aliasing.
 
-A beam ends at the horizon. Gauss-Legendre nodes in cos theta over [0, 1] never see the cut, so
-harmonic coefficients converge exponentially where pixel sums ring. Azimuth is uniform: a Fourier
-sum there is exact up to aliasing.
-
-Electric-field patterns of antennas: their response to a wave from every direction.
-
-Interpolation between the directions and the frequencies of a file.
-
-The beam B_k of every correlation product, and its spherical-harmonic coefficients.
-
-Functions on HEALPix pixels in other directions above the horizon.
-
-A ring of pixels is a Fourier series in phi. Order m of a smooth function passes the zenith as
-f_m(-theta) = (-1)^m f_m(theta), and is zero there unless m is: splines in theta need no end at the
-zenith, and no rings that have too few pixels for an order (4 i in ring number i). The error is that
-of cubic splines with the distance h = 1 / NSIDE of rings at most, 5/384 (h l)^4 of a pattern of
-degree l, and in the last step to the horizon, which is extrapolated, up to 35 times that. Orders 3
-pass for orders 1 in the first ring, by (h l)^3 / 43 of the pattern there.
+**HEALPix pixels** are interpolated to other directions above the horizon. A ring of pixels is a
+Fourier series in phi. Order m of a smooth function passes the zenith as f_m(-theta) = (-1)^m
+f_m(theta), and is zero there unless m is: splines in theta need no end at the zenith, and no rings
+that have too few pixels for an order (4 i in ring number i). The error is that of cubic splines
+with the distance h = 1 / NSIDE of rings at most, 5/384 (h l)^4 of a pattern of degree l, and in the
+last step to the horizon, which is extrapolated, up to 35 times that. Orders 3 pass for orders 1 in
+the first ring, by (h l)^3 / 43 of the pattern there.
 """
 
 from __future__ import annotations

@@ -1,17 +1,14 @@
 """Beams in luseepy's files: responses of the ports, and scalar beams.
 
-What the headers of luseepy's beam files state about their own conventions.
+Their headers may state their conventions, which are checked; a word that is absent, or "UNKNOWN",
+as luseepy writes where it was not given any, states nothing. For data that luseepy has made there
+are its own quadratures over the directions of a file.
 
-A word that is absent, or "UNKNOWN", as luseepy writes where it was not given any, states nothing.
-
-luseepy's quadrature over the directions of a file, for data that luseepy has made.
-
-Coupled antennas over ground, with their receivers, from the four-port files of luseepy.
-
-FITS version 3: bare effective lengths H_theta, H_phi (port, frequency, theta, phi) in m, RMS, of a
-wave arriving from (theta, phi), phi from East towards North; impedance ZA and its resistive parts
-Rsky, Rmoon, Rloss (frequency, port, port) in Ohm, with ZA + ZA^H = 2 (Rsky + Rmoon + Rloss); freq
-in MHz, theta and phi in degrees. At the receivers' inputs, one-sided, ::
+**Responses** are those of coupled antennas over ground, with their receivers. FITS version 3: bare
+effective lengths H_theta, H_phi (port, frequency, theta, phi) in m, RMS, of a wave arriving from
+(theta, phi), phi from East towards North; impedance ZA and its resistive parts Rsky, Rmoon, Rloss
+(frequency, port, port) in Ohm, with ZA + ZA^H = 2 (Rsky + Rmoon + Rloss); freq in MHz, theta and
+phi in degrees. At the receivers' inputs, one-sided, ::
 
     V_ab = k eta0 / lambda^2 int (M Ht)_a conj((M Ht)_b) + (M Hp)_a conj((M Hp)_b) T dOmega
            + 4 k (M (T_moon Rmoon + T_antenna Rloss) M^H)_ab    in V^2/Hz.
@@ -20,11 +17,10 @@ An enclosure of 1 K makes U = 4 k M (ZA + ZA^H) / 2 M^H; V_ab / sqrt(U_aa U_bb) 
 frequencies of the file luseepy interpolates impedances and the integrals of open ports (M left out)
 linearly, and takes M of the interpolated ZA.
 
-The field pattern of one arm, used once for each port, from the scalar files of luseepy.
-
-FITS version 2: images Etheta_real, Etheta_imag, EPhi_real, EPhi_imag (frequency, theta, phi), the
-response to a wave arriving from (theta, phi), phi from East towards North, time convention
-exp(+i w t); gain_conv g(frequency), freq in MHz, Z_real and Z_imag in Ohm. Visibilities in K are ::
+**Scalar beams** are the field pattern of one arm, used once for each port. FITS version 2: images
+Etheta_real, Etheta_imag, EPhi_real, EPhi_imag (frequency, theta, phi), the response to a wave
+arriving from (theta, phi), phi from East towards North, time convention exp(+i w t); gain_conv
+g(frequency), freq in MHz, Z_real and Z_imag in Ohm. Visibilities in K are ::
 
     T_ij = sqrt(g_i g_j) / (4 pi) int (Et_i conj(Et_j) + Ep_i conj(Ep_j)) I dOmega,
 

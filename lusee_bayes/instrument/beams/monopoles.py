@@ -1,12 +1,9 @@
 """Monopoles on a lossy ground: fields, circuit, receiver and their parameters.
 
-Reflection of a plane wave off the layered lunar ground.
-
-The package's own antenna model: thin monopoles above layered ground.
-
-An arm of length L points outwards and up from the feed, at height h over the ground; its current
-is I(s) ~ sin k(L - s). A wave from direction n reaches it directly and off the ground, so its
-response to the theta and phi components is
+This is the package's own antenna model: thin monopoles above layered ground. An arm of length L
+points outwards and up from the feed, at height h over the ground; its current is I(s) ~ sin k(L -
+s). A wave from direction n reaches it directly and off the ground, so its response to the theta and
+phi components is
 
     E = int I(s) [ u.e exp(i k n.r) + u.e' exp(i k n'.r - 2 i k h n_z) ] ds,   r = s u,
 
@@ -14,18 +11,12 @@ with u the arm, n' = n mirrored in the ground and e' the reflected polarisation.
 between arms, no lander: this is good enough for the paper's findings, and differentiable in all
 parameters.
 
-The parameters of the embedded antennas by name, with their domains.
+**Circuit.** Antennas of impedance matrix ZA with open-circuit voltages v make the voltages M v at
+the inputs of receivers of impedance ZL (Thevenin's theorem), M = ZL (ZA + ZL)^-1. ZL is that of
+luseepy's models of receivers.
 
-The receivers' input impedance ZL, of luseepy's models of receivers.
-
-Coupled antennas and their receivers as a circuit, at one frequency.
-
-Antennas of impedance matrix ZA with open-circuit voltages v make the voltages M v at the inputs of
-receivers of impedance ZL (Thevenin's theorem), M = ZL (ZA + ZL)^-1.
-
-The beam of every product in given directions: the exact response to a point source.
-
-Harmonic coefficients up to lmax blur a point source; the field pattern itself does not.
+**Point sources** are blurred by harmonic coefficients up to lmax, but not by the field pattern
+itself (:func:`beams_towards`).
 """
 
 from __future__ import annotations

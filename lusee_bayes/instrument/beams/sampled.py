@@ -1,30 +1,22 @@
 """Beams that were sampled: on a grid of directions, by another program, in a file.
 
-The directions that beams are sampled in, and interpolation between them.
+They are known in directions of a grid or of HEALPix pixels, at some frequencies: either E_theta and
+E_phi of every antenna, or the beam of every product. Frame: topocentric at turntable angle zero,
+theta from the zenith, phi from East towards North; time goes as exp(+i w t). Nothing is received
+from below the horizon.
 
-Beams of one's own: known in directions of a grid or of HEALPix pixels, at some frequencies.
+**Files** of the package are netCDF, or FITS with images of the same names. ``frequency_mhz``
+(frequency), growing; then either ``e_theta_real``, ``e_theta_imag``, ``e_phi_real`` and
+``e_phi_imag`` (frequency, antenna, directions), or ``product_beam`` (frequency, product,
+directions). Directions are (theta, phi) with ``theta_deg`` (theta) and ``phi_deg`` (phi), or
+(pixel): HEALPix, RING. Attributes, words of the primary header in FITS: ``format``, ``absolute`` (0
+or 1, see :class:`.SampledBeams`), and ``products``, the labels of product beams in their order.
 
-Either E_theta and E_phi of every antenna, or the beam of every product. Frame: topocentric at
-turntable angle zero, theta from the zenith, phi from East towards North; time goes as exp(+i w t).
-Nothing is received from below the horizon.
+**pyuvdata** is optional (the extra ``uvdata``). A UVBeam of type efield holds, for every feed, the
+response to the components of the field along azimuth and zenith angle (``az_za``), or along phi and
+theta (``healpix``); azimuth is phi, from East towards North.
 
-Files of beams of one's own: netCDF, or FITS with images of the same names.
-
-``frequency_mhz`` (frequency), growing; then either ``e_theta_real``, ``e_theta_imag``,
-``e_phi_real`` and ``e_phi_imag`` (frequency, antenna, directions), or ``product_beam`` (frequency,
-product, directions). Directions are (theta, phi) with ``theta_deg`` (theta) and ``phi_deg`` (phi),
-or (pixel): HEALPix, RING. Attributes, words of the primary header in FITS: ``format``, ``absolute``
-(0 or 1, see :class:`.SampledBeams`), and ``products``, the labels of product beams in their order.
-
-Sampled beams as a source of beams.
-
-pyuvdata's UVBeam as sampled beams; pyuvdata is optional (the extra ``uvdata``).
-
-A UVBeam of type efield holds, for every feed, the response to the components of the field along
-azimuth and zenith angle (``az_za``), or along phi and theta (``healpix``); azimuth is phi, from
-East towards North.
-
-Read beam files: luseepy's, scalar or four-port, sampled beams, and pyuvdata's UVBeam.
+:func:`read_beam` reads all of these, and luseepy's files.
 """
 
 from __future__ import annotations
@@ -444,7 +436,7 @@ def sampled_beams(
 FIELDS = ("e_theta_real", "e_theta_imag", "e_phi_real", "e_phi_imag")
 POWER = "product_beam"
 WHAT = "sampled beams"
-HINT = "lusee_bayes.sampled_beams(...).write makes one of arrays"
+HINT = "lusee_bayes.write_sampled_beams makes one of sampled_beams(...)"
 
 
 def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
