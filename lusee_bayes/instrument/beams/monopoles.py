@@ -193,9 +193,11 @@ class Monopoles(eqx.Module):
     ) -> AntennaFields:
         """Return the field patterns on a grid, with the phase centre at the feed for all arms."""
         require_positive("frequency_mhz", frequency_mhz)
-        e_theta, e_phi = self.towards(frequency_mhz, grid.theta[:, None], grid.phi[None])
-        return AntennaFields(e_theta, e_phi, grid)
+        # an array, so that all frequencies share one program
+        frequency = _array(frequency_mhz)
+        return AntennaFields(*self.towards(frequency, grid.theta[:, None], grid.phi[None]), grid)
 
+    @compiled
     def towards(
         self,
         frequency_mhz: float | Float[Array, ""],
@@ -215,30 +217,15 @@ class Monopoles(eqx.Module):
         -------
         e_theta, e_phi : (antennas, ...) complex array
         """
-        # an array, so that all frequencies share one program
-        return self._towards(_array(frequency_mhz), theta, phi)
-
-    @compiled
-    def _towards(
-        self,
-        frequency_mhz: Float[Array, ""],
-        theta: Float[Array, "*#directions"],
-        phi: Float[Array, "*#directions"],
-    ) -> tuple[Complex[Array, "antennas *directions"], Complex[Array, "antennas *directions"]]:
         k = wavenumber(frequency_mhz)
         xp = namespace(self, frequency_mhz, theta, phi)
         cos, sin = xp.cos(theta)[None], xp.sin(theta)[None]
         tilt = xp.radians(self.zenith_angle_deg)
-        azimuth = xp.radians(self.azimuths_deg + self.turntable_offset_deg).reshape(
-            -1, *(1,) * phi.ndim
-        )
-        relative = phi[None] - azimuth
+        azimuth = xp.radians(self.azimuths_deg + self.turntable_offset_deg)
+        relative = phi[None] - azimuth.reshape(-1, *(1,) * phi.ndim)
         # the arm along the horizontal direction of the wave, across it, and up
-        along, across, up = (
-            xp.sin(tilt) * xp.cos(relative),
-            -xp.sin(tilt) * xp.sin(relative),
-            xp.cos(tilt),
-        )
+        along, across = xp.sin(tilt) * xp.cos(relative), -xp.sin(tilt) * xp.sin(relative)
+        up = xp.cos(tilt)
         s, p = (
             r.reshape(cos.shape) for r in self.regolith.reflection(cos.reshape(-1), frequency_mhz)
         )
@@ -631,10 +618,17 @@ def beams_towards(
     """
     require_positive("frequency_mhz", frequency_mhz)
     require_array("directions", directions, (None, 3))
-    _require_unit(directions)
+    if not is_traced(directions):
+        length = np.linalg.norm(np.asarray(directions), axis=1)
+        bad = np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)
+        if bad.size:
+            raise InputError(
+                f"directions must be unit vectors, number {bad[0]} has length "
+                f"{length[bad[0]]:.6g}; divide them by their length"
+            )
     monopoles = Monopoles() if monopoles is None else monopoles
     # an array: one compilation for all frequencies
-    frequency = namespace(frequency_mhz).asarray(frequency_mhz, dtype=np.float64)
+    frequency = _array(frequency_mhz)
     patterns = _patterns(frequency, directions, monopoles, stokes)
     return patterns / _normalisation(frequency, monopoles)
 
@@ -661,15 +655,3 @@ def _normalisation(frequency_mhz: Float[Array, ""], monopoles: Monopoles) -> Flo
     grid = HemisphereGrid.for_lmax(NORMALISATION_LMAX)
     e_theta, e_phi = monopoles.towards(frequency_mhz, grid.theta[:, None], grid.phi[None])
     return mean_auto_integral(AntennaFields(e_theta, e_phi, grid))
-
-
-def _require_unit(directions: Float[Array, "directions 3"]) -> None:
-    if is_traced(directions):
-        return
-    length = np.linalg.norm(np.asarray(directions), axis=1)
-    bad = np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)
-    if bad.size:
-        raise InputError(
-            f"directions must be unit vectors, number {bad[0]} has length {length[bad[0]]:.6g}; "
-            "divide them by their length"
-        )
