@@ -48,6 +48,11 @@ def as_complex(real: Array, imaginary: Array) -> Array:
     return jax.lax.complex(jnp.asarray(real), jnp.asarray(imaginary))
 
 
+def scalar(value: Any) -> Array:
+    """Convert a number to a float64 array of JAX: a run value that it traces, not structure."""
+    return jnp.asarray(value, dtype=jnp.float64)
+
+
 def compiled(function: F) -> F:
     """Compile a function for JAX arrays; with NumPy arrays alone it runs as it is.
 

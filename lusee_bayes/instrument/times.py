@@ -263,39 +263,24 @@ class Windows(Described):
         for name in ("start_s", "end_s", "live_s"):
             require_finite(f"{name} of the windows", getattr(self, name))
         length = self.end_s - self.start_s
-        self._refuse(
-            ~(length > 0.0),
-            "ends {0:g} s from its time, not after its start at {1:g} s; windows need a start and "
-            "then an end",
-            self.end_s,
-            self.start_s,
-        )
-        self._refuse(
-            self.live_s > length + ROUNDING_S,
-            "was live for {0:g} s of a window of {1:g} s; live time cannot be longer than the "
-            "window",
-            self.live_s,
-            length,
-        )
-        self._refuse(
-            ~(self.live_s > 0.0),
-            "has a live time of {0:g} s; leave out samples in which nothing was integrated",
-            self.live_s,
-        )
         same = np.zeros(len(length), dtype=bool)
         same[1:] = (steps == 0) & (self.start_s[1:] < self.end_s[:-1] - ROUNDING_S)
-        self._refuse(
-            same,
-            "has a piece that begins at {0:g} s, before the one before it has ended; pieces of a "
-            "window must not overlap",
-            self.start_s,
-        )
-
-    def _refuse(self, wrong: Bool[np.ndarray, " pieces"], text: str, *values: np.ndarray) -> None:
-        if wrong.any():
-            first = int(np.argmax(wrong))
-            what = text.format(*(float(value[first]) for value in values))
-            raise InputError(f"sample {self.sample[first]} {what}")
+        rules = (
+            (~(length > 0.0), "ends {end:g} s from its time, not after its start at {start:g} s; "
+             "windows need a start and then an end"),
+            (self.live_s > length + ROUNDING_S, "was live for {live:g} s of a window of {length:g} "
+             "s; live time cannot be longer than the window"),
+            (~(self.live_s > 0.0), "has a live time of {live:g} s; leave out samples in which "
+             "nothing was integrated"),
+            (same, "has a piece that begins at {start:g} s, before the one before it has ended; "
+             "pieces of a window must not overlap"),
+        )  # fmt: skip
+        values = {"start": self.start_s, "end": self.end_s, "live": self.live_s, "length": length}
+        for wrong, text in rules:
+            if wrong.any():
+                first = int(np.argmax(wrong))
+                here = {name: float(value[first]) for name, value in values.items()}
+                raise InputError(f"sample {self.sample[first]} {text.format(**here)}")
 
     @classmethod
     def whole(

@@ -530,7 +530,20 @@ class TimeBlockFactor(Factor):
         return 2.0 * xp.log(xp.diagonal(self.lower, axis1=1, axis2=2)).sum()
 
 
-class TimeBlockCovariance(Covariance):
+class _OverLayout(Covariance):
+    """A covariance that knows which product and time each of its data has."""
+
+    layout: DataLayout
+
+    @property
+    def size(self) -> int:
+        return self.layout.size
+
+    def dense(self):
+        return self.mv(namespace(self).eye(self.size))
+
+
+class TimeBlockCovariance(_OverLayout):
     """N with one block for each time.
 
     Missing samples get the rows and columns of the unit matrix, which change neither the solution
@@ -549,7 +562,6 @@ class TimeBlockCovariance(Covariance):
     """
 
     blocks: Float[Array, "times products products"]
-    layout: DataLayout
 
     def __init__(self, blocks: Float[Array, "times products products"], layout: DataLayout):
         require_float64("the noise blocks", blocks)
@@ -564,18 +576,11 @@ class TimeBlockCovariance(Covariance):
         self.blocks = blocks
         self.layout = layout
 
-    @property
-    def size(self) -> int:
-        return self.layout.size
-
     def mv(self, x):
         return self.layout.from_times(self.blocks @ self.layout.by_time(x), x.shape)
 
     def diagonal(self):
         return self.layout.gather(namespace(self).diagonal(self.blocks, axis1=1, axis2=2).T)
-
-    def dense(self):
-        return self.mv(np.eye(self.size))
 
     def factor(self):
         lower = checked_cholesky("the noise covariance of one time", self.blocks)
@@ -711,7 +716,7 @@ class TimeBandedFactor(Factor):
         return 2.0 * jnp.log(jnp.diagonal(self.diagonal, axis1=1, axis2=2)).sum()
 
 
-class TimeBandedCovariance(Covariance):
+class TimeBandedCovariance(_OverLayout):
     """N with a block for every two times up to ``width`` samples apart, zero beyond.
 
     Missing samples get the rows and columns of the unit matrix.
@@ -732,7 +737,6 @@ class TimeBandedCovariance(Covariance):
     """
 
     band: Float[Array, "times widths products products"]
-    layout: DataLayout
     name: str = eqx.field(static=True, default="the time-banded covariance")
 
     def __init__(
@@ -750,10 +754,6 @@ class TimeBandedCovariance(Covariance):
         self.band = band
         self.layout = layout
         self.name = name
-
-    @property
-    def size(self) -> int:
-        return self.layout.size
 
     @property
     def width(self) -> int:
@@ -774,9 +774,6 @@ class TimeBandedCovariance(Covariance):
 
     def diagonal(self):
         return self.layout.gather(jnp.diagonal(self.band[:, 0], axis1=1, axis2=2).T)
-
-    def dense(self):
-        return self.mv(jnp.eye(self.size))
 
     def factor(self):
         left, diagonal = _cholesky(*_block_rows(self.band))

@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.checks import (
     is_traced,
     require_array,
@@ -93,10 +93,6 @@ def template_noise(
 REACH = float(np.sqrt(-2.0 * np.log(np.finfo(np.float64).eps)))
 
 
-def _scalar(x) -> Float[Array, ""]:
-    return jnp.asarray(x, dtype=jnp.float64)
-
-
 class GainDrift(eqx.Module):
     """Gain drifts, independent between antennas and alike for all of them.
 
@@ -115,8 +111,8 @@ class GainDrift(eqx.Module):
         If one of them is not positive.
     """
 
-    sigma: Float[Array, ""] = eqx.field(converter=_scalar)
-    correlation_h: Float[Array, ""] = eqx.field(default=10.0, converter=_scalar)
+    sigma: Float[Array, ""] = eqx.field(converter=scalar)
+    correlation_h: Float[Array, ""] = eqx.field(default=10.0, converter=scalar)
 
     def __check_init__(self):
         require_positive("the gain drift's sigma", self.sigma)

@@ -19,7 +19,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.monopoles import parameter
@@ -34,7 +34,6 @@ from lusee_bayes.systematics.systematic import (
     Scale,
     Systematic,
     normal_within,
-    scalar,
     uncertain_scale,
     with_added,
 )

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.checks import require_finite, require_positive, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import dist, numpyro
@@ -24,7 +24,6 @@ from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.systematic import (
     Scale,
     Systematic,
-    scalar,
     scalar_or_none,
     uncertain_scale,
     with_added,

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import dist, numpyro
@@ -249,11 +249,6 @@ def multiplied(model: LinearGaussian, response: Float[Array, " data"]) -> Linear
     """Multiply the mean of a model's data, of sky and offset, by gains."""
     offset = None if model.offset is None else model.offset * response
     return replace(model, coupling=model.coupling.with_response(response), offset=offset)
-
-
-def scalar(value: float | Float[Array, ""]) -> Float[Array, ""]:
-    """Convert a number to a float64 array: a run value that JAX traces, not structure."""
-    return jnp.asarray(value, dtype=jnp.float64)
 
 
 def scalar_or_none(value: float | Float[Array, ""] | None) -> Float[Array, ""] | None:
