@@ -31,7 +31,7 @@ from lusee_bayes.flight.flags import (
     robust_scale,
     threshold,
 )
-from lusee_bayes.flight.gain_model import NANO2, Curves, gain_curves
+from lusee_bayes.flight.gain_model import NANO2, gain_curves
 from lusee_bayes.flight.recipe import Recipe, Timeline, timeline
 from lusee_bayes.flight.reduced import (
     BURST,
@@ -130,26 +130,21 @@ def reduce_sessions(
 
 def _in_common(line: Timeline, recipe: Recipe) -> dict[str, Any]:
     """What does not depend on the spectra."""
+    levels = np.concatenate([s.level for s in line.sessions])
+    telemetry = {
+        name: np.concatenate([s.telemetry[name] for s in line.sessions])
+        for name in line.sessions[0].telemetry
+    }
     return {
         "frequencies_mhz": np.array(recipe.frequencies_mhz),
         "bandwidth_mhz": recipe.bandwidth_mhz,
         "average_s": recipe.average_s,
         "component_std": recipe.table.component_std,
         "gain_std": recipe.gain_std,
-        "curves": _curves(line, recipe),
+        "curves": gain_curves(recipe.table, recipe.gain_std, levels, telemetry),
         "sessions": tuple(_said_of(s, recipe) for s in line.sessions),
         "recipe": recipe.words(),
     }
-
-
-def _curves(line: Timeline, recipe: Recipe) -> Curves:
-    sessions = line.sessions
-    telemetry = {
-        name: np.concatenate([s.telemetry[name] for s in sessions])
-        for name in sessions[0].telemetry
-    }
-    levels = np.concatenate([s.level for s in sessions])
-    return gain_curves(recipe.table, recipe.gain_std, levels, telemetry)
 
 
 def _pieces(line: Timeline) -> list[slice]:

@@ -369,11 +369,14 @@ class Checkpoints:
                     "delete the chunks behind them to go on from there"
                 )
             done = chunk.iteration
-        kept = [chunk.draws for chunk in chunks if chunk.draws]
-        return {
-            name: np.concatenate([c[name] for c in kept]).swapaxes(0, 1)
-            for name in (kept[0] if kept else {})
-        }
+        return _by_chain([chunk.draws for chunk in chunks])
+
+
+def _by_chain(parts: list[dict[str, Array]]) -> dict[str, np.ndarray]:
+    """Draws (chains, draws, ...) by name, of parts (draws, chains, ...) one after the other."""
+    kept = [part for part in parts if part]
+    names = kept[0] if kept else ()
+    return {n: np.concatenate([np.asarray(k[n]) for k in kept]).swapaxes(0, 1) for n in names}
 
 
 def _iteration(path: Path) -> int:
@@ -535,14 +538,7 @@ def sample(
             else:
                 checkpoints.append(done, jax.tree.leaves(state), draws)
             report(done, state)
-    if checkpoints is not None:
-        merged = checkpoints.draws()
-    else:
-        kept = [k for k in kept if k]
-        merged = {
-            name: np.concatenate([np.asarray(k[name]) for k in kept]).swapaxes(0, 1)
-            for name in kept[0]
-        }
+    merged = _by_chain(kept) if checkpoints is None else checkpoints.draws()
     merged = {name: values[:, : sampler.draws] for name, values in merged.items()}
     return Chains(
         {name: values for name, values in merged.items() if name not in STATISTICS},

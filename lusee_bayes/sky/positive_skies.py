@@ -162,16 +162,8 @@ class PositiveSkies(eqx.Module):
         lmax, lmax_fields : int
             Highest ell of the maps, and of the exponents.
         """
-        return PositiveSkies(
-            self.frequencies_mhz,
-            self.mixing,
-            SphereGrid.of(lmax_fields, len(self.grid.theta) - 1),
-            self.levels,
-            self.weight,
-            self.sources[:, :, : n_modes(lmax)],
-            lmax,
-            self.names,
-        )
+        grid = SphereGrid.of(lmax_fields, len(self.grid.theta) - 1)
+        return replace(self, grid=grid, sources=self.sources[:, :, : n_modes(lmax)], lmax=lmax)
 
     @property
     def n_fields(self) -> int:
