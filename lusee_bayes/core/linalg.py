@@ -79,11 +79,6 @@ def invert_factorised(lower: Float[np.ndarray, "n n"]) -> None:
     _in_place("dpotri", b"U", lower)
 
 
-def invert_triangle(lower: Float[np.ndarray, "n n"]) -> None:
-    """Put L^-1 into the lower triangle of L, in C order; above it nothing is changed."""
-    _in_place("dtrtri", b"UN", lower)
-
-
 def solve_triangle(
     lower: Float[np.ndarray, "n n"], columns: Float[np.ndarray, "n columns"], *, transpose: bool
 ) -> None:
@@ -283,7 +278,7 @@ def invert_lower(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Return L^-1 for lower triangular L; entries above the diagonal are not read."""
     if namespace(lower) is np:
         inverse = np.tril(lower)
-        invert_triangle(inverse)
+        _in_place("dtrtri", b"UN", inverse)
         return inverse
     n = lower.shape[0]
     if n <= MAX_SUBSTITUTED:

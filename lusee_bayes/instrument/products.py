@@ -284,17 +284,23 @@ def site_of(site: Any) -> tuple[float, float]:
     return lon, lat
 
 
-def numbers_of_times(name: str, values: Any, n_times: int) -> Float[np.ndarray, " times"]:
-    """Return a finite number for each time. InputError, with the name, if there are others."""
+def numbers_of_times(
+    name: str, values: Any, n_times: int, *, or_one: bool = False
+) -> Float[np.ndarray, " times"]:
+    """Return a finite number for each time. InputError, with the name, if there are others.
+
+    With ``or_one`` a single number may stand for all times.
+    """
+    alone = "one number, or one for each" if or_one else "a number for each"
     try:
         numbers = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is {values!r}; give a number for each time") from error
-    if numbers.shape != (n_times,) or not np.isfinite(numbers).all():
-        raise InputError(
-            f"{name} has shape {numbers.shape}; give a finite number for each of {n_times} times"
-        )
-    return numbers
+        raise InputError(f"{name} is {values!r}; give {alone} time") from error
+    fits = numbers.shape == (n_times,) or (or_one and not numbers.ndim)
+    if not fits or not np.isfinite(numbers).all():
+        several = alone.replace("number", "finite number")
+        raise InputError(f"{name} has shape {numbers.shape}; give {several} of {n_times} times")
+    return np.broadcast_to(numbers, (n_times,))
 
 
 def runs_of(turntable_deg: Any, n_times: int) -> tuple[np.ndarray, tuple[float, ...]]:
@@ -311,16 +317,7 @@ def runs_of(turntable_deg: Any, n_times: int) -> tuple[np.ndarray, tuple[float, 
     InputError
         If there are neither one angle nor as many as times, or they are not finite.
     """
-    try:
-        angles = np.asarray(turntable_deg, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"turntable_deg is {turntable_deg!r}; give angles in degrees") from error
-    if angles.shape not in ((), (n_times,)) or not np.isfinite(angles).all():
-        raise InputError(
-            f"turntable_deg has shape {angles.shape}; give one finite angle in degrees, or one "
-            f"for each of {n_times} times"
-        )
-    angles = np.broadcast_to(angles, (n_times,))
+    angles = numbers_of_times("turntable_deg", turntable_deg, n_times, or_one=True)
     run = np.concatenate([[0], np.cumsum(np.diff(angles) != 0.0)]).astype(np.int64)
     return run, tuple(angles[np.searchsorted(run, np.arange(run[-1] + 1))].tolist())
 

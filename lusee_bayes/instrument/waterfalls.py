@@ -642,7 +642,8 @@ def write_four_port(
     ratio = np.divide(eigenvalues[..., 0], largest, out=np.zeros_like(largest), where=largest > 0)
     # visibilities are real products of a Hermitian matrix
     none = np.zeros_like(ratio)
-    parameters = json.dumps(receiver.luseepy_parameters(), sort_keys=True)
+    names = receiver.luseepy_parameters
+    parameters = json.dumps({k: getattr(receiver, own) for k, own in names.items()}, sort_keys=True)
     hdus += [
         _image("loading_condition_number", condition, "1"),
         _image("covariance_antihermitian_absolute", none, UNIT),

@@ -379,17 +379,16 @@ class Receiver(ABC):
     ----------
     luseepy_name : str
         Of the class that luseepy has for it.
+    luseepy_parameters : dict of str
+        What that class takes, by its names: the names of the attributes here.
     """
 
     luseepy_name: ClassVar[str]
+    luseepy_parameters: ClassVar[dict[str, str]] = {}
 
     @abstractmethod
     def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
         """Return ZL in Ohm. InputError at a frequency that the receiver does not know."""
-
-    @abstractmethod
-    def luseepy_parameters(self) -> dict[str, tuple[float, ...]]:
-        """Return what luseepy's class takes, by its names."""
 
 
 @dataclass(frozen=True)
@@ -412,6 +411,10 @@ class JFETReceiver(Receiver):
     """
 
     luseepy_name: ClassVar[str] = "JFETReceiver"
+    luseepy_parameters: ClassVar[dict[str, str]] = {
+        "C_pf": "capacitance_pf", "L_nh": "inductance_nh", "Rp_ohm": "parallel_ohm",
+        "Rs_ohm": "series_ohm", "a": "skin_ohm", "n": "skin_power",
+    }  # fmt: skip
 
     capacitance_pf: tuple[float, ...] = (33.79, 35.32, 34.89, 36.85)
     inductance_nh: tuple[float, ...] = (35.0, 36.4, 34.7, 8.5)
@@ -428,16 +431,6 @@ class JFETReceiver(Receiver):
         z = z + parallel / (1.0 + 1j * w * parallel * 1e-12 * np.array(self.capacitance_pf))
         return np.diag(z)
 
-    def luseepy_parameters(self) -> dict[str, tuple[float, ...]]:
-        return {
-            "C_pf": self.capacitance_pf,
-            "L_nh": self.inductance_nh,
-            "Rp_ohm": self.parallel_ohm,
-            "Rs_ohm": self.series_ohm,
-            "a": self.skin_ohm,
-            "n": self.skin_power,
-        }
-
 
 @dataclass(frozen=True)
 class CapacitorReceiver(Receiver):
@@ -449,14 +442,12 @@ class CapacitorReceiver(Receiver):
     """
 
     luseepy_name: ClassVar[str] = "IdealCapacitorReceiver"
+    luseepy_parameters: ClassVar[dict[str, str]] = {"C_pf": "capacitance_pf"}
 
     capacitance_pf: tuple[float, ...] = (30.0, 30.0, 30.0, 30.0)
 
     def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
         return np.diag(1.0 / (2.0e-6j * np.pi * frequency_mhz * np.array(self.capacitance_pf)))
-
-    def luseepy_parameters(self) -> dict[str, tuple[float, ...]]:
-        return {"C_pf": self.capacitance_pf}
 
 
 @dataclass(frozen=True)
@@ -481,9 +472,6 @@ class MeasuredReceiver(Receiver):
     def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
         (ohm,) = at_frequency(self.path, self.frequencies_mhz, frequency_mhz, self.load_ohm)
         return ohm
-
-    def luseepy_parameters(self) -> dict[str, tuple[float, ...]]:
-        return {}
 
 
 def receiver_of(
