@@ -7,6 +7,7 @@ import healpy
 import numpy as np
 import pytest
 from astropy.io import fits
+from made_skies import SmoothSky, SpottySky
 from reference import real_harmonics
 
 from lusee_bayes.core.errors import InputError
@@ -19,7 +20,6 @@ from lusee_bayes.sky.sky_source import (
     read_sky_file,
     sky_from_file,
 )
-from lusee_bayes.testing.cases import SmoothSky, SpottySky
 from lusee_bayes.testing.checks import assert_refused, check_sky_source
 
 NSIDE, LMAX = 16, 8
