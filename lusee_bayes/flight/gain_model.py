@@ -313,15 +313,8 @@ def read_gain_table(path: str | Path, model: str = "quadratic") -> GainModel:
     found = read_netcdf(path, formats.GAINS, LAYOUT, HINT).arrays
     if tuple(map(str, found["level"])) != LETTERS:
         raise InputError(f"{path}: levels are {found['level']}; expected {', '.join(LETTERS)}")
-    return GainModel(
-        str(path),
-        found["anchor_mhz"],
-        found["mean"],
-        found["components"],
-        found["coefficient"],
-        found.get("component_std"),
-        "netCDF",
-    )
+    tables = (found[name] for name in ("anchor_mhz", "mean", "components", "coefficient"))
+    return GainModel(str(path), *tables, found.get("component_std"), "netCDF")
 
 
 def write_gain_table(path: str | Path, table: GainModel) -> Path:

@@ -172,15 +172,9 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
         windows = Windows.whole(-window / 2.0, window / 2.0, share * window)
     state = _states(ordered)
     with naming(", ".join(str(s.path) for s in ordered)):
-        observation = Observation(
-            lon,
-            lat,
-            times,
-            state,
-            (recipe.turntable_deg,) * (int(state[-1]) + 1),
-            float(window.max()),
-            windows=windows,
-        )
+        angles = (recipe.turntable_deg,) * (int(state[-1]) + 1)
+        longest = float(window.max())
+        observation = Observation(lon, lat, times, state, angles, longest, windows=windows)
     bin_of = np.arange(len(state))
     if recipe.average_s is not None:
         bin_of = bins_of(observation, windows.bounds_s, recipe.average_s)

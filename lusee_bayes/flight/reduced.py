@@ -451,7 +451,7 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
     scenario : str
         Text of the scenario that they were reduced with.
     """
-    seen = reduced.observation
+    seen, meanings = reduced.observation, {"flag_meanings": ", ".join(REASONS)}
     variables = {
         "visibility": (BAND_DIMS, reduced.values, {"units": "V^2/Hz"}),
         "before_flags": (BAND_DIMS, reduced.before.astype(np.float32), {"units": "V^2/Hz"}),
@@ -470,11 +470,7 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
         "run": (("spectrum",), seen.run.astype(np.int32)),
         "bin_of": (("spectrum",), reduced.bin_of.astype(np.int32)),
         "turntable_deg": (("run_number",), np.array(seen.turntable_deg)),
-        "reason": (
-            ("frequency", "spectrum"),
-            reduced.reason,
-            {"flag_meanings": ", ".join(REASONS)},
-        ),
+        "reason": (("frequency", "spectrum"), reduced.reason, meanings),
         "line_share": (("frequency", "spectrum"), reduced.lines),
     }
     if seen.windows is not None:
@@ -538,15 +534,9 @@ def read_reduced(path: str | Path) -> Reduced:
             windows = Windows.whole(
                 here["window_start_s"], here["window_end_s"], here.get("live_s")
             )
-        observation = Observation(
-            said["lon_deg"],
-            said["lat_deg"],
-            utc_of_jd(found),
-            here["run"],
-            tuple(here["turntable_deg"].tolist()),
-            said["step_s"],
-            windows=windows,
-        )
+        site, angles = (said["lon_deg"], said["lat_deg"]), tuple(here["turntable_deg"].tolist())
+        runs = here["run"], angles, said["step_s"]
+        observation = Observation(*site, utc_of_jd(found), *runs, windows=windows)
     if here["bin_of"].max() >= found.sizes["bin"]:
         raise InputError(f"{path}: bin_of goes beyond the {found.sizes['bin']} bins")
     return Reduced(

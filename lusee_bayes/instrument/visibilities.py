@@ -543,20 +543,14 @@ def read_visibilities(path: str | Path) -> Visibilities:
         layout = DataLayout.from_flags(flags)
         utc = utc_of_jd(found)
         times, windows, says_window = read_windows(found, utc)
-        observation = Observation(
-            found.values["lon_deg"],
-            found.values["lat_deg"],
-            times,
-            here["run"],
-            tuple(here["turntable_deg"].tolist()),
-            found.values["step_s"],
-            windows=windows,
-        )
+        said, angles = found.values, tuple(here["turntable_deg"].tolist())
+        runs, site = (here["run"], angles, said["step_s"]), (said["lon_deg"], said["lat_deg"])
+        observation = Observation(*site, times, *runs, windows=windows)
         return Visibilities(
             layout.gather(values),
             layout,
             observation,
-            found.values["frequency_mhz"],
+            said["frequency_mhz"],
             here.get("truth"),
             receiver_of(path, here, "load_frequency_mhz", *LOADS),
             says_window,

@@ -456,16 +456,9 @@ def validate_draws(
         Check("BFMI", float(bfmi.min()), MIN_BFMI, infinite,
               "smallest of all chains: how well energies are explored"),
     )  # fmt: skip
+    error, null_mean = np.sqrt(2.0 / ess_square), null.mean(0)
     return Comparison(
-        mean_z,
-        variance_ratio,
-        np.sqrt(2.0 / ess_square),
-        eigenvalues,
-        null.mean(0),
-        rhat,
-        bulk,
-        tail,
-        checks,
+        mean_z, variance_ratio, error, eigenvalues, null_mean, rhat, bulk, tail, checks
     )
 
 

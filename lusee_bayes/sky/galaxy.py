@@ -428,18 +428,10 @@ class Slabs:
         chords = [(region.chord(direction), region) for region in REGIONS]
 
         # The discs do not tell l from -l: they are computed once for both.
-        _, one, of_line = np.unique(
-            np.round(np.stack([cos_lon, sin_lat]), 12),
-            axis=1,
-            return_index=True,
-            return_inverse=True,
-        )
-        cos_lon, cos_lat, sin_lat, of_line = (
-            cos_lon[one],
-            cos_lat[one],
-            sin_lat[one],
-            of_line.ravel(),
-        )
+        places = np.round(np.stack([cos_lon, sin_lat]), 12)
+        _, one, of_line = np.unique(places, axis=1, return_index=True, return_inverse=True)
+        cos_lon, cos_lat, sin_lat = cos_lon[one], cos_lat[one], sin_lat[one]
+        of_line = of_line.ravel()
         # Near a pole the same panels are used, shortened, so that the discs stay resolved.
         stretch = np.minimum(1.0, TOP_KPC / DEPTH_KPC / np.maximum(sin_lat, 1e-9))
         nodes, weights = _nodes()
@@ -450,9 +442,8 @@ class Slabs:
             s, ds = node * stretch, weight * stretch
             along, z = s * cos_lat, s * sin_lat
             radius = np.sqrt(SUN_RADIUS_KPC**2 + along * (along - 2.0 * SUN_RADIUS_KPC * cos_lon))
-            n_squared = thick_disc(radius) * height_profile(z, THICK_HEIGHT_KPC) + thin_disc(
-                radius
-            ) * height_profile(z, THIN_HEIGHT_KPC)
+            n_squared = thick_disc(radius) * height_profile(z, THICK_HEIGHT_KPC)
+            n_squared = n_squared + thin_disc(radius) * height_profile(z, THIN_HEIGHT_KPC)
             disc = emissivity_in_plane(radius) * emissivity_height_profile(z) * ds
             emitted[k], smooth = disc[of_line], n_squared[of_line]
 

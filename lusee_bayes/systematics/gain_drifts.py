@@ -103,17 +103,12 @@ class GainDrifts(Systematic):
         grid = white_grid(
             hours, middle / factor, middle * factor, per_correlation=PER_CORRELATION, margin=MARGIN
         )
-        return cls(
-            drift,
-            visibilities,
-            jnp.asarray(hours),
-            jnp.asarray(grid),
-            layout,
-            drift.width(hours),
-            longest.width(hours),
-            log_sigma_std,
-            log_correlation_std,
+        widths, stds = (
+            (drift.width(hours), longest.width(hours)),
+            (log_sigma_std, log_correlation_std),
         )
+        hours, grid = jnp.asarray(hours), jnp.asarray(grid)
+        return cls(drift, visibilities, hours, grid, layout, *widths, *stds)
 
     @property
     def n_antennas(self) -> int:
@@ -166,18 +161,11 @@ class GainDrifts(Systematic):
             return None
         noise = self.layout.scatter(model.noise.diagonal())
         floor = noise.sum() / (self.visibilities**2).sum()
-        reach = None
+        reach, sigma_is_site = None, self.log_sigma_std is not None
         if self.log_correlation_std is not None:
             reach = CORRELATION_REACH * self.log_correlation_std
-        return GainCoordinates(
-            self.drift,
-            self.hours,
-            self.grid,
-            self.n_antennas,
-            floor,
-            self.log_sigma_std is not None,
-            reach,
-        )
+        times = self.hours, self.grid
+        return GainCoordinates(self.drift, *times, self.n_antennas, floor, sigma_is_site, reach)
 
     def marginalised(self, model: LinearGaussian, drift: GainDrift | None = None) -> LinearGaussian:
         """Add the drifts' covariance to N, and multiply by the autos' mean response.
