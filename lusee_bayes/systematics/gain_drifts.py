@@ -103,10 +103,8 @@ class GainDrifts(Systematic):
         grid = white_grid(
             hours, middle / factor, middle * factor, per_correlation=PER_CORRELATION, margin=MARGIN
         )
-        widths, stds = (
-            (drift.width(hours), longest.width(hours)),
-            (log_sigma_std, log_correlation_std),
-        )
+        widths = drift.width(hours), longest.width(hours)
+        stds = log_sigma_std, log_correlation_std
         hours, grid = jnp.asarray(hours), jnp.asarray(grid)
         return cls(drift, visibilities, hours, grid, layout, *widths, *stds)
 
