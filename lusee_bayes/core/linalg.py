@@ -55,7 +55,7 @@ def _in_place(name: str, letters: bytes, matrix: Float[np.ndarray, "n n"]) -> in
     return info.value
 
 
-def factorise(matrix: Float[np.ndarray, "n n"]) -> bool:
+def factorise_in_place(matrix: Float[np.ndarray, "n n"]) -> bool:
     """Put L, with L L^T the matrix, into its lower triangle, and zeros above.
 
     Parameters
@@ -132,7 +132,7 @@ def cholesky(
         if matrix.ndim > 2:
             return np.stack([cholesky(block) for block in matrix])
         lower = np.ascontiguousarray(matrix) if overwrite else matrix.copy(order="C")
-        return lower if factorise(lower) else np.full(matrix.shape, np.nan)
+        return lower if factorise_in_place(lower) else np.full(matrix.shape, np.nan)
     return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 

@@ -47,7 +47,7 @@ from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.pointing import Pointing, kind_of, offset_names, with_offsets
+from lusee_bayes.instrument.pointing import Pointing, offset_kind, offset_names, with_offsets
 from lusee_bayes.instrument.products import all_products, auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.chi2 import WIDER, ChiSquare, expected_chi2, stands_out, two_sided, with_sky
@@ -674,7 +674,7 @@ def _offsets(here: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMis
             if curvature > 0.0:
                 value += reach * np.clip(0.5 * (seen[0] - seen[2]) / curvature, -3.0, 3.0)
             chi2 = min(seen)
-        section, kind = setup.scenario.noise.pointing, kind_of(name)
+        section, kind = setup.scenario.noise.pointing, offset_kind(name)
         remedy = f"give noise.pointing.{kind}"
         if section is not None and kind in section.kinds:
             remedy = f"widen its prior, noise.pointing.{kind}, or set treatment=sampled"

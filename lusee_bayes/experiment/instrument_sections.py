@@ -46,7 +46,7 @@ from lusee_bayes.instrument.beams.monopoles import (
     Regolith,
     read_receiver,
 )
-from lusee_bayes.instrument.beams.sampled import SampledFileBeams, kind_of, read_sampled
+from lusee_bayes.instrument.beams.sampled import SampledFileBeams, beam_kind, read_sampled
 from lusee_bayes.instrument.beams.source import (
     BeamSource,
     EmbeddedBeams,
@@ -558,7 +558,7 @@ def _one_kind(value: Any) -> Any:
     tree["model"] = tree.get("model") or default
     file = tree.get("file")
     if tree["model"] == default and file is not None:
-        tree["model"] = kind_of(file) if isinstance(file, str) else "luseepy"
+        tree["model"] = beam_kind(file) if isinstance(file, str) else "luseepy"
     if tree["model"] != "response" and tree.get("receiver") == "jfet":
         del tree["receiver"]  # scenarios of 0.1 held all keys of all kinds
     temperatures = ("moon_temperature_k", "antenna_temperature_k")
@@ -582,7 +582,7 @@ BeamSection = Annotated[
 
 def section_of_file(file: str, like: Any) -> Any:
     """The section of another beam file, turned as the beams of ``like`` are."""
-    kind = BEAM_SECTIONS[kind_of(file)]
+    kind = BEAM_SECTIONS[beam_kind(file)]
     shared = {
         name: value
         for name, value in like.model_dump().items()

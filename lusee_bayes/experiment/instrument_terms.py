@@ -27,10 +27,10 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, expected_signal, mean_flux, source_responses
 from lusee_bayes.experiment.term import Around, Term, Truth, gains_about, noise_visibilities
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import placed
+from lusee_bayes.instrument.beams.monopoles import with_values
 from lusee_bayes.instrument.beams.source import BeamSource, EmbeddedBeams
 from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.pointing import CLOCK, Pointing, kind_of, offset_names, with_offsets
+from lusee_bayes.instrument.pointing import CLOCK, Pointing, offset_kind, offset_names, with_offsets
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise.instrument_errors import (
     GainDrift,
@@ -110,7 +110,7 @@ def true_instrument(setup: Setup) -> TrueInstrument:
         other = section_of_file(error.file, scenario.beam).source().behind(setup.receiver)
         return TrueInstrument(other, frequency)
     truth = BeamErrorTerm().truth(setup, jax.random.key(scenario.seed))
-    return TrueInstrument(EmbeddedBeams(placed(source.monopoles, truth)), frequency)
+    return TrueInstrument(EmbeddedBeams(with_values(source.monopoles, truth)), frequency)
 
 
 def true_beams(setup: Setup) -> ProductBeams:
@@ -315,7 +315,7 @@ def _seen(
 
 def _stds(setup: Setup, names: tuple[str, ...]) -> Float[np.ndarray, " offsets"]:
     section = setup.scenario.noise.pointing
-    return np.array([float(getattr(section, kind_of(name))) for name in names])
+    return np.array([float(getattr(section, offset_kind(name))) for name in names])
 
 
 # what the scenario's seed is folded with: for the drifts, and for their scales

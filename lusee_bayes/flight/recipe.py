@@ -20,7 +20,7 @@ from lusee_bayes.flight.gain_model import GainModel
 from lusee_bayes.flight.session import BinOrigin, Session
 from lusee_bayes.instrument.averaging import bins_of
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.times import TO_MIDDLE, Timestamp, Windows, shifted
+from lusee_bayes.instrument.times import TO_MIDDLE, Timestamp, Windows, later
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +168,7 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
     )
     windows = None
     if recipe.timestamp != "instant":
-        times = shifted(times, TO_MIDDLE[recipe.timestamp] * window)
+        times = later(times, TO_MIDDLE[recipe.timestamp] * window)
         windows = Windows.whole(-window / 2.0, window / 2.0, share * window)
     state = _states(ordered)
     with naming(", ".join(str(s.path) for s in ordered)):

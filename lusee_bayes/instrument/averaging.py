@@ -42,7 +42,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import tilt_powers
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.instrument.times import ROUNDING_S, Windows, seconds_from, shifted
+from lusee_bayes.instrument.times import ROUNDING_S, Windows, later, seconds_from
 from lusee_bayes.instrument.visibilities import Visibilities
 
 # of what is left out of any sample, relative to its visibility if what a beam sees of the sky falls
@@ -376,7 +376,7 @@ def binned(
     begin = np.searchsorted(bin_of_piece, np.arange(len(first)))
     last = np.append(begin[1:], len(start)) - 1
     middle = (start[begin] + end[last]) / 2.0
-    times = shifted(here.times[first], middle - seconds[first])
+    times = later(here.times[first], middle - seconds[first])
     offset = middle[bin_of_piece]
     return replace(
         here,

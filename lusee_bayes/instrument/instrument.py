@@ -11,7 +11,12 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, placed
+from lusee_bayes.instrument.beams.monopoles import (
+    Monopoles,
+    monopole_beams,
+    parameter,
+    with_values,
+)
 from lusee_bayes.instrument.coupling import BeamOperator, CouplingMatrix
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
@@ -94,7 +99,7 @@ class Instrument(eqx.Module):
         InputError
             If there is no parameter of that name.
         """
-        antennas = placed(self.monopoles, values or {})
+        antennas = with_values(self.monopoles, values or {})
         return monopole_beams(self.frequency_mhz, self.lmax, antennas, nodes=self.nodes)
 
     def dense(self, values: Mapping[str, Float[Array, ""]]) -> Float[Array, "data modes"]:

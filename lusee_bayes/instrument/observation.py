@@ -31,9 +31,9 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.instrument.schedule import Cuts, Interval, Run, cut_intervals, cut_runs
 from lusee_bayes.instrument.times import (
     Windows,
+    later,
     require_ephemeris,
     seconds_from,
-    shifted,
     unannounced_leap_seconds,
 )
 
@@ -239,7 +239,7 @@ class Observation(Described):
         dark = self.sun_altitude_deg() < 0.0
         if throughout and self.windows is not None:
             for offset_s in self.windows.bounds_s.T:
-                times = shifted(self.times, offset_s)
+                times = later(self.times, offset_s)
                 dark &= replace(self, times=times, windows=None).sun_altitude_deg() < 0.0
         return dark
 
@@ -301,7 +301,7 @@ class Observation(Described):
         if self.windows is None:
             return self, np.arange(self.n_times), np.ones(self.n_times)
         sample, offset_s, weight = self.windows.nodes(n)
-        times = shifted(self.times[sample], offset_s)
+        times = later(self.times[sample], offset_s)
         instants = replace(self, times=times, run=self.run[sample], windows=None)
         return instants, sample, weight
 

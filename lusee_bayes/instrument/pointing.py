@@ -35,7 +35,7 @@ from lusee_bayes.core.harmonics import Rotation
 from lusee_bayes.instrument.averaging import sufficient_nodes, windowed
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.schedule import CYCLE_DAYS
-from lusee_bayes.instrument.times import Windows, shifted
+from lusee_bayes.instrument.times import Windows, later
 
 # bound on the relative error of a mode at lmax, and least order for any lmax
 TILT_TOLERANCE = 1e-7
@@ -269,7 +269,7 @@ def offset_names(kinds: tuple[str, ...], n_runs: int) -> tuple[str, ...]:
     return tuple(names)
 
 
-def kind_of(name: str) -> str:
+def offset_kind(name: str) -> str:
     """Return the key of ``OFFSETS`` that an offset's name belongs to."""
     return "turntable_deg" if name.startswith("turntable_") else name
 
@@ -297,7 +297,7 @@ def with_offsets(observation: Observation, values: Values) -> Observation:
     drift = given.get("clock_drift_s_per_day", 0.0)
     stretch = 1.0 + drift / 86400.0
     late = given.get("clock_s", 0.0) + drift * observation.hours / 24.0
-    times = shifted(observation.times, late)
+    times = later(observation.times, late)
     angles = zip(observation.turntable_deg, _of_runs(observation.n_runs), strict=True)
     windows = observation.windows
     if windows is not None:

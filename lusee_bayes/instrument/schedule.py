@@ -34,9 +34,9 @@ from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.instrument.times import (
     ROUNDING_S,
     Windows,
+    later,
     require_ephemeris,
     seconds_from,
-    shifted,
     unannounced_leap_seconds,
     utc_from_text,
 )
@@ -196,7 +196,7 @@ class Cuts:
                 "samples that are instants have no duty cycle; take windows "
                 "(observation.window=mean), or leave out the schedule's duty_cycle"
             )
-        return shifted(self.t0, seconds), windows
+        return later(self.t0, seconds), windows
 
     def by_night(self, dark: Bool[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
         """Return the samples that are left where nights alone are wanted.

@@ -56,7 +56,7 @@ def seconds_from(origin: Time, times: Time) -> Any:
         return (times - origin).to_value(u.s)
 
 
-def shifted(times: Time, seconds: Any) -> Time:
+def later(times: Time, seconds: Any) -> Time:
     """Return the times so many seconds later."""
     with unannounced_leap_seconds():
         return times + seconds * u.s
@@ -428,7 +428,7 @@ def stamped(
         raise InputError(
             f"unknown timestamp '{timestamp}'; {nearest(timestamp, [*TO_MIDDLE, 'instant'])}"
         )
-    middles = shifted(times, TO_MIDDLE[timestamp] * step_s)
+    middles = later(times, TO_MIDDLE[timestamp] * step_s)
     half = np.full(len(times), step_s / 2.0)
     return middles, _windows(seconds_from(times[0], times), -half, half, step_s, live_s)
 
@@ -459,7 +459,7 @@ def bounded(
         :class:`.Windows`.
     """
     start, end = (seconds_from(times, bounds[:, k]) for k in (0, 1))
-    middles = shifted(times, (start + end) / 2.0)
+    middles = later(times, (start + end) / 2.0)
     seconds = seconds_from(middles[0], middles)
     length = end - start
     step = step_of(times, float(length[0]) if step_s is None and len(times) == 1 else step_s)

@@ -56,8 +56,8 @@ from lusee_bayes.instrument.times import (
     JD_SCALES,
     Windows,
     bounded,
+    later,
     seconds_from,
-    shifted,
     stamped,
     step_of,
     utc_bounds,
@@ -78,7 +78,7 @@ def window_variables(observation: Observation) -> dict[str, tuple[Any, ...]]:
     windows = observation.windows
     if windows is None:
         return {}
-    bounds = shifted(observation.times[:, None], windows.bounds_s)
+    bounds = later(observation.times[:, None], windows.bounds_s)
     values = (windows.sample, windows.start_s, windows.end_s, windows.live_s)
     return {
         "time_bounds": (("time", "bounds"), _datetimes(bounds), {}, ENCODING),

@@ -56,10 +56,10 @@ from lusee_bayes.instrument.products import (
     to_matrix,
 )
 from lusee_bayes.instrument.times import (
+    later,
     require_ephemeris,
     scale_of,
     seconds_from,
-    shifted,
     utc_from_text,
     utc_of,
 )
@@ -307,7 +307,7 @@ def _observation(
         else:
             first, step_s = start_of(said["LUNAR_DAY"]), said["DELTAT_SEC"]
             require_ephemeris(first.jd + np.array([(n_times - 1) * step_s / 86400.0]))
-            times = shifted(first, step_s * np.arange(n_times))
+            times = later(first, step_s * np.arange(n_times))
         site, zeros = (said["LUN_LONG_DEG"], said["LUN_LAT_DEG"]), np.zeros(n_times, dtype=int)
         return Observation(*site, times, zeros, (0.0,), said["DELTAT_SEC"])
 
@@ -513,7 +513,7 @@ def grid_of(
 def site_and_times(observation: Observation) -> dict[str, Any]:
     """Return the words of the header that say where and when."""
     # luseepy counts steps up to the end: half a step less leaves no room for rounding
-    end = shifted(observation.times[-1], -0.5 * observation.step_s)
+    end = later(observation.times[-1], -0.5 * observation.step_s)
     return {
         "LUNAR_DAY": f"{_written(observation.times[0])} to {_written(end)}",
         "LUN_LAT_DEG": observation.lat_deg,

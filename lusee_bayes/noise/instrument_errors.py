@@ -43,7 +43,12 @@ from lusee_bayes.core.checks import (
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, placed
+from lusee_bayes.instrument.beams.monopoles import (
+    Monopoles,
+    monopole_beams,
+    parameter,
+    with_values,
+)
 from lusee_bayes.instrument.coupling import Coupling
 from lusee_bayes.instrument.products import DataLayout, ports
 from lusee_bayes.noise.covariance import LowRankCovariance, TimeBandedCovariance
@@ -332,7 +337,7 @@ def derivative(name: str, frequency_mhz: float, lmax: int, monopoles: Monopoles)
     """
 
     def modes(value: Float[Array, ""]) -> Float[Array, "products modes"]:
-        return monopole_beams(frequency_mhz, lmax, placed(monopoles, {name: value})).modes
+        return monopole_beams(frequency_mhz, lmax, with_values(monopoles, {name: value})).modes
 
     value = parameter(name).where(monopoles)
     _, slope = jax.jvp(modes, (value,), (jnp.ones_like(value),))

@@ -348,7 +348,7 @@ def parameter(name: str) -> Parameter:
     return PARAMETERS[name]
 
 
-def placed(monopoles: Monopoles, values: Mapping[str, float | Float[Array, ""]]) -> Monopoles:
+def with_values(monopoles: Monopoles, values: Mapping[str, float | Float[Array, ""]]) -> Monopoles:
     """Return the antennas with other values of the named parameters.
 
     Raises

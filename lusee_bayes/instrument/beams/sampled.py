@@ -731,10 +731,10 @@ def read_beam(path: str | Path) -> ScalarBeam | PortResponse | SampledBeams:
         If there is no file, or as the reader of its kind.
     """
     path = require_file(path, "beam file", "check beam.file")
-    return READERS[kind_of(path)](path)
+    return READERS[beam_kind(path)](path)
 
 
-def kind_of(path: str | Path) -> str:
+def beam_kind(path: str | Path) -> str:
     """Return the kind of a beam file, the ``model`` of a scenario; others are luseepy's scalar.
 
     Raises
