@@ -43,12 +43,7 @@ from lusee_bayes.core.checks import (
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import (
-    Monopoles,
-    monopole_beams,
-    parameter,
-    with_values,
-)
+from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, with_values
 from lusee_bayes.instrument.coupling import Coupling
 from lusee_bayes.instrument.products import DataLayout, ports
 from lusee_bayes.noise.covariance import LowRankCovariance, TimeBandedCovariance
