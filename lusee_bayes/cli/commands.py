@@ -5,6 +5,13 @@ They are not in the docstrings of the commands: ``lusee-bayes --help`` imports n
 
 from __future__ import annotations
 
+# the module of each
+MODULES = {
+    "map_commands": ("map", "simulate", "reduce", "average"),
+    "sample_commands": ("sample", "validate"),
+    "plan_command": ("plan",),
+    "look_commands": ("compare", "compare-priors", "report", "info", "keys", "paper"),
+}
 # the summary, what else there is to know, and examples
 COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "simulate": (

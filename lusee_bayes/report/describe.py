@@ -54,9 +54,11 @@ def describe(path: str | Path) -> str:
         If the file is missing, or of none of these kinds; for a folder that no run has written.
     """
     if Path(path).is_dir():
-        return str(resolve_name("lusee_bayes.report.describe_results:describe_folder")(Path(path)))
-    path = require_file(path, "file")
-    kind = OWN_FORMATS.get(formats.format_of(path) or "")
-    if kind is None:
-        kind = next(kind for recognises, kind in KINDS if recognises(path))
-    return str(resolve_name(f"lusee_bayes.report.{kind}")(path))
+        path, kind = Path(path), "describe_results:describe_folder"
+    else:
+        path = require_file(path, "file")
+        kind = OWN_FORMATS.get(formats.format_of(path) or "")
+        if kind is None:
+            kind = next(kind for recognises, kind in KINDS if recognises(path))
+    first, *further = resolve_name(f"lusee_bayes.report.{kind}")(path)
+    return "\n".join([f"{path}: {first}", *(f"  {line}" for line in further)])

@@ -28,7 +28,6 @@ from lusee_bayes.results.finished_runs import FinishedRun, Provenance, compariso
 from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
 from lusee_bayes.runs.cost import require_resources
 from lusee_bayes.runs.folder import (
-    FIGURES,
     Output,
     Run,
     RunKind,
@@ -73,9 +72,7 @@ def run_compare(
 
 
 def _write_page(runs: list[FinishedRun], folder: Path) -> None:
-    (folder / "comparison.html").write_text(
-        comparison_page(runs, folder / FIGURES), encoding="utf-8"
-    )
+    (folder / "comparison.html").write_text(comparison_page(runs, folder), encoding="utf-8")
 
 
 # what the folder of a comparison holds; a new file is one line here
