@@ -1,22 +1,15 @@
-"""Runs, or priors, side by side.
-
-A comparison: finished map runs side by side.
-
-One data set mapped under several priors, and which of them it prefers.
-"""
+"""Comparisons: of finished map runs, and of one data set mapped under several priors."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.reading import write_csv
-from lusee_bayes.experiment.data_files import Data, read_data
-from lusee_bayes.experiment.experiment import Experiment, observed, with_truth
+from lusee_bayes.experiment.data_files import Data
+from lusee_bayes.experiment.experiment import Experiment, observed
 from lusee_bayes.experiment.rounds import about_sky, learned_prior, named_priors
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup
@@ -26,16 +19,20 @@ from lusee_bayes.report.figures.maps import curves_of_runs, maps_of_runs
 from lusee_bayes.report.figures.plans import priors
 from lusee_bayes.results.finished_runs import FinishedRun, Provenance, comparison_rows, read_runs
 from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
-from lusee_bayes.runs.cost import require_resources
+from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import (
+    SCENARIO,
     Output,
     Run,
     RunKind,
     inputs_of,
+    json_file,
     origin_of,
     require_marginal,
     require_single_frequency,
+    rows_file,
     run_folder,
+    text_file,
     write_run,
 )
 
@@ -80,7 +77,7 @@ COMPARISON = RunKind(
     "compare",
     outputs=(
         Output(_write_page),
-        Output(lambda runs, folder: write_csv(folder / "comparison.csv", comparison_rows(runs))),
+        rows_file("comparison.csv", comparison_rows),
     ),
     figures={"maps": maps_of_runs, "curves": curves_of_runs},
     dpi=100,
@@ -134,7 +131,7 @@ def run_compare_priors(
     scenario = load_scenario(scenario)
     engine, stages = engine or ThisProcess(side_by_side=1), stages or Stages()
     require_single_frequency("compare-priors", bool(scenario.frequencies_mhz))
-    require_marginal("compare-priors", "set treatment=marginalised", scenario.samples)
+    require_marginal("compare-priors", "set treatment=marginalised", scenario)
     sections = named_priors(priors, scenario, known_sky=data is None or truth)
     sections = {name: section.anchored() for name, section in sections.items()}
     names = ",".join(sections)
@@ -142,11 +139,7 @@ def run_compare_priors(
     with run_folder(
         folder, COMPARE_PRIORS, origin, replace=replace, inputs=inputs_of(scenario, data)
     ) as place:
-        measured = None if data is None else read_data(data, scenario)
-        require_resources(scenario, measured, stages)
-        experiment = observed(scenario, measured, stages)
-        if truth:
-            experiment = with_truth(experiment)
+        experiment = measured_experiment(scenario, data, stages, truth=truth, make=observed)
         with stages("data"):
             information = about_sky(experiment.setup, experiment.data)
 
@@ -172,20 +165,14 @@ def _under(name: str, setup: Setup, experiment: Experiment, information: Informa
     return UnderPrior.of(name, mapped, learned.log_evidence)
 
 
-def _write_texts(result: PriorComparison, folder: Path) -> None:
-    (folder / "priors.json").write_text(
-        json.dumps(result.as_json(), indent=2) + "\n", encoding="utf-8"
-    )
-    (folder / "priors.md").write_text(result.as_markdown(), encoding="utf-8")
-    (folder / "scenario.yaml").write_text(result.scenario.to_yaml(), encoding="utf-8")
-
-
 # what the folder of a comparison of priors holds; a new file is one line here
 COMPARE_PRIORS = RunKind(
     "compare-priors",
     outputs=(
-        Output(_write_texts),
-        Output(lambda result, folder: write_csv(folder / "priors.csv", result.rows())),
+        json_file("priors.json", lambda result: result.as_json()),
+        text_file("priors.md", lambda result: result.as_markdown()),
+        SCENARIO,
+        rows_file("priors.csv", lambda result: result.rows()),
     ),
     figures={"priors": priors},
 )

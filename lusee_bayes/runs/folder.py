@@ -1,8 +1,7 @@
-"""The folder of a run: written whole or not at all, and what it was made of.
+"""The folder of a run: written in one transaction, and what its results were made of.
 
-What results are made of: results of something else are not replaced unless that is asked for.
-
-The folder of a run: written in one transaction, and what it holds if that does not happen.
+Results of something else are not replaced unless that is asked for, and a run that is interrupted
+says what its folder holds.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from matplotlib.figure import Figure
+from pandas import DataFrame
 
 from lusee_bayes.core.arrays import use_compilation_cache
 from lusee_bayes.core.errors import InputError, WorkersLost
@@ -30,6 +30,7 @@ from lusee_bayes.core.files import (
     user_path,
 )
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.reading import write_csv
 from lusee_bayes.experiment.data_files import Data, digest_of, files_of, names_of_data
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.report.figures.drawing import save
@@ -172,6 +173,37 @@ class Output:
 
     write: Callable[[Any, Path], None]
     wanted: Callable[[Any], bool] = lambda result: True
+
+
+def text_file(name: str, text: Callable[[Any], str]) -> Output:
+    """A file of text, UTF-8."""
+    return Output(lambda result, folder: _write_text(folder / name, text(result)))
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+def json_file(name: str, figures: Callable[[Any], Mapping[str, Any]]) -> Output:
+    """A file of JSON."""
+    return text_file(name, lambda result: json.dumps(figures(result), indent=2) + "\n")
+
+
+def rows_file(name: str, rows: Callable[[Any], Sequence[Mapping[str, object]]]) -> Output:
+    """A table, row by row."""
+    return Output(lambda result, folder: write_csv(folder / name, rows(result)))
+
+
+def table_file(name: str, table: Callable[[Any], DataFrame | None]) -> Output:
+    """A table of pandas; None where the run has none."""
+
+    def write(result: Any, folder: Path) -> None:
+        table(result).to_csv(folder / name, index=False)
+
+    return Output(write, lambda result: table(result) is not None)
+
+
+SCENARIO = text_file("scenario.yaml", lambda result: result.scenario.to_yaml())
 
 
 @dataclass(frozen=True)
@@ -337,14 +369,14 @@ def write_run(
                 provenance.write(stage)
             if kind.name in PAGES:
                 page = PAGES[kind.name](stage, folder.resolve().name)
-                (stage / REPORT).write_text(page, encoding="utf-8")
+                _write_text(stage / REPORT, page)
         files = sorted(path.relative_to(stage) for path in stage.rglob("*") if path.is_file())
     return Run(result, folder, [folder / name for name in files])
 
 
-def require_marginal(what: str, advice: str, samples: bool) -> None:
+def require_marginal(what: str, advice: str, scenario: Scenario) -> None:
     """InputError where what makes maps is to sample something."""
-    if samples:
+    if scenario.samples:
         raise InputError(
             f"the scenario says that something is to be sampled, and {what} can only marginalise; "
             f"{advice}"

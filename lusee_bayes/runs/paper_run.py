@@ -11,11 +11,19 @@ from pathlib import Path
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.reading import write_csv
 from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios, read_case
 from lusee_bayes.paper.claims import Cases, claim_table, claims_as_markdown
 from lusee_bayes.paper.figures import FIGURES
-from lusee_bayes.runs.folder import Output, Run, RunKind, origin_of, run_folder, write_run
+from lusee_bayes.runs.folder import (
+    Output,
+    Run,
+    RunKind,
+    origin_of,
+    rows_file,
+    run_folder,
+    text_file,
+    write_run,
+)
 
 CASES, UNFINISHED = "cases", "unfinished-cases"
 RESUME = "the same command continues from the finished cases"
@@ -100,21 +108,14 @@ def _write_cases(computed: _Computed, folder: Path) -> None:
             shutil.copy2(path, target)
 
 
-def _write_claims(computed: _Computed, folder: Path) -> None:
-    claims = claim_table(computed.cases)
-    write_csv(folder / "claims.csv", claims)
-    (folder / "claims.md").write_text(claims_as_markdown(claims), encoding="utf-8")
-
-
 # what the folder of the paper's run holds; a new file is one line here
 PAPER = RunKind(
     "paper",
     outputs=(
         Output(_write_cases),
-        Output(
-            lambda computed, folder: write_csv(folder / "cases.csv", case_table(computed.cases))
-        ),
-        Output(_write_claims),
+        rows_file("cases.csv", lambda computed: case_table(computed.cases)),
+        rows_file("claims.csv", lambda computed: claim_table(computed.cases)),
+        text_file("claims.md", lambda computed: claims_as_markdown(claim_table(computed.cases))),
     ),
     figures={
         name: lambda computed, draw=draw: draw(computed.cases) for name, draw in FIGURES.items()

@@ -8,16 +8,16 @@ from pathlib import Path
 
 from lusee_bayes.core.engine import Engine, ThisProcess
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.reading import naming, write_csv
+from lusee_bayes.core.reading import naming
 from lusee_bayes.report.figures.plans import forecasts
 from lusee_bayes.results.forecast import Forecast, Variation, forecast_rows
 from lusee_bayes.runs.cost import posterior_cost, require_fits
 from lusee_bayes.runs.folder import (
-    Output,
     Run,
     RunKind,
     inputs_of,
     origin_of,
+    rows_file,
     run_folder,
     write_run,
 )
@@ -76,9 +76,7 @@ def run_plan(
 # what the folder of a plan holds; a new file is one line here
 PLAN = RunKind(
     "plan",
-    outputs=(
-        Output(lambda forecasts, folder: write_csv(folder / "plan.csv", forecast_rows(forecasts))),
-    ),
+    outputs=(rows_file("plan.csv", forecast_rows),),
     figures={"plan": forecasts},
     unfinished=UNFINISHED,
 )

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from lusee_bayes.core.engine import Engine
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.data_files import Data, read_data
-from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.report.figures.sampling import comparison, rank_statistics
 from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.sample_result import CHAINS
 from lusee_bayes.results.validation_result import ValidationResult
-from lusee_bayes.runs.cost import require_resources
-from lusee_bayes.runs.folder import Output, Run, RunKind, inputs_of, run_folder, write_run
+from lusee_bayes.runs.cost import measured_experiment
+from lusee_bayes.runs.folder import (
+    Output,
+    Run,
+    RunKind,
+    inputs_of,
+    json_file,
+    run_folder,
+    text_file,
+    write_run,
+)
 from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_origin
 from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling.hmc import Sampler, require_draws, require_simulations
@@ -76,9 +83,8 @@ def run_validate(
     origin = sample_origin(scenario, data, program)
     inputs = inputs_of(scenario, data, program.path)
     with run_folder(folder, VALIDATION, origin, RESUME, replace=replace, inputs=inputs) as place:
-        measured = None if data is None else read_data(data, scenario)
-        require_resources(scenario, measured, stages, sampler.chains * sampler.draws)
-        experiment = build(scenario, measured, stages)
+        n_draws = sampler.chains * sampler.draws
+        experiment = measured_experiment(scenario, data, stages, n_draws=n_draws)
         sampled = sample_result(experiment, program, sampler, place, resume=resume, stages=stages)
         posterior, model = sampled.inference.posterior, sampled.inference.model
         with stages("comparison"):
@@ -105,17 +111,14 @@ def _of_sampled(output: Output) -> Output:
     return Output(lambda result, folder: output.write(result.sampled, folder))
 
 
-def _write_verdict(result: ValidationResult, folder: Path) -> None:
-    (folder / "validation.json").write_text(
-        json.dumps(result.as_json(), indent=2) + "\n", encoding="utf-8"
-    )
-    (folder / "validation.md").write_text(result.as_markdown(), encoding="utf-8")
-
-
 # what the folder of a validation holds; a new file is one line here
 VALIDATION = RunKind(
     "validate",
-    outputs=(*map(_of_sampled, SAMPLE_OUTPUTS), Output(_write_verdict)),
+    outputs=(
+        *map(_of_sampled, SAMPLE_OUTPUTS),
+        json_file("validation.json", lambda result: result.as_json()),
+        text_file("validation.md", lambda result: result.as_markdown()),
+    ),
     figures={
         "comparison": lambda result: comparison(result.comparison),
         "calibration": lambda result: rank_statistics(result.ranks),

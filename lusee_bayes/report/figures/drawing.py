@@ -41,6 +41,8 @@ BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#666666"
 # distinct without colour vision (Okabe-Ito), and by their lines
 COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#56B4E9", "#000000")
 LINES = ("-", "--", "-.", ":")
+# inches, across and down
+Size = tuple[float | int, float | int]
 # of PNGs: a fifth larger than with 6, and written in a third of the time
 COMPRESSION = 2
 
@@ -55,14 +57,14 @@ def save(figure: Figure, path: Path, dpi: int) -> None:
     imsave(path, canvas.buffer_rgba(), dpi=dpi, pil_kwargs={"compress_level": COMPRESSION})
 
 
-def framed(size: tuple[float, float], rows: int = 1, columns: int = 1, **options: object):
+def framed(size: Size, rows: int = 1, columns: int = 1, **options: object):
     """Make a figure of some size and its axes, one or an array of them, laid out by themselves."""
     figure = Figure(figsize=size, layout="constrained")
     return figure, figure.subplots(rows, columns, **options)
 
 
 def placed(
-    size: tuple[float, float], rows: int = 1, columns: int = 1, **places: float
+    size: Size, rows: int = 1, columns: int = 1, **places: float
 ) -> tuple[Figure, list[Axes]]:
     """Make a figure and all its axes in fixed places, which needs no layout."""
     figure = Figure(figsize=size)

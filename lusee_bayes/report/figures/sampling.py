@@ -22,6 +22,7 @@ from lusee_bayes.report.figures.drawing import (
     GREY,
     ORANGE,
     SEQUENTIAL,
+    Size,
     framed,
     note,
     plain_ticks,
@@ -80,7 +81,7 @@ def _drawn(
     group: str,
     quantities: Quantities,
     title: str,
-    size: tuple[float, float],
+    size: Size,
     **options: object,
 ) -> Figure:
     """ArviZ's figure, which pyplot then forgets; a note where draws do not suffice for it."""
