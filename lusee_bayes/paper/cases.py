@@ -69,7 +69,7 @@ def paper_scenarios(
     scenarios = {
         name: load_scenario(base, [*changes, *overrides]) for name, (base, changes) in CASES.items()
     }
-    return {name: with_sky(s, files) for name, s in scenarios.items()} if files else scenarios
+    return {name: with_sky_file(s, files) for name, s in scenarios.items()} if files else scenarios
 
 
 def sky_frequency_mhz(path: str | Path) -> float:
@@ -87,7 +87,7 @@ def sky_frequency_mhz(path: str | Path) -> float:
     return float(found[1])
 
 
-def with_sky(scenario: Scenario, files: Mapping[float, Path]) -> Scenario:
+def with_sky_file(scenario: Scenario, files: Mapping[float, Path]) -> Scenario:
     """The scenario with the file (by MHz) nearest in log frequency, scaled to its frequency."""
     nearest = min(files, key=lambda f: abs(np.log(f / scenario.frequency_mhz)))
     sky = FileSkySection(file=str(files[nearest]), file_frequency_mhz=nearest)

@@ -49,9 +49,14 @@ Judge = Callable[[Cases], Verdict]
 CLAIMS: list[Claim] = []
 
 
-def claim(section: str, statement: str, otherwise: str) -> Callable[[Judge], None]:
+def claim(section: str, statement: str, otherwise: str) -> Callable[[Judge], Judge]:
     """A decorator that adds its judge to the claims."""
-    return lambda judge: CLAIMS.append(Claim(section, statement, otherwise, judge))
+
+    def register(judge: Judge) -> Judge:
+        CLAIMS.append(Claim(section, statement, otherwise, judge))
+        return judge
+
+    return register
 
 
 def grade(obtained: str, agrees: bool | np.bool_, partly: bool | np.bool_ = False) -> Verdict:
@@ -96,7 +101,7 @@ def power_ratio(case: xr.Dataset, low: int, high: int) -> float:
     return middle((case["cl_mean"].values / case["cl_truth"].values)[low : high + 1])
 
 
-def observed(case: xr.Dataset) -> Bool[np.ndarray, " pixels"]:
+def ever_up(case: xr.Dataset) -> Bool[np.ndarray, " pixels"]:
     """Pixels that were ever above the horizon."""
     return case["highest_altitude"].values > 0
 
@@ -104,12 +109,12 @@ def observed(case: xr.Dataset) -> Bool[np.ndarray, " pixels"]:
 def residual_percent(case: xr.Dataset) -> float:
     """Median over the observed sky of |mean - truth|, in per cent of the true mean."""
     mean, truth = case["mean"].values, case["truth"].values
-    return 100.0 * middle(np.abs(mean - truth)[observed(case)]) / float(truth.mean())
+    return 100.0 * middle(np.abs(mean - truth)[ever_up(case)]) / float(truth.mean())
 
 
 def likeness(case: xr.Dataset) -> float:
     """Correlation of map and truth over the observed pixels, means removed."""
-    seen = observed(case)
+    seen = ever_up(case)
     return float(np.corrcoef(case["mean"].values[seen], case["truth"].values[seen])[0, 1])
 
 
@@ -285,7 +290,7 @@ def _overdetermined(cases: Cases) -> Verdict:
 def _mean_temperature(cases: Cases) -> Verdict:
     off = [100 * abs(float(c["mean"].mean() / c["truth"].mean()) - 1) for c in bands(cases)]
     seen = [
-        100 * abs(float(c["mean"][observed(c)].mean() / c["truth"][observed(c)].mean()) - 1)
+        100 * abs(float(c["mean"][ever_up(c)].mean() / c["truth"][ever_up(c)].mean()) - 1)
         for c in bands(cases)
     ]
     return grade(
@@ -356,7 +361,7 @@ def _residuals(cases: Cases) -> Verdict:
     "pole, next to the ecliptic pole and not the Earth's",
 )
 def _unobserved_cap(cases: Cases) -> Verdict:
-    hidden = ~observed(cases["fiducial"])
+    hidden = ~ever_up(cases["fiducial"])
     nside = healpy.npix2nside(hidden.size)
     radius = float(np.degrees(np.arccos(1 - 2 * hidden.mean())))
     centre = np.array(healpy.pix2vec(nside, np.flatnonzero(hidden))).sum(axis=1)
@@ -558,7 +563,7 @@ FRINGES = (
 
 
 def rmsd(case: str, percent: float) -> Judge:
-    """Whether a case's beams differ by some per cent rms, to 30 % (partly: between half and two)."""
+    """Whether a case's beams differ by ``percent`` rms, to 30 % (partly: to a factor of two)."""
 
     def judge(cases: Cases) -> Verdict:
         found = 100 * cases[case].attrs["beam_rms_difference"]
@@ -638,7 +643,7 @@ def _cycles_snr(cases: Cases) -> Verdict:
 )
 def _half_cycle(cases: Cases) -> Verdict:
     half, full = cases["half_cycle"], cases["fiducial"]
-    share = observed(half).sum() / observed(full).sum()
+    share = ever_up(half).sum() / ever_up(full).sum()
     data = half.attrs["n_data"] / half.attrs["n_modes"]
     return grade(
         f"half a cycle sees {100 * share:.1f} % of what a full one sees, {data:.2f} data per mode "
@@ -687,7 +692,7 @@ def _quarter_galaxy(cases: Cases) -> Verdict:
     case = cases["quarter_cycle"]
     alike = likeness(case)
     return grade(
-        f"correlation with the truth {alike:.2f} over the {100 * observed(case).mean():.0f} % of "
+        f"correlation with the truth {alike:.2f} over the {100 * ever_up(case).mean():.0f} % of "
         "the sky that it sees",
         alike > 0.7,
         alike > 0.4,

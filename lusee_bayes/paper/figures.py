@@ -69,7 +69,7 @@ MAP_CASES = (
 )  # fmt: skip
 
 
-def beams(cases: Cases) -> Figure:
+def beam_panels(cases: Cases) -> Figure:
     """Figure 2: an auto and two crosses at five frequencies, each over its peak."""
     figure, panels = framed((13, 8), 3, len(SHOWN_FREQUENCIES))
     for column, frequency in enumerate(SHOWN_FREQUENCIES):
@@ -84,7 +84,7 @@ def beams(cases: Cases) -> Figure:
     return figure
 
 
-def data_vector(cases: Cases) -> Figure:
+def data_by_product(cases: Cases) -> Figure:
     """Figure 3: the products at 25 MHz side by side, time running within each."""
     data = cases["fiducial"]["data"]
     n_products, n_times = data.shape
@@ -126,7 +126,7 @@ def frequency_maps(cases: Cases) -> Figure:
             axes.set_title(f"{frequency} MHz, {name}", fontsize=10)
             axes.set_xticklabels([])
             axes.set_yticklabels([])
-            colour_bar(figure, axes, image, "K" if row < 2 else "% of the mean sky")
+            flat_bar(figure, axes, image, "K" if row < 2 else "% of the mean sky")
     figure.suptitle(
         "Galactic coordinates, longitude grows to the left; dashed: never observed; drawn through "
         f"a beam of {taper_fwhm_deg(lmax_of(case.sizes['mode'])):.1f}° (FWHM)"
@@ -139,7 +139,7 @@ def drawn(case: xr.Dataset, name: str) -> Float[np.ndarray, " pixels"]:
     return shown(case[f"{name}_modes"].values, healpy.npix2nside(case.sizes["pixel"]))
 
 
-def colour_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> None:
+def flat_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> None:
     """A flat bar below; three round numbers on a logarithmic one."""
     bar = figure.colorbar(
         image,
@@ -187,7 +187,10 @@ def dress(axes: Axes, metric: str, lmax: int) -> None:
 
 
 def by_scenario(cases: Cases, metric: str) -> Figure:
-    """Figures 7, 8: rho_ell or SNR_ell at 25 MHz, a panel for each group of scenarios, the fiducial one in black in all of them."""
+    """Figures 7, 8: rho_ell or SNR_ell at 25 MHz, a panel for each group of scenarios.
+
+    The fiducial one is black in all of them.
+    """
     figure, panels = framed((12, 8), 2, 2, sharex=True, sharey=True)
     for axes, (title, (colour, members)) in zip(panels.flat, GROUPS.items(), strict=True):
         curve = cases["fiducial"][metric]
@@ -225,7 +228,7 @@ def scenario_maps(cases: Cases) -> Figure:
         axes.set_title(title, fontsize=11)
         axes.set_xticklabels([])
         axes.set_yticklabels([])
-    colour_bar(figure, figure.axes, image, "K")
+    flat_bar(figure, figure.axes, image, "K")
     lmax = lmax_of(cases["fiducial"].sizes["mode"])
     figure.suptitle(
         "Maps at 25 MHz, Galactic coordinates; dashed: never observed; drawn through a beam of "
@@ -235,8 +238,8 @@ def scenario_maps(cases: Cases) -> Figure:
 
 
 FIGURES = {
-    "2_beams": beams,
-    "3_data_vector": data_vector,
+    "2_beams": beam_panels,
+    "3_data_vector": data_by_product,
     "4_frequency_maps": frequency_maps,
     "5_rho_frequencies": lambda cases: by_frequency(cases, "rho"),
     "6_snr_frequencies": lambda cases: by_frequency(cases, "snr"),

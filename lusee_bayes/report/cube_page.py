@@ -82,7 +82,7 @@ def cube_page(folder: Path, name: str) -> str:
         summary,
         [
             html.verdict(summary["level"], summary["verdict"]),
-            html.doubts(where, summary),
+            html.doubtful(where, summary),
             "\n".join(html.paragraph(text, html.BAD) for text in unmapped),
         ],
         {

@@ -189,7 +189,7 @@ def sentences(path: Path, found: Mapping[str, Any], name: str) -> list[str]:
     return told
 
 
-def doubts(path: Path, found: Mapping[str, Any]) -> str:
+def doubtful(path: Path, found: Mapping[str, Any]) -> str:
     """What is doubtful about the data, as a run's figures tell it.
 
     InputError as :func:`sentences`.
@@ -198,7 +198,7 @@ def doubts(path: Path, found: Mapping[str, Any]) -> str:
     return "\n".join(paragraph(f"Doubtful: {text}", TENSE) for text in told)
 
 
-def about(folder: Path, channels: str) -> str:
+def provenance(folder: Path, channels: str) -> str:
     """Where the results come from; ``channels``: the frequencies in words."""
     found = Provenance.read(folder)
     if found is None:
@@ -283,7 +283,7 @@ def run_page(
         ("run", "The run"): details(folder, figures),
     }
     parts = [section(*name, inside) for name, inside in sections.items()]
-    return page(title, [contents(list(sections)), *head, about(folder, channels), *parts])
+    return page(title, [contents(list(sections)), *head, provenance(folder, channels), *parts])
 
 
 def details(folder: Path, figures: Mapping[str, Any]) -> list[str]:

@@ -50,7 +50,7 @@ def map_page(folder: Path, name: str) -> str:
         [
             html.verdict(found.attrs["level"], found.attrs["verdict"]),
             *_mistakes(folder, summary),
-            html.doubts(folder / "summary.json", summary),
+            html.doubtful(folder / "summary.json", summary),
         ],
         {
             ("map", "The map"): _map(folder, summary, found),

@@ -100,7 +100,7 @@ def sample_page(folder: Path, name: str) -> str:
         [
             html.paragraph(" ".join([*reasons[:1], verdict, *reasons[1:]]), kind),
             html.paragraph(CRITERIA, "threshold"),
-            html.doubts(folder / "sampling.json", sampling),
+            html.doubtful(folder / "sampling.json", sampling),
         ],
         sections,
     )

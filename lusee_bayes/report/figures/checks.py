@@ -24,8 +24,8 @@ from lusee_bayes.report.figures.drawing import (
     ORANGE,
     colour_bar,
     framed,
+    in_places,
     mollweide,
-    placed,
     plain_ticks,
     temperatures,
     without_minor_ticks,
@@ -45,7 +45,7 @@ def draws_of_posterior(found: xr.Dataset) -> Figure:
     altitude = found["highest_altitude"].values
     rows = (len(maps) + 1) // 2
     places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.9, "wspace": 0.02}
-    figure, grid_of_axes = placed((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
+    figure, grid_of_axes = in_places((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
     for k, (axes, pixels) in enumerate(zip(grid_of_axes, maps, strict=True)):
         image = mollweide(axes, pixels, norm=scale, highest_altitude=altitude)
         axes.set_title(f"draw {k + 1}")

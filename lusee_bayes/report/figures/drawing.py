@@ -63,7 +63,7 @@ def framed(size: Size, rows: int = 1, columns: int = 1, **options: object):
     return figure, figure.subplots(rows, columns, **options)
 
 
-def placed(
+def in_places(
     size: Size, rows: int = 1, columns: int = 1, **places: float
 ) -> tuple[Figure, list[Axes]]:
     """Make a figure and all its axes in fixed places, which needs no layout."""

@@ -24,8 +24,8 @@ from lusee_bayes.report.figures.drawing import (
     ORANGE,
     SEQUENTIAL,
     framed,
+    in_places,
     orthographic,
-    placed,
     seen_range,
     shown,
     sky_panel,
@@ -40,7 +40,7 @@ from lusee_bayes.results.finished_runs import FinishedRun
 
 def data_vector(data: Visibilities) -> Figure:
     """The data vector as the paper draws it: products side by side, time running within each."""
-    figure, (axes,) = placed((11, 4), left=0.08, right=0.99, bottom=0.13, top=0.91)
+    figure, (axes,) = in_places((11, 4), left=0.08, right=0.99, bottom=0.13, top=0.91)
     n_times = data.layout.n_times
     axes.plot(data.grid().ravel(), color=BLUE, lw=0.7)
     for k in range(1, data.layout.n_products):
@@ -67,7 +67,7 @@ def beams(setup: Setup) -> Figure:
         names = {0: "auto 00 (North)", 2: "|cross 02| (opposite)", 1: "|cross 01| (perpendicular)"}
     panels = [(name, patterns[0, k]) for k, name in names.items() if k < len(patterns)]
     places = {"left": 0.01, "right": 0.99, "bottom": 0.02, "top": 0.82, "wspace": 0.04}
-    figure, grid_of_axes = placed((11, 4), 1, len(panels), **places)
+    figure, grid_of_axes = in_places((11, 4), 1, len(panels), **places)
     for axes, (title, pattern) in zip(grid_of_axes, panels, strict=True):
         image = orthographic(axes, grid, pattern)
         axes.set_title(title)
@@ -100,7 +100,7 @@ def sky_maps(channel: ChannelResult) -> Figure:
     }
     rows = (len(panels) + 1) // 2
     places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.88, "wspace": 0.06}
-    figure, grid_of_axes = placed((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
+    figure, grid_of_axes = in_places((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
     for axes, (title, panel) in zip(grid_of_axes, panels.items(), strict=True):
         sky_panel(axes, title, *panel, altitude=altitude, shrink=0.8, pad=0.03)
     figure.suptitle(
@@ -116,7 +116,7 @@ def map_fidelity(channel: ChannelResult) -> Figure:
     spectra = channel.spectra()
     known = "snr" in spectra
     places = {"left": 0.06 if known else 0.14, "right": 0.98, "bottom": 0.13, "top": 0.9}
-    figure, panels = placed((12 if known else 5, 4), 1, 3 if known else 1, **places, wspace=0.25)
+    figure, panels = in_places((12 if known else 5, 4), 1, 3 if known else 1, **places, wspace=0.25)
     _fidelity(panels, spectra, color=BLUE)
     panels[-1].axhline(0.5, color=GREY, lw=0.8, ls=":")
     if known:
@@ -152,7 +152,7 @@ def _fidelity(
 def sky_spectra(channel: ChannelResult) -> Figure:
     """C_ell of prior, posterior mean, truth and posterior variance."""
     columns = channel.spectra()
-    figure, (axes,) = placed((6, 4.5), left=0.13, right=0.97, bottom=0.12, top=0.92)
+    figure, (axes,) = in_places((6, 4.5), left=0.13, right=0.97, bottom=0.12, top=0.92)
     ell = columns["ell"]
     styles = {
         "cl_prior": ("prior", GREY, "-"),
