@@ -113,8 +113,7 @@ def validate_command(
     resolved = options.loaded(scenario)
     from lusee_bayes.cli.tables import checks_table
     from lusee_bayes.report.pages import REPORT
-    from lusee_bayes.runs.cost import demand_of_calibration
-    from lusee_bayes.runs.validate_run import run_validate
+    from lusee_bayes.runs.validate_run import demand_of_calibration, run_validate
 
     with engine.open(demand_of_calibration(resolved)) as opened:
         run = run_validate(

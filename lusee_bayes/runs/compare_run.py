@@ -25,15 +25,13 @@ from lusee_bayes.runs.folder import (
     Output,
     Run,
     RunKind,
-    inputs_of,
     json_file,
-    origin_of,
     require_marginal,
     require_single_frequency,
     rows_file,
     run_folder,
+    scenario_run,
     text_file,
-    write_run,
 )
 
 
@@ -63,9 +61,8 @@ def run_compare(
         For fewer than two folders, or one that is not of a finished map run.
     """
     stages = stages or Stages()
-    origin = origin_of()
-    with run_folder(folder, COMPARISON, origin, replace=replace, inputs=folders) as place:
-        return write_run(place, read_runs(folders), COMPARISON, origin, stages)
+    with run_folder(folder, COMPARISON, {}, replace=replace, inputs=folders) as run:
+        return run.write(read_runs(folders), stages)
 
 
 def _write_page(runs: list[FinishedRun], folder: Path) -> None:
@@ -134,11 +131,8 @@ def run_compare_priors(
     require_marginal("compare-priors", "set treatment=marginalised", scenario)
     sections = named_priors(priors, scenario, known_sky=data is None or truth)
     sections = {name: section.anchored() for name, section in sections.items()}
-    names = ",".join(sections)
-    origin = origin_of(scenario, data, truth=truth or None, priors=names)
-    with run_folder(
-        folder, COMPARE_PRIORS, origin, replace=replace, inputs=inputs_of(scenario, data)
-    ) as place:
+    origin = {"truth": truth or None, "priors": ",".join(sections)}
+    with scenario_run(folder, COMPARE_PRIORS, scenario, data, replace=replace, **origin) as run:
         experiment = measured_experiment(scenario, data, stages, truth=truth, make=observed)
         with stages("data"):
             information = about_sky(experiment.setup, experiment.data)
@@ -147,11 +141,11 @@ def run_compare_priors(
             setup = experiment.setup.with_prior(sections[prior])
             return _under(prior, setup, experiment, information)
 
-        engine.work_in(place)
+        engine.work_in(run.path)
         found = engine.each(Tasks(under, list(sections), list(sections)), stages, "priors")
         result = PriorComparison(name, scenario, tuple(found), stages.seconds)
         provenance = Provenance.of_experiment(experiment, data)
-        return write_run(place, result, COMPARE_PRIORS, origin, stages, provenance)
+        return run.write(result, stages, provenance)
 
 
 def _under(name: str, setup: Setup, experiment: Experiment, information: Information) -> UnderPrior:

@@ -24,7 +24,6 @@ from lusee_bayes.experiment.leave_out import ARRAYS, MOST_MEMORY
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.runs.cube import lmax_of_fields
-from lusee_bayes.sampling.validation import BATCH, N_DRAWS
 
 # measured at lmax 12 to 80 and up to 3e5 data (docs/commands.md): what is there before anything is
 # computed, and what each datum takes from reading to the report
@@ -287,8 +286,3 @@ def _smaller(scenario: Scenario) -> Iterator[tuple[str, float | str, Scenario]]:
     for times in range(1, 40):
         step_s = float(ceil(scenario.observation.step_s)) * 2.0**times
         yield "observation.step_s", step_s, changed("observation", step_s=step_s)
-
-
-def demand_of_calibration(scenario: Scenario) -> Demand:
-    """What simulation-based calibration takes, in batches that use all processors."""
-    return replace(demand_of([posterior_cost(scenario, BATCH * N_DRAWS)]), side_by_side=1)

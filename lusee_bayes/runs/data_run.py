@@ -31,7 +31,7 @@ from lusee_bayes.instrument.averaging import averaged, product_live_s
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import NO_ROOM, write_four_port, write_waterfall
 from lusee_bayes.runs.cost import require_fits, require_resources, simulation_cost
-from lusee_bayes.runs.folder import RunKind, inputs_of, origin_of, run_folder
+from lusee_bayes.runs.folder import RunKind, inputs_of, scenario_run
 from lusee_bayes.runs.forecasting import expected_posterior
 
 
@@ -237,10 +237,9 @@ def run_simulate_flight(
     stages = stages or Stages()
     if frequencies_mhz:
         scenario = scenario.model_copy(update={"frequencies_mhz": tuple(frequencies_mhz)})
-    origin, inputs = origin_of(scenario), inputs_of(scenario)
-    with run_folder(folder, FLIGHT, origin, replace=replace, inputs=inputs) as place:
-        made = simulate_flight(scenario, stages)
-        with transaction(place, FLIGHT.name, origin=origin) as stage:
+    with scenario_run(folder, FLIGHT, scenario, replace=replace) as run:
+        made, place = simulate_flight(scenario, stages), run.path
+        with transaction(place, FLIGHT.name, origin=run.origin) as stage:
             names = _write_flight(made, stage, place.resolve(), stages)
         paths = tuple(place / name for name in names)
         return FlightFiles(paths, place / SCENARIO, made.observation.n_times)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -57,7 +57,7 @@ def origin_of(
     Returns
     -------
     dict
-        For :func:`.run_folder` and :func:`.write_run`.
+        For :func:`.run_folder`.
 
     Raises
     ------
@@ -223,6 +223,8 @@ class RunKind:
         Of the figures.
     after : sequence of str
         Kinds of runs whose results in the folder, of the same origin, it takes over.
+    resume : str
+        How a run that was stopped is gone on with.
     """
 
     name: str
@@ -231,6 +233,64 @@ class RunKind:
     unfinished: str = ""
     dpi: int = 110
     after: Sequence[str] = ()
+    resume: str = ""
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The folder of a run while it is open.
+
+    Attributes
+    ----------
+    path : Path
+    kind : RunKind
+    origin : mapping
+        What the results are made of (:func:`.origin_of`).
+    """
+
+    path: Path
+    kind: RunKind
+    origin: Origin
+
+    def write(
+        self, result: Result, stages: Stages, provenance: Provenance | None = None
+    ) -> Run[Result]:
+        """Draw all figures and write all files of a run, in one transaction.
+
+        Parameters
+        ----------
+        result : object
+            What the outputs and figures of the kind take.
+        stages : Stages
+            Told what is being done.
+        provenance : Provenance, optional
+            Where the data come from, for the head of the page.
+
+        Returns
+        -------
+        Run
+            With the files in the folder.
+        """
+        kind, folder = self.kind, self.path
+        discard = [kind.unfinished] if kind.unfinished else []
+        with transaction(folder, kind.name, discard, self.origin) as stage:
+            if kind.figures:
+                (stage / FIGURES).mkdir()
+                with stages("figures"):
+                    for name, draw in kind.figures.items():
+                        if (figure := draw(result)) is not None:
+                            save(figure, stage / FIGURES / f"{name}.png", kind.dpi)
+            with stages("files"):
+                for output in kind.outputs:
+                    if output.wanted(result):
+                        output.write(result, stage)
+                if provenance is not None:
+                    provenance.write(stage)
+                if kind.name in PAGES:
+                    page = PAGES[kind.name](stage, folder.resolve().name)
+                    _write_text(stage / REPORT, page)
+            files = sorted(path.relative_to(stage) for path in stage.rglob("*") if path.is_file())
+        return Run(result, folder, [folder / name for name in files])
 
 
 @contextmanager
@@ -238,11 +298,10 @@ def run_folder(
     folder: str | Path,
     kind: RunKind,
     origin: Origin,
-    resume: str = "",
     *,
     replace: bool = False,
     inputs: Iterable[str | Path] = (),
-) -> Iterator[Path]:
+) -> Iterator[RunFolder]:
     """Open a folder for a run, and say what it holds if the run is interrupted.
 
     Parameters
@@ -251,8 +310,6 @@ def run_folder(
     kind : RunKind
     origin : mapping
         What the results are made of (:func:`.origin_of`).
-    resume : str
-        How the run is gone on with.
     replace : bool
         Replace results of another run.
     inputs : iterable of path
@@ -260,8 +317,8 @@ def run_folder(
 
     Yields
     ------
-    Path
-        The folder; an interrupted transaction of an earlier run is completed.
+    RunFolder
+        An interrupted transaction of an earlier run is completed.
 
     Raises
     ------
@@ -286,15 +343,14 @@ def run_folder(
             before = _written_at(folder)
             use_compilation_cache()
             try:
-                yield folder
+                yield RunFolder(folder, kind, origin)
             except RunInterrupted:
                 # of a run in a folder inside this one
                 raise
             except KeyboardInterrupt as interrupt:
-                raise RunInterrupted(_state(folder, before, kind.unfinished, resume)) from interrupt
+                raise RunInterrupted(_state(folder, before, kind)) from interrupt
             except WorkersLost as error:
-                state = _state(folder, before, kind.unfinished, resume)
-                raise WorkersLost(f"{error}; {state}") from error
+                raise WorkersLost(f"{error}; {_state(folder, before, kind)}") from error
     finally:
         # nothing written: nothing left
         for place in ([folder / kind.unfinished] if kind.unfinished else []) + made:
@@ -314,64 +370,43 @@ def _written_at(folder: Path) -> int | None:
     return manifest.stat().st_mtime_ns if manifest.is_file() else None
 
 
-def _state(folder: Path, before: int | None, unfinished: str, resume: str) -> str:
+def _state(folder: Path, before: int | None, kind: RunKind) -> str:
     recover(folder)
     now = _written_at(folder)
     if now is not None and now != before:
         return f"the new results in '{folder}' are complete"
     earlier = "no results are written" if now is None else "the earlier results are as they were"
-    if unfinished and any((folder / unfinished).glob("*")):
-        return f"{earlier} in '{folder}'; {resume}"
+    if kind.unfinished and any((folder / kind.unfinished).glob("*")):
+        return f"{earlier} in '{folder}'; {kind.resume}"
     return f"{earlier} in '{folder}'"
 
 
-def write_run(
-    folder: Path,
-    result: Result,
+def scenario_run(
+    folder: str | Path,
     kind: RunKind,
-    origin: Origin,
-    stages: Stages,
-    provenance: Provenance | None = None,
-) -> Run[Result]:
-    """Draw all figures and write all files of a run, in one transaction.
+    scenario: Scenario,
+    data: Data | None = None,
+    *inputs: str | Path | None,
+    replace: bool = False,
+    **others: object,
+) -> AbstractContextManager[RunFolder]:
+    """Open a folder for a run of a scenario and data (:func:`run_folder`).
 
     Parameters
     ----------
-    folder : Path
-    result : object
-        What the outputs and figures of ``kind`` take.
+    folder : path
     kind : RunKind
-    origin : mapping
-        What the results are made of (:func:`.origin_of`).
-    stages : Stages
-        Told what is being done.
-    provenance : Provenance, optional
-        Where the data come from, for the head of the page.
-
-    Returns
-    -------
-    Run
-        With the files in the folder.
+    scenario : Scenario
+    data : Visibilities, path, or sequence of them, optional
+    *inputs
+        Other files that the run reads, if given (:func:`inputs_of`).
+    replace : bool
+        Replace results of another run.
+    **others
+        What else determines the numbers (:func:`origin_of`).
     """
-    discard = [kind.unfinished] if kind.unfinished else []
-    with transaction(folder, kind.name, discard, origin) as stage:
-        if kind.figures:
-            (stage / FIGURES).mkdir()
-            with stages("figures"):
-                for name, draw in kind.figures.items():
-                    if (figure := draw(result)) is not None:
-                        save(figure, stage / FIGURES / f"{name}.png", kind.dpi)
-        with stages("files"):
-            for output in kind.outputs:
-                if output.wanted(result):
-                    output.write(result, stage)
-            if provenance is not None:
-                provenance.write(stage)
-            if kind.name in PAGES:
-                page = PAGES[kind.name](stage, folder.resolve().name)
-                _write_text(stage / REPORT, page)
-        files = sorted(path.relative_to(stage) for path in stage.rglob("*") if path.is_file())
-    return Run(result, folder, [folder / name for name in files])
+    origin, files = origin_of(scenario, data, **others), inputs_of(scenario, data, *inputs)
+    return run_folder(folder, kind, origin, replace=replace, inputs=files)
 
 
 def require_marginal(what: str, advice: str, scenario: Scenario) -> None:

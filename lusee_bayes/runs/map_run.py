@@ -20,26 +20,7 @@ from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.flight_data import visibilities_of
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.flight.reduced import Reduced, write_reduced
-from lusee_bayes.report.figures.checks import (
-    calibration,
-    draws_of_posterior,
-    pointing_by_day,
-    residuals_by_product,
-    time_line,
-    unknowns_by_frequency,
-    waterfall,
-)
-from lusee_bayes.report.figures.maps import (
-    beams,
-    channel_fidelity,
-    channel_maps,
-    channel_spectra,
-    chi2,
-    data_vector,
-    map_fidelity,
-    sky_maps,
-    sky_spectra,
-)
+from lusee_bayes.report.figures import checks, maps
 from lusee_bayes.results.cube import CubeResult
 from lusee_bayes.results.diagnostics import write_diagnostics
 from lusee_bayes.results.finished_runs import Provenance
@@ -54,15 +35,12 @@ from lusee_bayes.runs.folder import (
     Output,
     Run,
     RunKind,
-    inputs_of,
     json_file,
-    origin_of,
     require_marginal,
     require_single_frequency,
     rows_file,
-    run_folder,
+    scenario_run,
     table_file,
-    write_run,
 )
 from lusee_bayes.sky.sky_files import write_alms
 
@@ -122,15 +100,13 @@ def run_map(
         "--diagnose": diagnosed,
     }.items():
         require_single_frequency(name, given and several)
-    kind, resume, cost = MAP, "", None
     if several:
-        kind, resume = CUBE, "the same command continues from the finished channels"
         require_fits(cost := posterior_cost(scenario), scenario)
-    origin = origin_of(scenario, data, truth=truth or None, onto=onto)
-    inputs = inputs_of(scenario, data, onto)
-    with run_folder(folder, kind, origin, resume, replace=replace, inputs=inputs) as place:
+    kind, origin = CUBE if several else MAP, {"truth": truth or None, "onto": onto}
+    with scenario_run(folder, kind, scenario, data, onto, replace=replace, **origin) as run:
         if several:
             stages.say(cost.line())
+            place = run.path
             file, reduced = _one_file(data, scenario, place, stages)
             made = cube_result(
                 scenario, place, data=file, truth=truth, engine=engine, stages=stages
@@ -144,7 +120,7 @@ def run_map(
             provenance = Provenance.of_experiment(experiment, data)
             reduced = reduced and _as_used(reduced, experiment)
         made = replace_fields(made, reduced=reduced)
-        return write_run(place, made, kind, origin, stages, provenance)
+        return run.write(made, stages, provenance)
 
 
 def _as_used(reduced: Reduced, experiment: Experiment) -> Reduced:
@@ -217,6 +193,11 @@ SHARED = (
     json_file("summary.json", lambda result: result.summary()),
 )
 
+FLIGHT_FIGURES = {
+    "flight_time_line": lambda r: r.reduced and checks.time_line(r.reduced),
+    "flight_calibration": lambda r: r.reduced and checks.calibration(r.reduced),
+}
+
 # what the folder of a map holds; a new file is one line here
 MAP = RunKind(
     "map",
@@ -234,17 +215,18 @@ MAP = RunKind(
         *SHARED,
     ),
     figures={
-        "maps": lambda result: sky_maps(result.channel),
-        "data_vector": lambda result: data_vector(result.experiment.data),
-        "beams": lambda result: beams(result.experiment.setup),
-        "fidelity": lambda result: map_fidelity(result.channel),
-        "spectra": lambda result: sky_spectra(result.channel),
-        "draws": lambda result: draws_of_posterior(result.diagnostics),
-        "residuals": lambda result: residuals_by_product(result.diagnostics),
-        "pointing": lambda result: result.pointing and pointing_by_day(result.pointing.preferred),
-        "flight_time_line": lambda r: r.reduced and time_line(r.reduced),
-        "flight_waterfall": lambda r: r.reduced and waterfall(r.reduced, r.band),
-        "flight_calibration": lambda r: r.reduced and calibration(r.reduced),
+        "maps": lambda result: maps.sky_maps(result.channel),
+        "data_vector": lambda result: maps.data_vector(result.experiment.data),
+        "beams": lambda result: maps.beams(result.experiment.setup),
+        "fidelity": lambda result: maps.map_fidelity(result.channel),
+        "spectra": lambda result: maps.sky_spectra(result.channel),
+        "draws": lambda result: checks.draws_of_posterior(result.diagnostics),
+        "residuals": lambda result: checks.residuals_by_product(result.diagnostics),
+        "pointing": lambda result: (
+            result.pointing and checks.pointing_by_day(result.pointing.preferred)
+        ),
+        "flight_waterfall": lambda r: r.reduced and checks.waterfall(r.reduced, r.band),
+        **FLIGHT_FIGURES,
     },
 )
 
@@ -257,14 +239,14 @@ CUBE = RunKind(
         *SHARED,
     ),
     figures={
-        "maps": channel_maps,
-        "spectra": channel_spectra,
-        "fidelity": channel_fidelity,
-        "chi2": chi2,
-        "unknowns": lambda r: r.unknowns and unknowns_by_frequency(r.unknowns),
-        "flight_time_line": lambda r: r.reduced and time_line(r.reduced),
-        "flight_calibration": lambda r: r.reduced and calibration(r.reduced),
+        "maps": maps.channel_maps,
+        "spectra": maps.channel_spectra,
+        "fidelity": maps.channel_fidelity,
+        "chi2": maps.chi2,
+        "unknowns": lambda r: r.unknowns and checks.unknowns_by_frequency(r.unknowns),
+        **FLIGHT_FIGURES,
     },
     unfinished=CHANNELS,
+    resume="the same command continues from the finished channels",
     dpi=100,
 )

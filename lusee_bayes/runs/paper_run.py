@@ -14,19 +14,9 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios, read_case
 from lusee_bayes.paper.claims import Cases, claim_table, claims_as_markdown
 from lusee_bayes.paper.figures import FIGURES
-from lusee_bayes.runs.folder import (
-    Output,
-    Run,
-    RunKind,
-    origin_of,
-    rows_file,
-    run_folder,
-    text_file,
-    write_run,
-)
+from lusee_bayes.runs.folder import Output, Run, RunKind, rows_file, run_folder, text_file
 
 CASES, UNFINISHED = "cases", "unfinished-cases"
-RESUME = "the same command continues from the finished cases"
 
 
 @dataclass(frozen=True)
@@ -72,11 +62,10 @@ def run_paper(
     """
     engine, stages = engine or ThisProcess(), stages or Stages()
     scenarios = paper_scenarios(overrides, skies)
-    origin = origin_of()
-    with run_folder(folder, PAPER, origin, RESUME, replace=replace) as place:
-        engine.work_in(place)
+    with run_folder(folder, PAPER, {}, replace=replace) as run:
+        engine.work_in(run.path)
         # workers may have other folders of their own
-        home = place.resolve()
+        home = run.path.resolve()
 
         def path_of(name: str) -> Path:
             """Where a case is, if it has been computed, or else will be."""
@@ -94,8 +83,7 @@ def run_paper(
         engine.each(Tasks(compute, names, names), stages, "cases")
         paths = {name: path_of(name) for name in names}
         cases = {name: read_case(path) for name, path in paths.items()}
-        run = write_run(place, _Computed(cases, paths), PAPER, origin, stages)
-        return Run(cases, place, run.files)
+        return Run(cases, run.path, run.write(_Computed(cases, paths), stages).files)
 
 
 def _write_cases(computed: _Computed, folder: Path) -> None:
@@ -121,4 +109,5 @@ PAPER = RunKind(
         name: lambda computed, draw=draw: draw(computed.cases) for name, draw in FIGURES.items()
     },
     unfinished=UNFINISHED,
+    resume="the same command continues from the finished cases",
 )

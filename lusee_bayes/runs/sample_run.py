@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,7 @@ from lusee_bayes.core.files import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.report.figures.sampling import (
-    against_analytic,
-    energy,
-    pairs,
-    ranks,
-    traces,
-    uncertainty,
-)
+from lusee_bayes.report.figures import sampling as figures
 from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.map_files import write_cube, write_map
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult
@@ -26,13 +20,11 @@ from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import (
     Output,
     Run,
+    RunFolder,
     RunKind,
-    inputs_of,
     json_file,
-    origin_of,
-    run_folder,
+    scenario_run,
     text_file,
-    write_run,
 )
 from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling.datatree import write_datatree
@@ -97,36 +89,39 @@ def run_sample(
     sampler = sampler or Sampler(seed=scenario.seed)
 
     def one(scenario: Scenario, folder: Path, stages: Stages) -> Run[tuple[SampleResult, ...]]:
-        origin = sample_origin(scenario, data, program)
-        inputs = inputs_of(scenario, data, program.path)
-        with run_folder(folder, SAMPLE, origin, RESUME, replace=replace, inputs=inputs) as place:
+        with sample_folder(folder, SAMPLE, scenario, data, program, replace) as run:
             n_draws = sampler.chains * sampler.draws
             experiment = measured_experiment(scenario, data, stages, n_draws=n_draws)
-            result = sample_result(
-                experiment, program, sampler, place, resume=resume, stages=stages
-            )
-            provenance = Provenance.of_experiment(experiment, data)
-            run = write_run(place, result, SAMPLE, origin, stages, provenance)
-            return Run((result,), place, run.files)
+            options = {"resume": resume, "stages": stages}
+            result = sample_result(experiment, program, sampler, run.path, **options)
+            written = run.write(result, stages, Provenance.of_experiment(experiment, data))
+            return Run((result,), run.path, written.files)
 
     folder, stages = user_path(folder), stages or Stages()
     if not scenario.frequencies_mhz:
         return one(scenario, folder, stages)
-    origin = sample_origin(scenario, data, program)
-    inputs = inputs_of(scenario, data, program.path)
-    with run_folder(folder, CUBES, origin, RESUME, replace=replace, inputs=inputs) as place:
+    with sample_folder(folder, CUBES, scenario, data, program, replace) as run:
         runs = []
         for channel in scenario.channels():
-            where = place / f"{channel.frequency_mhz:.15g}MHz"
+            where = run.path / f"{channel.frequency_mhz:.15g}MHz"
             runs.append(one(channel, where, Stages(stages.console, verbose=stages.verbose)))
-        results = tuple(result for run in runs for result in run.result)
-        cubes = write_run(place, (scenario, results), CUBES, origin, stages)
-        return Run(results, place, [*(f for run in runs for f in run.files), *cubes.files])
+        results = tuple(result for each in runs for result in each.result)
+        cubes = run.write((scenario, results), stages)
+        return Run(results, run.path, [*(f for each in runs for f in each.files), *cubes.files])
 
 
-def sample_origin(scenario: Scenario, data: Data | None, program: Program) -> dict[str, str]:
-    """What determines the draws of a program (:func:`.origin_of`)."""
-    return origin_of(scenario, data, program=f"{program.name} ({program.digest[:12]})")
+def sample_folder(
+    folder: str | Path,
+    kind: RunKind,
+    scenario: Scenario,
+    data: Data | None,
+    program: Program,
+    replace: bool,
+) -> AbstractContextManager[RunFolder]:
+    """Open the folder of a run whose draws are those of a program (:func:`.scenario_run`)."""
+    named = f"{program.name} ({program.digest[:12]})"
+    given = {"replace": replace, "program": named}
+    return scenario_run(folder, kind, scenario, data, program.path, **given)
 
 
 def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Path) -> None:
@@ -155,14 +150,15 @@ SAMPLE = RunKind(
     "sample",
     outputs=SAMPLE_OUTPUTS,
     figures={
-        "uncertainty": uncertainty,
-        "traces": traces,
-        "ranks": lambda result: ranks(result.quantities()),
-        "energy": lambda result: energy(result.tree["sample_stats"].dataset),
-        "pairs": lambda result: pairs(result.quantities()),
-        "against_analytic": lambda result: against_analytic(result.tree),
+        "uncertainty": figures.uncertainty,
+        "traces": figures.traces,
+        "ranks": lambda result: figures.ranks(result.quantities()),
+        "energy": lambda result: figures.energy(result.tree["sample_stats"].dataset),
+        "pairs": lambda result: figures.pairs(result.quantities()),
+        "against_analytic": lambda result: figures.against_analytic(result.tree),
     },
     unfinished=CHAINS,
+    resume=RESUME,
 )
 
 # what the folder of several channels holds, besides a folder of each

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace as replace_fields
 from pathlib import Path
 
-from lusee_bayes.core.engine import Engine
+from lusee_bayes.core.engine import Demand, Engine
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
@@ -12,22 +13,18 @@ from lusee_bayes.report.figures.sampling import comparison, rank_statistics
 from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.sample_result import CHAINS
 from lusee_bayes.results.validation_result import ValidationResult
-from lusee_bayes.runs.cost import measured_experiment
-from lusee_bayes.runs.folder import (
-    Output,
-    Run,
-    RunKind,
-    inputs_of,
-    json_file,
-    run_folder,
-    text_file,
-    write_run,
-)
-from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_origin
+from lusee_bayes.runs.cost import demand_of, measured_experiment, posterior_cost
+from lusee_bayes.runs.folder import Output, Run, RunKind, json_file, text_file
+from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_folder
 from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling.hmc import Sampler, require_draws, require_simulations
 from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.validation import calibrate_sky, validate_draws
+from lusee_bayes.sampling.validation import BATCH, N_DRAWS, calibrate_sky, validate_draws
+
+
+def demand_of_calibration(scenario: Scenario) -> Demand:
+    """What simulation-based calibration takes, in batches that use all processors."""
+    return replace_fields(demand_of([posterior_cost(scenario, BATCH * N_DRAWS)]), side_by_side=1)
 
 
 def run_validate(
@@ -80,12 +77,11 @@ def run_validate(
     program = load_program("sky")
     require_simulations(simulations)
     require_draws(sampler.draws)
-    origin = sample_origin(scenario, data, program)
-    inputs = inputs_of(scenario, data, program.path)
-    with run_folder(folder, VALIDATION, origin, RESUME, replace=replace, inputs=inputs) as place:
+    with sample_folder(folder, VALIDATION, scenario, data, program, replace) as run:
         n_draws = sampler.chains * sampler.draws
         experiment = measured_experiment(scenario, data, stages, n_draws=n_draws)
-        sampled = sample_result(experiment, program, sampler, place, resume=resume, stages=stages)
+        options = {"resume": resume, "stages": stages}
+        sampled = sample_result(experiment, program, sampler, run.path, **options)
         posterior, model = sampled.inference.posterior, sampled.inference.model
         with stages("comparison"):
             stats = sampled.tree["sample_stats"]
@@ -93,7 +89,7 @@ def run_validate(
                 sampled.skies, posterior, stats["diverging"].values, stats["energy"].values
             )
         if engine is not None:
-            engine.work_in(place)
+            engine.work_in(run.path)
         ranks = calibrate_sky(
             model,
             model,
@@ -104,7 +100,7 @@ def run_validate(
         )
         result = ValidationResult(name, sampled, found, ranks)
         provenance = Provenance.of_experiment(experiment, data)
-        return write_run(place, result, VALIDATION, origin, stages, provenance)
+        return run.write(result, stages, provenance)
 
 
 def _of_sampled(output: Output) -> Output:
@@ -125,4 +121,5 @@ VALIDATION = RunKind(
     },
     unfinished=CHAINS,
     after=("sample",),
+    resume=RESUME,
 )
