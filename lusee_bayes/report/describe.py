@@ -41,7 +41,7 @@ KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
     (lambda path: has_words(path, formats.UVBEAM_WORDS), "describe_data:describe_sampled_beams"),
     (_has_image("combinations", "products"), "describe_data:describe_waterfall"),
     (_is_session, "describe_data:describe_session"),
-    (lambda path: True, "describe_data:describe_sky"),
+    (lambda path: True, "describe_sky:describe_sky"),
 )
 
 

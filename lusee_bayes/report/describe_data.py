@@ -1,4 +1,4 @@
-"""What info says of data, sessions, gain tables, beams and skies, as lines."""
+"""What info says of data, sessions, gain tables and beams, as lines."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.formats import is_fits, opened
+from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.flight.reduced import read_reduced
 from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.instrument.beams.luseepy_files import (
@@ -20,7 +20,6 @@ from lusee_bayes.instrument.beams.sampled import read_sampled
 from lusee_bayes.instrument.products import N_ANTENNAS, auto_indices, labels
 from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall
-from lusee_bayes.sky.sky_source import read_sky_file
 
 
 def describe_response(path: Path) -> list[str]:
@@ -164,8 +163,6 @@ def describe_reduced(path: Path) -> list[str]:
 
 def describe_gains(path: Path) -> list[str]:
     """A gain table."""
-    from lusee_bayes.flight.gain_model import read_gain_table
-
     table = read_gain_table(path)
     errors = "errors not known" if table.component_std is None else "errors known"
     mhz = table.anchor_mhz
@@ -173,23 +170,3 @@ def describe_gains(path: Path) -> list[str]:
         f"gains of levels L, M, H of {table.mean.shape[1]} ports, {mhz.min():g} to "
         f"{mhz.max():g} MHz, mean {np.median(table.mean):.3g} counts for 1 nV^2/Hz, {errors}"
     ]
-
-
-def describe_sky(path: Path) -> list[str]:
-    """A sky map, cube or coefficients."""
-    return [*read_sky_file(path).summary(), *(_describe_cards(path) if is_fits(path) else [])]
-
-
-def _describe_cards(path: Path) -> list[str]:
-    """What a FITS file of the package says of itself."""
-    with opened(path) as hdus:
-        headers = [hdu.header for hdu in hdus if "SCENHASH" in hdu.header]
-        if not headers:
-            return []
-        (header, *_) = headers
-        at = f" at {header['FREQ']:g} MHz" if "FREQ" in header else ""
-        return [
-            f"{header['CONTENT']} of the posterior{at} up to ell = {header['LMAX']}, beam "
-            f"{header['BEAM']}, site {header['SITELON']:g}, {header['SITELAT']:g} degrees",
-            f"{header['CREATOR']}, scenario {header['SCENHASH'][:12]}",
-        ]

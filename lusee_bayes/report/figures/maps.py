@@ -269,7 +269,7 @@ def curves_of_runs(runs: Sequence[FinishedRun]) -> Figure:
     """rho_ell and SNR_ell where the truth is known, and the prior's share, of every run."""
     known = all("snr" in run.spectra for run in runs)
     figure, panels = framed((12 if known else 6, 4.2), 1, 3 if known else 1, squeeze=False)
-    panels = panels.ravel()
+    panels = list(panels.flat)
     for k, run in enumerate(runs):
         style = {"color": COLOURS[k % len(COLOURS)], "ls": LINES[k % len(LINES)], "lw": 1.3}
         _fidelity(panels, run.spectra, run.name, **style)
