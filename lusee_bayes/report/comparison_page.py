@@ -96,20 +96,7 @@ FIGURE = (
 
 
 def priors_page(folder: Path, name: str) -> str:
-    """The page as text.
-
-    Parameters
-    ----------
-    folder : Path
-        With the files of a run.
-    name : str
-        Of the run, for the title.
-
-    Raises
-    ------
-    InputError
-        If something is missing in the folder.
-    """
+    """The page as text, of the folder and the name of a run. InputError as :func:`.map_page`."""
     require_files(folder, ("priors.json", "scenario.yaml", "figures/priors.png"), "compare-priors")
     path = folder / "priors.json"
     found = read_json(path, PRIORS)

@@ -45,20 +45,7 @@ FIGURES = {
 
 
 def cube_page(folder: Path, name: str) -> str:
-    """The page as text.
-
-    Parameters
-    ----------
-    folder : Path
-        With the files of a run.
-    name : str
-        Of the run, for the title.
-
-    Raises
-    ------
-    InputError
-        If something is missing in the folder.
-    """
+    """The page as text, of the folder and the name of a run. InputError as :func:`.map_page`."""
     require_files(folder, (*NEEDED, *(f"figures/{figure}.png" for figure in FIGURES)), "map")
     where = folder / "summary.json"
     summary = read_json(where, CUBE_SUMMARY)

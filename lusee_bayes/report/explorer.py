@@ -40,9 +40,11 @@ def explorer(folder: Path, diagnostics: xr.Dataset) -> str:
 def _with_scripts(layout: str, found: dict[str, object], scripts: tuple[str, ...]) -> str:
     """A layout, its data, and what draws them."""
     data = json.dumps(found).replace("</", "<\\/")
+    # zoom, grid, names and colour bar of every view
+    controls = html.package_text("explorer_controls.html").rstrip("\n")
     return "\n".join(
         [
-            html.package_text(layout).rstrip("\n"),
+            html.package_text(layout).rstrip("\n").replace("{controls}", controls),
             f'<script type="application/json" id="explorer-data">{data}</script>',
             *(f"<script>\n{html.package_text(name)}\n</script>" for name in scripts),
         ]

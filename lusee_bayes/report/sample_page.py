@@ -53,20 +53,7 @@ FIGURES = {
 
 
 def sample_page(folder: Path, name: str) -> str:
-    """The page as text.
-
-    Parameters
-    ----------
-    folder : Path
-        With the files of a run.
-    name : str
-        Of the run, for the title.
-
-    Raises
-    ------
-    InputError
-        If something is missing in the folder.
-    """
+    """The page as text, of the folder and the name of a run. InputError as :func:`.map_page`."""
     require_files(folder, ("summary.csv", "sampling.json", "scenario.yaml"), "sample")
     sampling = read_json(folder / "sampling.json", SAMPLING)
     table = read_table(folder / "summary.csv", SUMMARY_TABLE)

@@ -50,10 +50,8 @@ def run_compare(
         Of finished map runs, two or more.
     folder : path
         Of the results.
-    replace : bool
-        Replace results of another run in the folder.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
 
     Raises
     ------
@@ -114,10 +112,8 @@ def run_compare_priors(
         Of the scenario, for the title.
     engine : Engine, optional
         What maps the data under each prior; by default this process, one after the other.
-    replace : bool
-        Replace results of another run in the folder.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
 
     Raises
     ------

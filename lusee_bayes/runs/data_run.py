@@ -148,10 +148,8 @@ def run_reduce(
         Sessions, in any order.
     path : path
         The netCDF file to write.
-    replace : bool
-        Replace a file that is there.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`run_simulate`.
 
     Raises
     ------
@@ -403,10 +401,8 @@ def run_average(
         The netCDF file to write.
     information : bool
         Work out the information about the map, in the data and in their averages.
-    replace : bool
-        Replace a file that is there.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`run_simulate`.
 
     Raises
     ------

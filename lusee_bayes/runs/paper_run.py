@@ -50,10 +50,8 @@ def run_paper(
         ULSA HDF5 files with the frequency in their names; each case scales the nearest one.
     engine : Engine, optional
         What computes the cases; by default this process.
-    replace : bool
-        Replace results of another run in the folder.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
 
     Raises
     ------

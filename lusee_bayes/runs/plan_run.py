@@ -38,10 +38,8 @@ def run_plan(
         Of the results.
     engine : Engine, optional
         What makes the forecasts; by default this process.
-    replace : bool
-        Replace results of another run in the folder.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
 
     Raises
     ------

@@ -68,10 +68,8 @@ def run_sample(
         Visibilities to use; without them the scenario's own are simulated.
     resume : bool
         Go on with the unfinished run in the folder, or take over a finished one.
-    replace : bool
-        Replace results of another run in the folder.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
 
     Raises
     ------

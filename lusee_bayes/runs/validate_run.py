@@ -61,10 +61,8 @@ def run_validate(
         Go on with the unfinished run in the folder, or judge the finished one again.
     engine : Engine, optional
         What works on the simulated data sets; by default this process.
-    replace : bool
-        Replace results of another run in the folder.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
 
     Raises
     ------
