@@ -1,14 +1,8 @@
 """Unfinished work of a run of several frequencies: a file for each channel that is done.
 
-Unfinished work of a run of several frequencies: a file for each channel that is done.
-
 ``DIR/channels/25.information.nc`` holds what a channel's data say, ``25.result.nc`` its posterior.
 So memory stays bounded, and an interrupted run goes on where it was. Files of other scenarios or
-data are made anew.
-
-What the data of a channel say, in a file: for the channels of a joint posterior.
-
-The channels of a joint posterior, in the files of a run, and sums over them.
+data are made anew. A joint posterior adds up what the files of all channels say.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
@@ -10,29 +10,21 @@ import numpy as np
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.data_files import Data, read_data
-from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.report.figures.sampling import (
-    against_analytic,
-    energy,
-    pairs,
-    ranks,
-    traces,
-    uncertainty,
-)
+from lusee_bayes.report.figures import sampling as figures
 from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.map_files import write_cube, write_map
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult
-from lusee_bayes.runs.cost import require_resources
+from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import (
     Output,
     Run,
+    RunFolder,
     RunKind,
-    inputs_of,
-    origin_of,
-    run_folder,
-    write_run,
+    json_file,
+    scenario_run,
+    text_file,
 )
 from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling.datatree import write_datatree
@@ -76,10 +68,8 @@ def run_sample(
         Visibilities to use; without them the scenario's own are simulated.
     resume : bool
         Go on with the unfinished run in the folder, or take over a finished one.
-    replace : bool
-        Replace results of another run in the folder.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
 
     Raises
     ------
@@ -95,49 +85,41 @@ def run_sample(
         )
     program = program or default_program(scenario)
     sampler = sampler or Sampler(seed=scenario.seed)
-    folder = user_path(folder)
+
+    def one(scenario: Scenario, folder: Path, stages: Stages) -> Run[tuple[SampleResult, ...]]:
+        with sample_folder(folder, SAMPLE, scenario, data, program, replace) as run:
+            n_draws = sampler.chains * sampler.draws
+            experiment = measured_experiment(scenario, data, stages, n_draws=n_draws)
+            options = {"resume": resume, "stages": stages}
+            result = sample_result(experiment, program, sampler, run.path, **options)
+            written = run.write(result, stages, Provenance.of_experiment(experiment, data))
+            return Run((result,), run.path, written.files)
+
+    folder, stages = user_path(folder), stages or Stages()
     if not scenario.frequencies_mhz:
-        return _run_single(scenario, folder, program, sampler, data, resume, replace, stages)
-    stages = stages or Stages()
-    origin = sample_origin(scenario, data, program)
-    inputs = inputs_of(scenario, data, program.path)
-    with run_folder(folder, CUBES, origin, RESUME, replace=replace, inputs=inputs) as place:
+        return one(scenario, folder, stages)
+    with sample_folder(folder, CUBES, scenario, data, program, replace) as run:
         runs = []
         for channel in scenario.channels():
-            where = place / f"{channel.frequency_mhz:.15g}MHz"
-            own = Stages(stages.console, verbose=stages.verbose)
-            runs.append(_run_single(channel, where, program, sampler, data, resume, replace, own))
-        results = tuple(result for run in runs for result in run.result)
-        cubes = write_run(place, (scenario, results), CUBES, origin, stages)
-        return Run(results, place, [*(f for run in runs for f in run.files), *cubes.files])
+            where = run.path / f"{channel.frequency_mhz:.15g}MHz"
+            runs.append(one(channel, where, Stages(stages.console, verbose=stages.verbose)))
+        results = tuple(result for each in runs for result in each.result)
+        cubes = run.write((scenario, results), stages)
+        return Run(results, run.path, [*(f for each in runs for f in each.files), *cubes.files])
 
 
-def sample_origin(scenario: Scenario, data: Data | None, program: Program) -> dict[str, str]:
-    """What determines the draws of a program (:func:`.origin_of`)."""
-    return origin_of(scenario, data, program=f"{program.name} ({program.digest[:12]})")
-
-
-def _run_single(
+def sample_folder(
+    folder: str | Path,
+    kind: RunKind,
     scenario: Scenario,
-    folder: Path,
-    program: Program,
-    sampler: Sampler,
     data: Data | None,
-    resume: bool,
+    program: Program,
     replace: bool,
-    stages: Stages | None,
-) -> Run[tuple[SampleResult, ...]]:
-    stages = stages or Stages()
-    origin = sample_origin(scenario, data, program)
-    inputs = inputs_of(scenario, data, program.path)
-    with run_folder(folder, SAMPLE, origin, RESUME, replace=replace, inputs=inputs) as place:
-        measured = None if data is None else read_data(data, scenario)
-        require_resources(scenario, measured, stages, sampler.chains * sampler.draws)
-        experiment = build(scenario, measured, stages)
-        result = sample_result(experiment, program, sampler, place, resume=resume, stages=stages)
-        provenance = Provenance.of_experiment(experiment, data)
-        run = write_run(place, result, SAMPLE, origin, stages, provenance)
-        return Run((result,), place, run.files)
+) -> AbstractContextManager[RunFolder]:
+    """Open the folder of a run whose draws are those of a program (:func:`.scenario_run`)."""
+    named = f"{program.name} ({program.digest[:12]})"
+    given = {"replace": replace, "program": named}
+    return scenario_run(folder, kind, scenario, data, program.path, **given)
 
 
 def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Path) -> None:
@@ -146,7 +128,6 @@ def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Pat
     for name in ("mean", "std"):
         pixels = np.stack([result.maps[name] for result in results])
         write_cube(folder / f"{name}.fits", name, pixels, frequencies, scenario)
-    (folder / "scenario.yaml").write_text(scenario.to_yaml(), encoding="utf-8")
 
 
 def _write_maps(result: SampleResult, folder: Path) -> None:
@@ -154,18 +135,12 @@ def _write_maps(result: SampleResult, folder: Path) -> None:
         write_map(folder / f"{name}.fits", name, pixels, result.experiment.scenario)
 
 
-def _write_summaries(result: SampleResult, folder: Path) -> None:
-    result.summary_table().to_csv(folder / "summary.csv", index_label="quantity")
-    (folder / "scenario.yaml").write_text(result.experiment.scenario.to_yaml(), encoding="utf-8")
-    (folder / "sampling.json").write_text(
-        json.dumps(result.figures(), indent=2) + "\n", encoding="utf-8"
-    )
-
-
 SAMPLE_OUTPUTS = (
     Output(lambda result, folder: write_datatree(result.tree, folder / SAMPLES)),
     Output(_write_maps),
-    Output(_write_summaries),
+    text_file("summary.csv", lambda run: run.summary_table().to_csv(index_label="quantity")),
+    text_file("scenario.yaml", lambda run: run.experiment.scenario.to_yaml()),
+    json_file("sampling.json", lambda run: run.figures()),
 )
 
 # what the folder of a sampled program holds; a new file is one line here
@@ -173,15 +148,23 @@ SAMPLE = RunKind(
     "sample",
     outputs=SAMPLE_OUTPUTS,
     figures={
-        "uncertainty": uncertainty,
-        "traces": traces,
-        "ranks": lambda result: ranks(result.quantities()),
-        "energy": lambda result: energy(result.tree["sample_stats"].dataset),
-        "pairs": lambda result: pairs(result.quantities()),
-        "against_analytic": lambda result: against_analytic(result.tree),
+        "uncertainty": figures.uncertainty,
+        "traces": figures.traces,
+        "ranks": lambda result: figures.ranks(result.quantities()),
+        "energy": lambda result: figures.energy(result.tree["sample_stats"].dataset),
+        "pairs": lambda result: figures.pairs(result.quantities()),
+        "against_analytic": lambda result: figures.against_analytic(result.tree),
     },
     unfinished=CHAINS,
+    resume=RESUME,
 )
 
 # what the folder of several channels holds, besides a folder of each
-CUBES = RunKind("sampled cubes", outputs=(Output(_write_cubes),), figures={})
+CUBES = RunKind(
+    "sampled cubes",
+    outputs=(
+        Output(_write_cubes),
+        text_file("scenario.yaml", lambda sampled: sampled[0].to_yaml()),
+    ),
+    figures={},
+)

@@ -266,7 +266,8 @@ def test_a_channel_that_cannot_be_mapped_leaves_the_others_as_they_are(
 
 def head_of(folder):
     """What a report says of channels that could not be mapped."""
-    return html.unmapped(folder / "summary.json", json.loads((folder / "summary.json").read_text()))
+    path = folder / "summary.json"
+    return "\n".join(html.sentences(path, json.loads(path.read_text()), "unmapped"))
 
 
 def test_too_few_channels_for_a_joint_posterior_are_named(gap, tmp_path, numbers_alone):

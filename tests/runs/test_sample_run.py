@@ -35,7 +35,7 @@ from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.results import sample_result as results
 from lusee_bayes.results.channel import channel_of_posterior
 from lusee_bayes.runs import sample_run, validate_run
-from lusee_bayes.runs.folder import run_folder, write_run
+from lusee_bayes.runs.folder import RunFolder, run_folder
 from lusee_bayes.runs.sample_run import SAMPLE
 from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling import hmc
@@ -292,9 +292,9 @@ def test_draws_stay_where_they_are_until_the_results_are_written(short, killed, 
     with monkeypatch.context() as patch:
         patch.setattr(sample_run, "write_map", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            write_run(killed, short, SAMPLE, {}, Stages())
+            RunFolder(killed, SAMPLE, {}).write(short, Stages())
     assert content(killed) == before
-    write_run(killed, short, SAMPLE, {}, Stages())
+    RunFolder(killed, SAMPLE, {}).write(short, Stages())
     assert not (killed / "chains").exists()
     written = read_datatree(killed / "samples.nc")["posterior"]["sky"]
     np.testing.assert_array_equal(written, tree["posterior"]["sky"].values[:, :60])
@@ -303,7 +303,7 @@ def test_draws_stay_where_they_are_until_the_results_are_written(short, killed, 
 def test_results_can_be_written_twice(short, killed, tmp_path):
     numbers = replace(SAMPLE, figures={}, name="without a page")
     for folder in (killed, killed, tmp_path / "elsewhere"):
-        write_run(folder, short, numbers, {}, Stages())
+        RunFolder(folder, numbers, {}).write(short, Stages())
     assert (tmp_path / "elsewhere" / "samples.nc").exists()
 
 
@@ -327,13 +327,13 @@ def test_a_kill_while_the_draws_are_removed_is_no_harm(
         patch.setattr(os, "unlink", unlink)
         patch.setattr(os, "remove", unlink)
         with pytest.raises(KeyboardInterrupt):
-            write_run(killed, short, numbers, {}, Stages())
+            RunFolder(killed, numbers, {}).write(short, Stages())
     assert (killed / "samples.nc").exists()
     # the marker of the run is a file, too
     assert len(list((killed / "chains").iterdir())) == n_chunks + 1 - deleted
     sampler = replace(SAMPLER, draws=60)
-    with run_folder(killed, numbers, {}) as folder:
-        again = sample_result(experiment, load_program("sky"), sampler, folder, resume=True)
+    with run_folder(killed, numbers, {}) as run:
+        again = sample_result(experiment, load_program("sky"), sampler, run.path, resume=True)
     assert not (killed / "chains").exists()
     np.testing.assert_array_equal(again.skies, tree["posterior"]["sky"].values[:, :60])
 
