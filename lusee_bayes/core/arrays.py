@@ -25,9 +25,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 from platformdirs import user_cache_path
 
 Array = jax.Array | np.ndarray
+# arrays that recur, with their shapes
+DataVector = Float[Array, " data"]
+Grid = Float[Array, "products times"]
+GridFlags = Bool[np.ndarray, "products times"]
+TimeFlags = Bool[np.ndarray, " times"]
+Modes = Float[np.ndarray, " modes"]
+ModesMatrix = Float[np.ndarray, "modes modes"]
+Ells = Float[np.ndarray, " ells"]
+Pixels = Float[np.ndarray, " pixels"]
 
 # rows that are added at once
 ACCUMULATED = 16

@@ -30,6 +30,7 @@ from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.progress import Stages, memory_limit
 from lusee_bayes.experiment.rounds import model_about, rebuilds, settled
+from lusee_bayes.experiment.section import is_modelled
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import DataLayout, all_products
@@ -234,8 +235,7 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Compar
 
 def _memory(setup: Setup, data: Visibilities) -> float:
     """Bytes; where N couples times, it is a matrix of all data, too."""
-    n, gain = data.layout.size, setup.scenario.noise.gain
-    across = gain is not None and gain.treatment != "ignored"
+    n, across = data.layout.size, is_modelled(setup.scenario.noise.gain)
     return 8.0 * ARRAYS * n * (setup.prior.size + (n if across else 0))
 
 

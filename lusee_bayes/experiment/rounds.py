@@ -27,6 +27,7 @@ from lusee_bayes.experiment.model import (
     systematics,
 )
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.section import is_modelled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.sky_sections import (
     IsotropicPriorSection,
@@ -268,8 +269,7 @@ def first_order(setup: Setup) -> tuple[Term, ...]:
 
 def rebuilds_gains(setup: Setup) -> bool:
     """Whether the gain term is built around the posterior's own prediction."""
-    gain = setup.scenario.noise.gain
-    return gain is not None and gain.treatment != "ignored" and gains_about(setup) == "posterior"
+    return is_modelled(setup.scenario.noise.gain) and gains_about(setup) == "posterior"
 
 
 def rebuilds_visibilities(setup: Setup) -> bool:

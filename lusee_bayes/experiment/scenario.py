@@ -30,7 +30,7 @@ from lusee_bayes.experiment.instrument_sections import (
     ObservationSection,
 )
 from lusee_bayes.experiment.noise_sections import NoiseSection
-from lusee_bayes.experiment.section import Frequency, OutputSection, Section, Seed
+from lusee_bayes.experiment.section import Frequency, OutputSection, Section, Seed, is_modelled
 from lusee_bayes.experiment.sky_sections import (
     GalaxySection,
     IsotropicPriorSection,
@@ -277,8 +277,8 @@ class Scenario(Section):
     def ties_receivers(self) -> bool:
         """Whether receivers' powers of several frequencies are inferred as smooth spectra."""
         receiver = self.noise.receiver
-        smooth = receiver is not None and receiver.smooth_octaves is not None
-        return smooth and receiver.treatment != "ignored" and bool(self.frequencies_mhz)
+        smooth = is_modelled(receiver) and receiver.smooth_octaves is not None
+        return smooth and bool(self.frequencies_mhz)
 
     def channels(self) -> tuple[Scenario, ...]:
         """The scenario of every channel; draws of each have a seed of their own, one further."""

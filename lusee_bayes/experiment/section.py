@@ -88,9 +88,20 @@ class Section(BaseModel):
         return found | {key: str(user_path(n)) for key, n in names.items() if n.startswith("~")}
 
 
-def known_keys(kinds: Mapping[str, type[Section]]) -> set[str]:
-    """Every key of a section that comes in several kinds."""
-    return {name for kind in kinds.values() for name in kind.model_fields}
+def requires(holds: Callable[[Any], Any], message: str) -> Any:
+    """A validator of a section: ValueError with this message unless a rule holds of it."""
+
+    def checked(section: Any) -> Any:
+        if not holds(section):
+            raise ValueError(message)
+        return section
+
+    return model_validator(mode="after")(checked)
+
+
+def is_modelled(section: Any) -> bool:
+    """Whether there is a section, and what it has is not ignored."""
+    return section is not None and section.treatment != "ignored"
 
 
 def without_other_kinds(

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, Grid
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
@@ -238,12 +238,7 @@ def set_up(
         source = scenario.beam.source().behind(receiver)
         beams = source.beams(scenario.frequency_mhz, scenario.lmax)
         background = background_of(scenario, source)
-        # sources need the exact pattern, which only the embedded antennas have
-        responses: tuple[Float[Array, "products times"], ...] = ()
-        if scenario.sources.list:
-            responses = source_responses(
-                scenario, observation, source.monopoles, scenario.frequency_mhz
-            )
+        responses = source_responses(scenario, observation, source)
     if data is not None and data.layout.n_products != beams.n_products:
         raise InputError(
             f"the data have {data.layout.n_products} products, the beams supply "
@@ -321,23 +316,31 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
 
 
 def source_responses(
-    scenario: Scenario, observation: Observation, antennas: Monopoles, frequency_mhz: float
-) -> tuple[Float[Array, "products times"], ...]:
-    """Response to 1 K sr of each of the scenario's sources, with these antennas, in K.
+    scenario: Scenario,
+    observation: Observation,
+    beams: BeamSource,
+    frequency_mhz: float | None = None,
+) -> tuple[Grid, ...]:
+    """Response to 1 K sr of each of the scenario's sources, with these beams, in K.
+
+    Sources need the exact pattern, which only the embedded antennas have.
 
     Their means over the windows, by instants: a source may rise and set within one.
     """
+    if not scenario.sources.list:
+        return ()
+    frequency_mhz = scenario.frequency_mhz if frequency_mhz is None else frequency_mhz
     instants, sample, weight = observation.at_nodes(SOURCE_NODES)
     first = np.searchsorted(sample, np.arange(observation.n_times))
     responses = (
         source_response(
             instants,
-            _direction(source, instants),
+            _direction(one, instants),
             frequency_mhz,
-            antennas,
-            stokes_v=source.stokes_v,
+            beams.monopoles,
+            stokes_v=one.stokes_v,
         )
-        for source in scenario.sources.list
+        for one in scenario.sources.list
     )
     return tuple(np.add.reduceat(np.asarray(r) * weight, first, axis=1) for r in responses)
 
