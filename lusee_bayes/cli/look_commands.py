@@ -111,7 +111,7 @@ def compare_priors_command(
         by default DASK_SCHEDULER_ADDRESS.
     """
     from lusee_bayes.cli.tables import priors_table
-    from lusee_bayes.core.engine import open_engine
+    from lusee_bayes.core.engines import open_engine
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.compare_run import run_compare_priors
     from lusee_bayes.runs.cost import demand_of, posterior_cost
@@ -233,7 +233,7 @@ def paper_command(
         Address of a Dask scheduler, as tcp://host:8786, whose workers share out the cases; by
         default DASK_SCHEDULER_ADDRESS.
     """
-    from lusee_bayes.core.engine import open_engine
+    from lusee_bayes.core.engines import open_engine
     from lusee_bayes.paper.cases import paper_scenarios
     from lusee_bayes.runs.cost import demand_of, posterior_cost
     from lusee_bayes.runs.paper_run import run_paper

@@ -99,7 +99,7 @@ def map_command(
     set_
         key.path=value; overrides an entry of the scenario, as often as needed.
     """
-    from lusee_bayes.core.engine import open_engine
+    from lusee_bayes.core.engines import open_engine
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.cost import demand_of_channels
     from lusee_bayes.runs.map_run import run_map

@@ -66,7 +66,7 @@ def plan_command(
         default DASK_SCHEDULER_ADDRESS.
     """
     from lusee_bayes.cli.tables import forecast_table
-    from lusee_bayes.core.engine import open_engine
+    from lusee_bayes.core.engines import open_engine
     from lusee_bayes.results.forecast import baseline
     from lusee_bayes.runs.cost import demand_of, posterior_cost
     from lusee_bayes.runs.plan_run import run_plan

@@ -172,7 +172,7 @@ def validate_command(
 
     require_simulations(simulations)
     require_draws(draws)
-    from lusee_bayes.core.engine import open_engine
+    from lusee_bayes.core.engines import open_engine
 
     console = Console(quiet=quiet, soft_wrap=True)
     resolved, stages = (

@@ -11,7 +11,7 @@ import xarray as xr
 from astropy.io import fits
 
 from lusee_bayes.cli.main import main
-from lusee_bayes.core import engine as engine_module
+from lusee_bayes.core import engines as engine_module
 from lusee_bayes.core.engine import ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map
