@@ -30,7 +30,14 @@ from lusee_bayes.experiment.instrument_sections import (
     ObservationSection,
 )
 from lusee_bayes.experiment.noise_sections import NoiseSection
-from lusee_bayes.experiment.section import Frequency, OutputSection, Section, Seed, is_modelled
+from lusee_bayes.experiment.section import (
+    Frequency,
+    OutputSection,
+    Section,
+    Seed,
+    is_modelled,
+    requires,
+)
 from lusee_bayes.experiment.sky_sections import (
     GalaxySection,
     IsotropicPriorSection,
@@ -225,14 +232,11 @@ class Scenario(Section):
             raise ValueError("a power of two is expected, as HEALPix's ring maps have it")
         return nside
 
-    @model_validator(mode="after")
-    def _sources_are_there_once(self) -> Scenario:
-        if self.sky.sources and self.sources.list:
-            raise ValueError(
-                "the embedded sky holds the catalogue's sources already; with sources.list of "
-                "its own, set sky.sources=false"
-            )
-        return self
+    _sources_are_there_once = requires(
+        lambda scenario: not (scenario.sky.sources and scenario.sources.list),
+        "the embedded sky holds the catalogue's sources already; with sources.list of its own, set "
+        "sky.sources=false",
+    )
 
     @model_validator(mode="after")
     def _files_have_no_parameters(self) -> Scenario:
@@ -262,16 +266,11 @@ class Scenario(Section):
             )
         return self
 
-    @model_validator(mode="after")
-    def _smooth_receivers_are_gaussian(self) -> Scenario:
-        if not self.ties_receivers:
-            return self
-        if self.joint:
-            raise ValueError(
-                "noise.receiver.smooth_octaves ties the receivers of channels that have a "
-                "posterior each; with joint, leave it out"
-            )
-        return self
+    _joint_channels_are_not_tied = requires(
+        lambda scenario: not (scenario.joint and scenario.ties_receivers),
+        "noise.receiver.smooth_octaves ties the receivers of channels that have a posterior each; "
+        "with joint, leave it out",
+    )
 
     @property
     def ties_receivers(self) -> bool:

@@ -8,7 +8,9 @@ What a map run writes besides its maps.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import reduce
+from operator import or_
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -47,15 +49,7 @@ Treatment = Literal["marginalised", "sampled", "ignored"]
 
 
 # entries that name files; one that has its default names none
-FILES = (
-    "clock",
-    "file",
-    "gain_table",
-    "lines",
-    "mean_file",
-    "schedule",
-    "spectrum_file",
-)
+FILES = ("clock", "file", "gain_table", "lines", "mean_file", "schedule", "spectrum_file")
 
 
 class Section(BaseModel):
@@ -97,6 +91,17 @@ def requires(holds: Callable[[Any], Any], message: str) -> Any:
         return section
 
     return model_validator(mode="after")(checked)
+
+
+def kinds_of(*sections: type[Section]) -> dict[str, type[Section]]:
+    """The kinds that a section comes in, by what their ``model`` says."""
+    return {section.model_fields["model"].default: section for section in sections}
+
+
+def one_of(kinds: Mapping[str, type[Section]], completed: Callable[[Any], Any]) -> Any:
+    """The type of a section that comes in kinds, with what is done to a tree before it is read."""
+    kind = Field(discriminator="model")
+    return Annotated[reduce(or_, kinds.values()), kind, BeforeValidator(completed)]
 
 
 def is_modelled(section: Any) -> bool:
@@ -142,16 +147,13 @@ def without_other_kinds(
             continue
         theirs = others[0]
         default = theirs.model_fields[key].get_default(call_default_factory=True)
-        same = value is None or value == default or value == _plain(default)
+        # YAML has lists where sections have tuples
+        plain = list(default) if isinstance(default, tuple) else default
+        same = value is None or value in (default, plain)
         if strict and not same:
             names = ", ".join(name for name, kind in kinds.items() if kind in others)
             raise ValueError(f"{key} is an entry of model {names}, not of {tree['model']}")
     return kept
-
-
-def _plain(value: Any) -> Any:
-    """As YAML has it."""
-    return list(value) if isinstance(value, tuple) else value
 
 
 class OutputSection(Section):

@@ -28,6 +28,7 @@ LEVELS = (0.50, 0.68, 0.90, 0.95)
 NAMES = tuple(f"{100 * level:.0f}" for level in LEVELS)
 
 
+REST = ("rms", "rms_scatter", "largest", "allowed")
 # draws that tell the scatter: it is then known to 4 %
 N_DRAWS = 300
 # skies that are counted together: their maps fit into a cache
@@ -77,16 +78,13 @@ class Coverage:
             "n": self.n,
             **{f"held_{name}": x for name, x in zip(NAMES, self.held, strict=True)},
             **{f"scatter_{name}": x for name, x in zip(NAMES, self.scatter, strict=True)},
-            "rms": self.rms,
-            "rms_scatter": self.rms_scatter,
-            "largest": self.largest,
-            "allowed": self.allowed,
+            **{name: getattr(self, name) for name in REST},
         }
 
     @classmethod
     def from_row(cls, row: Mapping[str, float | str]) -> Coverage:
         """The inverse of :meth:`row`."""
-        rest = {key: row[key] for key in ("name", "n", "rms", "rms_scatter", "largest", "allowed")}
+        rest = {key: row[key] for key in ("name", "n", *REST)}
         held, scatter = (
             tuple(float(row[f"{kind}_{name}"]) for name in NAMES) for kind in ("held", "scatter")
         )
@@ -165,17 +163,16 @@ class Counts:
         scatter, allowed = draws.std(2), np.quantile(draws[:, -1], ALLOWED, axis=1)
         n = len(LEVELS)
         return tuple(
-            Coverage(
-                name,
-                size,
-                tuple(truth[k, :n].tolist()),
-                tuple(scatter[k, :n].tolist()),
-                float(truth[k, n]),
-                float(scatter[k, n]),
-                float(truth[k, n + 1]),
-                float(allowed[k]),
+            Coverage(name, size, tuple(held[:n]), tuple(spread[:n]), held[n], spread[n], *largest)
+            for name, size, held, spread, *largest in zip(
+                self.names,
+                self.sizes,
+                truth.tolist(),
+                scatter.tolist(),
+                truth[:, n + 1].tolist(),
+                allowed.tolist(),
+                strict=True,
             )
-            for k, (name, size) in enumerate(zip(self.names, self.sizes, strict=True))
         )
 
 

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.core.progress import peak_memory_gb
-from lusee_bayes.core.version import versions
+from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment, infer
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.judge.chi2 import Split
@@ -167,9 +166,7 @@ class PriorComparison:
             "frequency_mhz": self.scenario.frequency_mhz,
             "n_data": self.best.channel.n_data,
             "priors": [one.as_json() for one in self.priors],
-            "seconds": {name: round(s, 3) for name, s in self.seconds.items()},
-            "peak_memory_gb": round(peak_memory_gb(), 3),
-            "versions": versions(),
+            **about_run(self.seconds),
         }
 
     def as_markdown(self) -> str:

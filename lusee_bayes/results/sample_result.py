@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lusee_bayes.core.progress import peak_memory_gb
-from lusee_bayes.core.version import versions
+from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.results.draws import warnings_of
@@ -121,7 +120,5 @@ class SampleResult:
             "step_size": [float(x) for x in stats["step_size"].values[:, -1]],
             "mean_steps": float(stats["n_steps"].mean()),
             "gradients_per_second": self.gradients_per_second,
-            "seconds": {name: round(s, 3) for name, s in self.seconds.items()},
-            "peak_memory_gb": round(peak_memory_gb(), 3),
-            "versions": versions(),
+            **about_run(self.seconds),
         }

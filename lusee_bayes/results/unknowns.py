@@ -36,6 +36,7 @@ from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
 from lusee_bayes.judge.residuals import HOURS_A_DAY
 from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, amplitudes_of_sky
+from lusee_bayes.results.saved import UNKNOWNS
 from lusee_bayes.systematics.gain_table import GainTable
 from lusee_bayes.systematics.systematic import LinearUnknowns
 
@@ -162,16 +163,12 @@ class UnknownsReport:
 
     def summary(self) -> dict[str, Any]:
         """Entry of summary.json."""
-        found: dict[str, Any] = {
-            "rows": self.table.to_dict("records"),
-            "common_gain_std_share": self.common,
-            "notes": self.notes(),
-        }
+        rows, notes = self.table.to_dict("records"), self.notes()
+        found: dict[str, Any] = {"rows": rows, "common_gain_std_share": self.common, "notes": notes}
         if self.null is None:
             return found
-        parts = dict(zip(self.null.names, self.null.weights.tolist(), strict=True))
         return found | {
-            "null_direction": parts,
+            "null_direction": dict(zip(self.null.names, self.null.weights.tolist(), strict=True)),
             "null_share": self.null.share,
             "null_sentence": self.null_sentence(),
         }
@@ -253,23 +250,16 @@ class Unknowns:
             It is also that of other data: no null direction is looked for.
         """
         told = self.amplitudes.integrated(np.asarray(mean), np.asarray(covariance))
-        rows = []
-        for row, z, std in zip(self.rows, told.mean.tolist(), told.std.tolist(), strict=True):
-            found = {
-                "unknown": row["unknown"],
-                "unit": row["unit"],
-                "value": row["expected"] + row["prior_std"] * z,
-                "std": row["prior_std"] * std,
-                "prior": row["prior"],
-                "prior_std": row["prior_std"],
-            }
-            rows.append(found | {"true": row["true"]} if "true" in row else found)
+        rows = pd.DataFrame(self.rows)
+        values = rows["expected"] + rows["prior_std"] * told.mean
+        rows = rows.assign(value=values, std=rows["prior_std"] * told.std)
         null = None if joint else self._null_direction(told, float(covariance[0, 0]))
         common = None
         if GAIN in self.names:
             gain = self.parts[self.names.index(GAIN)]
             common = float(np.sqrt(gain @ told.covariance @ gain))
-        return UnknownsReport(pd.DataFrame(rows), null, common)
+        columns = [*UNKNOWNS.variables, *(["true"] if "true" in rows else [])]
+        return UnknownsReport(rows[columns], null, common)
 
     def _null_direction(self, told: Amplitudes, variance: float) -> NullDirection:
         mixed = self.parts @ told.with_sky[0] / self.sky_std
@@ -365,15 +355,11 @@ def _like_the_sky(
     names, weights, at = [], [], 0
     every = np.eye(sum(len(systematic.names) for systematic in listed))
     for systematic in listed:
-        n = len(systematic.names)
-        own = every[at : at + n]
-        if isinstance(systematic, GainTable):
-            names.append(GAIN)
-            weights.append(systematic.common[None] @ own)
-        else:
-            names.extend(systematic.labels)
-            weights.append(own)
-        at += n
+        own = every[at : at + len(systematic.names)]
+        table = isinstance(systematic, GainTable)
+        names += [GAIN] if table else systematic.labels
+        weights.append(systematic.common[None] @ own if table else own)
+        at += len(own)
     return tuple(names), np.concatenate(weights)
 
 
@@ -450,17 +436,10 @@ def _table(
     noise = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
     left = second_order(experiment.setup, about, sky)
     truth = true_values(experiment.setup) if experiment.data.truth is not None else {}
-    rows = []
-    for name in mean:
-        row = {
-            "offset": name,
-            "value": mean[name],
-            "std": std[name],
-            "prior_std": prior[name],
-            "beyond_first_order": float(np.sqrt(np.mean((left[name] / noise) ** 2))),
-        }
-        rows.append(row | {"true": truth[name]} if truth else row)
-    return pd.DataFrame(rows)
+    beyond = {name: float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in mean}
+    columns = {"value": mean, "std": std, "prior_std": prior, "beyond_first_order": beyond}
+    columns |= {"true": {name: truth[name] for name in mean}} if truth else {}
+    return pd.DataFrame(columns, index=list(mean)).rename_axis("offset").reset_index()
 
 
 def _preferred(
@@ -471,11 +450,8 @@ def _preferred(
     values: dict[str, float],
 ) -> pd.DataFrame:
     setup, data = experiment.setup, experiment.data
-    steps = {
-        name: step
-        for kind, step in TESTED.items()
-        for name in offset_names((kind,), setup.observation.n_runs)
-    }
+    n_runs = setup.observation.n_runs
+    steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), n_runs)}
     centre = dict.fromkeys(steps, 0.0) | values
     offsets = offsets_about(setup, steps, sky, centre)
     per_unit = offsets.templates / np.asarray(offsets.stds)
