@@ -35,7 +35,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.arrays import Ells, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, mode_numbers, n_modes, turn_about_z
 from lusee_bayes.core.linalg import solve_lower
@@ -270,7 +270,7 @@ class UnderAnySky:
     setup: Setup
     data: Visibilities
     model: LinearGaussian
-    spectrum: Float[np.ndarray, " ells"]
+    spectrum: Ells
 
     @classmethod
     def of(cls, setup: Setup, data: Visibilities, model: LinearGaussian) -> UnderAnySky:
@@ -320,7 +320,7 @@ class UnderAnySky:
         return replace(self, data=data, model=model).wide(model.coupling)[0]
 
 
-def _any_sky(setup: Setup, data: Visibilities) -> Float[np.ndarray, " ells"]:
+def _any_sky(setup: Setup, data: Visibilities) -> Ells:
     """C_ell of a prior that allows any sky, as bright as the data ask for, in K^2."""
     prior = on_host(setup.prior if setup.family is None else setup.family.expected())
     power = np.asarray(prior.variance())

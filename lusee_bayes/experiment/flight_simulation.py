@@ -24,14 +24,7 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
 from lusee_bayes.flight.gain_model import GainModel, draw_gains, synthetic_gains
-from lusee_bayes.flight.session import (
-    ADC_HIGH,
-    ADC_LOW,
-    FRAME_S,
-    PORTS,
-    BinOrigin,
-    channel_mhz,
-)
+from lusee_bayes.flight.session import ADC_HIGH, ADC_LOW, FRAME_S, PORTS, BinOrigin, channel_mhz
 from lusee_bayes.flight.session_files import SessionRows
 from lusee_bayes.flight.synthesis import (
     SATURATED_FACTOR,

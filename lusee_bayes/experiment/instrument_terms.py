@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array, Grid
+from lusee_bayes.core.arrays import Array, Grid, Modes
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.lazy import numpyro
 from lusee_bayes.core.reading import naming
@@ -223,10 +223,7 @@ def pointing_offsets(setup: Setup, around: Around) -> PointingOffsets:
 
 
 def offsets_about(
-    setup: Setup,
-    stds: Mapping[str, float],
-    sky: Float[np.ndarray, " modes"],
-    centre: Mapping[str, float],
+    setup: Setup, stds: Mapping[str, float], sky: Modes, centre: Mapping[str, float]
 ) -> PointingOffsets:
     """Offsets with templates about a sky and values: half the difference at +-1 standard deviation.
 
@@ -265,7 +262,7 @@ def offsets_about(
 
 
 def second_order(
-    setup: Setup, stds: Mapping[str, float], sky: Float[np.ndarray, " modes"]
+    setup: Setup, stds: Mapping[str, float], sky: Modes
 ) -> dict[str, Float[np.ndarray, " data"]]:
     """What offsets of one standard deviation do to the data beyond first order, in K."""
     middle = sum(_seen(setup, sky))
@@ -277,7 +274,7 @@ def second_order(
 
 
 def _seen(
-    setup: Setup, sky: Float[np.ndarray, " modes"]
+    setup: Setup, sky: Modes
 ) -> tuple[Float[np.ndarray, " data"], Float[np.ndarray, " data"]]:
     """What the data are of the sky, and of the sources with their mean fluxes."""
     sources = np.zeros(setup.layout.size)

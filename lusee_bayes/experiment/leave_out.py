@@ -21,9 +21,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.arrays import GridFlags, TimeFlags, on_host
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
@@ -62,7 +62,7 @@ class Group(NamedTuple):
 
     kind: str
     name: str
-    data: Bool[np.ndarray, "products times"]
+    data: GridFlags
     of: int
 
 
@@ -101,7 +101,7 @@ class Comparison:
         known = np.asarray(layout.present) & np.isfinite(z) & (degrees > 0.0)
         return cls(data, left_out, chi2, degrees, np.where(known, z, 0.0))
 
-    def without(self, gone: Bool[np.ndarray, "products times"]) -> Comparison:
+    def without(self, gone: GridFlags) -> Comparison:
         """Compare the others, with the same model."""
         return Comparison.of(self.left_out.without(gone), self.data)
 
@@ -115,7 +115,7 @@ class Comparison:
         """By how much times, or one of their data, stand out: chi^2 over its mean."""
         return np.maximum(self.ratio, (self.z**2).max(axis=0) / len(self.z))
 
-    def worst(self, false_alarm: float, least: float = 0.0) -> Bool[np.ndarray, "products times"]:
+    def worst(self, false_alarm: float, least: float = 0.0) -> GridFlags:
         """The worst of what stands out: whole times, or a value without which its time fits.
 
         chi^2 of a time less z^2 of one of its data is that of its other data.
@@ -293,7 +293,7 @@ class Fitting:
         Why good data do not fit, where that was found: also why a map of them may fail.
     """
 
-    flagged: Bool[np.ndarray, "products times"]
+    flagged: GridFlags
     rounds: int
     chi2: Float[np.ndarray, " times"]
     remark: str = ""
@@ -303,7 +303,7 @@ class Fitting:
     cause: str = ""
 
     @property
-    def times(self) -> Bool[np.ndarray, " times"]:
+    def times(self) -> TimeFlags:
         """Times of which every product is flagged."""
         return self.flagged.all(axis=0)
 
@@ -419,7 +419,7 @@ class _Limits:
     present : (products, times) array of bool; values : number of values
     """
 
-    present: Bool[np.ndarray, "products times"]
+    present: GridFlags
     values: float
 
     @classmethod
@@ -430,21 +430,17 @@ class _Limits:
         left = (MOST - lost) / (1.0 - lost) * n
         return cls(np.asarray(data.layout.present), max(left, SMALL * n, data.layout.n_products))
 
-    def count(self, gone: Bool[np.ndarray, "products times"]) -> int:
+    def count(self, gone: GridFlags) -> int:
         """Number of values that there were."""
         return int((gone & self.present).sum())
 
-    def broken(
-        self,
-        gone: Bool[np.ndarray, "products times"],
-        groups: Bool[np.ndarray, "products times"],
-    ) -> bool:
+    def broken(self, gone: GridFlags, groups: GridFlags) -> bool:
         """Whether too much goes, ``groups`` as a whole, or an auto without its port's crosses."""
         times = (gone & ~groups).any(axis=0).sum()
         too_many = times > max(MOST * gone.shape[1], 1.0) or self.count(gone) > self.values
         return bool(too_many) or self.auto_alone(gone) is not None
 
-    def auto_alone(self, gone: Bool[np.ndarray, "products times"]) -> int | None:
+    def auto_alone(self, gone: GridFlags) -> int | None:
         """The port whose auto goes while crosses stay."""
         products = all_products(round(np.sqrt(len(gone))))
         left = (self.present & ~gone).any(axis=1)
@@ -461,18 +457,18 @@ class _Limits:
 class _Eliminated:
     """What goes, groups among it."""
 
-    flagged: Bool[np.ndarray, "products times"]
+    flagged: GridFlags
     groups: tuple[Group, ...]
 
 
 def _one_by_one(
     start: Comparison,
-    gone: Bool[np.ndarray, "products times"],
-    groups: Bool[np.ndarray, "products times"],
+    gone: GridFlags,
+    groups: GridFlags,
     limits: _Limits,
     false_alarm: float,
     least: float,
-) -> tuple[Comparison, Bool[np.ndarray, "products times"] | None]:
+) -> tuple[Comparison, GridFlags | None]:
     """Flag times and values, the worst first; ``groups`` are among what is ``gone`` from ``start``.
 
     Of what is left, and what goes in all; or of what was left before that was too much, and None.
@@ -487,10 +483,7 @@ def _one_by_one(
 
 
 def _eliminated(
-    start: Comparison,
-    gone: Bool[np.ndarray, "products times"],
-    limits: _Limits,
-    false_alarm: float,
+    start: Comparison, gone: GridFlags, limits: _Limits, false_alarm: float
 ) -> tuple[_Eliminated | None, str]:
     """What goes under one model, besides what is ``gone``; None if that is too much.
 
@@ -527,12 +520,7 @@ def _about_auto(port: int | None) -> str:
     )
 
 
-def _remark(
-    gone: Bool[np.ndarray, "products times"],
-    groups: tuple[Group, ...],
-    share: float,
-    false_alarm: float,
-) -> str:
+def _remark(gone: GridFlags, groups: tuple[Group, ...], share: float, false_alarm: float) -> str:
     single = gone & ~np.any([np.zeros_like(gone), *(group.data for group in groups)], axis=0)
     whole = gone.all(axis=0) & single.any(axis=0)
     n_single, n = int(single[:, ~whole].sum()), gone.shape[1]
@@ -550,9 +538,7 @@ def _remark(
     )
 
 
-def without(
-    setup: Setup, data: Visibilities, gone: Bool[np.ndarray, "products times"]
-) -> tuple[Setup, Visibilities]:
+def without(setup: Setup, data: Visibilities, gone: GridFlags) -> tuple[Setup, Visibilities]:
     """Setup and data without some of the data.
 
     Raises

@@ -11,9 +11,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import jax
-from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, on_device
+from lusee_bayes.core.arrays import Grid, on_device
 from lusee_bayes.experiment.instrument_terms import (
     PointingTerm,
     pointed,
@@ -127,7 +126,7 @@ def true_values(setup: Setup) -> Truth:
     return {name: value for term in TERMS for name, value in term.truth(setup, key).items()}
 
 
-def true_signal(setup: Setup, truth: Truth) -> Float[Array, "products times"]:
+def true_signal(setup: Setup, truth: Truth) -> Grid:
     """Visibilities of sky, ground and systematics with the true instrument and values, in K."""
     key = jax.random.key(setup.scenario.seed)
     setup = true_setup(setup, truth)

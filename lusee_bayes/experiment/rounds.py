@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.arrays import Grid, on_host
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.instrument_terms import pointed
@@ -277,9 +277,7 @@ def rebuilds_visibilities(setup: Setup) -> bool:
     return rebuilds_gains(setup) or radiometer_about(setup) == "posterior"
 
 
-def prediction(
-    setup: Setup, found: Inference, solved: Float[np.ndarray, " data"]
-) -> Float[Array, "products times"]:
+def prediction(setup: Setup, found: Inference, solved: Float[np.ndarray, " data"]) -> Grid:
     """Visibilities of the mean map, with all else that N holds but drifts and noise, in K.
 
     Parameters

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from lusee_bayes.core.arrays import Array, Grid
+from lusee_bayes.core.arrays import Array, DataVector, Grid
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
@@ -145,9 +145,9 @@ class Setup:
     beams: ProductBeams
     coupling: CouplingMatrix
     prior: Prior
-    responses: tuple[Float[Array, "products times"], ...]
+    responses: tuple[Grid, ...]
     background: Float[Array, " products"]
-    signal: Float[Array, "products times"]
+    signal: Grid
     receiver: Receiver | None = None
     family: PriorFamily | None = None
     calibration: Calibration | None = None
@@ -164,7 +164,7 @@ class Setup:
         return self.coupling.layout
 
     @property
-    def offset(self) -> Float[Array, " data"] | None:
+    def offset(self) -> DataVector | None:
         """The background in every datum, in K; None where there is none."""
         if not np.any(self.background):
             return None
@@ -365,8 +365,8 @@ def expected_signal(
     complete: CouplingMatrix,
     sky: Sky,
     background: Float[Array, " products"],
-    responses: tuple[Float[Array, "products times"], ...],
-) -> Float[Array, "products times"]:
+    responses: tuple[Grid, ...],
+) -> Grid:
     """Visibilities of sky, background and sources with their mean fluxes, in K.
 
     Parameters

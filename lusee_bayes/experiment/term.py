@@ -24,7 +24,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array, Grid
+from lusee_bayes.core.arrays import Array, DataVector, Grid
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.noise_sections import NoiseAbout
 from lusee_bayes.experiment.scenario import Scenario
@@ -63,11 +63,11 @@ class Around:
     """
 
     data: Visibilities | None = None
-    visibilities: Float[Array, "products times"] | None = None
+    visibilities: Grid | None = None
     sky: Float[Array, " modes"] | None = None
     values: Mapping[str, float] | None = None
-    seen: Float[Array, " data"] | None = None
-    freedom: Float[Array, " data"] | None = None
+    seen: DataVector | None = None
+    freedom: DataVector | None = None
 
 
 class Term(ABC):
@@ -194,9 +194,7 @@ def _has_autos(setup: Setup) -> bool:
     return all(seen[k] for port, k in enumerate(auto_indices(n)) if port in used)
 
 
-def noise_visibilities(
-    setup: Setup, around: Around, about: NoiseAbout
-) -> Float[Array, "products times"]:
+def noise_visibilities(setup: Setup, around: Around, about: NoiseAbout) -> Grid:
     """The visibilities that a term of N is built around, in K.
 
     Before there is a prediction it is the measured ones', or, if autos that noise depends on were
@@ -211,9 +209,7 @@ def noise_visibilities(
     return measured_visibilities(around.data, setup.signal)
 
 
-def measured_visibilities(
-    data: Visibilities, model: Float[Array, "products times"]
-) -> Float[Array, "products times"]:
+def measured_visibilities(data: Visibilities, model: Grid) -> Grid:
     """Visibilities that set a noise level: the measured ones, absent samples interpolated.
 
     A time without any sample takes the model's (it enters nothing).

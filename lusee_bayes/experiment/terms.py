@@ -20,9 +20,7 @@ from lusee_bayes.experiment.sky_terms import (
     RegolithTerm,
     SourcesTerm,
 )
-from lusee_bayes.experiment.term import (
-    Term,
-)
+from lusee_bayes.experiment.term import Term
 
 # in the order in which they are applied to the model, and to simulated visibilities
 TERMS: tuple[Term, ...] = (

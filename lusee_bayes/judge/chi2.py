@@ -41,7 +41,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.arrays import Array, Ells, Pixels, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mean_over_m, sum_over_m
 from lusee_bayes.core.lazy import healpy, special
@@ -150,9 +150,7 @@ def probability(p: float) -> str:
     return f"= {p:.2g}" if p > 0 else "< 1e-300"
 
 
-def correlation(
-    mean: Float[Array, " modes"], truth: Float[Array, " modes"]
-) -> Float[np.ndarray, " ells"]:
+def correlation(mean: Float[Array, " modes"], truth: Float[Array, " modes"]) -> Ells:
     """Compute rho_ell = sum_m a a_true / sqrt(sum_m a^2 sum_m a_true^2), as the paper does.
 
     Parameters
@@ -170,9 +168,7 @@ def correlation(
     return _ratio(sum_over_m(mean * truth), power)
 
 
-def signal_to_noise(
-    mean: Float[Array, " modes"], truth: Float[Array, " modes"]
-) -> Float[np.ndarray, " ells"]:
+def signal_to_noise(mean: Float[Array, " modes"], truth: Float[Array, " modes"]) -> Ells:
     """Compute SNR_ell = sqrt( sum_m a^2 / sum_m (a - a_true)^2 ), as the paper does.
 
     Parameters
@@ -194,7 +190,7 @@ def _ratio(top: np.ndarray, bottom: np.ndarray) -> np.ndarray:
     return np.divide(top, bottom, out=np.full_like(top, np.nan), where=bottom > 0)
 
 
-def ell_cross(snr: Float[np.ndarray, " ells"]) -> int | None:
+def ell_cross(snr: Ells) -> int | None:
     """Find the first ell >= 1 with SNR_ell < 1.
 
     Parameters
@@ -211,7 +207,7 @@ def ell_cross(snr: Float[np.ndarray, " ells"]) -> int | None:
     return int(below[0]) + 1 if below.size else None
 
 
-def prior_fraction_per_ell(posterior: Posterior) -> Float[np.ndarray, " ells"]:
+def prior_fraction_per_ell(posterior: Posterior) -> Ells:
     """Average the share of the prior variance that is left over m.
 
     Parameters
@@ -232,7 +228,7 @@ def prior_fraction_per_ell(posterior: Posterior) -> Float[np.ndarray, " ells"]:
     return mean_over_m(posterior.prior_fraction())
 
 
-def effective_resolution_deg(prior_fraction: Float[np.ndarray, " ells"]) -> float | None:
+def effective_resolution_deg(prior_fraction: Ells) -> float | None:
     """Compute 180 degrees over the first ell >= 1 with more than half of the prior variance left.
 
     Parameters
@@ -268,7 +264,7 @@ def expected_chi2(posterior: Posterior, n_data: int) -> float:
     return float(n_data - len(inverse) + (inverse**2).sum())
 
 
-def highest_altitude(observation: Observation, nside: int) -> Float[np.ndarray, " pixels"]:
+def highest_altitude(observation: Observation, nside: int) -> Pixels:
     """Compute the highest altitude that every pixel of the sky reached.
 
     Parameters

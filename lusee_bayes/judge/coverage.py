@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lusee_bayes.core.arrays import Modes, Pixels
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.harmonics import columns_to_maps, lmax_of, mode_numbers
 from lusee_bayes.core.lazy import healpy, special
@@ -112,10 +113,7 @@ class Counts:
 
     @classmethod
     def of_pixels(
-        cls,
-        std: Float[np.ndarray, " pixels"],
-        error: Float[np.ndarray, " modes"],
-        deviations: Float[np.ndarray, "draws modes"],
+        cls, std: Pixels, error: Modes, deviations: Float[np.ndarray, "draws modes"]
     ) -> Counts:
         """By Galactic latitude.
 
@@ -142,10 +140,7 @@ class Counts:
 
     @classmethod
     def of_modes(
-        cls,
-        std: Float[np.ndarray, " modes"],
-        error: Float[np.ndarray, " modes"],
-        deviations: Float[np.ndarray, "draws modes"],
+        cls, std: Modes, error: Modes, deviations: Float[np.ndarray, "draws modes"]
     ) -> Counts:
         """By multipole, of harmonic coefficients; what is known exactly pulls at nothing."""
         groups = multipoles(lmax_of(len(std)))

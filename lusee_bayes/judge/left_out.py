@@ -68,7 +68,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 
-from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.arrays import DataVector, GridFlags, TimeFlags, on_host
 from lusee_bayes.core.engine import once
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mode_numbers
@@ -118,11 +118,11 @@ class LeftOut(ABC):
     inverse_diagonal: Float[np.ndarray, "products times"]
 
     @abstractmethod
-    def stretch(self, times: Bool[np.ndarray, " times"]) -> Missed:
+    def stretch(self, times: TimeFlags) -> Missed:
         """Leave out all data of a stretch of time, such as a day."""
 
     @abstractmethod
-    def together(self, times: Bool[np.ndarray, " times"]) -> Missed:
+    def together(self, times: TimeFlags) -> Missed:
         """Leave out a large part of all data, such as those at one turntable angle."""
 
     @abstractmethod
@@ -159,7 +159,7 @@ class DenseLeftOut(LeftOut):
         If the model cannot be factorised.
     """
 
-    def __init__(self, model: LinearGaussian, data: Float[Array, " data"], layout: DataLayout):
+    def __init__(self, model: LinearGaussian, data: DataVector, layout: DataLayout):
         model = on_host(model)
         self.layout = layout
         self._blocks, templates = _blocks(model.noise, layout)
@@ -170,7 +170,7 @@ class DenseLeftOut(LeftOut):
         self._rest = self._rest - (0.0 if mean is None else sky @ mean)
         self._solve()
 
-    def without(self, gone: Bool[np.ndarray, "products times"]) -> DenseLeftOut:
+    def without(self, gone: GridFlags) -> DenseLeftOut:
         """Take out data for good.
 
         Parameters
@@ -283,13 +283,18 @@ class DenseLeftOut(LeftOut):
         return Missed(float(chi2), float(without - within), log_det)
 
 
+def base_and_templates(noise: Covariance) -> tuple[Covariance, Float[np.ndarray, "data templates"]]:
+    """N_0 and T of N = N_0 + T T^T; T has no columns where N is not of this form."""
+    if isinstance(noise, LowRankUpdate):
+        return noise.base, np.asarray(noise.update.root)
+    return noise, np.zeros((noise.size, 0))
+
+
 def _blocks(
     noise: Covariance, layout: DataLayout
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], Float[np.ndarray, "data templates"]]:
     """D in blocks, each with its data, and T; all data in one block where N couples times."""
-    base, templates = noise, np.zeros((noise.size, 0))
-    if isinstance(base, LowRankUpdate):
-        base, templates = base.base, np.asarray(base.update.root)
+    base, templates = base_and_templates(noise)
     weights = base.time_weights(layout)
     if weights is None:
         root = cho_factor(np.asarray(noise.dense()), lower=True)
@@ -394,10 +399,9 @@ def roots_of_blocks(
     return np.linalg.cholesky(by_time + missing) * present[:, None] * present[:, :, None]
 
 
-def log_det_of_weights(weights: np.ndarray) -> float:
-    """ln|D| of the data that are there, for D as in :func:`weigh`."""
-    root = np.sqrt(weights).ravel() if weights.ndim == 2 else roots_of_blocks(weights)
-    return _log_det_of_roots(root)
+def _root_of_weights(weights: np.ndarray) -> np.ndarray:
+    """c of D = c c^T, for D as in :func:`weigh`."""
+    return np.sqrt(weights).ravel() if weights.ndim == 2 else roots_of_blocks(weights)
 
 
 def _log_det_of_roots(root: Float[np.ndarray, "..."]) -> float:
@@ -426,11 +430,9 @@ class StructuredLeftOut(LeftOut):
 
     """
 
-    def __init__(self, model: LinearGaussian, posterior: Posterior, data: Float[Array, " data"]):
+    def __init__(self, model: LinearGaussian, posterior: Posterior, data: DataVector):
         model, posterior = on_host(model), on_host(posterior)
-        base, templates = model.noise, np.zeros((model.n_data, 0))
-        if isinstance(base, LowRankUpdate):
-            base, templates = base.base, np.asarray(base.update.root)
+        base, templates = base_and_templates(model.noise)
         self._coupling = model.coupling
         shape = self._coupling.layout.n_products, self._coupling.layout.n_times
         self._complete = replace(self._coupling, layout=DataLayout(*shape))
@@ -456,12 +458,9 @@ class StructuredLeftOut(LeftOut):
         # C'^(1/2) of the random directions, whose amplitudes are zero
         self._probed = self._probes.copy()
         self._probed[: len(signs)] = solve_lower(self._lower, 2.0 * signs - 1.0, transpose=False)
-        self._amplitudes = np.concatenate(
-            [
-                -solve_lower(self._lower, across.T, transpose=False),
-                solve_lower(self._q, np.eye(n), transpose=False),
-            ]
-        )
+        of_sky = solve_lower(self._lower, across.T, transpose=False)
+        own = solve_lower(self._q, np.eye(n), transpose=False)
+        self._amplitudes = np.concatenate([-of_sky, own])
 
     def stretch(self, times):
         outside, log_det, inside, halves = 0.0, 0.0, [], []
@@ -488,19 +487,16 @@ class StructuredLeftOut(LeftOut):
     def together(self, times):
         squared = float((self.u * self._y)[:, times].sum())
         every = np.ones(len(self.u), dtype=bool)
-        log_det = log_det_of_weights(self._weights[..., times])
+        log_det = _log_det_of_roots(_root_of_weights(self._weights[..., times]))
         return self._taken_out(self._weights * times, self.u * times, every, squared, log_det)
 
     def product(self, number):
-        own, mixing = self._weights[number], 0.0
+        own, mixing = self._weights[number], np.zeros(self.u.shape)
         if self._weights.ndim == 2:
-            mixing = np.zeros(self.u.shape)
             mixing[number] = own > 0
         else:
             own = self._weights[number, number]
-            mixing = np.divide(
-                self._weights[number], own, out=np.zeros(self.u.shape), where=own > 0
-            )
+            np.divide(self._weights[number], own, out=mixing, where=own > 0)
         here = own > 0
         white = np.divide(self.u[number], np.sqrt(own), out=np.zeros(len(own)), where=here)
         log_det = float(np.log(own[here]).sum())
@@ -589,7 +585,7 @@ class StructuredLeftOut(LeftOut):
                 Part((k, here), slice(k * n, (k + 1) * n), np.sqrt(weights[k]), functions)
                 for k in range(n_products)
             ]
-        root = np.sqrt(weights).ravel() if weights.ndim == 2 else roots_of_blocks(weights)
+        root = _root_of_weights(weights)
         every = np.kron(np.eye(n_products), functions)
         amplitudes = self._t[:, here].reshape(len(every), -1)
         where = np.ix_(np.arange(n_products), here)
@@ -647,11 +643,8 @@ class StructuredLeftOut(LeftOut):
             left[n:, :n] -= taken
             left[:n, n:] -= taken.T
             left[n:, n:] -= np.einsum("kta,ktb->ab", weighted, self._t)
-        h = [
-            self._pulled(coupling, pull[used][..., None])[0],
-            np.einsum("kt,kta->a", pull, self._t),
-        ]
-        h = np.concatenate(h)
+        of_sky = self._pulled(coupling, pull[used][..., None])[0]
+        h = np.concatenate([of_sky, np.einsum("kt,kta->a", pull, self._t)])
         try:
             root = cho_factor(left, lower=True, overwrite_a=True)
         except LinAlgError:

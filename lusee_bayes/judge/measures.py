@@ -27,10 +27,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, compiled, on_host
+from lusee_bayes.core.arrays import Array, DataVector, Modes, ModesMatrix, Pixels, on_host
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.judge.coverage import latitudes, multipoles
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
@@ -82,18 +81,6 @@ def data_freedom(
     return freedom + (columns * solved).sum(1)
 
 
-@compiled
-def _rows(posterior: Posterior, directions: Float[Array, "n modes"]) -> Float[Array, "n modes"]:
-    """y G (1 - C_w) G^-1, C_w the covariance of u."""
-    white = posterior.prior.colour_columns(directions)
-    inside = white if posterior.basis is None else white @ posterior.basis
-    half = solve_lower(posterior.lower, inside.T, transpose=False)
-    known = inside - solve_lower(posterior.lower, half, transpose=True).T
-    if posterior.basis is not None:
-        known = known @ posterior.basis.T
-    return posterior.prior.whiten_columns(known)
-
-
 # relative, of a difference of two quadratic forms
 ROUNDING = 1e-10
 
@@ -118,8 +105,8 @@ class Preferences:
 def preferences(
     model: LinearGaussian,
     posterior: Posterior,
-    covariance: Float[np.ndarray, "modes modes"],
-    data: Float[Array, " data"],
+    covariance: ModesMatrix,
+    data: DataVector,
     templates: Float[np.ndarray, "data n"],
 ) -> Preferences:
     """Test templates one by one.
@@ -161,11 +148,7 @@ def preferences(
     return Preferences(pull * inverse, np.sqrt(inverse), pull**2 * inverse)
 
 
-def strengths(
-    deviation: Float[np.ndarray, " modes"],
-    of_modes: Float[np.ndarray, " modes"],
-    of_pixels: Float[np.ndarray, " pixels"],
-) -> dict[str, float]:
+def strengths(deviation: Modes, of_modes: Modes, of_pixels: Pixels) -> dict[str, float]:
     """Compute the square of a sky's deviation over what is expected, part by part.
 
     The monopole, of which priors know little, is left out.

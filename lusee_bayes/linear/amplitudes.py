@@ -47,7 +47,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.arrays import Array, DataVector, Modes, ModesMatrix, on_host
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
@@ -104,11 +104,9 @@ class AmplitudesOfSky:
     mean: Float[np.ndarray, " n"]
     pull: Float[np.ndarray, "n modes"]
     covariance: Float[np.ndarray, "n n"]
-    reference: Float[np.ndarray, " modes"]
+    reference: Modes
 
-    def integrated(
-        self, mean: Float[np.ndarray, " modes"], covariance: Float[np.ndarray, "modes modes"]
-    ) -> Amplitudes:
+    def integrated(self, mean: Modes, covariance: ModesMatrix) -> Amplitudes:
         """Integrate a sky N(mean, covariance) out, in K and K^2: given any data besides."""
         with_sky = -covariance @ self.pull.T
         return Amplitudes(
@@ -142,7 +140,7 @@ class AmplitudesOfSky:
 def amplitudes_of_sky(
     model: LinearGaussian,
     reference: Float[Array, " modes"],
-    data: Float[Array, " data"],
+    data: DataVector,
     templates: Float[Array, "data n"],
 ) -> AmplitudesOfSky:
     """Compute the posterior of templates' amplitudes given the sky.
@@ -175,10 +173,7 @@ def amplitudes_of_sky(
 
 
 def template_amplitudes(
-    model: LinearGaussian,
-    posterior: Posterior,
-    data: Float[Array, " data"],
-    templates: Float[Array, "data n"],
+    model: LinearGaussian, posterior: Posterior, data: DataVector, templates: Float[Array, "data n"]
 ) -> Amplitudes:
     """Compute the posterior of templates' amplitudes.
 
@@ -204,7 +199,7 @@ def template_amplitudes(
 
 
 def weighted_residual(
-    model: LinearGaussian, posterior: Posterior, data: Float[Array, " data"]
+    model: LinearGaussian, posterior: Posterior, data: DataVector
 ) -> Float[np.ndarray, " data"]:
     """Compute N^-1 (d - offset - A m), m the posterior mean of the sky.
 
@@ -264,7 +259,7 @@ class Patterns(eqx.Module):
         return cls(patterns, information, lower)
 
     @property
-    def expected(self) -> Float[np.ndarray, " modes"]:
+    def expected(self) -> Modes:
         """sum_j t_j, in K."""
         return self.patterns.sum(0)
 
@@ -284,7 +279,7 @@ class Patterns(eqx.Module):
             log_det=np.asarray(whole.log_det + 2.0 * np.log(np.diagonal(self.lower)).sum()),
         )
 
-    def whole_sky(self, diffuse: Float[np.ndarray, " modes"]) -> Float[np.ndarray, " modes"]:
+    def whole_sky(self, diffuse: Modes) -> Modes:
         """Compute the mean of m given d, in K.
 
         Parameters
@@ -295,9 +290,7 @@ class Patterns(eqx.Module):
         return self.whole_skies(diffuse[None], np.zeros((1, len(self.patterns))))[0]
 
     def whole_skies(
-        self,
-        diffuse: Float[np.ndarray, "skies modes"],
-        z: Float[np.ndarray, "skies patterns"],
+        self, diffuse: Float[np.ndarray, "skies modes"], z: Float[np.ndarray, "skies patterns"]
     ) -> Float[np.ndarray, "skies modes"]:
         """Compute draws of m given draws of d, in K.
 
@@ -317,9 +310,7 @@ class Patterns(eqx.Module):
         half = solve_lower(self.lower, self.patterns @ pull.T, transpose=False) + z.T
         return there + solve_lower(self.lower, half, transpose=True).T @ self.patterns
 
-    def whole_covariance(
-        self, covariance: Float[np.ndarray, "modes modes"]
-    ) -> Float[np.ndarray, "modes modes"]:
+    def whole_covariance(self, covariance: ModesMatrix) -> ModesMatrix:
         """Compute the covariance of m from that of d, in K^2.
 
         Parameters

@@ -24,6 +24,7 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import (
     Array,
+    DataVector,
     compiled,
     namespace,
     on_processor,
@@ -39,17 +40,11 @@ from lusee_bayes.core.checks import (
     require_shape,
 )
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import (
-    cholesky,
-    gram_matrix,
-    precise_residual,
-    scaled,
-    solve_lower,
-)
+from lusee_bayes.core.linalg import cholesky, gram_matrix, precise_residual, scaled, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
 from lusee_bayes.linear.normal_matrix import has_structure, is_within_times, normal_matrix
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.solver import CONVERGENCE, MAX_REFINEMENTS
+from lusee_bayes.linear.solver import CONVERGENCE, MAX_REFINEMENTS, unfinished
 from lusee_bayes.noise.covariance import Covariance, Factor
 from lusee_bayes.sky.prior import Prior
 
@@ -86,8 +81,8 @@ class Information(Described, eqx.Module):
         coupling: Coupling,
         prior: Prior,
         noise: Covariance,
-        offset: Float[Array, " data"] | None,
-        data: Float[Array, " data"],
+        offset: DataVector | None,
+        data: DataVector,
     ) -> tuple[Information, Posterior]:
         """Compute the information of data, and the posterior under a prior.
 
@@ -285,12 +280,7 @@ def _precision_root(matrix: Float[Array, "modes modes"], prior: Prior) -> Array:
 
 @compiled
 def _condition(
-    information: Information,
-    prior: Prior,
-    lower: Array,
-    refinements: int,
-    *,
-    precise: bool = False,
+    information: Information, prior: Prior, lower: Array, refinements: int, *, precise: bool = False
 ) -> tuple[Array, Array, Array]:
     """Mean of u, ln p(d), and the last step in standard deviations.
 
@@ -302,13 +292,6 @@ def _condition(
     mean = prior.white_mean
     expected = xp.zeros_like(start) if mean is None else mean
     here = information.recentred(prior.colour(start))
-
-    def unfinished(state):
-        _, moved, before, count = state
-        # what is left may be rounding, which no refinement makes smaller
-        settled = (moved < CONVERGENCE) & (moved > 0.5 * before)
-        more = (moved > 1e-3 * CONVERGENCE) & ~settled & (count < refinements)
-        return (count < 1) | more
 
     def refine(state):
         correction, before, _, count = state
@@ -324,7 +307,7 @@ def _condition(
 
     never = xp.asarray(np.inf)
     first = (xp.zeros_like(start), never, never, xp.asarray(0))
-    correction, moved, _, _ = repeated(xp, unfinished, refine, first)
+    correction, moved, _, _ = repeated(xp, unfinished(refinements), refine, first)
     u = start + correction
     log_evidence = -0.5 * (
         here.recentred(prior.colour(u)).misfit

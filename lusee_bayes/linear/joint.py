@@ -29,14 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import (
-    Array,
-    accumulated,
-    compiled,
-    namespace,
-    on_processor,
-    placed,
-)
+from lusee_bayes.core.arrays import Array, accumulated, compiled, namespace, on_processor, placed
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import (
@@ -219,9 +212,7 @@ def _assembled(sums: ComponentSums) -> Information:
 
 
 def solve_directly(
-    prior: SpectralPrior,
-    channels: Iterable[Information],
-    reference: Float[Array, "channels modes"],
+    prior: SpectralPrior, channels: Iterable[Information], reference: Float[Array, "channels modes"]
 ) -> Posterior:
     """Compute the posterior of all component maps by factorising its matrix.
 

@@ -37,7 +37,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from lusee_bayes.core.arrays import Array, as_complex, compiled, namespace, placed, scan
+from lusee_bayes.core.arrays import (
+    Array,
+    ModesMatrix,
+    as_complex,
+    compiled,
+    namespace,
+    placed,
+    scan,
+)
 from lusee_bayes.core.checks import is_traced, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import Rotation, mode_numbers
@@ -320,15 +328,11 @@ def _with_templates(coupling: CouplingMatrix, noise: LowRankUpdate) -> Array:
     return normal_matrix(coupling, noise.base) - gram_matrix(solve_lower(lower, v, transpose=False))
 
 
-def _of_bands(coupling: CouplingMatrix, noise: TimeBandedCovariance) -> Array:
-    return _streamed(coupling, noise.factor())
-
-
 # how A^T N^-1 A is summed for each structure of N in time; those without an entry need A itself
 NORMAL_MATRICES: dict[type[Covariance], Callable[..., Array]] = {
     DiagonalCovariance: _within_times,
     TimeBlockCovariance: _within_times,
-    TimeBandedCovariance: _of_bands,
+    TimeBandedCovariance: lambda coupling, noise: _streamed(coupling, noise.factor()),
     LowRankUpdate: _with_templates,
 }
 
@@ -381,9 +385,7 @@ def _turntable_groups(
 
 @compiled
 def _to_galactic(
-    pole_from_galactic: Rotation,
-    lower: Float[Array, "modes modes"],
-    place: Int[Array, " modes"],
+    pole_from_galactic: Rotation, lower: Float[Array, "modes modes"], place: Int[Array, " modes"]
 ) -> Float[Array, "modes modes"]:
     """R^T M R, symmetric to the last bit.
 
@@ -399,8 +401,8 @@ def _to_galactic(
 
 
 def _turned(
-    rotation: Rotation, matrix: Float[np.ndarray, "modes modes"], place: Int[np.ndarray, " modes"]
-) -> Float[np.ndarray, "modes modes"]:
+    rotation: Rotation, matrix: ModesMatrix, place: Int[np.ndarray, " modes"]
+) -> ModesMatrix:
     """R^T M R degree by degree, on and below the diagonal: what is worked on fits into a cache."""
     turned = np.empty_like(matrix)
     spans = [slice(ell**2, (ell + 1) ** 2) for ell in range(len(rotation.blocks))]

@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.arrays import Modes, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, per_mode, power_spectrum, sum_over_m
 from lusee_bayes.core.linalg import inverse_from_cholesky, symmetric_product
@@ -51,10 +51,19 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
+# arrays that recur
+Fields = Float[np.ndarray, "fields modes"]
+ChannelModes = Float[np.ndarray, "channels modes"]
+
 # found when a round moves all unknowns together by less than this, in standard deviations, and no
 # ln A or tilt by more than that
 SETTLED, SETTLED_LAW = 0.1, 0.05
 MAX_ROUNDS, HALVINGS = 60, 20
+
+
+# functions of a channel's number and information
+OfChannel = Callable[[int, Information], dict[str, np.ndarray]]
+Linearised = Callable[[int, Information], Information]
 
 
 @runtime_checkable
@@ -62,17 +71,12 @@ class Channels(Protocol):
     """The channels of a joint posterior, wherever their data are."""
 
     def each(
-        self,
-        function: Callable[[int, Information], dict[str, np.ndarray]],
-        shapes: dict[str, tuple[int, ...]],
+        self, function: OfChannel, shapes: dict[str, tuple[int, ...]]
     ) -> dict[str, np.ndarray]:
         """Call a function with number and information of every channel; its arrays, stacked."""
 
     def summed(
-        self,
-        prior: SpectralPrior,
-        reference: Float[np.ndarray, "channels modes"],
-        function: Callable[[int, Information], Information],
+        self, prior: SpectralPrior, reference: ChannelModes, function: Linearised
     ) -> Information:
         """What a function of every channel's information says of the component maps."""
 
@@ -90,19 +94,14 @@ class ChannelsInMemory:
     informations: tuple[Information, ...]
 
     def each(
-        self,
-        function: Callable[[int, Information], dict[str, np.ndarray]],
-        shapes: dict[str, tuple[int, ...]],
+        self, function: OfChannel, shapes: dict[str, tuple[int, ...]]
     ) -> dict[str, np.ndarray]:
         """Call a function with number and information of every channel; its arrays, stacked."""
         found = [function(k, information) for k, information in enumerate(self.informations)]
         return {name: np.stack([part[name] for part in found]) for name in shapes}
 
     def summed(
-        self,
-        prior: SpectralPrior,
-        reference: Float[np.ndarray, "channels modes"],
-        function: Callable[[int, Information], Information],
+        self, prior: SpectralPrior, reference: ChannelModes, function: Linearised
     ) -> Information:
         """What a function of every channel's information says of the component maps."""
         sums = ComponentSums.empty(prior, reference)
@@ -133,7 +132,7 @@ class PositiveMode:
 
     skies: PositiveSkies
     laws: FieldLaws
-    exponents: Float[np.ndarray, "channels modes"]
+    exponents: ChannelModes
     posterior: Posterior
     energy: float
     moved: float
@@ -145,7 +144,7 @@ class PositiveMode:
         return self.laws.prior(self.skies)
 
     @property
-    def fields(self) -> Float[np.ndarray, "fields modes"]:
+    def fields(self) -> Fields:
         """Posterior mean of the fields."""
         return np.asarray(self.posterior.mean).reshape(len(self.skies.names), -1)
 
@@ -156,10 +155,7 @@ def diffuse_part(skies: PositiveSkies, channel: int, information: Information) -
 
 
 def linearised(
-    skies: PositiveSkies,
-    channel: int,
-    information: Information,
-    exponent: Float[np.ndarray, " modes"],
+    skies: PositiveSkies, channel: int, information: Information, exponent: Modes
 ) -> Information:
     """What a channel's data say of its exponent, the sky being linear about a given one.
 
@@ -192,8 +188,8 @@ def linearised(
 class _Point:
     """Fields and exponents of all channels, and chi^2 of their skies."""
 
-    fields: Float[np.ndarray, "fields modes"]
-    exponents: Float[np.ndarray, "channels modes"]
+    fields: Fields
+    exponents: ChannelModes
     chi2: float
 
     def energy(self, prior: SpectralPrior) -> float:
@@ -211,7 +207,7 @@ def find_joint_mode(
     channels: Channels,
     *,
     learn: bool = False,
-    start: Float[np.ndarray, "fields modes"] | None = None,
+    start: Fields | None = None,
     report: Callable[[int, str], None] | None = None,
 ) -> PositiveMode:
     """Find the most probable skies.
@@ -244,29 +240,7 @@ def find_joint_mode(
     last = np.zeros_like(laws.parameters)
     for rounds in range(MAX_ROUNDS):
         prior = laws.prior(skies)
-
-        def relative(
-            channel: int, information: Information, at: np.ndarray = here.exponents
-        ) -> Information:
-            return linearised(skies, channel, information, at[channel])
-
-        information = channels.summed(prior, here.exponents, relative)
-        posterior = on_host(component_posterior(information, prior))
-        maps = np.asarray(posterior.mean).reshape(prior.n_components, -1)
-        spread = np.asarray(paired(posterior.covariance(), prior)) if learn else None
-
-        def judged(
-            channel: int,
-            information: Information,
-            relative: Callable = relative,
-            prior: SpectralPrior = prior,
-            maps: np.ndarray = maps,
-            spread: np.ndarray | None = spread,
-        ) -> dict[str, np.ndarray]:
-            return _judged(prior, channel, relative(channel, information), maps, spread)
-
-        found = channels.each(judged, shapes)
-        there = _Point(maps, found["exponent"], float(found["chi2"].sum()))
+        posterior, there, found = _linear_round(skies, channels, prior, here.exponents, shapes)
         energy = here.energy(prior)
         moved = np.sqrt(max(energy - there.energy(prior), 0.0))
         if report is not None:
@@ -289,9 +263,7 @@ def find_joint_mode(
     )
 
 
-def _chi2(
-    skies: PositiveSkies, channels: Channels, exponents: Float[np.ndarray, "channels modes"]
-) -> float:
+def _chi2(skies: PositiveSkies, channels: Channels, exponents: ChannelModes) -> float:
     def chi2(channel: int, information: Information) -> dict[str, np.ndarray]:
         diffuse = diffuse_part(skies, channel, information).without()
         return {"chi2": np.asarray(diffuse.chi2(skies.modes(channel, exponents[channel])))}
@@ -299,11 +271,35 @@ def _chi2(
     return float(channels.each(chi2, {"chi2": ()})["chi2"].sum())
 
 
+def _linear_round(
+    skies: PositiveSkies,
+    channels: Channels,
+    prior: SpectralPrior,
+    exponents: ChannelModes,
+    shapes: dict[str, tuple[int, ...]],
+) -> tuple[Posterior, _Point, dict[str, np.ndarray]]:
+    """The posterior of skies that are linear about exponents, its mean, and every channel there."""
+
+    def relative(channel: int, information: Information) -> Information:
+        return linearised(skies, channel, information, exponents[channel])
+
+    information = channels.summed(prior, exponents, relative)
+    posterior = on_host(component_posterior(information, prior))
+    maps = np.asarray(posterior.mean).reshape(prior.n_components, -1)
+    spread = np.asarray(paired(posterior.covariance(), prior)) if "power" in shapes else None
+
+    def judged(channel: int, information: Information) -> dict[str, np.ndarray]:
+        return _judged(prior, channel, relative(channel, information), maps, spread)
+
+    found = channels.each(judged, shapes)
+    return posterior, _Point(maps, found["exponent"], float(found["chi2"].sum())), found
+
+
 def _judged(
     prior: SpectralPrior,
     channel: int,
     information: Information,
-    maps: Float[np.ndarray, "fields modes"],
+    maps: Fields,
     spread: Float[np.ndarray, "pairs modes modes"] | None,
 ) -> dict[str, np.ndarray]:
     """Exponent and chi^2 of a channel at the mean of a linear round, and its residual's power."""
@@ -461,7 +457,7 @@ def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsI
     )
 
 
-def _small_scales(skies: PositiveSkies, channel: int) -> Float[np.ndarray, " modes"]:
+def _small_scales(skies: PositiveSkies, channel: int) -> Modes:
     """The template's power in every mode, with its sources'."""
     template = skies.modes(channel, np.zeros(skies.n_fields))
     return per_mode(power_spectrum(template) + power_spectrum(skies.sources[channel]).sum(0))

@@ -50,7 +50,7 @@ from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cho
 from lusee_bayes.judge.chi2 import ChiSquare, Split, expected_chi2, stands_out
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.priors.families import Hyperprior, Member, PriorFamily
+from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily
 from lusee_bayes.sky.prior import Prior
 
 # steps of Newton's method, each halved until ln p is not lower
@@ -70,14 +70,14 @@ class NormalScores:
     """
 
     hyperprior: Hyperprior
-    mean: Float[np.ndarray, " parameters"]
+    mean: Parameters
     root: Float[np.ndarray, "parameters parameters"]
 
     @classmethod
     def around(
         cls,
         hyperprior: Hyperprior,
-        parameters: Float[np.ndarray, " parameters"],
+        parameters: Parameters,
         covariance: Float[np.ndarray, "parameters parameters"],
     ) -> NormalScores:
         """Transform the normal distribution about the most probable parameters.
@@ -98,11 +98,11 @@ class NormalScores:
         known = np.linalg.inv(covariance) - np.diag(hyperprior.curvature(parameters))
         slope = -hyperprior.gradient(parameters)
 
-        def value(z: Float[np.ndarray, " parameters"]) -> float:
+        def value(z: Parameters) -> float:
             off = hyperprior.of_scores(z) - parameters
             return float(slope @ off - 0.5 * off @ known @ off - 0.5 * z @ z)
 
-        def precision(z: Float[np.ndarray, " parameters"]) -> np.ndarray:
+        def precision(z: Parameters) -> np.ndarray:
             j = hyperprior.slopes_of_scores(z)
             return j[:, None] * known * j + np.eye(len(z))
 
@@ -172,7 +172,7 @@ class Learned:
 
     prior: Prior
     names: tuple[str, ...]
-    parameters: Float[np.ndarray, " parameters"]
+    parameters: Parameters
     covariance: Float[np.ndarray, "parameters parameters"]
     log_evidence: float
     steps: int
@@ -198,17 +198,14 @@ class Learned:
 class _Point:
     """What is known of ln p(d, theta) at some theta."""
 
-    parameters: Float[np.ndarray, " parameters"]
+    parameters: Parameters
     member: Member
     posterior: Posterior
     value: float
 
 
 def learn(
-    family: PriorFamily,
-    information: Information,
-    start: Float[np.ndarray, " parameters"] | None = None,
-    seed: int = 1,
+    family: PriorFamily, information: Information, start: Parameters | None = None, seed: int = 1
 ) -> Learned:
     """Find the most probable parameters of a family, and the prior that they give.
 
@@ -245,10 +242,7 @@ def learn(
 
 
 def learn_whatever_fits(
-    family: PriorFamily,
-    information: Information,
-    start: Float[np.ndarray, " parameters"] | None = None,
-    seed: int = 1,
+    family: PriorFamily, information: Information, start: Parameters | None = None, seed: int = 1
 ) -> Learned:
     """Learn a prior as :func:`learn`, from data that no sky explains, too.
 
@@ -316,9 +310,7 @@ def _fixed(family: PriorFamily, information: Information, factor: float) -> Lear
     return Learned(prior, (), np.zeros(0), np.zeros((0, 0)), evidence, 0, settled=False)
 
 
-def _at(
-    family: PriorFamily, information: Information, parameters: Float[np.ndarray, " parameters"]
-) -> _Point:
+def _at(family: PriorFamily, information: Information, parameters: Parameters) -> _Point:
     member = family.at(parameters)
     posterior = information.posterior(family.prior(member.covariance))
     value = float(posterior.log_evidence) + family.hyperprior.log_density(parameters)
@@ -326,10 +318,7 @@ def _at(
 
 
 def _uphill(
-    family: PriorFamily,
-    information: Information,
-    here: _Point,
-    step: Float[np.ndarray, " parameters"],
+    family: PriorFamily, information: Information, here: _Point, step: Parameters
 ) -> _Point:
     """The end of a step, or of a half, a quarter, ... of it, if ln p is not lower there."""
     part = 1.0
@@ -348,7 +337,7 @@ def _uphill(
 
 def _slope(
     family: PriorFamily, here: _Point, rng: np.random.Generator, n: int
-) -> tuple[Float[np.ndarray, " parameters"], Float[np.ndarray, "parameters parameters"]]:
+) -> tuple[Parameters, Float[np.ndarray, "parameters parameters"]]:
     """Gradient of ln p(d, theta), and its expected curvature."""
     prior, posterior, hyperprior = here.posterior.prior, here.posterior, family.hyperprior
     unknown = np.asarray(inverse_from_cholesky(posterior.lower))

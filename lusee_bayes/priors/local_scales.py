@@ -22,11 +22,12 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy import sparse
 
+from lusee_bayes.core.arrays import Ells, Modes, ModesMatrix
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.harmonics import n_modes, per_mode, sum_over_m, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.priors.families import Hyperprior, Member, PriorFamily, SpectrumBasis
+from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, SpectrumBasis
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource
 from lusee_bayes.sky.prior import PIVOT, DensePrior
 from lusee_bayes.sky.template import EmbeddedTemplate
@@ -73,18 +74,13 @@ class Band:
         Interpolation between cells.
     """
 
-    window: Float[np.ndarray, " ells"]
+    window: Ells
     grid: SphereGrid
     covariates: Float[np.ndarray, "points covariates"]
     cells: sparse.csr_array
 
     @classmethod
-    def of(
-        cls,
-        window: Float[np.ndarray, " ells"],
-        template: SmoothedTemplate,
-        transparent: SmoothedTemplate,
-    ) -> Band:
+    def of(cls, window: Ells, template: SmoothedTemplate, transparent: SmoothedTemplate) -> Band:
         """Make the band of a window."""
         top = int(np.flatnonzero(window)[-1])
         grid = SphereGrid.of(top, max((3 * top + 1) // 2, LEAST_BAND))
@@ -124,7 +120,7 @@ def windows(lmax: int) -> Float[np.ndarray, "bands ells"]:
     return found
 
 
-def _middle(window: Float[np.ndarray, " ells"]) -> float:
+def _middle(window: Ells) -> float:
     """Root mean square ell of a window's modes."""
     ell = np.arange(len(window))
     weight = window**2 * (2.0 * ell + 1.0)
@@ -198,7 +194,7 @@ class LocalScales(PriorFamily):
         What is expected of the coefficients of the bands' bases.
     """
 
-    mean: Float[np.ndarray, " modes"]
+    mean: Modes
     wide: Float[np.ndarray, "modes 2"]
     sources: Float[np.ndarray, "modes sources"]
     spectrum: SpectrumBasis
@@ -258,7 +254,7 @@ class LocalScales(PriorFamily):
     def names(self) -> tuple[str, ...]:
         return SpectrumBasis.names
 
-    def at(self, parameters: Float[np.ndarray, " parameters"]) -> LocalScalesMember:
+    def at(self, parameters: Parameters) -> LocalScalesMember:
         return LocalScalesMember(self, *self._split(parameters))
 
     def averaged(self, parameters, spread):
@@ -287,18 +283,14 @@ class LocalScales(PriorFamily):
         return np.split(parameters, np.cumsum([n_spectrum, 1, n_covariates]))
 
 
-def _covariance(
-    family: LocalScales, flux: float, texture: Float[np.ndarray, "modes modes"]
-) -> Float[np.ndarray, "modes modes"]:
+def _covariance(family: LocalScales, flux: float, texture: ModesMatrix) -> ModesMatrix:
     sources = flux * (family.sources @ family.sources.T)
     return family.wide @ family.wide.T + sources + texture
 
 
 def _texture(
-    family: LocalScales,
-    spectrum: Float[np.ndarray, " ells"],
-    strengths: list[Float[np.ndarray, " _"]],
-) -> Float[np.ndarray, "modes modes"]:
+    family: LocalScales, spectrum: Ells, strengths: list[Float[np.ndarray, " _"]]
+) -> ModesMatrix:
     total = np.zeros((len(family.mean),) * 2)
     for band, strength in zip(family.bands, strengths, strict=True):
         scale = _scale(band, spectrum)
@@ -307,7 +299,7 @@ def _texture(
     return total
 
 
-def _scale(band: Band, spectrum: Float[np.ndarray, " ells"]) -> Float[np.ndarray, " modes"]:
+def _scale(band: Band, spectrum: Ells) -> Modes:
     """w_j C_ell^1/2 of every mode up to the band's last."""
     ells = slice(band.grid.lmax + 1)
     return per_mode(band.window[ells] * np.sqrt(spectrum[ells]))
@@ -331,7 +323,7 @@ class LocalScalesMember(Member):
     factors: Float[np.ndarray, " cells"]
 
     @cached_property
-    def spectrum(self) -> Float[np.ndarray, " ells"]:
+    def spectrum(self) -> Ells:
         """C_ell, in K^2."""
         return np.exp(self.family.spectrum.matrix @ self.power)
 
@@ -344,7 +336,7 @@ class LocalScalesMember(Member):
         ]
 
     @cached_property
-    def texture(self) -> Float[np.ndarray, "modes modes"]:
+    def texture(self) -> ModesMatrix:
         """Covariance of the last term of the module's equation, in K^2."""
         return _texture(self.family, self.spectrum, self.strengths)
 

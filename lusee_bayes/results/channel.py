@@ -22,7 +22,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float, Shaped
 
-from lusee_bayes.core.arrays import Array, Modes
+from lusee_bayes.core.arrays import Array, Ells, Modes, ModesMatrix, Pixels
 from lusee_bayes.core.checks import Described, extent
 from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, power_spectrum
 from lusee_bayes.experiment.experiment import Experiment
@@ -63,9 +63,9 @@ class Observed:
     """
 
     frequency_mhz: float
-    prior_std: Float[np.ndarray, " modes"]
-    truth: Float[np.ndarray, " modes"] | None
-    highest_altitude: Float[np.ndarray, " pixels"]
+    prior_std: Modes
+    truth: Modes | None
+    highest_altitude: Pixels
     n_missing: int
     rounds: int
     instrument: ChiSquare
@@ -150,15 +150,15 @@ class ChannelResult(Described):
     """
 
     frequency_mhz: float
-    mean: Float[np.ndarray, " modes"]
-    std: Float[np.ndarray, " modes"]
-    prior_std: Float[np.ndarray, " modes"]
-    prior_fraction: Float[np.ndarray, " ells"]
-    pixel_std: Float[np.ndarray, " pixels"]
-    highest_altitude: Float[np.ndarray, " pixels"]
+    mean: Modes
+    std: Modes
+    prior_std: Modes
+    prior_fraction: Ells
+    pixel_std: Pixels
+    highest_altitude: Pixels
     draws: Float[np.ndarray, "n modes"]
-    truth: Float[np.ndarray, " modes"] | None
-    independent: Float[np.ndarray, " modes"] | None
+    truth: Modes | None
+    independent: Modes | None
     log_evidence: float
     information_bits: float
     chi2: float
@@ -191,7 +191,7 @@ class ChannelResult(Described):
         """Share of the sky that was never above the horizon."""
         return float((self.highest_altitude < 0).mean())
 
-    def snr(self, mean: Float[np.ndarray, " modes"] | None = None) -> np.ndarray | None:
+    def snr(self, mean: Modes | None = None) -> np.ndarray | None:
         """SNR_ell of the map, or of another mean; None where the truth is not known."""
         if self.truth is None:
             return None
@@ -223,7 +223,7 @@ class ChannelResult(Described):
         """:attr:`coverage` for summary.json; None where the truth is not known."""
         return [band.row() for band in self.coverage] or None
 
-    def maps(self) -> dict[str, Float[np.ndarray, " pixels"]]:
+    def maps(self) -> dict[str, Pixels]:
         """HEALPix RING maps by name, in K: mean, std and, where known, truth and residual."""
         maps = {"mean": modes_to_map(self.mean, self.nside), "std": self.pixel_std}
         if self.truth is not None:
@@ -357,7 +357,7 @@ def _channel(
 def channel_of_posterior(
     experiment: Experiment,
     inference: Inference,
-    covariance: Float[np.ndarray, "modes modes"],
+    covariance: ModesMatrix,
     *,
     n_draws: int = 0,
     judged: Inference | None = None,

@@ -19,7 +19,7 @@ import xarray as xr
 from jaxtyping import Float, Int8
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.arrays import ModesMatrix, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import read_dataset
 from lusee_bayes.core.harmonics import (
@@ -87,7 +87,7 @@ def diagnostics(
     inference: Inference,
     found: Residuals,
     channel: ChannelResult,
-    covariance: Float[np.ndarray, "modes modes"],
+    covariance: ModesMatrix,
 ) -> xr.Dataset:
     """Work out what a report shows beyond the map itself.
 
@@ -173,7 +173,7 @@ def diagnostics(
 
 
 def packed_resolution(
-    covariance: Float[np.ndarray, "modes modes"], prior: Prior
+    covariance: ModesMatrix, prior: Prior
 ) -> tuple[Int8[np.ndarray, "modes modes"], Float[np.ndarray, "ells ells"]]:
     """Pack what the data know of the modes, for point-spread functions of any direction.
 

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Ells, Pixels
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover, require_files, user_path
 from lusee_bayes.core.reading import read_json, read_table
@@ -137,9 +137,9 @@ class FinishedRun:
 
     name: str
     summary: dict
-    spectra: dict[str, Float[np.ndarray, " ells"]]
-    mean: Float[np.ndarray, " pixels"]
-    std: Float[np.ndarray, " pixels"]
+    spectra: dict[str, Ells]
+    mean: Pixels
+    std: Pixels
     diagnostics: xr.Dataset
     provenance: Provenance | None
 

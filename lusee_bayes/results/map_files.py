@@ -17,6 +17,7 @@ from astropy.io import fits
 from jaxtyping import Float
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.arrays import Pixels
 from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.version import __version__, versions
@@ -69,9 +70,7 @@ def text_hash(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def write_map(
-    path: Path, name: str, pixels: Float[np.ndarray, " pixels"], scenario: Scenario
-) -> None:
+def write_map(path: Path, name: str, pixels: Pixels, scenario: Scenario) -> None:
     """Write one map of a scenario: HEALPix RING, Galactic, K, float64, for healpy.read_map."""
     extra = [
         (key, *value) if isinstance(value, tuple) else (key, value)

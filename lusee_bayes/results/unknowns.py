@@ -27,7 +27,7 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, on_host
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.instrument_terms import offsets_about, second_order
 from lusee_bayes.experiment.model import radiometer, true_values
@@ -234,11 +234,7 @@ class Unknowns:
         return cls(_rows(experiment, listed), amplitudes, names, parts, sky_std)
 
     def report(
-        self,
-        mean: Float[np.ndarray, " modes"],
-        covariance: Float[np.ndarray, "modes modes"],
-        *,
-        joint: bool = False,
+        self, mean: Modes, covariance: ModesMatrix, *, joint: bool = False
     ) -> UnknownsReport:
         """What is told of them with the sky integrated out.
 
@@ -285,9 +281,7 @@ class Unknowns:
         )
 
     @classmethod
-    def from_dataset(
-        cls, dataset: xr.Dataset, reference: Float[np.ndarray, " modes"]
-    ) -> Unknowns | None:
+    def from_dataset(cls, dataset: xr.Dataset, reference: Modes) -> Unknowns | None:
         """The inverse of :meth:`to_dataset`; None if it has none."""
         if "unknowns" not in dataset.attrs:
             return None
@@ -407,7 +401,7 @@ class PointingReport:
 
 
 def pointing_report(
-    experiment: Experiment, found: Inference, covariance: Float[np.ndarray, "modes modes"]
+    experiment: Experiment, found: Inference, covariance: ModesMatrix
 ) -> PointingReport:
     """Work out the offsets of the model, and those that the data prefer besides.
 
@@ -425,9 +419,7 @@ def pointing_report(
     return PointingReport(table, _preferred(experiment, found, covariance, sky, values))
 
 
-def _table(
-    experiment: Experiment, found: Inference, sky: Float[np.ndarray, " modes"]
-) -> pd.DataFrame:
+def _table(experiment: Experiment, found: Inference, sky: Modes) -> pd.DataFrame:
     mean, covariance = offset_posterior(found)
     std = dict(zip(mean, np.sqrt(np.diagonal(covariance)).tolist(), strict=True))
     prior = found.offsets.in_units(np.ones(len(mean)))
@@ -445,8 +437,8 @@ def _table(
 def _preferred(
     experiment: Experiment,
     found: Inference,
-    covariance: Float[np.ndarray, "modes modes"],
-    sky: Float[np.ndarray, " modes"],
+    covariance: ModesMatrix,
+    sky: Modes,
     values: dict[str, float],
 ) -> pd.DataFrame:
     setup, data = experiment.setup, experiment.data
