@@ -34,10 +34,13 @@ DataVector = Float[Array, " data"]
 Grid = Float[Array, "products times"]
 GridFlags = Bool[np.ndarray, "products times"]
 TimeFlags = Bool[np.ndarray, " times"]
-Modes = Float[np.ndarray, " modes"]
-ModesMatrix = Float[np.ndarray, "modes modes"]
+Modes = Float[Array, " modes"]
+ModesMatrix = Float[Array, "modes modes"]
+Draws = Float[np.ndarray, "draws modes"]
 Ells = Float[np.ndarray, " ells"]
 Pixels = Float[np.ndarray, " pixels"]
+Vector = Float[np.ndarray, " n"]
+Square = Float[np.ndarray, "n n"]
 
 # rows that are added at once
 ACCUMULATED = 16

@@ -35,7 +35,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Ells, on_host
+from lusee_bayes.core.arrays import Ells, Grid, Square, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, mode_numbers, n_modes, turn_about_z
 from lusee_bayes.core.linalg import solve_lower
@@ -95,9 +95,7 @@ class DataMistake:
     time: int | None = None
     reverses: bool = False
 
-    def undone(
-        self, grid: Float[np.ndarray, "products times"]
-    ) -> Float[np.ndarray, "products times"]:
+    def undone(self, grid: Grid) -> Grid:
         """The visibilities without the mistake, in K."""
         grid = grid[:, ::-1] if self.reverses else grid
         mixed = self.mixing @ grid
@@ -332,7 +330,7 @@ def _any_sky(setup: Setup, data: Visibilities) -> Ells:
     return mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2
 
 
-def filled(data: Visibilities) -> Float[np.ndarray, "products times"]:
+def filled(data: Visibilities) -> Grid:
     """The data on the full grid, absent samples interpolated in time."""
     grid = np.array(data.grid())
     times = np.arange(grid.shape[1])
@@ -356,7 +354,7 @@ class MixedProducts:
 
     here: UnderAnySky
     posterior: Posterior
-    grid: Float[np.ndarray, "products times"]
+    grid: Grid
     q: Float[np.ndarray, "columns columns"]
 
     @classmethod
@@ -484,9 +482,7 @@ def _number(factor: float, std: float) -> str:
     return f"{factor:.5g} +- {std * factor**2:.1g}"
 
 
-def _gram(
-    here: UnderAnySky, posterior: Posterior, columns: Float[np.ndarray, "data n"]
-) -> Float[np.ndarray, "n n"]:
+def _gram(here: UnderAnySky, posterior: Posterior, columns: Float[np.ndarray, "data n"]) -> Square:
     """X^T K^-1 X, K^-1 = N^-1 - N^-1 A C A^T N^-1."""
     solved = np.asarray(here.model.noise.factor().solve(columns))
     seen = np.stack([np.asarray(here.model.coupling.transpose_mv(x)) for x in solved.T])

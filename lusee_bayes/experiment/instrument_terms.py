@@ -7,14 +7,14 @@ and pointing that are off; drifts of the antennas' gains; and errors of the gain
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array, Grid, Modes
+from lusee_bayes.core.arrays import DataVector, Grid, Modes
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.lazy import numpyro
 from lusee_bayes.core.reading import naming
@@ -29,13 +29,7 @@ from lusee_bayes.instrument.beams.source import BeamSource, EmbeddedBeams
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing import CLOCK, Pointing, kind_of, offset_names, with_offsets
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.noise.instrument_errors import (
-    GainDrift,
-    derivative,
-    difference,
-    rms_difference,
-    with_gains,
-)
+from lusee_bayes.noise import instrument_errors
 from lusee_bayes.systematics.gain_drifts import GainDrifts
 from lusee_bayes.systematics.gain_table import GAIN_TABLE, GainTable, TableErrors
 from lusee_bayes.systematics.instrument_unknowns import (
@@ -71,20 +65,11 @@ class BeamErrorTerm(Term):
         }
 
 
-@dataclass(frozen=True)
-class TrueInstrument:
+class TrueInstrument(NamedTuple):
     """What simulated data are taken with: beams of a source at a frequency."""
 
     source: BeamSource
     frequency_mhz: float
-
-    def beams(self, lmax: int) -> ProductBeams:
-        """Beams of all products."""
-        return self.source.beams(self.frequency_mhz, lmax)
-
-    def background(self) -> Float[Array, " products"]:
-        """Visibilities without any sky, in K."""
-        return self.source.background(self.frequency_mhz)
 
 
 def true_instrument(setup: Setup) -> TrueInstrument:
@@ -106,7 +91,8 @@ def true_beams(setup: Setup) -> ProductBeams:
     """The beams that simulated data are taken with."""
     if setup.scenario.noise.beam is None:
         return setup.beams
-    return true_instrument(setup).beams(setup.scenario.lmax)
+    true = true_instrument(setup)
+    return true.source.beams(true.frequency_mhz, setup.scenario.lmax)
 
 
 def beam_directions(setup: Setup) -> list[ProductBeams]:
@@ -115,11 +101,11 @@ def beam_directions(setup: Setup) -> list[ProductBeams]:
     if beam is None:
         return []
     if not beam.parameters:
-        return [difference(true_beams(setup), setup.beams)]
+        return [instrument_errors.difference(true_beams(setup), setup.beams)]
     frequency, lmax = setup.scenario.frequency_mhz, setup.scenario.lmax
     directions = []
     for name, sigma in beam.parameters.items():
-        slope = derivative(name, frequency, lmax, setup.instrument.monopoles)
+        slope = instrument_errors.derivative(name, frequency, lmax, setup.instrument.monopoles)
         directions.append(ProductBeams(sigma * slope.modes, frequency))
     return directions
 
@@ -128,7 +114,7 @@ def beam_rms_difference(setup: Setup) -> float | None:
     """RMS difference of the true beams and the model's, over the model's; None if the same."""
     if setup.scenario.noise.beam is None:
         return None
-    return rms_difference(true_beams(setup), setup.beams)
+    return instrument_errors.rms_difference(true_beams(setup), setup.beams)
 
 
 # what the scenario's seed is folded with
@@ -261,9 +247,7 @@ def offsets_about(
     )
 
 
-def second_order(
-    setup: Setup, stds: Mapping[str, float], sky: Modes
-) -> dict[str, Float[np.ndarray, " data"]]:
+def second_order(setup: Setup, stds: Mapping[str, float], sky: Modes) -> dict[str, DataVector]:
     """What offsets of one standard deviation do to the data beyond first order, in K."""
     middle = sum(_seen(setup, sky))
     return {
@@ -273,9 +257,7 @@ def second_order(
     }
 
 
-def _seen(
-    setup: Setup, sky: Modes
-) -> tuple[Float[np.ndarray, " data"], Float[np.ndarray, " data"]]:
+def _seen(setup: Setup, sky: Modes) -> tuple[DataVector, DataVector]:
     """What the data are of the sky, and of the sources with their mean fluxes."""
     sources = np.zeros(setup.layout.size)
     for section, response in zip(setup.scenario.sources.list, setup.responses, strict=True):
@@ -308,9 +290,9 @@ class GainTerm(Term):
         return {"gain_sigma": float(drift.sigma), "gain_correlation_h": float(drift.correlation_h)}
 
     def distorted(self, visibilities: Grid, setup: Setup, truth: Truth, key: PRNGKeyArray) -> Grid:
-        drift = GainDrift(truth["gain_sigma"], truth["gain_correlation_h"])
+        drift = instrument_errors.GainDrift(truth["gain_sigma"], truth["gain_correlation_h"])
         gains = drift.sample(jax.random.fold_in(key, GAIN_DRAW), setup.observation.hours)
-        return with_gains(visibilities, gains)
+        return instrument_errors.with_gains(visibilities, gains)
 
 
 def gain_drifts(setup: Setup, around: Around) -> GainDrifts:
@@ -319,7 +301,7 @@ def gain_drifts(setup: Setup, around: Around) -> GainDrifts:
     if gain is None:
         raise InputError("the scenario has no noise.gain that could be sampled")
     return GainDrifts.of(
-        GainDrift(gain.sigma, gain.correlation_h),
+        instrument_errors.GainDrift(gain.sigma, gain.correlation_h),
         noise_visibilities(setup, around, gains_about(setup)),
         setup.observation.hours,
         setup.layout,
@@ -411,7 +393,7 @@ def table_errors(setup: Setup) -> TableErrors:
     return TableErrors(names, tuple(port.tolist()), slope, setup.layout)
 
 
-def table_factors(setup: Setup, around: Around) -> Float[np.ndarray, " data"] | None:
+def table_factors(setup: Setup, around: Around) -> DataVector | None:
     """Gains of the errors that terms of N are built around; None where these are none."""
     if not around.values or not GainTableTerm().moves(setup.scenario):
         return None

@@ -18,12 +18,13 @@ fits no data; so before much is flagged, higher ones are tried.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from lusee_bayes.core.arrays import GridFlags, TimeFlags, on_host
+from lusee_bayes.core.arrays import Grid, GridFlags, TimeFlags, Vector, on_host
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
@@ -85,7 +86,7 @@ class Comparison:
     left_out: DenseLeftOut
     chi2: Float[np.ndarray, " times"]
     degrees: Float[np.ndarray, " times"]
-    z: Float[np.ndarray, "products times"]
+    z: Grid
 
     @classmethod
     def of(cls, left_out: DenseLeftOut, data: Visibilities) -> Comparison:
@@ -165,11 +166,10 @@ class Comparison:
         for number in np.unique(layout.product).tolist():
             mine = np.arange(shape[0])[:, None] == number
             groups.append(("product", self.data.labels[number], np.broadcast_to(mine, shape)))
-            leave.append(lambda number=number: left_out.product(number))
+            leave.append(partial(left_out.product, number))
         for number in np.unique(day[layout.time]).tolist():
-            mine = day == number
-            groups.append(("day", str(number), np.broadcast_to(mine, shape)))
-            leave.append(lambda mine=mine: left_out.stretch(mine))
+            groups.append(("day", str(number), np.broadcast_to(day == number, shape)))
+            leave.append(partial(left_out.stretch, day == number))
         counts = np.array([int((mine & np.asarray(layout.present)).sum()) for _, _, mine in groups])
         # one that holds all data has nothing to be compared with
         some = np.flatnonzero(counts < layout.size)
@@ -182,9 +182,7 @@ class Comparison:
         return Group(kind, name, mine, sum(of == kind for of, _, _ in groups))
 
 
-def _judged(
-    missed: list[Missed], counts: Int[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def _judged(missed: list[Missed], counts: Int[np.ndarray, " n"]) -> tuple[Vector, Vector]:
     """chi^2 of groups and its means; 0 where the others tell less than half a datum."""
     chi2, new = np.array([(m.chi2, m.directions) for m in missed]).reshape(-1, 2).T
     degrees = counts - np.clip(new, 0.0, counts)
@@ -192,9 +190,7 @@ def _judged(
     return np.where(told, chi2, 0.0), np.where(told, degrees, 0.0)
 
 
-def _tail(
-    chi2: Float[np.ndarray, " n"], degrees: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
+def _tail(chi2: Vector, degrees: Vector) -> Vector:
     """Probability of this chi^2 or more; 1 where there are no degrees of freedom."""
     some = degrees > 0.0
     found = special.chdtrc(np.where(some, degrees, 1.0), np.maximum(chi2, 0.0))
@@ -358,12 +354,13 @@ def _found(setup: Setup, data: Visibilities, false_alarm: float, stages: Stages)
         kept = kept or auto
         if more is None:
             break
-        gone, groups = gone | more.flagged, (*groups, *more.groups)
+        flagged, blamed = more
+        gone, groups = gone | flagged, (*groups, *blamed)
         stages.say(
             f"  times compared at lmax={setup.scenario.lmax}, round {rounds}: "
             f"{limits.count(gone)} of {data.layout.size} values flagged"
         )
-        if not more.flagged.any():
+        if not flagged.any():
             share = limits.count(gone) / data.layout.size
             remark = " ".join(filter(None, [_remark(gone, groups, share, false_alarm), kept]))
             return Fitting(gone, rounds, before, remark, groups, share)
@@ -453,14 +450,6 @@ class _Limits:
         return None
 
 
-@dataclass(frozen=True)
-class _Eliminated:
-    """What goes, groups among it."""
-
-    flagged: GridFlags
-    groups: tuple[Group, ...]
-
-
 def _one_by_one(
     start: Comparison,
     gone: GridFlags,
@@ -484,7 +473,7 @@ def _one_by_one(
 
 def _eliminated(
     start: Comparison, gone: GridFlags, limits: _Limits, false_alarm: float
-) -> tuple[_Eliminated | None, str]:
+) -> tuple[tuple[GridFlags, tuple[Group, ...]] | None, str]:
     """What goes under one model, besides what is ``gone``; None if that is too much.
 
     And what is to be said of an auto that cannot go.
@@ -496,7 +485,7 @@ def _eliminated(
         found, flagged = _one_by_one(
             base, gone | of_groups, gone | of_groups, limits, false_alarm, least
         )
-        result = None if flagged is None else _Eliminated(flagged & ~gone, groups)
+        result = None if flagged is None else (flagged & ~gone, groups)
         first = first if groups else result
         if result is not None and found.worst(false_alarm).any():
             return result, ""

@@ -41,23 +41,12 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
     section = setup.scenario.noise.radiometer
     visibilities = noise_visibilities(setup, around or Around(), radiometer_about(setup))
     if setup.calibration is not None:
-        return radiometer_noise(
-            visibilities,
-            setup.layout,
-            bandwidth_hz=1.0,
-            step_s=setup.calibration.n_averaged,
-            form=section.form,
-            factor=section.factor,
-        )
-    return radiometer_noise(
-        visibilities,
-        setup.layout,
-        bandwidth_hz=section.bandwidth_hz,
-        step_s=setup.observation.live_s,
-        form=section.form,
-        duty_cycle=section.duty_cycle,
-        factor=section.factor,
-    )
+        given = {"bandwidth_hz": 1.0, "step_s": setup.calibration.n_averaged}
+    else:
+        given = section.model_dump(include={"bandwidth_hz", "duty_cycle"})
+        given["step_s"] = setup.observation.live_s
+    common = {"form": section.form, "factor": section.factor}
+    return radiometer_noise(visibilities, setup.layout, **given, **common)
 
 
 def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, Systematic]]:
@@ -132,7 +121,8 @@ def true_signal(setup: Setup, truth: Truth) -> Grid:
     setup = true_setup(setup, truth)
     true = CouplingMatrix.build(true_beams(setup), setup.pointing)
     visibilities = true.layout.scatter(true @ setup.sky.modes)
-    visibilities = visibilities + true_instrument(setup).background()[:, None]
+    source, frequency_mhz = true_instrument(setup)
+    visibilities = visibilities + source.background(frequency_mhz)[:, None]
     for term in TERMS:
         visibilities = term.distort(visibilities, setup, truth, key)
     return visibilities

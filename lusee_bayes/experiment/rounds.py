@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Grid, on_host
+from lusee_bayes.core.arrays import DataVector, Grid, Vector, on_host
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.instrument_terms import pointed
@@ -161,11 +161,11 @@ class _Step:
     swing : how much of it is gone unless it is far; size : how much of it is gone
     """
 
-    whole: Float[np.ndarray, " n"] | None = None
+    whole: Vector | None = None
     swing: float = 1.0
     size: float = 1.0
 
-    def after(self, whole: Float[np.ndarray, " n"]) -> _Step:
+    def after(self, whole: Vector) -> _Step:
         """The next step: a smaller part if it turns back without becoming short."""
         back = (
             self.whole is not None
@@ -226,8 +226,8 @@ def _before_gains(
     found: Inference,
     table: GainTable,
     z: Float[np.ndarray, " errors"],
-    solved: Float[np.ndarray, " data"],
-) -> Float[np.ndarray, " data"]:
+    solved: DataVector,
+) -> DataVector:
     """What the data tell of the visibilities before the gains: less radiometer noise, and gains."""
     data = found.around.data
     noise = np.asarray(on_host(radiometer(setup, found.around)).mv(solved))
@@ -277,7 +277,7 @@ def rebuilds_visibilities(setup: Setup) -> bool:
     return rebuilds_gains(setup) or radiometer_about(setup) == "posterior"
 
 
-def prediction(setup: Setup, found: Inference, solved: Float[np.ndarray, " data"]) -> Grid:
+def prediction(setup: Setup, found: Inference, solved: DataVector) -> Grid:
     """Visibilities of the mean map, with all else that N holds but drifts and noise, in K.
 
     Parameters

@@ -22,9 +22,9 @@ from typing import Any, ClassVar
 
 import jax
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array, DataVector, Grid
+from lusee_bayes.core.arrays import DataVector, Grid, Modes
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.noise_sections import NoiseAbout
 from lusee_bayes.experiment.scenario import Scenario
@@ -64,7 +64,7 @@ class Around:
 
     data: Visibilities | None = None
     visibilities: Grid | None = None
-    sky: Float[Array, " modes"] | None = None
+    sky: Modes | None = None
     values: Mapping[str, float] | None = None
     seen: DataVector | None = None
     freedom: DataVector | None = None

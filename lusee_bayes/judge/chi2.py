@@ -39,9 +39,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, Ells, Pixels, on_host
+from lusee_bayes.core.arrays import Ells, Modes, Pixels, Square, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mean_over_m, sum_over_m
 from lusee_bayes.core.lazy import healpy, special
@@ -150,7 +149,7 @@ def probability(p: float) -> str:
     return f"= {p:.2g}" if p > 0 else "< 1e-300"
 
 
-def correlation(mean: Float[Array, " modes"], truth: Float[Array, " modes"]) -> Ells:
+def correlation(mean: Modes, truth: Modes) -> Ells:
     """Compute rho_ell = sum_m a a_true / sqrt(sum_m a^2 sum_m a_true^2), as the paper does.
 
     Parameters
@@ -168,7 +167,7 @@ def correlation(mean: Float[Array, " modes"], truth: Float[Array, " modes"]) -> 
     return _ratio(sum_over_m(mean * truth), power)
 
 
-def signal_to_noise(mean: Float[Array, " modes"], truth: Float[Array, " modes"]) -> Ells:
+def signal_to_noise(mean: Modes, truth: Modes) -> Ells:
     """Compute SNR_ell = sqrt( sum_m a^2 / sum_m (a - a_true)^2 ), as the paper does.
 
     Parameters
@@ -396,5 +395,5 @@ def widened(posterior: Posterior, factor: float) -> tuple[Posterior, float]:
     return wide, less
 
 
-def _log_diagonal(lower: Float[np.ndarray, "n n"]) -> float:
+def _log_diagonal(lower: Square) -> float:
     return float(np.log(np.diagonal(lower)).sum())

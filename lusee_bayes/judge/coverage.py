@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lusee_bayes.core.arrays import Modes, Pixels
+from lusee_bayes.core.arrays import Draws, Modes, Pixels
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.harmonics import columns_to_maps, lmax_of, mode_numbers
 from lusee_bayes.core.lazy import healpy, special
@@ -112,9 +112,7 @@ class Counts:
     values: Float[np.ndarray, "parts statistics skies"]
 
     @classmethod
-    def of_pixels(
-        cls, std: Pixels, error: Modes, deviations: Float[np.ndarray, "draws modes"]
-    ) -> Counts:
+    def of_pixels(cls, std: Pixels, error: Modes, deviations: Draws) -> Counts:
         """By Galactic latitude.
 
         Parameters
@@ -139,9 +137,7 @@ class Counts:
         return cls._of(bands, np.concatenate(in_threads(count, batches), axis=2))
 
     @classmethod
-    def of_modes(
-        cls, std: Modes, error: Modes, deviations: Float[np.ndarray, "draws modes"]
-    ) -> Counts:
+    def of_modes(cls, std: Modes, error: Modes, deviations: Draws) -> Counts:
         """By multipole, of harmonic coefficients; what is known exactly pulls at nothing."""
         groups = multipoles(lmax_of(len(std)))
         width = np.where(std > 0, std, np.inf)[:, None]

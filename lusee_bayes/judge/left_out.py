@@ -68,7 +68,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 
-from lusee_bayes.core.arrays import DataVector, GridFlags, TimeFlags, on_host
+from lusee_bayes.core.arrays import DataVector, Grid, GridFlags, Square, TimeFlags, Vector, on_host
 from lusee_bayes.core.engine import once
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mode_numbers
@@ -114,8 +114,8 @@ class LeftOut(ABC):
         The diagonal of K^-1, in 1/K^2, of the data that :meth:`stretch` has left out; else NaN.
     """
 
-    u: Float[np.ndarray, "products times"]
-    inverse_diagonal: Float[np.ndarray, "products times"]
+    u: Grid
+    inverse_diagonal: Grid
 
     @abstractmethod
     def stretch(self, times: TimeFlags) -> Missed:
@@ -130,7 +130,7 @@ class LeftOut(ABC):
         """Leave out all data of one product."""
 
 
-def log_det_of(root: Float[np.ndarray, "n n"]) -> float:
+def log_det_of(root: Square) -> float:
     """ln|M| of a matrix with this Cholesky factor; entries off the diagonal are not read."""
     return 2.0 * float(np.log(np.diagonal(root)).sum())
 
@@ -345,7 +345,7 @@ class Part:
         turned = (self.root.swapaxes(1, 2) if transpose else self.root) @ by_time
         return turned.swapaxes(0, 1).reshape(x.shape)
 
-    def diagonal(self) -> Float[np.ndarray, " data"]:
+    def diagonal(self) -> DataVector:
         """The diagonal of D = c c^T."""
         return self.root**2 if self.root.ndim == 1 else (self.root**2).sum(2).T.ravel()
 
@@ -511,7 +511,7 @@ class StructuredLeftOut(LeftOut):
         half = half + self._amplitudes @ np.einsum("jt,jta->at", mixing, self._t)
         return self._between((half * np.sqrt(own))[:, here], white[here], 0.0, log_det)
 
-    def _mixed(self, mixing: Float[np.ndarray, "products times"]) -> np.ndarray:
+    def _mixed(self, mixing: Grid) -> np.ndarray:
         """C^(1/2) of the products' rows of every time, added with these factors."""
         if self._kept is not None:
             return np.einsum("jt,jtm->mt", mixing, self._kept, optimize=True)
@@ -624,7 +624,7 @@ class StructuredLeftOut(LeftOut):
     def _taken_out(
         self,
         weights: Float[np.ndarray, "..."],
-        pull: Float[np.ndarray, "products times"],
+        pull: Grid,
         used: Bool[np.ndarray, " products"],
         squared: float,
         log_det: float,
@@ -655,11 +655,7 @@ class StructuredLeftOut(LeftOut):
         return Missed(float(squared + h @ cho_solve(root, h)), float(grown / PROBES), log_det)
 
     def _between(
-        self,
-        half: Float[np.ndarray, "rank n"],
-        b: Float[np.ndarray, " n"],
-        outside: float,
-        log_det: float,
+        self, half: Float[np.ndarray, "rank n"], b: Vector, outside: float, log_det: float
     ) -> Missed:
         """``outside`` + b^T (1 - W^T W)^-1 b, in whichever of the two spaces is smaller.
 

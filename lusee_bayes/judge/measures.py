@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, DataVector, Modes, ModesMatrix, Pixels, on_host
+from lusee_bayes.core.arrays import Array, DataVector, Modes, ModesMatrix, Pixels, Vector, on_host
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.judge.coverage import latitudes, multipoles
@@ -41,7 +41,7 @@ CHUNK, DENSE = 256, 10**8
 
 def data_freedom(
     model: LinearGaussian, posterior: Posterior, columns: Float[Array, "data n"]
-) -> Float[np.ndarray, " data"]:
+) -> DataVector:
     """Compute the diagonal of K_s K^-1: which share of each datum sky and templates follow.
 
     With the templates V among the columns of N's square root, K_s = A S A^T + V V^T is the
@@ -97,9 +97,9 @@ class Preferences:
         By how much chi^2 of the data would be lower.
     """
 
-    amplitude: Float[np.ndarray, " n"]
-    std: Float[np.ndarray, " n"]
-    gain: Float[np.ndarray, " n"]
+    amplitude: Vector
+    std: Vector
+    gain: Vector
 
 
 def preferences(

@@ -105,11 +105,7 @@ def _about_range(
     )
 
 
-def _about_crosses(
-    data: Visibilities,
-    values: Float[np.ndarray, "products times"],
-    sigma: Float[np.ndarray, "products times"],
-) -> tuple[str, ...]:
+def _about_crosses(data: Visibilities, values: Grid, sigma: Grid) -> tuple[str, ...]:
     """Pairs of antennas whose crosses are larger than their autos allow."""
     n = round(np.sqrt(data.layout.n_products))
     position = {tuple(product): k for k, product in enumerate(all_products(n))}

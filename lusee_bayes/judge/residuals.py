@@ -24,9 +24,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.arrays import DataVector, on_host
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.chi2 import (
@@ -113,8 +113,8 @@ class Residuals:
         noise that couples times would need an A of more than ``DENSE_BYTES``.
     """
 
-    predicted: Float[np.ndarray, " data"]
-    z: Float[np.ndarray, " data"]
+    predicted: DataVector
+    z: DataVector
     split: Split
     products: tuple[Group, ...]
     days: tuple[Group, ...]

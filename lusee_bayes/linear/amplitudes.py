@@ -47,7 +47,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, DataVector, Modes, ModesMatrix, on_host
+from lusee_bayes.core.arrays import Array, DataVector, Modes, ModesMatrix, Square, Vector, on_host
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
@@ -69,12 +69,12 @@ class Amplitudes:
         Covariance of the sky with the amplitudes, in K.
     """
 
-    mean: Float[np.ndarray, " n"]
-    covariance: Float[np.ndarray, "n n"]
+    mean: Vector
+    covariance: Square
     with_sky: Float[np.ndarray, "modes n"]
 
     @property
-    def std(self) -> Float[np.ndarray, " n"]:
+    def std(self) -> Vector:
         """Standard deviations."""
         return np.sqrt(np.diagonal(self.covariance))
 
@@ -101,9 +101,9 @@ class AmplitudesOfSky:
         The reference sky m0, in K.
     """
 
-    mean: Float[np.ndarray, " n"]
+    mean: Vector
     pull: Float[np.ndarray, "n modes"]
-    covariance: Float[np.ndarray, "n n"]
+    covariance: Square
     reference: Modes
 
     def integrated(self, mean: Modes, covariance: ModesMatrix) -> Amplitudes:
@@ -115,9 +115,7 @@ class AmplitudesOfSky:
             with_sky,
         )
 
-    def given(
-        self, precision: Float[np.ndarray, "n n"], vector: Float[np.ndarray, " n"]
-    ) -> AmplitudesOfSky:
+    def given(self, precision: Square, vector: Vector) -> AmplitudesOfSky:
         """Take in what is known of the amplitudes besides: exp(-z^T Q z / 2 + q^T z).
 
         Parameters
@@ -138,10 +136,7 @@ class AmplitudesOfSky:
 
 
 def amplitudes_of_sky(
-    model: LinearGaussian,
-    reference: Float[Array, " modes"],
-    data: DataVector,
-    templates: Float[Array, "data n"],
+    model: LinearGaussian, reference: Modes, data: DataVector, templates: Float[Array, "data n"]
 ) -> AmplitudesOfSky:
     """Compute the posterior of templates' amplitudes given the sky.
 
@@ -198,9 +193,7 @@ def template_amplitudes(
     return found.integrated(np.asarray(posterior.mean), np.asarray(posterior.covariance()))
 
 
-def weighted_residual(
-    model: LinearGaussian, posterior: Posterior, data: DataVector
-) -> Float[np.ndarray, " data"]:
+def weighted_residual(model: LinearGaussian, posterior: Posterior, data: DataVector) -> DataVector:
     """Compute N^-1 (d - offset - A m), m the posterior mean of the sky.
 
     T^T of it is the mean of amplitudes, and a term N_0 of N times it that of its part in the data.
@@ -408,21 +401,15 @@ def tie(
 
 
 def told_by_others(
-    mean: Float[np.ndarray, " n"],
-    covariance: Float[np.ndarray, "n n"],
-    tied_mean: Float[np.ndarray, " n"],
-    tied_covariance: Float[np.ndarray, "n n"],
-) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
+    mean: Vector, covariance: Square, tied_mean: Vector, tied_covariance: Square
+) -> tuple[Square, Vector]:
     """Q and q of one channel, from its own posterior and that given all data."""
     own, tied = np.linalg.inv(covariance), np.linalg.inv(tied_covariance)
     return tied - own, own @ (tied_mean - mean) + (tied - own) @ tied_mean
 
 
 def information_given(
-    information: Information,
-    amplitudes: AmplitudesOfSky,
-    precision: Float[np.ndarray, "n n"],
-    vector: Float[np.ndarray, " n"],
+    information: Information, amplitudes: AmplitudesOfSky, precision: Square, vector: Vector
 ) -> Information:
     """What data say of the sky where amplitudes are known to be N((1 + Q)^-1 q, (1 + Q)^-1).
 

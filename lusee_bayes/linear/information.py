@@ -25,6 +25,8 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import (
     Array,
     DataVector,
+    Modes,
+    ModesMatrix,
     compiled,
     namespace,
     on_processor,
@@ -68,9 +70,9 @@ class Information(Described, eqx.Module):
         Number of data, as a float.
     """
 
-    matrix: Float[Array, "modes modes"]
-    vector: Float[Array, " modes"]
-    reference: Float[Array, " modes"]
+    matrix: ModesMatrix
+    vector: Modes
+    reference: Modes
     misfit: Float[Array, ""]
     log_det: Float[Array, ""]
     n_data: Float[Array, ""]
@@ -150,7 +152,7 @@ class Information(Described, eqx.Module):
         """Number of modes of the sky."""
         return self.reference.shape[0]
 
-    def recentred(self, sky: Float[Array, " modes"]) -> Information:
+    def recentred(self, sky: Modes) -> Information:
         """Write the same function with another reference sky.
 
         Parameters
@@ -194,7 +196,7 @@ class Information(Described, eqx.Module):
             log_det=xp.asarray(self.log_det + self.n_data * np.log(factor)),
         )
 
-    def chi2(self, sky: Float[Array, " modes"]) -> Float[Array, ""]:
+    def chi2(self, sky: Modes) -> Float[Array, ""]:
         """Compute ``chi^2 = |L^-1 (d - A m - offset)|^2`` of a sky.
 
         Parameters
@@ -271,7 +273,7 @@ def gradient_and_misfit(
 
 
 @compiled
-def _precision_root(matrix: Float[Array, "modes modes"], prior: Prior) -> Array:
+def _precision_root(matrix: ModesMatrix, prior: Prior) -> Array:
     """L of the precision 1 + G^T M G of u = G^-1 m."""
     precision = prior.sandwich(matrix)
     diagonal = np.diag_indices(len(precision))

@@ -29,7 +29,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array, accumulated, compiled, namespace, on_processor, placed
+from lusee_bayes.core.arrays import (
+    Array,
+    Modes,
+    ModesMatrix,
+    accumulated,
+    compiled,
+    namespace,
+    on_processor,
+    placed,
+)
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import (
@@ -44,11 +53,12 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import IndependentPrior
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
+# arrays that recur
+ChannelModes = Float[Array, "channels modes"]
+
 
 @compiled
-def common_part(
-    information: Information, residual_root: Float[Array, " modes"] | None
-) -> Information:
+def common_part(information: Information, residual_root: Modes | None) -> Information:
     """Integrate a channel's residual out of its information about the sky.
 
     Parameters
@@ -83,9 +93,7 @@ def common_part(
     )
 
 
-def residual_lower(
-    information: Information, residual_root: Float[Array, " modes"]
-) -> Float[Array, "modes modes"]:
+def residual_lower(information: Information, residual_root: Modes) -> ModesMatrix:
     """L L^T = 1 + P."""
     normal = scaled(information.matrix, residual_root)
     diagonal = np.diag_indices(len(residual_root))
@@ -119,9 +127,7 @@ class ComponentSums(eqx.Module):
     n_data: Float[Array, ""]
 
     @classmethod
-    def empty(
-        cls, prior: SpectralPrior, reference: Float[Array, "channels modes"]
-    ) -> ComponentSums:
+    def empty(cls, prior: SpectralPrior, reference: ChannelModes) -> ComponentSums:
         """Start the sums, with no channel in them.
 
         Parameters
@@ -154,7 +160,7 @@ class ComponentSums(eqx.Module):
 
 
 def reference_maps(
-    prior: SpectralPrior, reference: Float[Array, "channels modes"]
+    prior: SpectralPrior, reference: ChannelModes
 ) -> Float[Array, "components modes"]:
     """Fit component maps to a sky of every channel, by least squares.
 
@@ -212,7 +218,7 @@ def _assembled(sums: ComponentSums) -> Information:
 
 
 def solve_directly(
-    prior: SpectralPrior, channels: Iterable[Information], reference: Float[Array, "channels modes"]
+    prior: SpectralPrior, channels: Iterable[Information], reference: ChannelModes
 ) -> Posterior:
     """Compute the posterior of all component maps by factorising its matrix.
 
@@ -337,8 +343,8 @@ class ChannelSky(eqx.Module):
         Of the channel's data, at the mean.
     """
 
-    mean: Float[Array, " modes"]
-    covariance: Float[Array, "modes modes"] | None
+    mean: Modes
+    covariance: ModesMatrix | None
     draws: Float[Array, "n modes"]
     chi2: Float[Array, ""]
 

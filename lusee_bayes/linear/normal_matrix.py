@@ -129,7 +129,7 @@ def of_one_angle(
     azimuth: Float[Array, " times"],
     functions: Float[Array, "functions times"],
     n_products: int,
-) -> Float[Array, "modes modes"]:
+) -> ModesMatrix:
     """The lower triangle of their part in the mean-pole frame; modes as :func:`places` has them."""
     n = by_order.shape[0]
     beams = by_order.reshape(n, n_products, -1, 2, n).swapaxes(2, 3)
@@ -139,7 +139,7 @@ def of_one_angle(
 
 def _from_sums(
     beams: Float[Array, "orders products 2 functions degrees"], f: Complex[Array, "..."]
-) -> Float[Array, "modes modes"]:
+) -> ModesMatrix:
     """The matrix of beams (W_lm, W_l,-m) and Fourier sums, one strip of orders after the other.
 
     Only columns of orders up to the strip's own last one, and rows of degrees from its first one,
@@ -242,7 +242,7 @@ def _weighted(
     return [x.reshape(n_orders, -1, n) for x in products]
 
 
-def normal_matrix(coupling: Coupling, noise: Covariance) -> Float[Array, "modes modes"]:
+def normal_matrix(coupling: Coupling, noise: Covariance) -> ModesMatrix:
     """Compute A^T N^-1 A without forming A.
 
     Exact for the coupling's own functions of time. For diagonal noise and blocks in time the cost
@@ -337,7 +337,7 @@ NORMAL_MATRICES: dict[type[Covariance], Callable[..., Array]] = {
 }
 
 
-def summed(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> Float[Array, "modes modes"]:
+def summed(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> ModesMatrix:
     """Compute A^T W A for weights W within times.
 
     Parameters
@@ -385,8 +385,8 @@ def _turntable_groups(
 
 @compiled
 def _to_galactic(
-    pole_from_galactic: Rotation, lower: Float[Array, "modes modes"], place: Int[Array, " modes"]
-) -> Float[Array, "modes modes"]:
+    pole_from_galactic: Rotation, lower: ModesMatrix, place: Int[Array, " modes"]
+) -> ModesMatrix:
     """R^T M R, symmetric to the last bit.
 
     Of M the lower triangle is given, with the packed mode k in row ``place[k]``. NumPy's is
@@ -414,7 +414,7 @@ def _turned(
 
 
 @eqx.filter_jit
-def _streamed(coupling: CouplingMatrix, factor: TimeBandedFactor) -> Float[Array, "modes modes"]:
+def _streamed(coupling: CouplingMatrix, factor: TimeBandedFactor) -> ModesMatrix:
     """For time-banded noise: A is made, whitened and summed one block row of N after the other."""
     pointing, layout = coupling.pointing, coupling.layout
     n_blocks, rows, window = factor.left.shape

@@ -52,6 +52,7 @@ from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 # arrays that recur
+Pairs = Float[np.ndarray, "pairs modes modes"]
 Fields = Float[np.ndarray, "fields modes"]
 ChannelModes = Float[np.ndarray, "channels modes"]
 
@@ -296,11 +297,7 @@ def _linear_round(
 
 
 def _judged(
-    prior: SpectralPrior,
-    channel: int,
-    information: Information,
-    maps: Fields,
-    spread: Float[np.ndarray, "pairs modes modes"] | None,
+    prior: SpectralPrior, channel: int, information: Information, maps: Fields, spread: Pairs | None
 ) -> dict[str, np.ndarray]:
     """Exponent and chi^2 of a channel at the mean of a linear round, and its residual's power."""
     none = np.zeros((0, *maps.shape))
@@ -356,7 +353,7 @@ def positive_sky(
     mode: PositiveMode,
     channel: int,
     information: Information,
-    spread: Float[np.ndarray, "pairs modes modes"],
+    spread: Pairs,
     draws: Float[np.ndarray, "n fields modes"],
     key: PRNGKeyArray,
 ) -> ChannelSky:

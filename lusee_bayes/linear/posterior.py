@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array, Pixels, compiled, namespace
+from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, Pixels, compiled, namespace
 from lusee_bayes.core.checks import Described, is_traced, number
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import (
@@ -333,7 +333,7 @@ def _whiten(posterior: Posterior, skies: Float[Array, "n unknowns"]) -> Float[Ar
     return u + (white - inside) @ posterior.basis.T
 
 
-def pixel_std(covariance: Float[Array, "modes modes"], nside: int) -> Pixels:
+def pixel_std(covariance: ModesMatrix, nside: int) -> Pixels:
     """Compute the standard deviation of a map at the centre of every pixel.
 
     Parameters
@@ -354,7 +354,7 @@ def pixel_std(covariance: Float[Array, "modes modes"], nside: int) -> Pixels:
     return np.sqrt(_on_pixels(((azimuth @ between) * azimuth).sum(2), place))
 
 
-def independent_pixel_std(variance: Float[Array, " modes"], nside: int) -> Pixels:
+def independent_pixel_std(variance: Modes, nside: int) -> Pixels:
     """Compute :func:`pixel_std` of coefficients that are independent of each other.
 
     Parameters

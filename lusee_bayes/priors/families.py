@@ -19,20 +19,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import (
-    gammainc,
-    gammaincc,
-    gammainccinv,
-    gammaincinv,
-    gammaln,
-    ndtr,
-    ndtri,
-    stdtr,
-    stdtrit,
-)
+from scipy import special
 
 from lusee_bayes.core.arrays import Ells, ModesMatrix
 from lusee_bayes.core.harmonics import per_mode, sum_over_m
@@ -108,10 +99,12 @@ class Hyperprior:
         z, t = self._parts(parameters)
         half = FREEDOM / 2.0
         theta = -(half + 0.5) * np.log1p(z**2 / FREEDOM) - np.log(self.width)
-        constant = gammaln(half + 0.5) - gammaln(half) - 0.5 * np.log(FREEDOM * np.pi)
+        constant = (
+            special.gammaln(half + 0.5) - special.gammaln(half) - 0.5 * np.log(FREEDOM * np.pi)
+        )
         shape = self.tail / self.steepness
         cells = -self.tail * t - shape * np.exp(-self.steepness * t)
-        of_cell = np.log(self.steepness) + shape * np.log(shape) - gammaln(shape)
+        of_cell = np.log(self.steepness) + shape * np.log(shape) - special.gammaln(shape)
         return np.concatenate([theta + constant, cells + of_cell])
 
     def gradient(self, parameters: Parameters) -> Parameters:
@@ -135,18 +128,22 @@ class Hyperprior:
         x, t = self._parts(parameters)
         shape = self.tail / self.steepness
         # the smaller of both tails keeps its digits
-        theta = np.sign(x) * -ndtri(stdtr(FREEDOM, -np.abs(x)))
+        theta = np.sign(x) * -special.ndtri(special.stdtr(FREEDOM, -np.abs(x)))
         power = shape * np.exp(-self.steepness * t)
-        below, above = gammaincc(shape, power), gammainc(shape, power)
-        cells = np.where(below < above, ndtri(below), -ndtri(above))
+        below, above = special.gammaincc(shape, power), special.gammainc(shape, power)
+        cells = np.where(below < above, special.ndtri(below), -special.ndtri(above))
         return np.concatenate([theta, cells])
 
     def of_scores(self, scores: Parameters) -> Parameters:
         """Compute the inverse of :meth:`scores`."""
         x, t = np.split(scores, [len(self.centre)])
         shape = self.tail / self.steepness
-        theta = np.sign(x) * -stdtrit(FREEDOM, ndtr(-np.abs(x)))
-        power = np.where(t < 0, gammainccinv(shape, ndtr(t)), gammaincinv(shape, ndtr(-t)))
+        theta = np.sign(x) * -special.stdtrit(FREEDOM, special.ndtr(-np.abs(x)))
+        power = np.where(
+            t < 0,
+            special.gammainccinv(shape, special.ndtr(t)),
+            special.gammaincinv(shape, special.ndtr(-t)),
+        )
         cells = -np.log(power / shape) / self.steepness
         return np.concatenate([self.centre + self.width * theta, cells])
 
@@ -182,15 +179,13 @@ class Member(ABC):
 class PriorFamily(ABC):
     """Priors N(mean, S(theta)) over harmonic coefficients, in NumPy."""
 
+    # of those parameters that are reported: the first ones
+    names: ClassVar[tuple[str, ...]] = ("ln C at ell = 9", "tilt", "curvature")
+
     @property
     @abstractmethod
     def hyperprior(self) -> Hyperprior:
         """What is expected of the parameters."""
-
-    @property
-    @abstractmethod
-    def names(self) -> tuple[str, ...]:
-        """Names of those parameters that are reported: the first ones."""
 
     @abstractmethod
     def at(self, parameters: Parameters) -> Member:
@@ -245,9 +240,6 @@ class SpectrumBasis:
     centre: Parameters
     width: Parameters
 
-    # of the parameters that are reported
-    names = ("ln C at ell = 9", "tilt", "curvature")
-
     @classmethod
     def around(cls, power: float, lmax: int) -> SpectrumBasis:
         """Make the basis.
@@ -297,10 +289,6 @@ class IsotropicFamily(PriorFamily):
             np.append(self.spectrum.centre, self.log_monopole),
             np.append(self.spectrum.width, LOG_MONOPOLE_WIDTH),
         )
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return SpectrumBasis.names
 
     def at(self, parameters: Parameters) -> IsotropicMember:
         return IsotropicMember(self, parameters)

@@ -43,7 +43,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.arrays import Draws, Square, on_host
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cholesky, invert_lower
@@ -357,7 +357,7 @@ def _slope(
     return found + hyperprior.gradient(here.parameters), curvature
 
 
-def _root(known: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n k"]:
+def _root(known: Square) -> Float[np.ndarray, "n k"]:
     """A root of a covariance with eigenvalues from 0 to 1.
 
     Of data that are very precise, those near 0 are wrong by more than ``ROUNDING``; then what lies
@@ -398,7 +398,7 @@ ATTEMPTS = 5
 
 def draws_with_parameters(
     family: PriorFamily, learned: Learned, posterior: Posterior, key: PRNGKeyArray, n: int
-) -> Float[np.ndarray, "draws modes"]:
+) -> Draws:
     """Draw skies; neighbouring ones have different parameters.
 
     Parameters

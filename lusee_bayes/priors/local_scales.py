@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy import sparse
 
-from lusee_bayes.core.arrays import Ells, Modes, ModesMatrix
+from lusee_bayes.core.arrays import Ells, Modes, ModesMatrix, Vector
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.harmonics import n_modes, per_mode, sum_over_m, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
@@ -250,10 +250,6 @@ class LocalScales(PriorFamily):
             N_CELLS,
         )
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return SpectrumBasis.names
-
     def at(self, parameters: Parameters) -> LocalScalesMember:
         return LocalScalesMember(self, *self._split(parameters))
 
@@ -366,10 +362,7 @@ class LocalScalesMember(Member):
         return self._gathered(ells, sources, fields)
 
     def _gathered(
-        self,
-        ells: Float[np.ndarray, "ells n"],
-        sources: Float[np.ndarray, " n"],
-        fields: list[np.ndarray],
+        self, ells: Float[np.ndarray, "ells n"], sources: Vector, fields: list[np.ndarray]
     ) -> Float[np.ndarray, "parameters n"]:
         """Derivatives by the parameters, from those by ln C_ell, ln f^2 and the strengths."""
         family = self.family
@@ -380,14 +373,8 @@ class LocalScalesMember(Member):
             by_point = field.reshape(len(field), -1)
             covariates += (by_point @ (band.covariates * area[:, None])).T
             cells += band.cells.multiply(area[:, None]).T @ by_point.T
-        return np.concatenate(
-            [
-                family.spectrum.matrix.T @ ells,
-                np.exp(self.fluxes[0]) * sources[None],
-                covariates,
-                cells,
-            ]
-        )
+        fluxes = np.exp(self.fluxes[0]) * sources[None]
+        return np.concatenate([family.spectrum.matrix.T @ ells, fluxes, covariates, cells])
 
 
 def embedded_local_scales(

@@ -279,12 +279,12 @@ class ChannelResult(Described):
 def channel_of_information(
     observed: Observed,
     information: Information,
-    mean: Float[Array, " modes"],
-    covariance: Float[Array, "modes modes"],
+    mean: Modes,
+    covariance: ModesMatrix,
     draws: Float[Array, "n modes"],
     *,
     compared: Float[np.ndarray, "more modes"] | None = None,
-    independent: Float[Array, " modes"] | None = None,
+    independent: Modes | None = None,
     log_evidence: float = np.nan,
     information_bits: float = np.nan,
     chi2_model: float = np.nan,
@@ -332,7 +332,7 @@ def channel_of_information(
 def _channel(
     observed: Observed,
     mean: Modes,
-    covariance: Float[Array, "modes modes"],
+    covariance: ModesMatrix,
     compared: Float[np.ndarray, "more modes"] | None,
     **figures: Any,
 ) -> ChannelResult:

@@ -27,7 +27,7 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, on_host
+from lusee_bayes.core.arrays import Modes, ModesMatrix, on_host
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.instrument_terms import offsets_about, second_order
 from lusee_bayes.experiment.model import radiometer, true_values
@@ -211,9 +211,7 @@ class Unknowns:
     sky_std: float
 
     @classmethod
-    def of(
-        cls, experiment: Experiment, found: Inference, reference: Float[Array, " modes"]
-    ) -> Unknowns | None:
+    def of(cls, experiment: Experiment, found: Inference, reference: Modes) -> Unknowns | None:
         """Of data and their model; None if that has no such unknowns.
 
         Parameters
