@@ -123,6 +123,13 @@ def require_finite(name: str, array: Any) -> None:
         )
 
 
+def require_array(name: str, array: Any, shape: tuple[int | None, ...]) -> None:
+    """Check that an array is of finite 64-bit floats and of this shape; see the checks of each."""
+    require_float64(name, array)
+    require_shape(name, array, shape)
+    require_finite(name, array)
+
+
 def require_positive(name: str, array: Any, hint: str = "") -> None:
     """Check that every entry is positive and finite.
 

@@ -57,6 +57,9 @@ from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import HarmonicPrior
 
+# arrays that recur
+Products = Float[np.ndarray, " products"]
+
 Mixing = Float[np.ndarray, "products products"]
 
 # seconds to be added to times that are not what they are taken for
@@ -91,7 +94,7 @@ class DataMistake:
     words: str
     remedy: str
     mixing: Mixing
-    constant: Float[np.ndarray, " products"] | None = None
+    constant: Products | None = None
     time: int | None = None
     reverses: bool = False
 
@@ -397,9 +400,7 @@ class MixedProducts:
         yield self._constant(np.flatnonzero(autos))
         yield from self._times()
 
-    def _factor(
-        self, name: str, which: Float[np.ndarray, " products"]
-    ) -> tuple[float, DataMistake]:
+    def _factor(self, name: str, which: Products) -> tuple[float, DataMistake]:
         """A factor of some products: chi^2 is a parabola in what is missing."""
         whole = self.vector(np.eye(len(which)))
         step = self.vector(np.diag(which), 0.0)
@@ -412,7 +413,7 @@ class MixedProducts:
             np.diag(1.0 + missing * which),
         )
 
-    def _gain(self, port: int, powers: Float[np.ndarray, " products"]) -> tuple[float, DataMistake]:
+    def _gain(self, port: int, powers: Products) -> tuple[float, DataMistake]:
         """A gain of a port's voltage, squared in its auto: chi^2 is of fourth order in it."""
         parts = [self.vector(np.diag((powers == k) * 1.0), -1.0 * (k == 0)) for k in range(3)]
         gram = np.array([[u @ self.q @ v for v in parts] for u in parts])

@@ -80,6 +80,10 @@ from lusee_bayes.linear.normal_matrix import summed
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import Covariance, LowRankUpdate
 
+# arrays that recur
+Functions = Float[np.ndarray, "times n"]
+TimeIndex = Int[np.ndarray, " times"]
+
 
 class Missed(NamedTuple):
     """How a group differs from its prediction.
@@ -356,7 +360,7 @@ class Part:
 
 def smooth_functions(
     phases: Float[np.ndarray, "times functions"], azimuth: Float[np.ndarray, " times"]
-) -> Float[np.ndarray, "times n"]:
+) -> Functions:
     """Find few orthonormal functions of time that make up all of the given ones.
 
     Parameters
@@ -541,14 +545,14 @@ class StructuredLeftOut(LeftOut):
         return kept
 
     def _modes(
-        self, run: int, here: Int[np.ndarray, " times"], functions: Float[np.ndarray, "times n"]
+        self, run: int, here: TimeIndex, functions: Functions
     ) -> Float[np.ndarray, "modes columns"]:
         """C^(1/2) of the rows of functions of time, for every product."""
         if len(here) == functions.shape[1] and self._kept is not None:
             return self._kept[:, here].reshape(-1, self._prior.size).T
         return self._whitened(self._rows(run, here, functions))
 
-    def _phases(self, here: Int[np.ndarray, " times"]) -> Float[np.ndarray, "times functions"]:
+    def _phases(self, here: TimeIndex) -> Float[np.ndarray, "times functions"]:
         """cos and sin of m phi(t) times every function of time: all that A knows of time."""
         factors = self._coupling.pointing.functions[here]
         angle = self._coupling.pointing.azimuth[here, None] * np.arange(self._coupling.lmax + 1.0)
@@ -556,7 +560,7 @@ class StructuredLeftOut(LeftOut):
         return (factors[:, :, None] * waves[:, None]).reshape(len(here), -1)
 
     def _rows(
-        self, run: int, here: Int[np.ndarray, " times"], functions: Float[np.ndarray, "times n"]
+        self, run: int, here: TimeIndex, functions: Functions
     ) -> Float[np.ndarray, "rows modes"]:
         """R: for every product U^T A, whose rows are combinations of those of A."""
         coupling, n = self._coupling, self._coupling.lmax + 1
@@ -575,9 +579,7 @@ class StructuredLeftOut(LeftOut):
         rows = packed.transpose(1, 2, 0).reshape(-1, len(m))
         return coupling.pointing.pole_from_galactic.T(rows)
 
-    def _parts(
-        self, here: Int[np.ndarray, " times"], functions: Float[np.ndarray, "times n"]
-    ) -> list[Part]:
+    def _parts(self, here: TimeIndex, functions: Functions) -> list[Part]:
         n_products, n = len(self.u), functions.shape[1]
         weights = self._weights[..., here]
         if weights.ndim == 2 and not len(self._q):

@@ -33,14 +33,7 @@ from lusee_bayes.core.arrays import (
     placed,
     repeated,
 )
-from lusee_bayes.core.checks import (
-    Described,
-    is_traced,
-    number,
-    require_finite,
-    require_float64,
-    require_shape,
-)
+from lusee_bayes.core.checks import Described, is_traced, number, require_array, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import cholesky, gram_matrix, precise_residual, scaled, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
@@ -116,9 +109,7 @@ class Information(Described, eqx.Module):
             If ``data`` is not float64, not finite or of another length, N is not positive definite,
             the prior is over pixels, or the mean does not converge.
         """
-        require_float64("the data", data)
-        require_shape("the data", data, (noise.size,))
-        require_finite("the data", data)
+        require_array("the data", data, (noise.size,))
         if is_within_times(noise):
             coupling, prior, noise, offset, data = on_processor(
                 (coupling, prior, noise, offset, data)

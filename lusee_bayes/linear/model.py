@@ -31,7 +31,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, DataVector, on_processor
-from lusee_bayes.core.checks import Described, require_finite, require_float64, require_shape
+from lusee_bayes.core.checks import Described, require_array
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.instrument.coupling import Coupling, as_coupling
@@ -81,9 +81,7 @@ class LinearGaussian(Described, eqx.Module):
                 "unknowns; give both the same lmax"
             )
         if self.offset is not None:
-            require_float64("the offset", self.offset)
-            require_shape("the offset", self.offset, (n_data,))
-            require_finite("the offset", self.offset)
+            require_array("the offset", self.offset, (n_data,))
 
     def description(self) -> tuple[str, ...]:
         offset = "" if self.offset is None else " + offset"

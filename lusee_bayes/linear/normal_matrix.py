@@ -60,6 +60,9 @@ from lusee_bayes.noise.covariance import (
     TimeBlockCovariance,
 )
 
+# arrays that recur
+Beams = Float[Array, "orders products 2 functions degrees"]
+
 # times that are summed at once: it bounds the memory
 CHUNK = 512
 
@@ -137,9 +140,7 @@ def of_one_angle(
     return _from_sums(beams, f.reshape(*weights.shape[:-1], *f.shape[1:]))
 
 
-def _from_sums(
-    beams: Float[Array, "orders products 2 functions degrees"], f: Complex[Array, "..."]
-) -> ModesMatrix:
+def _from_sums(beams: Beams, f: Complex[Array, "..."]) -> ModesMatrix:
     """The matrix of beams (W_lm, W_l,-m) and Fourier sums, one strip of orders after the other.
 
     Only columns of orders up to the strip's own last one, and rows of degrees from its first one,
@@ -184,11 +185,7 @@ def _by_order(lmax: int) -> Int[np.ndarray, " modes"]:
 
 
 def _rows_of_order(
-    m: Array,
-    beams: Float[Array, "orders products 2 functions degrees"],
-    f: Complex[Array, "..."],
-    first: int,
-    end: int,
+    m: Array, beams: Beams, f: Complex[Array, "..."], first: int, end: int
 ) -> Float[Array, "rows columns"]:
     """Rows a_lm, then a_l,-m, of one order; columns a_l'm', then a_l',-m', of orders below end.
 
@@ -210,9 +207,7 @@ def _rows_of_order(
 
 
 def _weighted(
-    even: Complex[Array, "..."],
-    odd: Complex[Array, "..."],
-    beams: Float[Array, "orders products 2 functions degrees"],
+    even: Complex[Array, "..."], odd: Complex[Array, "..."], beams: Beams
 ) -> list[Float[Array, "orders parts degrees"]]:
     """(P + Q) / 2 and (P - Q) / 2 without the row's own beam, real and imaginary parts.
 

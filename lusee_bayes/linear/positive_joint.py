@@ -36,17 +36,9 @@ from lusee_bayes.core.arrays import Modes, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, per_mode, power_spectrum, sum_over_m
 from lusee_bayes.core.linalg import inverse_from_cholesky, symmetric_product
+from lusee_bayes.linear import joint
 from lusee_bayes.linear.amplitudes import Patterns
 from lusee_bayes.linear.information import Information, integrated_out
-from lusee_bayes.linear.joint import (
-    ChannelSky,
-    ComponentSums,
-    channel_sky,
-    component_posterior,
-    paired,
-    residual_lower,
-    summed,
-)
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
 from lusee_bayes.sky.spectral_prior import SpectralPrior
@@ -62,8 +54,10 @@ SETTLED, SETTLED_LAW = 0.1, 0.05
 MAX_ROUNDS, HALVINGS = 60, 20
 
 
+# arrays by name, and their shapes
+Arrays, Shapes = dict[str, np.ndarray], dict[str, tuple[int, ...]]
 # functions of a channel's number and information
-OfChannel = Callable[[int, Information], dict[str, np.ndarray]]
+OfChannel = Callable[[int, Information], Arrays]
 Linearised = Callable[[int, Information], Information]
 
 
@@ -71,9 +65,7 @@ Linearised = Callable[[int, Information], Information]
 class Channels(Protocol):
     """The channels of a joint posterior, wherever their data are."""
 
-    def each(
-        self, function: OfChannel, shapes: dict[str, tuple[int, ...]]
-    ) -> dict[str, np.ndarray]:
+    def each(self, function: OfChannel, shapes: Shapes) -> Arrays:
         """Call a function with number and information of every channel; its arrays, stacked."""
 
     def summed(
@@ -94,9 +86,7 @@ class ChannelsInMemory:
 
     informations: tuple[Information, ...]
 
-    def each(
-        self, function: OfChannel, shapes: dict[str, tuple[int, ...]]
-    ) -> dict[str, np.ndarray]:
+    def each(self, function: OfChannel, shapes: Shapes) -> Arrays:
         """Call a function with number and information of every channel; its arrays, stacked."""
         found = [function(k, information) for k, information in enumerate(self.informations)]
         return {name: np.stack([part[name] for part in found]) for name in shapes}
@@ -105,9 +95,9 @@ class ChannelsInMemory:
         self, prior: SpectralPrior, reference: ChannelModes, function: Linearised
     ) -> Information:
         """What a function of every channel's information says of the component maps."""
-        sums = ComponentSums.empty(prior, reference)
+        sums = joint.ComponentSums.empty(prior, reference)
         for k, information in enumerate(self.informations):
-            sums = summed(sums, prior, k, function(k, information))
+            sums = joint.summed(sums, prior, k, function(k, information))
         return sums.information()
 
 
@@ -235,7 +225,7 @@ def find_joint_mode(
     fields = np.zeros((len(skies.names), skies.n_fields)) if start is None else start
     exponents = skies.mixing @ fields
     here = _Point(fields, exponents, _chi2(skies, channels, exponents))
-    shapes: dict[str, tuple[int, ...]] = {"exponent": (skies.n_fields,), "chi2": ()}
+    shapes: Shapes = {"exponent": (skies.n_fields,), "chi2": ()}
     if learn:
         shapes |= dict.fromkeys(("power", "known"), (skies.grid.lmax + 1,))
     last = np.zeros_like(laws.parameters)
@@ -265,7 +255,7 @@ def find_joint_mode(
 
 
 def _chi2(skies: PositiveSkies, channels: Channels, exponents: ChannelModes) -> float:
-    def chi2(channel: int, information: Information) -> dict[str, np.ndarray]:
+    def chi2(channel: int, information: Information) -> Arrays:
         diffuse = diffuse_part(skies, channel, information).without()
         return {"chi2": np.asarray(diffuse.chi2(skies.modes(channel, exponents[channel])))}
 
@@ -277,19 +267,19 @@ def _linear_round(
     channels: Channels,
     prior: SpectralPrior,
     exponents: ChannelModes,
-    shapes: dict[str, tuple[int, ...]],
-) -> tuple[Posterior, _Point, dict[str, np.ndarray]]:
+    shapes: Shapes,
+) -> tuple[Posterior, _Point, Arrays]:
     """The posterior of skies that are linear about exponents, its mean, and every channel there."""
 
     def relative(channel: int, information: Information) -> Information:
         return linearised(skies, channel, information, exponents[channel])
 
     information = channels.summed(prior, exponents, relative)
-    posterior = on_host(component_posterior(information, prior))
+    posterior = on_host(joint.component_posterior(information, prior))
     maps = np.asarray(posterior.mean).reshape(prior.n_components, -1)
-    spread = np.asarray(paired(posterior.covariance(), prior)) if "power" in shapes else None
+    spread = np.asarray(joint.paired(posterior.covariance(), prior)) if "power" in shapes else None
 
-    def judged(channel: int, information: Information) -> dict[str, np.ndarray]:
+    def judged(channel: int, information: Information) -> Arrays:
         return _judged(prior, channel, relative(channel, information), maps, spread)
 
     found = channels.each(judged, shapes)
@@ -298,15 +288,17 @@ def _linear_round(
 
 def _judged(
     prior: SpectralPrior, channel: int, information: Information, maps: Fields, spread: Pairs | None
-) -> dict[str, np.ndarray]:
+) -> Arrays:
     """Exponent and chi^2 of a channel at the mean of a linear round, and its residual's power."""
     none = np.zeros((0, *maps.shape))
-    sky = on_host(channel_sky(prior, channel, information, maps, None, none, jax.random.key(0)))
+    sky = on_host(
+        joint.channel_sky(prior, channel, information, maps, None, none, jax.random.key(0))
+    )
     found = {"exponent": np.asarray(sky.mean), "chi2": np.asarray(sky.chi2)}
     if spread is None:
         return found
     root, mixing = prior.residual_root(channel), np.asarray(prior.mixing[channel])
-    inverse = inverse_from_cholesky(residual_lower(information, root))
+    inverse = inverse_from_cholesky(joint.residual_lower(information, root))
     first, second = np.tril_indices(len(mixing))
     common = np.tensordot(mixing[first] * mixing[second], spread, 1)
     # of the residual given the common part, and of what it follows of that
@@ -317,7 +309,7 @@ def _judged(
 
 
 def _powers(
-    posterior: Posterior, prior: SpectralPrior, found: dict[str, np.ndarray]
+    posterior: Posterior, prior: SpectralPrior, found: Arrays
 ) -> tuple[Float[np.ndarray, "laws ells"], Float[np.ndarray, "laws ells"]]:
     """sum_m u^2 and sum_m (1 - var u) of all fields and residuals."""
     shape = prior.n_components, -1
@@ -356,7 +348,7 @@ def positive_sky(
     spread: Pairs,
     draws: Float[np.ndarray, "n fields modes"],
     key: PRNGKeyArray,
-) -> ChannelSky:
+) -> joint.ChannelSky:
     """Compute the sky of one channel.
 
     Its mean is the sky of the mean exponent, and draws are those of exponents' draws: all are
@@ -378,12 +370,14 @@ def positive_sky(
 
     Returns
     -------
-    ChannelSky
+    joint.ChannelSky
         In K.
     """
     skies, exponent = mode.skies, mode.exponents[channel]
     relative = linearised(skies, channel, information, exponent)
-    found = on_host(channel_sky(mode.prior, channel, relative, mode.fields, spread, draws, key))
+    found = on_host(
+        joint.channel_sky(mode.prior, channel, relative, mode.fields, spread, draws, key)
+    )
     beside = diffuse_part(skies, channel, information)
     slope = skies.jacobian(channel, exponent)
     covariance = beside.whole_covariance(symmetric_product(slope @ found.covariance, slope.T))
@@ -396,7 +390,7 @@ def positive_sky(
         here = slice(first, first + CHUNK)
         drawn[here] = skies.modes(channel, np.asarray(found.draws[here]))
     whole = on_host(information)
-    return ChannelSky(mean, covariance, beside.whole_skies(drawn, z), whole.chi2(mean))
+    return joint.ChannelSky(mean, covariance, beside.whole_skies(drawn, z), whole.chi2(mean))
 
 
 # highest ell of the maps that laws are learned from
@@ -438,7 +432,7 @@ def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsI
     """What all channels say of the first modes."""
     names = ("matrix", "vector", "reference", "misfit", "log_det", "n_data")
 
-    def large(channel: int, information: Information) -> dict[str, np.ndarray]:
+    def large(channel: int, information: Information) -> Arrays:
         found = on_host(information)
         if found.n_modes > n:
             found = integrated_out(found, n, _small_scales(skies, channel)[n:])

@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, DataVector
-from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
+from lusee_bayes.core.checks import is_traced, require_array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import gram_matrix, solve_lower
 from lusee_bayes.instrument.coupling import Coupling
@@ -156,9 +156,7 @@ class Solver(eqx.Module):
         return solve_lower(self.lower, inside.T, transpose=False)
 
     def _solve(self, data: DataVector) -> tuple[Array, Array, Array]:
-        require_float64("the data", data)
-        require_shape("the data", data, (self.whitened.shape[0],))
-        require_finite("the data", data)
+        require_array("the data", data, (self.whitened.shape[0],))
         u, log_evidence, moved = _solve(self, jnp.asarray(data))
         if not is_traced(moved) and not float(moved) <= CONVERGENCE:
             raise InputError(

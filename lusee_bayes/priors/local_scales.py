@@ -32,6 +32,9 @@ from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource
 from lusee_bayes.sky.prior import PIVOT, DensePrior
 from lusee_bayes.sky.template import EmbeddedTemplate
 
+# arrays that recur
+Covariates = Float[np.ndarray, " covariates"]
+
 # frequency in MHz at which the Galaxy is nearly transparent
 TRANSPARENT_MHZ = 50.0
 # fluctuations of the texture relative to the template's mean, where its spectrum is started
@@ -163,9 +166,7 @@ class SmoothedTemplate:
         return np.log(healpy.get_interp_val(smooth, theta, phi)) - self.mean_log
 
 
-def expected_covariates() -> tuple[
-    Float[np.ndarray, " covariates"], Float[np.ndarray, " covariates"]
-]:
+def expected_covariates() -> tuple[Covariates, Covariates]:
     """Return centre and width of what is expected of the covariates' coefficients."""
     ell = np.sqrt(np.arange(1, n_modes(FIELD_LMAX))).astype(int)
     named = [POWER_WIDTH, POWER_WIDTH, PLANE_WIDTH, TILTS_WIDTH, TILTS_WIDTH]
@@ -199,7 +200,7 @@ class LocalScales(PriorFamily):
     sources: Float[np.ndarray, "modes sources"]
     spectrum: SpectrumBasis
     bands: tuple[Band, ...]
-    covariates: tuple[Float[np.ndarray, " covariates"], Float[np.ndarray, " covariates"]]
+    covariates: tuple[Covariates, Covariates]
 
     @classmethod
     def of(
@@ -315,7 +316,7 @@ class LocalScalesMember(Member):
     family: LocalScales
     power: Float[np.ndarray, " spectrum"]
     fluxes: Float[np.ndarray, "1"]
-    coefficients: Float[np.ndarray, " covariates"]
+    coefficients: Covariates
     factors: Float[np.ndarray, " cells"]
 
     @cached_property
