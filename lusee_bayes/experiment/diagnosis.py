@@ -1,14 +1,11 @@
 """Usual mistakes in data and model: which of them would make the data fit.
 
-The usual mistakes in data and models, each as what would undo it.
+Where no sky explains data, each of the usual mistakes is undone, and the residual chi^2 of that,
+what a prior wide enough for any sky leaves (:mod:`lusee_bayes.judge.chi2`), tells whether the data
+would fit. A mistake in the data is undone by mixing the products of every time. One in the model is
+undone by other beams, or by another observation: other times, angles or another site.
 
-A mistake in the data is undone by mixing the products of every time. One in the model is undone by
-other beams, or by another observation: other times, angles or another site.
-
-The residual chi^2 of data, what no sky absorbs, with the data or the model changed.
-
-Changes of data that mix the products of each time, and their residual chi^2, all at once.
-
+Changes of data that mix the products of each time are tried all at once:
 d' = sum_jk W_jk x_jk, where x_jk has product k in the place of product j. With K the covariance of
 the data under a prior that allows any sky, and b the model without a sky, ::
 
@@ -16,12 +13,7 @@ the data under a prior that allows any sky, and b the model without a sky, ::
 
 With Q at hand exchanges, signs and reversals cost nothing; factors and constants are solved for.
 
-Did you mean, for data: the usual mistakes, tried where no sky explains the data.
-
-Each is undone, and its residual chi^2, what a prior wide enough for any sky leaves
-(:mod:`lusee_bayes.judge.chi2`), tells whether the data would fit.
-
-Changes of the data cost one matrix together (:mod:`.diagnosis`). A change of the model needs a
+A change of the model needs a
 normal matrix of its own; these are compared up to ``SCREENED_LMAX`` first. The best of both are
 computed as the scenario has it, with N for the changed data.
 """

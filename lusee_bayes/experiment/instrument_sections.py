@@ -1,18 +1,10 @@
 """Sections of a scenario on the instrument and its data.
 
-Where, when and with which turntable angles.
-
-What is not known about clock and pointing.
-
-What is connected to the ports of a response: one section for each kind, told by ``model``.
-
-The beams: one section for each kind, selected by ``model``.
-
-A new kind is a class here, with its :class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
-
-Sessions of the spectrometer that are simulated, and what disturbs them.
-
-How sessions of the spectrometer become visibilities.
+They say where, when and with which turntable angles; what is not known about clock and pointing;
+the beams, and what is connected to their ports; and how sessions of the spectrometer become
+visibilities, or are simulated. Beams and receivers have one section for each kind, told by
+``model``. A new kind of beams is a class here, with its :class:`BeamSource`, and its name in
+``BEAM_SECTIONS``.
 """
 
 from __future__ import annotations

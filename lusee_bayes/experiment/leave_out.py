@@ -1,11 +1,8 @@
 """Data that disagree with all others, and the fit without them.
 
-Times, values, products and days of data against what the model predicts from all others.
-
-Data that do not fit what all others predict for them, found one after the other.
-
-The worst times are flagged, or a single product of theirs without which the time fits; what is left
-is compared again under the same model, and so on, until none has a chi^2 that noise gives with less
+Times, values, products and days are compared with what the model predicts from all others. The
+worst times are flagged, or a single product of theirs without which the time fits; what is left is
+compared again under the same model, and so on, until none has a chi^2 that noise gives with less
 than the rate of false alarms. Then products and days are compared in the same way. A bad product or
 day spoils the predictions of all times: where more times do not fit than may be flagged, it goes
 first. What is left is fitted again, since N is built around the data, until nothing more goes.

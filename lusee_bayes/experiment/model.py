@@ -1,8 +1,7 @@
 """The model of a setup, and data simulated from it.
 
-d = A m + n of a setup: with radiometer noise alone, or with every systematic.
-
-Simulated data: the true instrument, its drifts and fluxes, drawn with the scenario's seed.
+d = A m + n has radiometer noise alone, or every systematic. Simulated data hold the true
+instrument, its drifts and fluxes, drawn with the scenario's seed.
 """
 
 from __future__ import annotations

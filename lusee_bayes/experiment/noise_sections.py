@@ -1,9 +1,4 @@
-"""Sections of a scenario on N and the unknowns in it.
-
-What is not known about receivers, ground and gain table.
-
-The terms of N.
-"""
+"""Sections of a scenario on the terms of N, receivers, ground and gain table among them."""
 
 from __future__ import annotations
 

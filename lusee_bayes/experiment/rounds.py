@@ -1,10 +1,7 @@
 """Inference in rounds: the prior, and N about the map, until neither moves.
 
-N that is built around what the data tell, in rounds, and the posterior of each.
-
-A prior whose parameters the data of an experiment tell.
-
-Priors by name, for a comparison under which of them data are most probable.
+N may be built around what the data tell, and the parameters of the prior be told by the data.
+Priors also come by name, for a comparison under which of them data are most probable.
 """
 
 from __future__ import annotations

@@ -1,12 +1,7 @@
-"""Scenarios: read, overridden, validated.
+"""A scenario: everything that determines a run, as YAML, validated before anything is computed.
 
-``--set key.path=value``: changing one entry of a tree of keys and values.
-
-What is wrong with a scenario, in one sentence.
-
-A scenario: everything that determines a run, as YAML, validated before anything is computed.
-
-Unknown keys are errors that name the nearest known one. ``to_yaml`` writes the resolved scenario,
+``--set key.path=value`` changes one entry. What is wrong with a scenario is said in one sentence;
+unknown keys are errors that name the nearest known one. ``to_yaml`` writes the resolved scenario,
 defaults included; running that file again gives the same numbers.
 """
 

@@ -1,9 +1,4 @@
-"""What every section of a scenario has in common.
-
-What all sections of a scenario have in common.
-
-What a map run writes besides its maps.
-"""
+"""What all sections of a scenario have in common: types of entries, validators, kinds."""
 
 from __future__ import annotations
 

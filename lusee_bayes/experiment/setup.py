@@ -1,8 +1,6 @@
-"""A, S, the sky and what is known of the instrument, from a scenario.
+"""A scenario's instrument pointed at its sky: all that is fixed before there are data.
 
-What a scenario's antennas and receivers add to every visibility, whatever the sky.
-
-A scenario's instrument pointed at its sky: all that is fixed before there are data.
+That is A, S, the sky, and what antennas and receivers add to every visibility, whatever the sky.
 """
 
 from __future__ import annotations

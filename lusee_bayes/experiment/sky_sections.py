@@ -1,16 +1,9 @@
 """Sections of a scenario on skies and priors.
 
-The sky: one section for each kind, selected by ``model``.
-
-A new kind is a class here, with its :class:`SkySource`, and its name in ``SKY_SECTIONS``.
-
-Point sources that are not part of the map.
-
-The prior on the sky: one section for each kind, selected by ``model``.
-
-A new kind is a class here, which makes its :class:`Prior`, and its name in ``PRIOR_SECTIONS``.
-
-The prior on skies of several frequencies.
+Sky and prior have one section for each kind, selected by ``model``. A new kind is a class here,
+with its :class:`SkySource` or :class:`Prior`, and its name in ``SKY_SECTIONS`` or
+``PRIOR_SECTIONS``. Point sources that are not part of the map, and the prior on skies of several
+frequencies, have sections of their own.
 """
 
 from __future__ import annotations

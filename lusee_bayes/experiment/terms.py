@@ -1,6 +1,4 @@
-"""All terms of N by the section that asks for them.
-
-The systematics of a scenario: how each is built, and what simulated data hold of it.
+"""The systematics of a scenario, by the sections that ask for them.
 
 A new one is a :class:`Systematic`, its section in the schema, and its line in ``TERMS``.
 """

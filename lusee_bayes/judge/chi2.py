@@ -1,7 +1,5 @@
 """chi^2 of data and maps: tests at one rate of false alarms, and what no sky explains.
 
-Whether data fit: chi^2 tests, one rate of false alarms for all of them, and words.
-
 If a model holds, chi^2 of n degrees of freedom has ::
 
     p = 2 min(P(chi^2_n > chi^2), P(chi^2_n < chi^2)),
@@ -11,9 +9,7 @@ probabilities is judged by k p, which is below any bound at most that often, how
 one another (Bonferroni). A report makes all of its tests at one rate, so that a report of data that
 fit says otherwise at most once in 1 / ``FALSE_ALARM``.
 
-Quality of a map: its fidelity to a known truth, and measures that need no truth.
-
-chi^2 of data in two parts: what no sky explains, and what the prior does not expect.
+Maps are judged by their fidelity to a known truth, and by measures that need none.
 
 chi^2 of all data under the model, (d - A mu)^T (A S A^T + N)^-1 (d - A mu), mixes up instrument and
 prior. Give the sky a prior k times as wide, and ::

@@ -1,9 +1,5 @@
 """How often error bars hold the truth, and how often they would by chance.
 
-Levels of central intervals, in one place for all that counts coverage.
-
-Coverage: how often error bars hold the known truth, and how often they would by chance.
-
 If a posterior is right, the truth is one of its draws. The pulls (truth - mean) / std are then
 those of draws, z ~ N(0, corr(C)): each is standard normal, but neighbouring pixels pull alike, so
 that counts over a band of latitude scatter far more than counts of independent pixels would. How

@@ -1,7 +1,5 @@
 """Groups of data against their prediction by all others.
 
-The protocol of what tells how a group of data differs from its prediction by all others.
-
 With K = A S A^T + N the covariance of data under the model and u = K^-1 (d - E[d]), a group s
 differs from its prediction by K_ss^-1 u_s, K_ss being a block of K^-1, and ::
 
@@ -11,10 +9,8 @@ differs from its prediction by K_ss^-1 u_s, K_ss being a block of K^-1, and ::
 Of noise alone its mean is tr K_ss^-1 (K^-1 N K^-1)_ss. Under a wide prior that is the number of
 data, less one for every direction of the sky that only this group measures.
 
-Groups of data against their prediction by all others, with A and N of any kind as matrices.
-
-With N = N_0 + T T^T, F = [A S^(1/2), T] and D = N_0^-1, in blocks of data that N_0 couples (the
-products of a time, or all data), K = N_0 + F F^T has ::
+*Matrices*, for A and N of any kind: with N = N_0 + T T^T, F = [A S^(1/2), T] and D = N_0^-1, in
+blocks of data that N_0 couples (the products of a time, or all data), K = N_0 + F F^T has ::
 
     K^-1 = D - Y Q^-1 Y^T,    Y = D F,    Q = 1 + F^T D F,    K^-1 F = Y Q^-1,
 
@@ -25,10 +21,8 @@ more data than Q has rows is taken out of Q instead, ::
 
 What is left without a group has N_0 without it, and so the D of that: nothing is fitted again.
 
-Data of a stretch of time: the few functions of time in their rows of A, and their noise.
-
-Within a day the rows of A are combinations of a few smooth functions of time, however many samples
-it has, and noise within times couples no two of them.
+*Structure in time*: within a day the rows of A are combinations of a few smooth functions of time,
+however many samples it has, and noise within times couples no two of them.
 
 Groups of data against their prediction by all others, through the structure of A.
 

@@ -2,19 +2,17 @@
 
 Degrees of freedom are those of sky and templates together.
 
-What the data would prefer of something that the model leaves out: score tests of templates.
-
-With K = A S A^T + N the covariance of data under the model and u = K^-1 (d - E[d]), data that hold
-a t besides prefer ::
+Score tests tell what the data would prefer of something that the model leaves out. With K = A S A^T
++ N the covariance of data under the model and u = K^-1 (d - E[d]), data that hold a t besides
+prefer ::
 
     a = t^T u / F,    F = t^T K^-1 t = t^T N^-1 t - P^T C P,    P = A^T N^-1 t,
 
 with the standard deviation F^(-1/2), C being the covariance of the sky; chi^2 of the data would be
 lower by (t^T u)^2 / F. A is not formed.
 
-How strong the sky is compared with its prior: by Galactic latitude and by multipole.
-
-If the model holds, the deviation of the posterior mean from that of the prior is drawn from
+How strong the sky is compared with its prior is told by Galactic latitude and by multipole. If the
+model holds, the deviation of the posterior mean from that of the prior is drawn from
 N(0, S - C): what the prior allows less what the data leave open. Its square over that expectation
 is 1 on average, larger where the prior is too narrow, and smaller where it is too wide.
 """

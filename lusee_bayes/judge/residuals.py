@@ -1,7 +1,5 @@
 """What the model predicts of data from all other data, and what does not fit.
 
-Compare data with what all other data predict, to find products, days or angles that do not fit.
-
 Under a prior that is wide enough for any sky (:mod:`.chi2`), with K = k^2 A S A^T + N the
 covariance of data and u = K^-1 (d - E[d]), a group s of data differs from its prediction by all
 others by K_ss^-1 u_s, K_ss being a block of K^-1, and ::
@@ -11,8 +9,6 @@ others by K_ss^-1 u_s, K_ss being a block of K^-1, and ::
 Directions of the sky that only the group measures take a degree of freedom each: a day that sees
 what no other day does is not blamed for it. A bad group spoils the predictions for all others too;
 the culprit is the group whose removal makes the rest fit.
-
-What the model predicts of every product and of every day from all other data.
 
 The density ln p(d_s | all others) of a group is that of its prediction, whose width counts: a prior
 that predicts too much is punished as one that predicts too little is.

@@ -1,9 +1,8 @@
 """Amplitudes beside the sky: templates in N, patterns, and amplitudes that channels share.
 
-Amplitudes of templates that are part of the noise, as point sources' fluxes are.
-
-With N = N_0 + T T^T, an amplitude of each column of T is N(0, 1) before there are data. With
-K = A S A^T + N the covariance of data under the model, and C that of the sky, ::
+*Templates* are part of the noise, as point sources' fluxes are. With N = N_0 + T T^T, an amplitude
+of each column of T is N(0, 1) before there are data. With K = A S A^T + N the covariance of data
+under the model, and C that of the sky, ::
 
     mean = T^T K^-1 (d - offset) = T^T N^-1 (d - offset - A m),    m the posterior mean of the sky,
     covariance = 1 - T^T K^-1 T = 1 - T^T N^-1 T + P C P^T,        P = T^T N^-1 A,
@@ -11,8 +10,7 @@ K = A S A^T + N the covariance of data under the model, and C that of the sky, :
 
 A is not formed.
 
-Patterns of unknown strength beside a sky, such as point sources: integrated out and put back.
-
+*Patterns* of unknown strength beside a sky, such as point sources, are integrated out and put back,
 ::
 
     m = d + sum_j (1 + g_j) t_j,    g_j ~ N(0, 1)
@@ -24,12 +22,11 @@ d + sum_j t_j with ::
 
 and given d, g ~ N(K^-1 T v(d + sum_j t_j), K^-1).
 
-Amplitudes of several channels that are tied to one another, where each was worked out alone.
-
-Channel k has amplitudes z_k, N(0, 1) when it is worked out, and its posterior of them is
-N(E_k, V_k). Its likelihood is then exp(-z^T (V_k^-1 - 1) z / 2 + z^T V_k^-1 E_k) up to a factor.
-Let the prior of all of them be N(0, K x 1) instead: K_kk = 1 ties the channels' values of one
-amplitude, and different amplitudes are independent. With K = R R^T and z = R w, w ~ N(0, 1), ::
+*Tied amplitudes* of several channels: channel k has amplitudes z_k, N(0, 1) when it is worked out,
+and its posterior of them is N(E_k, V_k). Its likelihood is then exp(-z^T (V_k^-1 - 1) z / 2 + z^T
+V_k^-1 E_k) up to a factor. Let the prior of all of them be N(0, K x 1) instead: K_kk = 1 ties the
+channels' values of one amplitude, and different amplitudes are independent. With K = R R^T and z =
+R w, w ~ N(0, 1), ::
 
     Lambda = 1 + sum_k R_k^T (V_k^-1 - 1) R_k,    mean of w = Lambda^-1 sum_k R_k^T V_k^-1 E_k,
 

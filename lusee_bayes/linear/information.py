@@ -1,6 +1,4 @@
-"""What data say of the sky, as a quadratic form.
-
-The log-likelihood of data as a quadratic form in the sky.
+"""What data say of the sky: their log-likelihood as a quadratic form.
 
 ::
 
@@ -9,9 +7,8 @@ The log-likelihood of data as a quadratic form in the sky.
 
 for any reference sky m0. It has the size of the sky, however many data there are. With a prior it
 gives the posterior, with those of other frequencies a joint one. m0 is chosen near the posterior
-mean: for m0 = 0 the terms are 1e10 times larger than their sum.
-
-The information of data about some of the unknowns, the others integrated out.
+mean: for m0 = 0 the terms are 1e10 times larger than their sum. Unknowns that are
+of no interest are integrated out.
 """
 
 from __future__ import annotations

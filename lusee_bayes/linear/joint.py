@@ -1,7 +1,5 @@
 """One posterior for the skies of several frequencies.
 
-One posterior for the skies of several frequencies.
-
 With m_f = sum_c s_fc a_c + r_f (spectral_prior.py), the residual r_f of each channel is integrated
 out by itself. In units of its prior, P = R^1/2 M R^1/2, and ::
 
@@ -9,13 +7,8 @@ out by itself. In units of its prior, P = R^1/2 M R^1/2, and ::
 
 are the channel's information about the common part sum_c s_fc a_c. Sums over channels of
 s_fc s_fc' M' are the information of all channels about the component maps, (components x modes)
-unknowns, from which the posterior follows as for one sky. Given the components, each residual has a
-posterior of its own.
-
-The sky of one channel, from the joint posterior of the component maps.
-
-Given the components, the residual of each channel (:mod:`.joint`) has a posterior of its own, from
-the channel's data alone.
+unknowns, from which the posterior follows as for one sky. Given the components, the residual of
+each channel has a posterior of its own, from the channel's data alone.
 """
 
 from __future__ import annotations

@@ -1,17 +1,14 @@
 """The linear Gaussian model d = A m + n, and its update with new data.
 
-The linear Gaussian model d = A m + n: a distribution over data, and its posterior over m.
-
-::
+It is a distribution over data, with a posterior over m, ::
 
     Lambda = A^T N^-1 A + S^-1,    C = Lambda^-1,    mean = C A^T N^-1 d
 
 The posterior is computed in a map-space form, of the size of the sky, or a data-space form, of the
 size of the data; :mod:`lusee_bayes.linear.solver` has the algebra of both.
 
-Update a posterior with new data; the old data are not needed any more.
-
-With the posterior m = m1 + R z, z ~ N(0, 1), new data d = A m + offset + n are data of z, ::
+A posterior is updated with new data without the old ones. With the posterior m = m1 + R z, z ~ N(0,
+1), new data d = A m + offset + n are data of z, ::
 
     d = (A R) z + (offset + A m1) + n,
 

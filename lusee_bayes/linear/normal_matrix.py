@@ -1,19 +1,11 @@
 """A^T N^-1 A without A: from the beams and Fourier sums over time.
 
-Sums over times of weights, pairs of functions and exp(i q phi): all of time in A^T N^-1 A.
-
-::
+Sums over times of weights, pairs of functions and exp(i q phi) hold all of time, ::
 
     F_c,jk(q) = sum_t w_c(t) u_j(t) u_k(t) exp(i q phi(t)),    q = -2 lmax .. 2 lmax
 
 They are the only part of a normal matrix whose cost grows with the number of samples, and a small
 part of its cost.
-
-A^T W A of the samples at one turntable angle, from beams and Fourier sums over time.
-
-The equations are those of :mod:`.normal_matrix`; here is the arithmetic that takes the time.
-
-A^T N^-1 A without A: from the beams and Fourier sums over time.
 
 With c_lm(t) = sum_j u_j(t) beta_j,lm exp(i m phi(t)), beta_lm = W_lm + i W_l,-m (coupling.py), a
 visibility is Re sum_m conj(c_lm) (a_lm + i a_l,-m), and for noise that does not couple times ::
@@ -21,7 +13,7 @@ visibility is Re sum_m conj(c_lm) (a_lm + i a_l,-m), and for noise that does not
     sum_t w(t) c_lm conj(c'_l'm') = sum_jk beta_j,lm conj(beta'_k,l'm') F_jk(m - m') = P,
     sum_t w(t) c_lm c'_l'm'       = sum_jk beta_j,lm beta'_k,l'm' F_jk(m + m')       = Q,
 
-with F the sums of :mod:`.normal_matrix`. The four parts of the matrix follow from P + Q and P - Q.
+at each turntable angle. The four parts of the matrix follow from P + Q and P - Q.
 Noise that couples different times is whitened in order of time, a few rows of A at once.
 """
 

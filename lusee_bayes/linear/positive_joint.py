@@ -1,6 +1,4 @@
-"""One posterior for positive skies of several frequencies.
-
-One posterior for positive skies of several frequencies, by Gauss and Newton.
+"""One posterior for positive skies of several frequencies, by Gauss and Newton.
 
 With the exponents phi_f = sum_c s_fc a_c + r_f of :mod:`.positive_skies`, ::
 
@@ -12,13 +10,9 @@ of maps without unit. The step to its mean is halved until E falls, and rounds a
 step would gain nothing. Meanwhile A and tilt of the fields may be learned.
 The last posterior is the Gaussian about the mode, its evidence Laplace's.
 
-The positive sky of one channel, from the joint posterior of the fields.
-
-Laws of the fields of positive skies, learned from the large scales of all channels.
-
-Learning takes twenty rounds of :mod:`.positive_joint`. A and tilt are those of a power law, of
-which modes up to a low ell tell nearly all: those above are integrated out, with the power of the
-template.
+The laws of the fields are learned in twenty rounds from the large scales of all channels. A and
+tilt are those of a power law, of which modes up to a low ell tell nearly all: those above are
+integrated out, with the power of the template.
 """
 
 from __future__ import annotations

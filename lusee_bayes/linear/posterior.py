@@ -1,10 +1,7 @@
-"""The posterior over sky maps, and the variances of its pixels.
+"""The posterior over sky maps: mean, covariance, standard deviations, draws.
 
-The posterior over sky maps: mean, covariance, standard deviations, draws.
-
-Variances of all pixels of a map, from the covariance of its harmonic coefficients.
-
-diag(Y C Y^T) ring by ring; see :mod:`lusee_bayes.core.harmonics`.
+The variances of all pixels of a map are diag(Y C Y^T), ring by ring; see
+:mod:`lusee_bayes.core.harmonics`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
 """How the parameters of a family of priors are learned from data, and draws with them.
 
-A family's parameters in coordinates in which what is expected of them is standard normal.
-
 Parameters that the data do not tell keep what is expected of them, which has heavy tails: Laplace's
 approximation misses 0.32 in ln p(d) for every such theta, and 0.11 for every cell. In normal scores
 z, theta_i = F_i^-1(Phi(z_i)) with F_i the hyperprior's distribution function, it is exact for them.
@@ -13,17 +11,13 @@ is raised by Newton's method, J = d theta / d z, with the precision P = J F J + 
 there; the quadratic form holds near theta* only, and further ones may leave for a maximum of its
 own.
 
-Learning the parameters of a family of priors from data, by their most probable values.
-
 With the sky integrated out, ln p(d, theta) is maximised by Fisher scoring: its gradient is exact,
 its curvature the Fisher information, estimated from simulated data, and that of the hyperprior.
 Around the maximum theta is taken for normal; the prior that is returned has the variances' means
 over it. The evidence is the integral of p(d, theta) by Laplace's approximation, in coordinates that
-know the hyperprior's tails (:mod:`.learning`).
+know the hyperprior's tails.
 
-Draws of a sky whose prior was learned, with the parameters as uncertain as they are.
-
-::
+Draws of a sky have the parameters as uncertain as they are, ::
 
     p(m | d) = int p(m | d, theta) p(theta | d) d theta
 

@@ -1,15 +1,8 @@
-"""The posterior over the sky at one frequency, and what is known of it.
-
-What is known of a channel besides its posterior.
-
-The posterior over the sky at one frequency: what every kind of run has in common.
+"""The posterior over the sky at one frequency: what every kind of run has in common.
 
 A map is one channel, a cube several; samples and the paper's cases stand beside one. It is made of
-an information with its covariance here, or of a posterior with its model (:mod:`.claims`).
-
-The channel of a posterior with its model at hand: that of a map of one frequency.
-
-How far a map is from a known truth, by latitude and at some multipoles.
+an information with its covariance, or of a posterior with its model, and tells how far it is from a
+known truth, by latitude and at some multipoles.
 """
 
 from __future__ import annotations

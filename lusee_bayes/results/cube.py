@@ -1,9 +1,4 @@
-"""The posterior over the skies of several frequencies.
-
-Receivers, ground and gain table of a run of several frequencies, channel by channel.
-
-The posterior over the skies of several frequencies: a channel each, or one for all.
-"""
+"""The posterior over the skies of several frequencies: a channel each, or one for all."""
 
 from __future__ import annotations
 

@@ -1,9 +1,5 @@
 """What a report shows beyond the map: computed once, kept in diagnostics.nc.
 
-diagnostics.nc: written and read.
-
-What a report shows beyond the map itself, computed once and kept in diagnostics.nc.
-
 Residuals of data against the prediction of the rest, draws as maps, the prior's share of every
 pixel, posterior of regions, and point-spread functions.
 """

@@ -1,9 +1,4 @@
-"""Draws of a posterior, and whether draws can be trusted.
-
-Draws of a posterior, which of them a scenario's seed stands for, and what is doubtful.
-
-Whether draws can be trusted: what is wanted of chains, and what they fall short of.
-"""
+"""Draws of a posterior: which of them a seed stands for, and whether they can be trusted."""
 
 from __future__ import annotations
 

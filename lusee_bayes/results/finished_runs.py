@@ -1,8 +1,6 @@
-"""Runs that are finished, read back from their folders, and where they come from.
+"""Runs that are finished, read back from their folders to be set side by side.
 
-Where results come from: which data, of which site and dates, by which command and when.
-
-Map runs that are finished, read back from their folders to be set side by side.
+Their provenance says which data they are of, of which site and dates, by which command and when.
 """
 
 from __future__ import annotations

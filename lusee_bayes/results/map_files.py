@@ -1,9 +1,4 @@
-"""The files of a map: posterior.nc, and HEALPix FITS.
-
-Maps as HEALPix FITS files whose headers say where they come from.
-
-posterior.nc of a map: mean, standard deviations, and what was asked for besides.
-"""
+"""The files of a map: posterior.nc, and HEALPix FITS whose headers say where they come from."""
 
 from __future__ import annotations
 

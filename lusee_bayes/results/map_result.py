@@ -1,10 +1,6 @@
 """A posterior map at one frequency, with what is needed to judge it.
 
-Fluxes of the point sources beside a map.
-
-Where a map's prior comes from, in words and numbers.
-
-A posterior map at one frequency, with what is needed to judge it.
+Beside the map are the fluxes of point sources, and where its prior comes from.
 """
 
 from __future__ import annotations

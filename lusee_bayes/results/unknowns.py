@@ -1,18 +1,14 @@
 """What the data tell of the instrument: receivers, ground, gain table, clock and pointing.
 
-What data cannot tell of unknowns that look alike.
-
 A uniform sky, warmer ground and noisier receivers look much alike. Of their joint posterior, each
 in units of its prior's standard deviation, the *null direction* is the one with the largest
 variance, which is 1 where the data say nothing.
-
-Receivers, ground and gain table of a map: what the data tell of each, and what they cannot.
 
 Of a joint posterior each channel has its own unknowns z ~ N(0, 1), and given the channel's sky m no
 other channel's data tell of them: p(z | all data) is p(z | m, d) with the joint posterior of m
 integrated out.
 
-Clock and pointing of a map: what the data tell of their offsets, and which each day prefers.
+Of clock and pointing, the offsets of the model are told, and which each day prefers.
 """
 
 from __future__ import annotations
