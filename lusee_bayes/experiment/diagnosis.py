@@ -5,17 +5,15 @@ what a prior wide enough for any sky leaves (:mod:`lusee_bayes.judge.chi2`), tel
 would fit. A mistake in the data is undone by mixing the products of every time. One in the model is
 undone by other beams, or by another observation: other times, angles or another site.
 
-Changes of data that mix the products of each time are tried all at once:
-d' = sum_jk W_jk x_jk, where x_jk has product k in the place of product j. With K the covariance of
-the data under a prior that allows any sky, and b the model without a sky, ::
+Changes of data that mix the products of each time are tried all at once: d' = sum_jk W_jk x_jk,
+where x_jk has product k in the place of product j. With K the covariance of the data under a prior that allows any sky, and b the model without a sky, ::
 
     chi^2(W) = (X w - b)^T K^-1 (X w - b) = (w, -1)^T Q (w, -1),    Q = (X, b)^T K^-1 (X, b).
 
 With Q at hand exchanges, signs and reversals cost nothing; factors and constants are solved for.
 
-A change of the model needs a
-normal matrix of its own; these are compared up to ``SCREENED_LMAX`` first. The best of both are
-computed as the scenario has it, with N for the changed data.
+A change of the model needs a normal matrix of its own; these are compared up to ``SCREENED_LMAX``
+first. The best of both are computed as the scenario has it, with N for the changed data.
 """
 
 from __future__ import annotations

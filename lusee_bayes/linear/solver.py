@@ -44,13 +44,13 @@ CONVERGENCE = 1e-6
 MAX_REFINEMENTS = 10
 
 
-def unfinished(most: int = MAX_REFINEMENTS) -> Callable[[tuple], Array]:
+def unfinished(most: int = MAX_REFINEMENTS) -> Callable:
     """Whether a mean is to be refined once more, at most so often.
 
     The state is the mean, the length of the last step and of that before, and the number of steps.
     """
 
-    def more(state: tuple) -> Array:
+    def more(state):
         _, moved, before, count = state
         # what is left may be rounding, which no refinement makes smaller
         settled = (moved < CONVERGENCE) & (moved > 0.5 * before)
