@@ -9,8 +9,11 @@ The folders are the symbols, then what is done with them; each imports only from
     core          checks, harmonics, rotations, linear algebra, files, progress
     sky           m and S: skies and priors
     instrument    A and d: beams, observation, coupling, visibilities
-    noise         N: covariances and their terms
+    flight        sessions of the spectrometer, made into visibilities
+    noise         N: covariances and the errors that they are made of
     linear        p(m | d) in closed form
+    judge         do data and model agree, and does the error bar cover
+    priors        families of priors, and how they are learned
     systematics   unknowns that are marginalised into N or sampled
     sampling      p(m | d) by Hamiltonian Monte Carlo
     experiment    a YAML scenario turned into A, S, N and data

@@ -1,8 +1,11 @@
 """The house: what the package exports, and that a name means one thing."""
 
 import ast
+import io
 import pkgutil
 import re
+import tokenize
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -73,3 +76,69 @@ def test_every_text_names_its_encoding():
             opens = call.func.attr == "open" and mode in ("r", "w", "a", "x")
             if opens or call.func.attr in ("read_text", "write_text"):
                 assert any(one.arg == "encoding" for one in call.keywords), (path, call.lineno)
+
+
+def lines_of_code(path):
+    """Lines without blank ones, comments and docstrings, and how many of them are imports."""
+    text = path.read_text(encoding="utf-8")
+    tree = ast.parse(text)
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    docstrings = {
+        line
+        for node in ast.walk(tree)
+        if isinstance(node, documented) and ast.get_docstring(node, clean=False) is not None
+        for line in range(node.body[0].lineno, node.body[0].end_lineno + 1)
+    }
+    layout = {
+        tokenize.COMMENT,
+        tokenize.NL,
+        tokenize.NEWLINE,
+        tokenize.INDENT,
+        tokenize.DEDENT,
+        tokenize.ENDMARKER,
+    }
+    code = {
+        line
+        for token in tokenize.generate_tokens(io.StringIO(text).readline)
+        if token.type not in layout
+        for line in range(token.start[0], token.end[0] + 1)
+    }
+    imports = {
+        line
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for line in range(node.lineno, node.end_lineno + 1)
+    }
+    return len(code - docstrings), len(imports)
+
+
+def test_every_folder_keeps_its_budget():
+    """The budgets are those of docs/house.md; new lines name those that go."""
+    house = (ROOT / "docs" / "house.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \|.*\| ([\d,]+) \|$", house, re.MULTILINE)
+    budgets = {folder: int(most.replace(",", "")) for folder, most in rows}
+    paths = list(PACKAGE.rglob("*.py"))
+    counted = [(path.relative_to(PACKAGE).parts, *lines_of_code(path)) for path in paths]
+    spent = Counter()
+    for parts, code, _ in counted:
+        spent[parts[0] if len(parts) > 1 else ""] += code
+    assert spent.keys() - {""} <= budgets.keys()
+    assert not {f: n for f, n in spent.items() if f and n > budgets[f]}
+    total = sum(spent.values())
+    assert total <= 29_000
+    assert len(paths) <= 200
+    assert sum(imports for *_, imports in counted) <= 0.11 * total
+    assert sum(lines_of_code(path)[0] for path in (ROOT / "tests").rglob("*.py")) <= 22_000
+
+
+def test_a_name_means_one_thing():
+    """No two public classes, functions or files of the package have the same name."""
+    files = [path for path in PACKAGE.rglob("*.py") if path.stem not in ("__init__", "__main__")]
+    defined = Counter(
+        node.name
+        for path in files
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_")
+    )
+    assert not [name for name, n in defined.items() if n > 1]
+    assert not [name for name, n in Counter(path.stem for path in files).items() if n > 1]

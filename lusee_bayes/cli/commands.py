@@ -5,6 +5,16 @@ They are not in the docstrings of the commands: ``lusee-bayes --help`` imports n
 
 from __future__ import annotations
 
+# where a command stands that is not in look_commands
+MODULES = {
+    "simulate": "map_commands",
+    "average": "map_commands",
+    "reduce": "map_commands",
+    "map": "map_commands",
+    "sample": "sample_commands",
+    "validate": "sample_commands",
+    "plan": "plan_command",
+}
 # the summary, what else there is to know, and examples
 COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "simulate": (

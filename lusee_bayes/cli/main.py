@@ -20,7 +20,7 @@ from threading import current_thread, main_thread
 from cyclopts import App, CycloptsError, Parameter
 from rich.console import Console
 
-from lusee_bayes.cli.commands import COMMANDS, help_of
+from lusee_bayes.cli.commands import COMMANDS, MODULES, help_of
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.version import COMMAND, printable, release
@@ -45,7 +45,8 @@ app.register_install_completion_command()
 # named by path: each is imported when called, so that --help and completion answer at once
 for _name in COMMANDS:
     _command = f"{_name.replace('-', '_')}_command"
-    app.command(f"lusee_bayes.cli.{_command}:{_command}", name=_name, help=help_of(_name))
+    _module = MODULES.get(_name, "look_commands")
+    app.command(f"lusee_bayes.cli.{_module}:{_command}", name=_name, help=help_of(_name))
 
 
 # beginnings of messages of RuntimeErrors for want of memory: of XLA, and of Python's threads
