@@ -6,7 +6,8 @@ would fit. A mistake in the data is undone by mixing the products of every time.
 undone by other beams, or by another observation: other times, angles or another site.
 
 Changes of data that mix the products of each time are tried all at once: d' = sum_jk W_jk x_jk,
-where x_jk has product k in the place of product j. With K the covariance of the data under a prior that allows any sky, and b the model without a sky, ::
+where x_jk has product k in the place of product j. With K the covariance of the data under a prior
+that allows any sky, and b the model without a sky, ::
 
     chi^2(W) = (X w - b)^T K^-1 (X w - b) = (w, -1)^T Q (w, -1),    Q = (X, b)^T K^-1 (X, b).
 
