@@ -25,9 +25,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 from platformdirs import user_cache_path
 
 Array = jax.Array | np.ndarray
+# arrays that recur, with their shapes
+DataVector = Float[Array, " data"]
+Grid = Float[Array, "products times"]
+GridFlags = Bool[np.ndarray, "products times"]
+TimeFlags = Bool[np.ndarray, " times"]
+Modes = Float[Array, " modes"]
+ModesMatrix = Float[Array, "modes modes"]
+Draws = Float[np.ndarray, "draws modes"]
+Ells = Float[np.ndarray, " ells"]
+Pixels = Float[np.ndarray, " pixels"]
+Vector = Float[np.ndarray, " n"]
+Square = Float[np.ndarray, "n n"]
 
 # rows that are added at once
 ACCUMULATED = 16

@@ -79,7 +79,7 @@ TERM = AdditiveTerm(KEY, hum)
 @pytest.fixture
 def registered(monkeypatch, tiny_experiment):
     """The term behind those of the package, once there is an experiment without it."""
-    for module in (model_module, simulate_module):
+    for module in (model_module,):
         monkeypatch.setattr(module, "TERMS", (*TERMS, TERM))
 
 
@@ -193,7 +193,7 @@ def test_terms_distort_in_their_order(monkeypatch):
     setup = setup_with(sigma_k=100.0)
 
     def simulated(*terms: Term) -> np.ndarray:
-        monkeypatch.setattr(simulate_module, "TERMS", (*TERMS, *terms))
+        monkeypatch.setattr(model_module, "TERMS", (*TERMS, *terms))
         assert true_values(setup) == ({"factor": 3.0} if Amplifier in map(type, terms) else {})
         return np.asarray(simulate(setup).data)
 

@@ -104,7 +104,7 @@ def test_scenarios_that_contradict_themselves(overrides, message):
 def test_unknown_sources_name_the_nearest(source, message):
     scenario, setup = small_scenario(f"sources.list=[{source}]"), built()
     with refused(message):
-        source_responses(scenario, setup.observation, setup.instrument.monopoles, 25.0)
+        source_responses(scenario, setup.observation, setup.beam_source, 25.0)
 
 
 def test_a_source_of_which_nothing_is_known_needs_a_flux():

@@ -123,7 +123,7 @@ def test_the_circularly_polarised_part_enters_linearly():
     fornax = "ra_deg: 50.67, dec_deg: -37.21, flux_jy: 1"
     circular = [f"{{name: V {v}, stokes_v: {v}, {fornax}}}" for v in (0.0, 1.0, -1.0, 0.3)]
     scenario = small_scenario(f"sources.list=[{', '.join(circular)}]")
-    found = source_responses(scenario, e.observation, scenario.beam.source().monopoles, 25.0)
+    found = source_responses(scenario, e.observation, scenario.beam.source(), 25.0)
     none, right, left, some = (np.asarray(r) for r in found)
     largest = np.abs(none).max()
     slope = 0.5 * (right - left)
