@@ -24,10 +24,10 @@ def within(got: object, expected: object, atol: object) -> None:
 
 
 @contextmanager
-def refused(words: str) -> Iterator[None]:
+def refused(words: str) -> Iterator[pytest.ExceptionInfo[InputError]]:
     """Assert that input is refused in one sentence that has these words, or their pattern."""
     with pytest.raises(InputError) as caught:
-        yield
+        yield caught
     text = str(caught.value)
     assert words in text or re.search(words, text), text
     assert "\n" not in text and "Traceback" not in text and "pydantic" not in text

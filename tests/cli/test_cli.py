@@ -7,8 +7,6 @@ import hashlib
 import json
 import shutil
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,9 +17,9 @@ import numpy as np
 import pytest
 import xarray as xr
 from astropy.io import fits
+from commands import content, posterior_of, run
 
 import lusee_bayes
-from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
 from lusee_bayes.experiment.section import OutputSection
 from lusee_bayes.results.map_result import MapResult
@@ -34,10 +32,6 @@ SMALL = [
     for override in ["lmax=6", "observation.runs.0.cycles=0.1"]
     for argument in ("--set", override)
 ]
-
-
-def run(*arguments) -> int:
-    return main([str(a) for a in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +52,7 @@ def test_map_writes_what_it_promises(folder):
 
 
 def test_the_files_agree_with_each_other(folder):
-    posterior = xr.open_dataset(folder / "posterior.nc", engine="h5netcdf")
+    posterior = posterior_of(folder)
     mean, std = posterior["mean"].values, posterior["std"].values
     np.testing.assert_array_equal(
         posterior["ell"].values ** 2 + posterior["ell"].values + posterior["m"].values,
@@ -110,16 +104,6 @@ def test_headers_say_where_the_numbers_come_from(folder):
 
 
 @pytest.mark.long
-def test_the_resolved_scenario_gives_the_same_numbers(folder, tmp_path):
-    assert run("map", folder / "scenario.yaml", "-o", tmp_path, "-q") == 0
-    first, again = (
-        xr.open_dataset(f / "posterior.nc", engine="h5netcdf")["mean"].values
-        for f in (folder, tmp_path)
-    )
-    np.testing.assert_array_equal(first, again)
-
-
-@pytest.mark.long
 @pytest.mark.essential
 def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
     data, scenario = tmp_path / "data.nc", folder / "scenario.yaml"
@@ -133,9 +117,7 @@ def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
     for path in (tmp_path / "out").rglob("*"):
         assert path.is_dir() or path.name == "manifest.json" or str(path) in said
     assert said.strip().splitlines()[-1] == f"look at {tmp_path}/out/report.html"
-    first, again = (
-        xr.open_dataset(f / "posterior.nc", engine="h5netcdf") for f in (folder, tmp_path / "out")
-    )
+    first, again = posterior_of(folder), posterior_of(tmp_path / "out")
     np.testing.assert_array_equal(first["mean"].values, again["mean"].values)
     np.testing.assert_array_equal(first["truth"].values, again["truth"].values)
     assert again.sizes["draw"] == 3 and "covariance" in first and "covariance" not in again
@@ -194,49 +176,6 @@ def test_data_without_truth(folder, tmp_path):
     assert "rho" not in (out / "spectra.csv").read_text()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["map", "nonsense"], "no scenario 'nonsense'"),
-        (["map", "fiducial", "--set", "sky.file=gone.fits"], "no sky map at 'gone.fits'"),
-        (["map", "fiducial", "--set", "sky.fil=x"], "unknown key 'sky.fil'; did you mean 'file'?"),
-        (["map", "fiducial", "--data", "gone.nc"], "no data at 'gone.nc'; make some"),
-        (["map", "fiducial", "--set", "observation.start=2051-01-01"], "outside the ephemeris"),
-        (["map", "fiducial", "--set", "observation.start=soon"], "'soon' is not a date"),
-        (["map", "fiducial", "--set", "noise.radiometer.factor=-1"], "greater than 0"),
-        (["map", "fiducial", "--set", "observation.runs.0.cycles=0.0001"], "holds no sample"),
-        (
-            ["map", "fiducial", "--set", "noise.gain=3"],
-            "noise.gain is 3, but it should be a section",
-        ),
-        (["map", "three_cycle.yaml"], "no scenario file at 'three_cycle.yaml'; check the path"),
-        (["map", "three/cycles"], "no scenario file at 'three/cycles'; check the path"),
-        (["map", "three_cycle"], "did you mean 'three_cycles'"),
-        (["info", "gone.fits"], "no file at 'gone.fits'"),
-        (["info", "[red]x[/red].nc"], "no file at '[red]x[/red].nc'"),
-        (["info", "x\udcff.nc"], r"no file at 'x\udcff.nc'"),
-        (["map", "fiducial", "--data", "x\udcff.nc"], r"no data at 'x\udcff.nc'"),
-        (["mapp", "fiducial"], "mapp"),
-        (["map"], "scenario"),
-        (["map", "fiducial", "--draws", "many"], "many"),
-    ],
-)
-def test_bad_input_is_one_sentence_and_exit_code_2(tmp_path, capsys, arguments, message):
-    out = tmp_path / "out"
-    if arguments[0] == "map" and len(arguments) > 1:
-        arguments = [*arguments, "-o", str(out)]
-    assert run(*arguments) == 2
-    error = capsys.readouterr().err.strip()
-    assert message in error
-    assert error.startswith("lusee-bayes: ")
-    assert "\n" not in error and "Section" not in error
-    assert not out.exists()
-
-
-def content(folder):
-    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
 def test_an_interrupted_write_leaves_the_previous_result_whole(
     small_map, tmp_path, monkeypatch, capsys
 ):
@@ -258,23 +197,6 @@ def test_an_interrupted_write_leaves_the_previous_result_whole(
     assert run("map", "fiducial", *SMALL, "-o", tmp_path / "new", "-q") == 130
     assert "interrupted; no results are written in" in capsys.readouterr().err
     assert content(tmp_path / "new") == {}
-
-
-def test_a_file_as_folder_is_refused(tmp_path, capsys):
-    (tmp_path / "x").write_text("")
-    for out in (tmp_path / "x", tmp_path / "x" / "y"):
-        assert run("map", "fiducial", *SMALL, "-o", out, "-q") == 2
-        assert "x' is a file; give a folder for the results" in capsys.readouterr().err
-
-
-def test_help_and_version_do_not_load_the_heavy_libraries():
-    code = (
-        "import sys; from lusee_bayes.cli.main import main; main(['--help']); "
-        "sys.exit(any(m in sys.modules for m in ('healpy', 'lunarsky', 'xarray', 'matplotlib')))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "map" in done.stdout
 
 
 def raises(error):

@@ -1,7 +1,9 @@
-"""What the terminal shows: tables that fit, options that are checked first, what a folder is."""
+"""What the terminal shows, help, and what a command waits for: libraries, programs to compile."""
 
 from __future__ import annotations
 
+import os
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,7 +12,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from lusee_bayes.cli.main import main
+from lusee_bayes.cli.commands import COMMANDS
+from lusee_bayes.cli.main import app, main
 from lusee_bayes.cli.options import show
 from lusee_bayes.cli.tables import checks_table, comparison_table
 from lusee_bayes.core.version import COMMAND
@@ -106,7 +109,96 @@ def test_info_of_a_folder(small_map, tmp_path, capsys):
     assert "a folder that no run has written" in capsys.readouterr().err
 
 
-def test_info_of_coefficients_says_their_frequency_once(small_map, capsys):
-    assert main(["info", str(small_map.folder / "mean_alm.fits")]) == 0
-    told = capsys.readouterr().out
-    assert "at 25 MHz" in told and "not said" not in told and "one sky" in told
+EXAMPLES = [(name, line) for name, (_, _, lines) in COMMANDS.items() for line in lines]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_shows_the_examples(name, capsys):
+    assert main([name, "--help"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    for example in COMMANDS[name][2]:
+        assert example in shown
+    assert "Examples" in shown
+
+
+@pytest.mark.parametrize(("name", "line"), EXAMPLES, ids=[line for _, line in EXAMPLES])
+def test_examples_are_of_the_command_and_can_be_parsed(name, line):
+    program, *arguments = shlex.split(line)
+    assert (program, arguments[0]) == ("lusee-bayes", name)
+    # an unknown option or a value of the wrong type raises
+    command, *_ = app.parse_args(arguments, exit_on_error=False, print_error=False)
+    assert command.__name__ == f"{name.replace('-', '_')}_command"
+
+
+def test_keys_are_listed(capsys):
+    assert main(["keys", "noise.gain"]) == 0
+    shown = capsys.readouterr().out
+    assert "noise.gain.correlation_h = 10.0\n    Correlation time\n" in shown
+    assert "number, > 0 [h]" in shown
+    assert main(["keys", "--markdown", "lmax"]) == 0
+    assert "| `lmax` |" in capsys.readouterr().out
+    assert main(["keys", "lmx"]) == 2
+    assert capsys.readouterr().err == (
+        "lusee-bayes: a scenario has no key 'lmx'; did you mean 'lmax'?\n"
+    )
+
+
+# as without the extra "cluster": xarray imports Dask where it is there, and Dask SciPy
+PROGRAM = """
+import sys
+sys.modules["dask"] = None
+from lusee_bayes.cli.main import main
+counted = []
+if {count}:
+    import jax
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, *_, **__: counted.append(name)
+    )
+assert main({arguments!r}) == 0
+print(len([name for name in counted if "backend_compile" in name]), *sys.modules)
+"""
+
+
+def outcome(*arguments, count=False):
+    """The number of programs compiled, and the modules imported."""
+    program = PROGRAM.format(count=count, arguments=[str(a) for a in arguments])
+    environment = {name: v for name, v in os.environ.items() if not name.startswith("JAX")}
+    found = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=environment | {"LUSEE_BAYES_CACHE": "off"},
+    )
+    n, *modules = found.stdout.splitlines()[-1].split()
+    return int(n), set(modules)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["map", "--help"], ["--version"]])
+def test_help_waits_for_no_library(arguments):
+    _, modules = outcome(*arguments)
+    assert not modules & {"jax", "numpy", "astropy", "healpy", "matplotlib", "xarray", "pydantic"}
+
+
+@pytest.mark.parametrize(
+    ("name", "spared"),
+    [
+        ("posterior.nc", {"jax", "healpy", "matplotlib", "scipy"}),
+        ("diagnostics.nc", {"jax", "healpy", "matplotlib", "scipy"}),
+        ("mean.fits", {"numpyro", "xarray", "lunarsky", "scipy.stats"}),
+    ],
+)
+def test_info_waits_for_no_more_than_its_file(name, spared, small_map):
+    _, modules = outcome("info", small_map.folder / name)
+    assert not modules & spared
+
+
+def test_a_map_compiles_little_and_imports_no_sampler(tmp_path):
+    n, modules = outcome(
+        *("map", "fiducial", "--set", "lmax=8", "--set", "observation.runs.0.cycles=0.2"),
+        *("-o", tmp_path / "map", "-q"),
+        count=True,
+    )
+    # single random numbers, most of them; none of it grows with the map
+    assert 0 < n <= 60
+    assert not modules & {"numpyro", "arviz_stats", "scipy.stats", "scipy.optimize"}

@@ -1,15 +1,18 @@
 """Tasks in threads of this process: order, progress, failures, and the tree of a sum."""
 
+from __future__ import annotations
+
+import os
 import socketserver
 import threading
 import time
 from dataclasses import replace
+from threading import Barrier, get_ident
 
-import numpy as np
 import pytest
 
 from lusee_bayes.core import engines
-from lusee_bayes.core.engine import Demand, Tasks, ThisProcess
+from lusee_bayes.core.engine import Demand, Tasks, ThisProcess, in_threads, once
 from lusee_bayes.core.engines import open_engine
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
@@ -118,24 +121,6 @@ def test_what_cannot_be_started_is_refused(given, message):
         pass
 
 
-def test_sums_of_channels_are_added_and_not_changed():
-    from lusee_bayes.linear.joint import ComponentSums
-
-    rng = np.random.default_rng(1)
-
-    def sums():
-        shapes = (3, 4, 4), (2, 4), (2, 4), (), (), ()
-        return ComponentSums(*(np.asarray(rng.standard_normal(shape)) for shape in shapes))
-
-    one, other = sums(), sums()
-    before = one.matrices.copy()
-    both = one.plus(other)
-    np.testing.assert_array_equal(both.matrices, one.matrices + other.matrices)
-    np.testing.assert_array_equal(both.reference, one.reference)
-    np.testing.assert_array_equal(one.matrices, before)
-    assert both.misfit == one.misfit + other.misfit
-
-
 @pytest.mark.parametrize(
     "answer", [b"", b"HTTP/1.0 400 Bad Request\r\n\r\n"], ids=["silent", "HTTP"]
 )
@@ -159,3 +144,48 @@ def test_what_is_no_scheduler_is_refused_in_seconds(answer, monkeypatch):
         ):
             pass
         server.shutdown()
+
+
+def test_results_come_in_the_order_of_the_items():
+    def late(k: int) -> int:
+        time.sleep(0.002 * (7 - k))
+        return k * k
+
+    assert in_threads(late, range(8)) == [k * k for k in range(8)]
+    assert in_threads(late, []) == []
+
+
+def test_an_error_is_the_callers():
+    def fail(k: int) -> None:
+        if k == 3:
+            raise ValueError("the third")
+
+    with pytest.raises(ValueError, match="the third"):
+        in_threads(fail, range(6))
+
+
+def test_what_is_shared_is_computed_once():
+    class Shared:
+        count = 0
+
+        @once
+        def value(self) -> int:
+            time.sleep(0.01)
+            Shared.count += 1
+            return 42
+
+    shared = Shared()
+    assert in_threads(lambda _: shared.value, range(6)) == [42] * 6
+    assert Shared.count == 1
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one processor")
+def test_pieces_run_side_by_side():
+    """Two that wait for each other end only if both have begun."""
+    meeting = Barrier(2, timeout=30)
+
+    def meet(_: int) -> int:
+        meeting.wait()
+        return get_ident()
+
+    assert len(set(in_threads(meet, range(2)))) == 2

@@ -1,4 +1,7 @@
-"""Transactions: a folder is wholly old or wholly new, whenever the process that writes it dies."""
+"""Transactions: a folder is wholly old or wholly new, whenever the process that writes it dies.
+
+And locks: one run at a time works in a folder.
+"""
 
 import json
 import os
@@ -15,11 +18,14 @@ import lusee_bayes
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import (
     COMMITTED,
+    LOCK,
     MANIFEST,
     SCRATCH,
+    locked,
     read_manifest,
     recover,
     replacing,
+    require_folder,
     transaction,
 )
 
@@ -312,3 +318,52 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
         partial.write_text("half")
         raise KeyboardInterrupt
     assert content(tmp_path) == {"a/page.html": "first"}
+
+
+HOLD = """
+import sys
+from pathlib import Path
+from lusee_bayes.core.files import locked
+with locked(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@pytest.fixture
+def elsewhere(tmp_path):
+    """Another process that works in the folder."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout.readline() == "held\n"
+    yield process
+    process.kill()
+    process.wait()
+    process.stdin.close()
+    process.stdout.close()
+
+
+def test_two_runs_cannot_mix(tmp_path, elsewhere):
+    message = f"another run works in .*process {elsewhere.pid} on"
+    with pytest.raises(InputError, match=message), locked(tmp_path):
+        pass
+
+
+def test_a_lock_ends_with_its_process(tmp_path, elsewhere):
+    elsewhere.kill()
+    elsewhere.wait()
+    for _ in range(2):
+        with locked(tmp_path):
+            assert (tmp_path / LOCK).exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["new", "new/inside", ".", "folder"])
+def test_folders_that_can_be_written_into(name, tmp_path):
+    (tmp_path / "folder").mkdir()
+    require_folder(tmp_path / name)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["folder"]  # nothing is made

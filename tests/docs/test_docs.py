@@ -1,4 +1,4 @@
-"""The code of the documentation runs, and its lists are complete.
+"""The code of the documentation and the notebooks runs, and its lists are complete.
 
 Python and commands of each page run in order, in a folder of their own, with few modes, samples and
 draws.
@@ -6,22 +6,31 @@ draws.
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
+import nbformat
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from nbclient import NotebookClient
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.scenario import load_scenario, scenario_names
+from lusee_bayes.sampling.evidence import estimate_evidence
+from lusee_bayes.sampling.programs import load_program
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = [DOCS / "extend.md", *sorted((DOCS / "howto").glob("*.md"))]
 SMALL = ["--set", "lmax=4", "--set", "observation.step_s=86400"]
@@ -145,3 +154,169 @@ def test_the_table_of_public_names_is_complete():
 def test_the_table_of_scenarios_is_complete():
     page = (DOCS / "scenarios.md").read_text()
     assert [name for name in scenario_names() if f"`{name}`" not in page] == []
+
+
+ROOT = Path(__file__).resolve().parents[2]
+BLOCK = re.compile(
+    r"^```\{code-block\} python\n:caption: (?P<path>[^\s,]+)"
+    r'(?:, (?P<how>before|after|instead of) "(?P<line>[^\n]*)")?\n\n(?P<code>.*?)^```',
+    flags=re.DOTALL | re.MULTILINE,
+)
+
+
+def applied(text: str, how: str, line: str, code: str) -> str:
+    """A file with a block put before, after or in place of the line that begins so."""
+    lines = text.splitlines(keepends=True)
+    places = [k for k, there in enumerate(lines) if there.startswith(line)]
+    assert len(places) == 1, f"{line!r} stands {len(places)} times"
+    first, rest = places[0], places[0] + 1
+    if how == "before":
+        rest = first
+    elif how == "after":
+        first = rest
+    return "".join([*lines[:first], code, *lines[rest:]])
+
+
+def test_a_worked_example_touches_four_files_at_most():
+    page = (ROOT / "docs" / "extend.md").read_text()
+    part = page[page.index("## In the package, file by file") :]
+    examples = part.split("\n### ")[1:]
+    assert len(examples) == 4
+    for example in examples:
+        touched = {match["path"] for match in BLOCK.finditer(example)}
+        assert 2 <= len(touched) <= 4, touched
+        assert any(path.startswith("tests/") for path in touched)
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_the_worked_examples_pass_their_tests(tmp_path):
+    for folder in ("lusee_bayes", "models"):
+        shutil.copytree(ROOT / folder, tmp_path / folder)
+    (tmp_path / "tests").mkdir()
+    for match in BLOCK.finditer((ROOT / "docs" / "extend.md").read_text()):
+        path = tmp_path / match["path"]
+        if match["how"] is None:
+            assert not path.exists(), path
+            path.write_text(match["code"])
+        else:
+            changed = applied(path.read_text(), match["how"], match["line"], match["code"])
+            path.write_text(changed)
+    environment = os.environ | {"PYTHONPATH": str(tmp_path), "MPLBACKEND": "agg"}
+    found = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tmp_path / "tests")],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stdout[-3000:]
+    assert "6 passed" in found.stdout
+
+
+NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
+each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+
+MOST_BYTES = 600_000
+# from the root of a machine, or of somebody's home
+ABSOLUTE_PATH = re.compile(r"(?<![\w.:/])(?:/(?:home|root|tmp|usr|opt|var|work|Users)/|[A-Z]:\\)")
+
+
+def outputs(notebook):
+    """All outputs of all cells."""
+    return [o for cell in notebook.cells if cell.cell_type == "code" for o in cell.outputs]
+
+
+def text_of(output) -> str:
+    """Everything in an output that is not an image."""
+    if output.output_type == "stream":
+        return output.text
+    return "\n".join(str(v) for kind, v in output.data.items() if not kind.startswith("image/"))
+
+
+def run(path, monkeypatch):
+    """Execute a notebook in its folder; an error of a cell is raised."""
+    # tqdm's opinion of an environment without widgets
+    monkeypatch.setenv("PYTHONWARNINGS", "ignore:IProgress not found")
+    notebook = nbformat.read(path, as_version=4)
+    where = {"metadata": {"path": str(path.parent)}}
+    NotebookClient(notebook, timeout=180, kernel_name="python3", resources=where).execute()
+    made = outputs(notebook)
+    assert made
+    assert [o.text for o in made if o.output_type == "stream" and o.name == "stderr"] == []
+    return made
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("default")  # Jupyter's own warnings are not ours
+@each_notebook
+def test_notebook_runs(path, monkeypatch):
+    run(path, monkeypatch)
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("default")
+def test_luseepy_files_runs_without_the_files(tmp_path, monkeypatch):
+    monkeypatch.setenv("LUSEE_BAYES_TEST_DATA", str(tmp_path / "nothing"))
+    (path,) = [p for p in NOTEBOOKS if p.stem == "luseepy_files"]
+    text = "".join(text_of(output) for output in run(path, monkeypatch))
+    assert "the team's files are not here" in text
+
+
+@each_notebook
+def test_kept_outputs_are_small_and_clean(path):
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    assert path.stat().st_size < MOST_BYTES
+    assert any("image/png" in o.get("data", {}) for o in outputs(notebook))
+    for output in outputs(notebook):
+        assert output.output_type != "error"
+        assert output.get("name") != "stderr"
+        assert ABSOLUTE_PATH.search(text_of(output)) is None
+
+
+@each_notebook
+def test_links_lead_somewhere(path):
+    """Relative links of the text, to other notebooks and to pages."""
+    notebook = nbformat.read(path, as_version=4)
+    text = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
+    for target in re.findall(r"\]\(([^)#]+)", text):
+        assert target.startswith("https://") or (path.parent / target).exists(), target
+
+
+GUIDE = Path(__file__).parents[2] / "docs" / "systematics.md"
+
+
+@pytest.mark.long
+@pytest.mark.essential
+def test_both_faces_of_the_guides_systematic_have_one_evidence(tmp_path):
+    (code,) = re.findall(r"```python\n(.*?)```", GUIDE.read_text(), flags=re.DOTALL)
+    program = """
+
+def model(gaussian, systematics, data=None):
+    for systematic in systematics:
+        gaussian = systematic.sampled(gaussian)
+    numpyro.sample("data", lb.Marginal(gaussian), obs=data)
+    return gaussian
+"""
+    path = tmp_path / "pickup.py"
+    path.write_text("import jax\n" + code + program)
+    loaded = load_program(path)
+    pickup = loaded.model.__globals__["CablePickup"]
+    rng = np.random.default_rng(1)
+    gaussian = lb.LinearGaussian(
+        jnp.asarray(rng.normal(size=(30, 9))),
+        lb.HarmonicPrior(jnp.ones(3)),
+        lb.DiagonalCovariance(jnp.full(30, 0.1)),
+    )
+    cable = pickup(jnp.asarray(rng.normal(size=30)), 0.7)
+    data = gaussian.sample(jax.random.key(0))[1] + 0.5 * cable.pattern
+    pieces = {"gaussian": lambda: gaussian, "systematics": lambda: (cable,)}
+    found = estimate_evidence(loaded, loaded.arguments(gaussian, pieces), data)
+    exact = float(cable.marginalised(gaussian).log_prob(data))
+    # a Gaussian is what the proposal is about, so that nearly every draw counts
+    assert found.effective > 200
+    assert found.error < 0.05
+    assert found.log_evidence == pytest.approx(exact, abs=5 * found.error)
+    assert float(gaussian.log_prob(data)) < exact - 1.0

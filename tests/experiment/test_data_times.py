@@ -1,22 +1,37 @@
-"""Files of data and scenarios about what times are: one of them has to say it, and not both."""
+"""Times of data: what files and scenarios say of them, schedules, and maps of averages.
+
+Maps of averages are compared with those of the fine samples that they are made of. These are so
+short that an instant in their middle stands for them: what A knows of windows does not enter their
+map. Averages are a part of what the fine samples say. So, over draws of sky and noise, the mean of
+their map differs from that of the fine samples with the covariance C_avg - C_fine, and
+``log2 det(C_avg C_fine^-1) / 2`` bits are lost.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from fits_files import write_images
+from scipy import stats
+from scipy.linalg import eigh
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.data_files import digest_of, items_of, read_data
-from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.experiment import build, infer
+from lusee_bayes.experiment.model import full_model, simulate
+from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.schedule import Run
+from lusee_bayes.instrument.schedule import Run, read_schedule
 from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities
 from lusee_bayes.instrument.waterfalls import write_waterfall
+from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.runs.cost import posterior_cost, simulation_cost
+from lusee_bayes.runs.data_run import run_simulate
+from lusee_bayes.runs.forecasting import default_variations, expected_posterior, forecast
 from lusee_bayes.testing.cases import small_scenario
 from lusee_bayes.testing.checks import assert_refused
 
@@ -107,8 +122,6 @@ def test_a_file_that_says_it_is_believed_whatever_is_simulated(tmp_path, window)
 @pytest.mark.parametrize(
     ("window", "timestamp", "words"),
     [
-        (None, None, "neither time_bounds nor the attribute window = 'instant'"),
-        (None, None, "tens to hundreds of standard deviations"),
         (None, None, "use --set observation.timestamp=start (or middle, end, instant)"),
         ("instant", "start", "says that its samples are instants, the scenario that their times"),
         ("mean", "start", "says that its samples are means over windows"),
@@ -179,3 +192,246 @@ def test_waterfalls_have_no_room_for_windows(tmp_path):
     with pytest.raises(InputError, match=r"no room for windows.*observation\.window=instant"):
         write_waterfall(tmp_path / "w.fits", 2 * [experiment.data])
     assert not list(tmp_path.iterdir())
+
+
+STEP_S = 20000.0
+TABLE = """\
+start,end,turntable_deg,duty_cycle
+2027-01-15,2027-01-18,0,0.5
+2027-01-18T00:30:00,2027-01-20,30,0.5
+2027-02-14,2027-02-19T12:00:00,30,1
+"""
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "nights.csv"
+    path.write_text(TABLE)
+    return path
+
+
+@pytest.fixture
+def given(path):
+    values = {"schedule": path, "step_s": STEP_S, "window": "mean"}
+    return ["lmax=4", *(f"observation.{name}={value}" for name, value in values.items())]
+
+
+def test_a_schedule_is_simulated_and_mapped(path, given, tmp_path):
+    scenario = load_scenario("fiducial", given)
+    observation = scenario.observation.observation()
+    expected = Observation.from_schedule(read_schedule(path), step_s=STEP_S)
+    np.testing.assert_array_equal(observation.times.jd, expected.times.jd)
+    np.testing.assert_array_equal(observation.live_s, expected.live_s)
+    # 3 days, 47.5 hours and 5.5 days in steps of 20000 s: 13, 9 and 24 of them
+    assert (observation.n_times, observation.turntable_deg) == (46, (0.0, 30.0))
+    (simulated,) = run_simulate(scenario, tmp_path / "data.nc")
+    assert simulated.observation.n_times == 46
+    experiment = build(scenario)
+    np.testing.assert_array_equal(experiment.data.observation.run, expected.run)
+    posterior = infer(experiment).posterior
+    error = np.asarray(posterior.mean - experiment.setup.sky.modes)
+    # 25 modes: their chi^2 is not above 60 once in 1e4 schedules
+    covariance = np.asarray(posterior.covariance())
+    assert error @ np.linalg.solve(covariance, error) < 60.0
+
+
+def test_costs_count_the_samples_of_a_schedule(given):
+    scenario = load_scenario("fiducial", given)
+    n_data = 16 * scenario.observation.observation().n_times
+    assert simulation_cost(scenario).n_data == n_data
+    assert posterior_cost(scenario).n_data == n_data
+    runs = load_scenario("fiducial", ["observation.step_s=7200"])
+    assert simulation_cost(runs).n_data == 16 * runs.observation.observation().n_times
+
+
+def test_a_plan_keeps_the_dates_of_a_schedule(given):
+    scenario = load_scenario("fiducial", given)
+    variations = default_variations("fiducial", scenario)
+    assert {v.family for v in variations} == {"as given", "duty cycle", "antenna lost"}
+    assert all(v.scenario.observation == scenario.observation for v in variations)
+    # 3 days and 47.5 hours at half duty, and 5.5 days
+    live = (3.0 + 47.5 / 24.0) / 2.0 + 5.5
+    assert forecast(variations[0]).days == pytest.approx(live, abs=1e-9)
+
+
+def test_half_duty_in_the_schedule_is_half_duty_of_the_receivers(given, path):
+    """Live time is what noise goes by, whoever says that it is half of the time."""
+    header, *rows = TABLE.splitlines()
+    said = {}
+    for duty, of_receivers in (("0.5", 1.0), ("1", 0.5)):
+        lines = [f"{row.rpartition(',')[0]},{duty}" for row in rows]
+        path.write_text("\n".join([header, *lines]))
+        overrides = [*given, f"noise.radiometer.duty_cycle={of_receivers}"]
+        scenario = load_scenario("fiducial", overrides)
+        said[duty] = forecast(default_variations("fiducial", scenario)[0])
+    # the same numbers but for products of 0.5, which are exact
+    assert said["0.5"].information_bits == pytest.approx(said["1"].information_bits, rel=1e-9)
+    assert said["1"].days == pytest.approx(2.0 * said["0.5"].days, rel=1e-12)
+
+
+def test_what_is_wrong_with_the_file_is_said(given, path):
+    path.write_text(TABLE.replace("2027-01-18,", "2028-01-18,"))
+    with pytest.raises(InputError, match=r"nights.csv, row 2: the interval from .* begins"):
+        build(load_scenario("fiducial", given))
+    path.unlink()
+    with pytest.raises(InputError, match="no schedule, a table in CSV or .* at '"):
+        posterior_cost(load_scenario("fiducial", given))
+
+
+DRAWS = 12
+HOUR = 3600.0
+
+
+@dataclass(frozen=True)
+class Map:
+    """A model, the covariance of its posterior, and what the planner says of its information."""
+
+    model: LinearGaussian
+    covariance: np.ndarray
+    bits: float
+
+    def mean(self, data):
+        """C A^T N^-1 d, refined: no mean of the prior, no correlations in N."""
+        model, found = self.model, np.zeros(len(self.covariance))
+        for _ in range(3):
+            left = (data - np.asarray(model.coupling @ found)) / np.asarray(model.noise.diagonal())
+            gradient = np.asarray(model.coupling.transpose_mv(left))
+            found = found + self.covariance @ (gradient - found / model.prior.variance())
+        return found
+
+    def chi2(self, data):
+        """Of data under the model, any sky of the prior being possible."""
+        mean = self.mean(data)
+        return float(self.model.chi2(mean, data) + (mean**2 / self.model.prior.variance()).sum())
+
+    def squared(self, shift):
+        """Square of a shift of the map in standard deviations, correlations counted."""
+        return float(shift @ np.linalg.solve(self.covariance, shift))
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Maps of fine samples (as instants), of averages, and of of averages taken for instants."""
+
+    samples: Visibilities
+    to_s: float
+    sky: np.ndarray
+    fine: Map
+    windows: Map
+    instants: Map
+
+    def average(self, values):
+        return self.averaged(values).data
+
+    def averaged(self, values):
+        return averaged(replace(self.samples, data=np.asarray(values)), self.to_s)
+
+
+def map_of(scenario, data, observation):
+    setup = set_up(scenario, replace(data, observation=observation))
+    model = full_model(setup)
+    covariance = np.asarray(model.condition(np.zeros(model.n_data)).covariance())
+    bits = float(expected_posterior(setup).information_bits())
+    return Map(model, covariance, bits)
+
+
+def maps_of(lmax, step_s, cycles, to_s):
+    overrides = [
+        f"lmax={lmax}",
+        f"observation.step_s={step_s}",
+        "observation.window=mean",
+        f"observation.runs=[{{cycles: {cycles}}}]",
+    ]
+    scenario = load_scenario("fiducial", overrides)
+    setup = set_up(scenario)
+    samples = simulate(setup)
+    coarse = averaged(samples, to_s)
+    mean = coarse.observation
+    return Maps(
+        samples,
+        to_s,
+        np.asarray(setup.sky.modes),
+        map_of(scenario, samples, replace(samples.observation, windows=None)),
+        map_of(scenario, coarse, mean),
+        map_of(scenario, coarse, replace(mean, windows=None)),
+    )
+
+
+@pytest.fixture(scope="module", params=[2, 12], ids=lambda hours: f"60 s to {hours} h")
+def maps(request):
+    return maps_of(8, 60.0, 0.1, request.param * HOUR)
+
+
+@pytest.fixture(scope="module")
+def draws(maps):
+    """Skies of the prior, their fine samples with noise, and the averages of these."""
+    rng = np.random.default_rng(3)
+    model, found = maps.fine.model, []
+    std = np.sqrt(np.asarray(model.noise.diagonal()))
+    for _ in range(DRAWS):
+        sky = np.asarray(model.prior.colour(rng.standard_normal(model.prior.size)))
+        fine = np.asarray(model.coupling @ sky) + std * rng.standard_normal(len(std))
+        found.append((sky, fine, maps.average(fine)))
+    return found
+
+
+def test_averages_of_the_fine_samples_are_what_a_with_windows_says(maps):
+    sigma = np.sqrt(np.asarray(maps.windows.model.noise.diagonal()))
+    expected = maps.average(maps.fine.model.coupling @ maps.sky)
+    off = (np.asarray(maps.windows.model.coupling @ maps.sky) - expected) / sigma
+    # instants for the fine samples: (lmax w step / 2)^2 / 6 of the part of V that varies, below
+    # 1e5 sigma of an average
+    assert np.abs(off).max() < 1e-2
+    instants = (np.asarray(maps.instants.model.coupling @ maps.sky) - expected) / sigma
+    assert np.abs(instants).max() > (0.5 if maps.to_s < 4 * HOUR else 10.0)
+
+
+def test_as_much_is_lost_as_the_planner_says(maps):
+    ratios = eigh(maps.windows.covariance, maps.fine.covariance, eigvals_only=True)
+    # N of averages has the squares of mean autos, which are smaller than the mean squares
+    noise = maps.averaged(maps.fine.model.noise.diagonal())
+    samples = noise.observation.live_s[noise.layout.time] / maps.samples.observation.step_s
+    too_small = 1.0 - np.asarray(maps.windows.model.noise.diagonal()) / (noise.data / samples)
+    assert 0.0 < too_small.max() < 2e-3
+    # and of the finest structure A leaves out up to 1e-5 of what little it adds
+    assert ratios.min() > 1.0 - too_small.max() - 2e-5
+    lost = 0.5 * np.log2(ratios).sum()
+    assert maps.fine.bits - maps.windows.bits == pytest.approx(lost, abs=1e-3)
+    assert 0.1 < lost < 0.02 * maps.fine.bits
+
+
+def test_means_differ_by_what_is_lost(maps, draws):
+    """|mean_avg - mean_fine|^2 in units of C_fine is a sum of squares of variances ratio - 1."""
+    ratios = eigh(maps.windows.covariance, maps.fine.covariance, eigvals_only=True)
+    excess = ratios - 1.0
+    shifts = [
+        maps.fine.squared(maps.windows.mean(coarse) - maps.fine.mean(fine))
+        for _, fine, coarse in draws
+    ]
+    scatter = np.sqrt(2.0 * (excess**2).sum() / DRAWS)
+    assert np.mean(shifts) == pytest.approx(excess.sum(), abs=4.0 * scatter)
+
+
+def test_maps_of_averages_are_right_and_of_instants_wrong(maps, draws):
+    n_modes, n_data = len(maps.sky), maps.windows.model.n_data
+    low, high = stats.chi2(DRAWS * n_modes).interval(1 - 1e-4)
+    right, wrong = (
+        sum(one.squared(one.mean(coarse) - sky) for sky, _, coarse in draws)
+        for one in (maps.windows, maps.instants)
+    )
+    assert low < right < high < wrong
+    low, high = stats.chi2(DRAWS * n_data).interval(1 - 1e-4)
+    assert low < sum(maps.windows.chi2(coarse) for *_, coarse in draws) < high
+
+
+def test_how_wrong_instants_are_and_what_chi2_shows_of_it(maps):
+    """A mean smooths the sky along the Moon's turn, which another sky explains as well."""
+    signal = maps.average(maps.fine.model.coupling @ maps.sky)
+    unexplained = signal - np.asarray(maps.instants.model.coupling @ maps.sky)
+    off = np.sqrt(maps.instants.squared(maps.instants.mean(unexplained)))
+    shown = maps.instants.chi2(unexplained) / np.sqrt(2.0 * len(unexplained))
+    if maps.to_s < 4 * HOUR:
+        assert off > 3.0
+        assert shown < 0.1
+    else:
+        assert off > 100.0

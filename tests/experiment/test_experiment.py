@@ -1,23 +1,29 @@
 """From a scenario to data, and from data to a map that recovers a sky."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
+import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from experiments import small_experiment as make_small_experiment
 
+import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import map_to_modes
 from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.model import full_model, radiometer, simulate
+from lusee_bayes.experiment.model import full_model, simulate
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.experiment.term import Around, measured_visibilities
+from lusee_bayes.experiment.term import measured_visibilities
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.model import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.results.map_result import map_result
+from lusee_bayes.sky.prior import read_spectrum
 from lusee_bayes.testing.cases import small_scenario
 
 
@@ -113,22 +119,6 @@ def test_measured_temperatures(small_experiment):
         measured_visibilities(flagged(data, flags), setup.signal)
 
 
-def test_the_radiometer_is_built_around_measured_temperatures_if_asked(tiny_experiment):
-    """Paper's form: sigma_ij^2 = d_ii d_jj / (bandwidth x time), so autos follow d^2."""
-    scenario = small_scenario("noise.radiometer.temperature=measured")
-    setup = replace(tiny_experiment.setup, scenario=scenario)
-    data = replace(tiny_experiment.data, data=2.0 * tiny_experiment.data.data)
-    autos = [0, 7, 12, 15]
-    measured = np.asarray(radiometer(setup, Around(data)).diagonal()).reshape(16, -1)[autos]
-    modelled = np.asarray(radiometer(setup).diagonal()).reshape(16, -1)[autos]
-    signal = np.asarray(setup.signal)[autos]
-    expected = modelled * (np.asarray(data.data).reshape(16, -1)[autos] / signal) ** 2
-    np.testing.assert_allclose(measured, expected, rtol=1e-12)
-    np.testing.assert_array_equal(
-        full_model(setup, Around(data)).noise.diagonal(), radiometer(setup, Around(data)).diagonal()
-    )
-
-
 def test_data_of_another_frequency_are_refused(small_experiment):
     other = small_scenario("frequency_mhz=10", cycles=0.2)
     with pytest.raises(InputError, match="data are at 25.0 MHz, the scenario at 10.0"):
@@ -167,3 +157,89 @@ def test_the_main_job_on_ulsa(test_data):
     away = channel.highest_altitude > np.sin(np.radians(10.0))
     residual = np.median(np.abs(maps["residual"][away])) / maps["truth"].mean()
     assert residual < 0.05
+
+
+FILE_LMAX, NSIDE = 6, 16
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """C_ell and a mean map, in the current folder: paths are relative to it, as all are."""
+    monkeypatch.chdir(tmp_path)
+    ell = np.arange(12)
+    spectrum = 1e9 * (ell + 1.0) ** -2.0
+    lines = [f"{k} {c:.17g}" for k, c in zip(ell, spectrum, strict=True)]
+    (tmp_path / "cl.txt").write_text("# ell C_ell\n" + "\n".join(lines) + "\n")
+    theta, phi = healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2))
+    pixels = 3e4 * (1.0 + 0.3 * np.cos(theta) + 0.2 * np.sin(theta) * np.cos(phi))
+    healpy.write_map("mean.fits", pixels, coord="G", column_units="K", dtype=np.float64)
+    return spectrum, pixels
+
+
+def test_the_map_is_that_of_the_same_prior_in_python(files, tmp_path):
+    spectrum, pixels = files
+    scenario = small_scenario(
+        "prior={spectrum_file: cl.txt, mean_file: mean.fits}", lmax=FILE_LMAX, cycles=0.1
+    )
+    experiment = lb.build(scenario)
+    found = lb.infer(experiment).posterior
+    prior = lb.HarmonicPrior(spectrum[: FILE_LMAX + 1], mean=map_to_modes(pixels, FILE_LMAX))
+    model = replace(full_model(experiment.setup), prior=prior)
+    ours = model.condition(experiment.data.data)
+    # the same numbers through the same code
+    np.testing.assert_allclose(found.mean, ours.mean, rtol=1e-12)
+    np.testing.assert_allclose(found.log_evidence, ours.log_evidence, rtol=1e-12)
+    # and what it says is what was said: without data there is the prior alone
+    assert not np.allclose(found.mean, full_model(experiment.setup).prior.mean)
+    (tmp_path / "again.yaml").write_text(scenario.to_yaml())
+    assert lb.load_scenario(tmp_path / "again.yaml") == scenario
+
+
+def test_files_of_another_frequency_are_scaled(files):
+    spectrum, pixels = files
+    scenario = small_scenario(
+        "prior={spectrum_file: cl.txt, mean_file: mean.fits, file_frequency_mhz: 50, scale: 2}",
+        lmax=FILE_LMAX,
+    )
+    sky = lb.galaxy_sky(25.0, FILE_LMAX)
+    prior = scenario.prior.prior(sky)
+    # half the frequency: 2^2.5 times as bright
+    np.testing.assert_allclose(prior.spectrum, 2 * 2**5 * spectrum[: FILE_LMAX + 1], rtol=1e-14)
+    np.testing.assert_allclose(prior.mean, 2**2.5 * map_to_modes(pixels, FILE_LMAX), rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("0 1\n1 2\n3 4\n", "no C_ell at ell = 2"),
+        ("2 1\n3 2\n", "no C_ell at ell = 0"),
+        ("0 1\n1 2\n", "no C_ell at ell = 2 and 4 more up to lmax = 6"),
+        ("0 1\n0 2\n", "does not grow"),
+        ("".join(f"{ell} 0\n" for ell in range(9)), "cl.txt: C_ell is zero"),
+        ("0 -1\n", "outside 0 to inf"),
+        ("0 nan\n", "NaN"),
+        ("0 1 2\n", "expected ell and C_ell"),
+        ("0.5 1\n", "expected ell and C_ell"),
+        ("ell cl\n0 one\n", "no numbers"),
+        ("", "no numbers"),
+        ("\0\1", "cl.txt"),
+    ],
+)
+def test_a_bad_spectrum_is_refused(tmp_path, text, words):
+    path = tmp_path / "cl.txt"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_spectrum(path, FILE_LMAX)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_coarse_files_are_refused(files):
+    sky = lb.galaxy_sky(25.0, FILE_LMAX)
+    with pytest.raises(InputError, match="check prior.spectrum_file"):
+        small_scenario("prior.spectrum_file=no.txt").prior.prior(sky)
+    with pytest.raises(InputError, match="check prior.mean_file"):
+        small_scenario("prior.mean_file=no.fits").prior.prior(sky)
+    healpy.write_map("coarse.fits", np.ones(12), coord="G", dtype=np.float64)
+    with pytest.raises(InputError, match="too large for a map of NSIDE 1"):
+        small_scenario("prior.mean_file=coarse.fits").prior.prior(sky)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
-from itertools import product
 
 import equinox as eqx
 import jax
@@ -14,19 +14,37 @@ from experiments import small_experiment
 from scipy.stats import chi2, kstest
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.experiment import model as model_module
 from lusee_bayes.experiment.experiment import Experiment, build, infer
 from lusee_bayes.experiment.instrument_terms import beam_directions, beam_rms_difference, true_beams
-from lusee_bayes.experiment.model import full_model, radiometer
+from lusee_bayes.experiment.model import (
+    full_model,
+    model_to_sample,
+    radiometer,
+    simulate,
+    systematics,
+    true_values,
+)
+from lusee_bayes.experiment.noise_sections import NoiseSection
 from lusee_bayes.experiment.rounds import SETTLED, Inference, prediction
-from lusee_bayes.experiment.scenario import load_scenario, scenario_names
-from lusee_bayes.experiment.term import Around
+from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.section import Positive, Section, Treatment
+from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.experiment.term import AdditiveTerm, Around, Term, Truth
+from lusee_bayes.experiment.terms import TERMS
 from lusee_bayes.instrument.beams.monopoles import monopole_beams
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.schedule import Run
 from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.noise.covariance import DiagonalCovariance, LowRankUpdate, TimeBandedCovariance
+from lusee_bayes.noise.covariance import (
+    Covariance,
+    DiagonalCovariance,
+    LowRankCovariance,
+    LowRankUpdate,
+    TimeBandedCovariance,
+)
 from lusee_bayes.noise.instrument_errors import (
     GainDrift,
     beam_error_noise,
@@ -36,6 +54,7 @@ from lusee_bayes.noise.instrument_errors import (
 )
 from lusee_bayes.noise.radiometer import radiometer_noise
 from lusee_bayes.sky.prior import HarmonicPrior
+from lusee_bayes.systematics.systematic import AdditiveNoise
 from lusee_bayes.testing.cases import small_scenario
 
 GAIN = "noise.gain.sigma=0.01"
@@ -121,88 +140,43 @@ def test_the_gain_terms_model_is_the_papers():
 # --- evidence ---------------------------------------------------------------------------------
 
 
-def peak(amplitudes, log_evidence):
-    return amplitudes[int(np.argmax(log_evidence))]
-
-
 @pytest.mark.long
-def test_the_evidence_finds_the_size_of_the_drifts():
+@pytest.mark.parametrize("term", [GAIN, pytest.param(SHIFT, marks=pytest.mark.essential)])
+def test_the_evidence_finds_the_size_of_an_error(term):
     """About 13 independent stretches of 10 h of four gains: sigma_g is known to some 10 %."""
-    setup, data = experiment(GAIN).setup, experiment(GAIN).data
+    setup, data = experiment(term).setup, experiment(term).data
     level, hours = radiometer(setup), data.observation.hours
     coupling, width = full_model(setup).coupling, GainDrift(0.01).width(hours)
     # every second step: an evidence takes a second or two where LLVM does not optimise
     factors = 1.15 ** np.arange(-8.0, 9.0, 2.0)
 
+    def drifts(factor):
+        return GainDrift(0.01 * factor).covariance(setup.signal, hours, data.layout, width)
+
+    def beam_error(factor):
+        other = CouplingMatrix.build(difference(true_beams(setup), setup.beams), setup.pointing)
+        return beam_error_noise(other, setup.prior).scaled(factor**2)
+
     @jax.jit
-    def log_evidence(sigma, coupling, values):
-        term = GainDrift(sigma).covariance(setup.signal, hours, data.layout, width)
-        return LinearGaussian(coupling, setup.prior, level + term).log_prob(values)
+    def log_evidence(factor, coupling, values):
+        noise = level + (drifts if term == GAIN else beam_error)(factor)
+        return LinearGaussian(coupling, setup.prior, noise).log_prob(values)
 
     def evidence_without(coupling, values):
         return float(LinearGaussian(coupling, setup.prior, level).log_prob(values))
 
-    scan = [float(log_evidence(jnp.asarray(0.01 * f), coupling, data.data)) for f in factors]
-    assert 1 / 1.5 < peak(factors, scan) < 1.5
+    scan = [float(log_evidence(jnp.asarray(f), coupling, data.data)) for f in factors]
+    assert 1 / 1.5 < factors[int(np.argmax(scan))] < 1.5
     assert max(scan) > evidence_without(coupling, data.data) + 1000.0
     # a clear peak, not a plateau
     assert max(scan) > max(scan[0], scan[-1]) + 10.0
-    # data without drifts do not want the term
+    # data without errors do not want the term
     clean, quiet = experiment().setup.coupling, experiment().data.data
-    with_drift = float(log_evidence(jnp.asarray(0.01), clean, quiet))
-    assert evidence_without(clean, quiet) > with_drift + 100.0
-
-
-@pytest.mark.long
-@pytest.mark.essential
-def test_the_evidence_finds_the_size_of_the_beam_error():
-    setup, data = experiment(SHIFT).setup, experiment(SHIFT).data
-    level, coupling = radiometer(setup), full_model(setup).coupling
-    direction = CouplingMatrix.build(difference(true_beams(setup), setup.beams), setup.pointing)
-    term = beam_error_noise(direction, setup.prior)
-    factors = 1.15 ** np.arange(-8.0, 9.0)
-
-    def evidence(noise):
-        return float(LinearGaussian(coupling, setup.prior, noise).log_prob(data.data))
-
-    scan = [evidence(level + term.scaled(f**2)) for f in factors]
-    assert 1 / 1.5 < peak(factors, scan) < 1.5
-    assert max(scan) > evidence(level) + 1000.0
-    assert max(scan) > max(scan[0], scan[-1]) + 10.0
+    with_error = float(log_evidence(jnp.asarray(1.0), clean, quiet))
+    assert evidence_without(clean, quiet) > with_error + 100.0
 
 
 # --- what the gain term is built around -------------------------------------------------------
-
-
-@pytest.mark.long
-@pytest.mark.essential
-@pytest.mark.parametrize("source", ["measured", "posterior"])
-def test_what_the_gain_term_is_built_around_matters_to_second_order(source):
-    """Around d' instead of d, the drift X d is X d' with X (d' - d) left over.
-
-    N allows sigma_g^2 d on top of the linear part: the map cannot move by more standard deviations
-    than the rms of X (d' - d) / (sigma_g^2 d). For measured d' (they hold the drifts themselves)
-    that is 4 sqrt(3) on average over drifts, for the map's own prediction well below a tenth.
-    """
-    rebuilt = (GAIN, f"noise.gain.visibilities={source}")
-    setup, data, by_model = experiment(GAIN).setup, experiment(GAIN).data, inferred(GAIN).posterior
-    posterior, rounds = inferred(*rebuilt).posterior, inferred(*rebuilt).rounds
-    np.testing.assert_array_equal(data.data, experiment(*rebuilt).data.data)
-    autos = np.array([0, 7, 12, 15])
-    true = np.asarray(setup.signal)[autos]
-    measured = np.asarray(data.data).reshape(16, -1)[autos]
-    around = measured
-    if source == "posterior":
-        predicted = CouplingMatrix.build(setup.beams, setup.pointing) @ posterior.mean
-        around = np.asarray(predicted).reshape(16, -1)[autos]
-    leftover = (measured / true - 1.0) * (around / true - 1.0) / 0.01**2
-    bound = float(np.sqrt(np.mean(leftover**2)))
-    assert bound < {"measured": 14.0, "posterior": 0.1}[source]
-    assert 0.0 < float(posterior.rms_shift_from(by_model)) < bound
-    # variances follow d by twice its relative error, standard deviations by as much as d does
-    worst = np.abs(around / true - 1.0).max()
-    np.testing.assert_allclose(posterior.std(), by_model.std(), rtol=worst)
-    assert (rounds > 1) == (source == "posterior")
 
 
 def test_the_posteriors_own_prediction_has_settled():
@@ -279,79 +253,6 @@ def test_the_seed_decides_every_draw(term):
     assert difference_of_seeds.max() > 20 * level
 
 
-def test_shipped_scenarios_are_what_their_names_say():
-    fiducial = load_scenario("fiducial")
-    noise = fiducial.noise
-
-    def gain(sigma, treatment="marginalised"):
-        section = {"sigma": sigma, "correlation_h": 10.0, "treatment": treatment}
-        known = {"log_sigma_std": None, "log_correlation_std": None}
-        return {"gain": section | known | {"visibilities": None}}
-
-    def beam(shift, treatment="marginalised"):
-        return {
-            "beam": {"shift_mhz": shift, "file": None, "parameters": {}, "treatment": treatment}
-        }
-
-    def radiometer(**changes):
-        return {"radiometer": noise.radiometer.model_dump() | changes}
-
-    def runs(*pairs):
-        return [{"cycles": c, "turntable_deg": a, "night_only": False} for c, a in pairs]
-
-    noises = {
-        "noise_x10": radiometer(factor=10.0),
-        "noise_x100": radiometer(factor=100.0),
-        "duty_cycle_50": radiometer(duty_cycle=0.5),
-        "gain_1e-2": gain(0.01),
-        "gain_1e-3": gain(0.001),
-        "gain_ignored": gain(0.01, "ignored"),
-        "beam_4MHz": beam(4.0),
-        "beam_0.4MHz": beam(0.4),
-        "beam_ignored": beam(4.0, "ignored"),
-    }
-    observations = {
-        "two_cycles": runs((1, 0), (1, 30)),
-        "three_cycles": runs((1, 0), (1, 30), (1, 60)),
-        "quarter_cycle": runs((0.25, 0)),
-    }
-    assert {"fiducial", *noises, *observations} <= set(scenario_names())
-    tree = fiducial.model_dump(mode="json")
-    for name, changes in noises.items():
-        expected = tree | {"noise": tree["noise"] | changes}
-        assert load_scenario(name).model_dump(mode="json") == expected, name
-    for name, changes in observations.items():
-        expected = tree | {"observation": tree["observation"] | {"runs": changes}}
-        assert load_scenario(name).model_dump(mode="json") == expected, name
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (
-            ["noise.gain.treatment=marginalized"],
-            "'marginalized', but .*'marginalised', 'sampled' or 'ignored'",
-        ),
-        (
-            [SHIFT, "noise.beam.treatment=ignore"],
-            "'ignore', but .*'marginalised', 'sampled' or 'ignored'",
-        ),
-        (["noise.gain.visibilities=modle"], "'modle', but .*'model', 'measured' or 'posterior'"),
-        ([SHIFT, PARAMETERS], "give either shift_mhz, file or parameters"),
-        (["noise.beam.treatment=ignored"], "give either shift_mhz, file or parameters"),
-        (["noise.gain.sigma=0"], "noise.gain.sigma is 0, but .*greater than 0"),
-        (["noise.gain.correlation_h=0"], "correlation_h is 0, but .*greater than 0"),
-        (["noise.gain.correlation_h=-3"], "correlation_h is -3, but .*greater than 0"),
-        (["noise.beam.parameters={length_m: -0.1}"], "length_m is -0.1, but .*greater than 0"),
-        (["noise.gain.sgima=1"], "unknown key 'noise.gain.sgima'; did you mean 'sigma'"),
-    ],
-)
-def test_misspelt_systematics_are_refused(overrides, message):
-    with pytest.raises(InputError, match=message) as caught:
-        load_scenario("fiducial", overrides)
-    assert "\n" not in str(caught.value)
-
-
 def test_unknown_beam_parameters_name_the_nearest():
     with pytest.raises(InputError, match="'lenght_m'; did you mean 'length_m'"):
         experiment("noise.beam.parameters={lenght_m: 0.1}")
@@ -360,6 +261,7 @@ def test_unknown_beam_parameters_name_the_nearest():
 # --- calibration with every combination of terms ----------------------------------------------
 
 LMAX, N_MODES, N_DRAWS, SEED = 6, 49, 400, 20270115
+EVERY = ("gain", "beam", "templates")
 SPECTRUM = 1e8 * (1.0 + np.arange(LMAX + 1.0)) ** -2.5
 
 
@@ -422,32 +324,18 @@ def p_value(skies, means, covariance) -> float:
     return kstest((z**2).sum(1), chi2(N_MODES).cdf).pvalue
 
 
-SUBSETS = [
-    [name for name, on in zip(("gain", "beam", "templates"), chosen, strict=True) if on]
-    for chosen in product([False, True], repeat=3)
-]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("terms", SUBSETS, ids="+".join)
-@pytest.mark.parametrize("form", ["paper", "exact"])
-def test_calibrated_with_every_combination(setup, form, terms):
-    model = setup.model(form, terms)
+@pytest.mark.parametrize("form", [pytest.param("paper", marks=pytest.mark.long), "exact"])
+def test_calibrated_with_everything_at_once(setup, form):
+    model = setup.model(form, EVERY)
     keys = jax.random.split(jax.random.key(SEED), N_DRAWS)
-    # 16 tests: one of them falls below 1e-3 in 1.6 % of the seeds
     assert p_value(*simulate_and_condition(model, model, keys)) > 1e-3
 
 
-def test_calibrated_with_everything_at_once(setup):
-    """One of the combinations above, for every run of the tests."""
-    test_calibrated_with_every_combination(setup, "exact", max(SUBSETS, key=len))
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("missing", ["gain", "beam", "templates"])
+@pytest.mark.parametrize("missing", EVERY)
 def test_notices_a_term_that_is_missing(setup, missing):
-    model = setup.model("exact", ["gain", "beam", "templates"])
-    assumed = setup.model("exact", [t for t in ("gain", "beam", "templates") if t != missing])
+    model = setup.model("exact", EVERY)
+    assumed = setup.model("exact", [term for term in EVERY if term != missing])
     keys = jax.random.split(jax.random.key(SEED), N_DRAWS)
     assert p_value(*simulate_and_condition(model, assumed, keys)) < 1e-10
 
@@ -479,13 +367,169 @@ def test_calibrated_with_gains_that_really_drift(setup):
         return [(p.mean, p.covariance()) for p in posteriors]
 
     right, wrong = condition(jnp.asarray(skies), jnp.asarray(gains), jnp.asarray(added))
-    scale = np.sqrt(np.asarray(setup.prior.variance()))
+    assert p_value(skies, *right) > 0.01
+    assert p_value(skies, *wrong) < 1e-10
 
-    def p(mean, covariance):
-        off = (skies - np.asarray(mean)) / scale
-        roots = np.linalg.cholesky(np.asarray(covariance) / np.outer(scale, scale))
-        z = np.linalg.solve(roots, off[..., None])[..., 0]
-        return kstest((z**2).sum(1), chi2(N_MODES).cdf).pvalue
 
-    assert p(*right) > 0.01
-    assert p(*wrong) < 1e-10
+KEY = "noise.hum"
+TREATMENTS = ("marginalised", "sampled", "ignored")
+
+
+class HumSection(Section):
+    """Three patterns in the data whose amplitudes are not known."""
+
+    sigma_k: Positive = 100.0
+    treatment: Treatment = "marginalised"
+
+
+class NoiseWithHum(NoiseSection):
+    """The terms of N, and the hum."""
+
+    hum: HumSection | None = None
+
+
+class ScenarioWithHum(Scenario):
+    """A scenario that can say so."""
+
+    noise: NoiseWithHum = NoiseWithHum()
+
+
+class Hum(AdditiveNoise):
+    """Patterns with unknown amplitudes of zero mean."""
+
+    root: jax.Array
+
+    def covariance(self) -> Covariance:
+        return LowRankCovariance(self.root, "the hum")
+
+
+def patterns(n_data: int, sigma_k: float) -> np.ndarray:
+    """(data, 3), rms sigma_k."""
+    return sigma_k * np.random.default_rng(5).normal(size=(n_data, 3))
+
+
+def hum(setup: Setup, section: HumSection) -> Hum:
+    """The term of a scenario."""
+    root = jnp.asarray(patterns(setup.layout.size, section.sigma_k))
+    return Hum("hum", setup.layout, root)
+
+
+TERM = AdditiveTerm(KEY, hum)
+
+
+@pytest.fixture
+def registered(monkeypatch, tiny_experiment):
+    """The term behind those of the package, once there is an experiment without it."""
+    monkeypatch.setattr(model_module, "TERMS", (*TERMS, TERM))
+
+
+def with_hum(**section) -> Scenario:
+    """The small scenario with the hum, if there is one."""
+    tree = small_experiment().scenario.model_dump()
+    tree["noise"]["hum"] = section or None
+    return ScenarioWithHum.model_validate(tree)
+
+
+def setup_with(**section) -> Setup:
+    return replace(small_experiment().setup, scenario=with_hum(**section))
+
+
+def test_it_is_marginalised_into_n(registered):
+    setup = setup_with(sigma_k=20.0)
+    ((treatment, term),) = systematics(setup)
+    assert treatment == "marginalised"
+    assert isinstance(term, Hum)
+    root = patterns(96, 20.0)
+    expected = np.diag(np.asarray(radiometer(setup).diagonal())) + root @ root.T
+    got = np.asarray(full_model(setup).noise.dense())
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13 * expected.max())
+    # the sky's part of the model is as it was
+    kept, own = (jax.tree.leaves(c) for c in (full_model(setup).coupling, setup.coupling))
+    for one, other in zip(kept, own, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_ignored_or_left_out_it_is_not_in_n(registered):
+    for setup in (setup_with(treatment="ignored"), setup_with()):
+        assert systematics(setup) == []
+        np.testing.assert_array_equal(
+            full_model(setup).noise.diagonal(), radiometer(setup).diagonal()
+        )
+
+
+def test_sampled_it_is_left_to_the_program(registered):
+    setup = setup_with(treatment="sampled")
+    base, (term,) = model_to_sample(setup, Around(small_experiment().data))
+    assert isinstance(term, Hum)
+    np.testing.assert_array_equal(base.noise.diagonal(), radiometer(setup).diagonal())
+
+
+def test_simulated_data_hold_it_whatever_its_treatment(registered):
+    plain = np.asarray(small_experiment().data.data)
+    added = {t: np.asarray(simulate(setup_with(treatment=t)).data) - plain for t in TREATMENTS}
+    for treatment in TREATMENTS:
+        np.testing.assert_array_equal(added[treatment], added["marginalised"])
+    # it is made of the patterns, up to rounding of data of 2e4 K
+    root = patterns(96, 100.0)
+    amplitudes, *_ = np.linalg.lstsq(root, added["marginalised"], rcond=None)
+    left = added["marginalised"] - root @ amplitudes
+    assert np.abs(left).max() < 1e-9
+    assert 0.0 < np.abs(amplitudes).max() < 5.0
+    # the data without the section are those that they were
+    np.testing.assert_array_equal(simulate(setup_with()).data, plain)
+    # another seed draws other amplitudes
+    reseeded, bare = (
+        replace(setup, scenario=setup.scenario.model_copy(update={"seed": 2}))
+        for setup in (setup_with(treatment="ignored"), setup_with())
+    )
+    other = np.asarray(simulate(reseeded).data - simulate(bare).data)
+    assert np.abs(other - added["ignored"]).max() > 1.0
+
+
+def test_a_whole_experiment_knows_its_noise(registered):
+    """chi^2 of noise about the true signal: right with the hum in N, absurd without it."""
+    experiment = build(with_hum(sigma_k=100.0))
+    setup = experiment.setup
+    off = experiment.data.data - setup.layout.gather(setup.signal)
+    right = float((off * full_model(setup, Around(experiment.data)).noise.solve(off)).sum())
+    wrong = float((off**2 / radiometer(setup).diagonal()).sum())
+    n = off.shape[0]
+    assert abs(right - n) < 5 * np.sqrt(2 * n)
+    assert wrong > 100 * n
+
+
+# --- a term with values of its own ----------------------------------------------------------------
+
+
+class Amplifier(Term):
+    """A factor that simulated data hold and the model does not know."""
+
+    key = "amplifier"
+
+    def build(self, setup, around):
+        return []
+
+    def truth(self, setup, key) -> Truth:
+        return {"factor": 3.0}
+
+    def distort(self, visibilities, setup, truth, key):
+        return truth["factor"] * visibilities
+
+
+def test_terms_distort_in_their_order(monkeypatch):
+    """What comes before the amplifier is amplified with the sky; radiometer noise never is."""
+    setup = setup_with(sigma_k=100.0)
+
+    def simulated(*terms: Term) -> np.ndarray:
+        monkeypatch.setattr(model_module, "TERMS", (*TERMS, *terms))
+        assert true_values(setup) == ({"factor": 3.0} if Amplifier in map(type, terms) else {})
+        return np.asarray(simulate(setup).data)
+
+    signal = np.asarray(setup.layout.gather(setup.signal))
+    noise = simulated() - signal
+    added = simulated(TERM) - signal - noise
+    close = {"rtol": 0, "atol": 1e-9}
+    np.testing.assert_allclose(
+        simulated(TERM, Amplifier()), 3.0 * (signal + added) + noise, **close
+    )
+    np.testing.assert_allclose(simulated(Amplifier(), TERM), 3.0 * signal + added + noise, **close)

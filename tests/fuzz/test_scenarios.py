@@ -13,10 +13,13 @@ from pydantic import BaseModel
 
 from lusee_bayes.cli.options import parse_frequencies
 from lusee_bayes.cli.plan_command import own_variations
+from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.runs.cost import posterior_cost, require_fits
 
-FEW, MANY = 100, 500 * SCALE
+few_and_many = pytest.mark.parametrize(
+    "n", [100, pytest.param(500 * SCALE, marks=pytest.mark.long)]
+)
 
 NUMBERS = st.one_of(
     st.integers(), st.floats(), st.integers(-3, 60), st.floats(0.0, 50.0),
@@ -60,17 +63,12 @@ PATHS = paths(Scenario)
 def load(overrides: list[str]) -> None:
     scenario = load_scenario("fiducial", overrides)
     # what is taken can be written and read again, and is small enough or refused
-    assert load_scenario_text(scenario.to_yaml()) == scenario
+    again = parse_yaml(scenario.to_yaml(), "the resolved scenario")
+    assert Scenario.model_validate(again) == scenario
     require_fits(posterior_cost(scenario), scenario)
 
 
-def load_scenario_text(text: str) -> Scenario:
-    from lusee_bayes.core.reading import parse_yaml
-
-    return Scenario.model_validate(parse_yaml(text, "the resolved scenario"))
-
-
-@pytest.mark.parametrize("n", [FEW, pytest.param(MANY, marks=pytest.mark.long)])
+@few_and_many
 def test_every_entry_with_any_value(n):
     @settings(max_examples=n)
     @given(st.lists(st.tuples(st.sampled_from(PATHS), VALUES), min_size=1, max_size=3))
@@ -82,7 +80,7 @@ def test_every_entry_with_any_value(n):
     check()
 
 
-@pytest.mark.parametrize("n", [FEW, pytest.param(MANY, marks=pytest.mark.long)])
+@few_and_many
 def test_any_text_as_an_override(n):
     @settings(max_examples=n)
     @given(st.one_of(st.text(), st.builds("{}={}".format, st.sampled_from(PATHS), st.text())))
@@ -93,7 +91,7 @@ def test_any_text_as_an_override(n):
     check()
 
 
-@pytest.mark.parametrize("n", [FEW, pytest.param(MANY, marks=pytest.mark.long)])
+@few_and_many
 def test_any_file_as_a_scenario(n, tmp_path):
     path = tmp_path / "scenario.yaml"
     whole = load_scenario("gain_1e-2").to_yaml().encode()
@@ -116,7 +114,7 @@ def test_any_file_as_a_scenario(n, tmp_path):
     check()
 
 
-@pytest.mark.parametrize("n", [FEW, pytest.param(MANY, marks=pytest.mark.long)])
+@few_and_many
 def test_any_frequencies(n):
     parts = st.one_of(
         st.floats().map(str), st.text(max_size=4), st.sampled_from(["1e-9", "50", "1"])

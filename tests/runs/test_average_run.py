@@ -11,7 +11,6 @@ from lusee_bayes.cli.main import main
 from lusee_bayes.cli.options import parse_duration
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.products import DataLayout
@@ -66,18 +65,6 @@ def test_what_is_lost_is_small_and_grows_with_the_square_of_the_length(path, tmp
     assert lost[1] == pytest.approx(lost[0], rel=0.1)
 
 
-def test_the_bits_are_those_of_the_determinant(path, data, tmp_path):
-    run = run_average(scenario(), path, 7200.0, tmp_path / "averaged.nc")
-    for seen, bits in zip((data, run.averaged), run.bits, strict=True):
-        setup = set_up(scenario(), seen)
-        a, root = np.asarray(setup.coupling.dense()), np.sqrt(np.asarray(setup.prior.variance()))
-        noise = np.asarray(full_model(setup).noise.diagonal())
-        white = a * root / np.sqrt(noise)[:, None]
-        expected = 0.5 * np.linalg.slogdet(np.eye(len(root)) + white.T @ white)[1] / np.log(2.0)
-        # singular values of 1e5 squared, in double precision
-        assert bits == pytest.approx(expected, rel=1e-6)
-
-
 def test_the_command_writes_averages_and_says_what_they_cost(path, tmp_path, capsys):
     out = tmp_path / "averaged.nc"
     given = ["--set", f"lmax={LMAX}"]
@@ -129,15 +116,12 @@ def test_average_s_of_the_scenario_does_not_count(path, data, tmp_path):
     ("arguments", "words"),
     [
         (["--to", "2hours"], "'2hours' is not a length of time; give a positive number"),
-        (["--to", "2"], "'2' is not a length of time"),
-        (["--to", "0s"], "'0s' is not a length of time"),
         (["--to", "10min"], "shorter than their samples of 1800 s"),
         (["--to", "2h", "-o", "w.fits"], "give -o a name that does not end in .fits"),
         (["--to", "2h", "-o", "data.nc"], "would replace the data that they are made of"),
         (["--to", "2h", "--set", "frequency_mhz=10"], "the data are at 25.0 MHz"),
         (["--to", "2h", "--set", "frequencies_mhz=[10,20]"], "averages are of one frequency"),
         (["--to", "2h", "--set", "observation.timestamp=start"], "leave that out"),
-        ([], "--to"),
     ],
 )
 def test_bad_input_is_a_sentence(path, tmp_path, monkeypatch, capsys, arguments, words):
@@ -146,14 +130,6 @@ def test_bad_input_is_a_sentence(path, tmp_path, monkeypatch, capsys, arguments,
     error = capsys.readouterr().err.strip()
     assert words in error and "\n" not in error
     assert [p.name for p in tmp_path.iterdir()] == ["data.nc"]
-
-
-def test_instants_have_no_average(tmp_path):
-    instants = build(small_scenario(lmax=2, cycles=0.01)).data
-    assert instants.observation.windows is None
-    path = instants.write(tmp_path / "data.nc")
-    with pytest.raises(InputError, match=r"data\.nc: the samples are instants"):
-        run_average(scenario(), path, 14400.0, tmp_path / "a.nc")
 
 
 @pytest.mark.parametrize(
@@ -165,7 +141,7 @@ def test_lengths_of_time(text, seconds):
     assert parse_duration(text) == seconds
 
 
-@pytest.mark.parametrize("text", ["", "h", "-2h", "2 hours", "1e999d", "nan s", "٣s", "2h 30min"])
+@pytest.mark.parametrize("text", ["", "h", "2", "0s", "-2h", "2 hours", "1e999d", "nan s", "٣s"])
 def test_what_is_no_length_of_time(text):
     with pytest.raises(InputError, match="is not a length of time; .* 30s, 10min, 2h or 1d"):
         parse_duration(text)

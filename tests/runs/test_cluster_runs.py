@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from commands import posterior_of
 
 from lusee_bayes.core.engine import ThisProcess
 from lusee_bayes.experiment.scenario import load_scenario
@@ -105,10 +106,6 @@ def cluster(tmp_path):
     found.close()
 
 
-def posterior_of(folder: Path) -> xr.Dataset:
-    return xr.load_dataset(folder / "posterior.nc", engine="h5netcdf").drop_attrs()
-
-
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
     """The same runs in this process, independent and joint, with one thread for each product."""
@@ -173,51 +170,32 @@ def test_a_cluster_gives_the_same_numbers_though_a_worker_is_killed(cluster, alo
 
 
 @pytest.mark.long
-def test_all_workers_killed(cluster, alone, tmp_path):
-    process = cluster.command(*MAP, "--joint", "-o", tmp_path / "a")
+@pytest.mark.parametrize("killed", ["workers", "scheduler", signal.SIGKILL, signal.SIGINT])
+def test_what_is_killed_goes_on_where_it_was(killed, cluster, alone, tmp_path):
+    """All workers of a joint run, the scheduler, or the command itself."""
+    joint = ["--joint"] if killed == "workers" else []
+    process = cluster.command(*MAP, *joint, "-o", tmp_path / "a")
     when_some_are_there(process, tmp_path / "a")
-    for worker in cluster.workers:
-        cluster.kill(worker)
+    if killed in ("workers", "scheduler"):
+        for one in cluster.workers if killed == "workers" else [cluster.scheduler]:
+            cluster.kill(one)
+    else:
+        process.send_signal(killed)
     _, errors = process.communicate(timeout=120)
-    assert process.returncode == 1
-    assert errors.startswith("lusee-bayes: the Dask scheduler is gone, has no workers, or has ")
-    assert errors.endswith("the same command continues from the finished channels\n")
-    cluster.add()
-    goes_on(cluster, tmp_path / "a", "--joint")
-    assert_same(tmp_path / "a", alone["joint"])
-
-
-@pytest.mark.long
-def test_the_scheduler_killed(cluster, alone, tmp_path):
-    process = cluster.command(*MAP, "-o", tmp_path / "a")
-    when_some_are_there(process, tmp_path / "a")
-    cluster.kill(cluster.scheduler)
-    _, errors = process.communicate(timeout=120)
-    assert process.returncode == 1
-    assert errors == (
-        "lusee-bayes: the Dask scheduler is gone, has no workers, or has forgotten this run; no "
-        f"results are written in '{tmp_path}/a'; the same command continues from the finished "
-        "channels\n"
-    )
-    for worker in cluster.workers:
-        cluster.kill(worker)
-    cluster.start()
-    cluster.add()
-    goes_on(cluster, tmp_path / "a")
-    assert_same(tmp_path / "a", alone["independent"])
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_the_command_ended(how, cluster, alone, tmp_path):
-    process = cluster.command(*MAP, "-o", tmp_path / "a", "-q")
-    when_some_are_there(process, tmp_path / "a")
-    process.send_signal(how)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == (130 if how == signal.SIGINT else -9)
-    assert ("continues from the finished channels" in errors) == (how == signal.SIGINT)
-    goes_on(cluster, tmp_path / "a")
-    assert_same(tmp_path / "a", alone["independent"])
+    code = {"workers": 1, "scheduler": 1, signal.SIGKILL: -9, signal.SIGINT: 130}[killed]
+    assert process.returncode == code
+    if code == 1:
+        assert errors.startswith("lusee-bayes: the Dask scheduler is gone, has no workers, or has ")
+    if code != -9:
+        assert errors.endswith("the same command continues from the finished channels\n")
+    if killed == "scheduler":
+        for worker in cluster.workers:
+            cluster.kill(worker)
+        cluster.start()
+    if code == 1:
+        cluster.add()
+    goes_on(cluster, tmp_path / "a", *joint)
+    assert_same(tmp_path / "a", alone["joint" if joint else "independent"])
 
 
 @pytest.mark.long

@@ -8,8 +8,8 @@ import json
 import jax
 import numpy as np
 import pytest
+from commands import run
 
-from lusee_bayes.cli.main import main
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.rounds import NAMED
 from lusee_bayes.experiment.setup import set_up
@@ -30,10 +30,6 @@ FILES = {
     "scenario.yaml",
     "manifest.json",
 }
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -98,23 +94,3 @@ def test_data_of_a_prior_prefer_it(name, tmp_path):
     if name == "local_scales":  # it has seen what it predicts, with parameters enough to gain by it
         products = {one.name: one.held_out[0].log_density for one in result.priors}
         assert max(products, key=products.get) == name
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--priors", "isotropic,local"], "no prior 'local'; did you mean 'local_scales'?"),
-        (["--priors", "isotropic"], "1 given, and a comparison needs two or more of isotropic"),
-        (["--priors", "isotropic,isotropic"], "give each prior once"),
-        (["--priors", "isotropic,isotropic-sky", "--data", "x.nc"], "C_ell of the scenario's sky"),
-        (["--set", "frequencies_mhz=[10, 20]"], "compare-priors is for a single frequency"),
-        (["--set", "prior.tilt_std=0.1"], "something is to be sampled"),
-    ],
-    ids=str,
-)
-def test_bad_input_is_one_sentence(arguments, message, tmp_path, capsys):
-    (tmp_path / "x.nc").touch()
-    arguments = [str(tmp_path / "x.nc") if word == "x.nc" else word for word in arguments]
-    assert run("compare-priors", "fiducial", *SMALL, *arguments, "-o", tmp_path / "x") == 2
-    assert message in " ".join(capsys.readouterr().err.split())
-    assert not (tmp_path / "x").exists()

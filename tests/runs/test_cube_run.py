@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import xarray as xr
 from astropy.io import fits
+from commands import posterior_of, run
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core import engines as engine_module
 from lusee_bayes.core.engine import ThisProcess
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import modes_to_map
+from lusee_bayes.core.harmonics import modes_to_map, n_modes
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
@@ -23,6 +24,7 @@ from lusee_bayes.judge.chi2 import signal_to_noise
 from lusee_bayes.report import html
 from lusee_bayes.runs import cube, map_run
 from lusee_bayes.runs import folder as folder_module
+from lusee_bayes.runs.cube import cube_result, lmax_of_fields, positive_skies
 from lusee_bayes.runs.map_run import run_map
 from lusee_bayes.sampling.datatree import read_datatree
 from lusee_bayes.sky.sky_files import SkyCube
@@ -31,14 +33,6 @@ SMALL = ["--set", "lmax=4", "--set", "observation.runs.0.cycles=0.1"]
 THREE = ["--frequencies", "20:30:5", *SMALL]
 # two components for three channels
 JOINT = [*THREE, "--joint", "--set", "spectral.components=[power_law, curvature]"]
-
-
-def run(*arguments) -> int:
-    return main([str(a) for a in arguments])
-
-
-def posterior_of(folder) -> xr.Dataset:
-    return xr.load_dataset(folder / "posterior.nc", engine="h5netcdf")
 
 
 def assert_equal(got, expected, sigma):
@@ -168,36 +162,6 @@ def made(monkeypatch):
 
 
 @pytest.mark.long
-def test_an_interrupted_run_goes_on_where_it_was(
-    independent, tmp_path, made, monkeypatch, capsys, numbers_alone
-):
-    inform = cube.inform
-
-    def some(*arguments):
-        if len(made) == 2:
-            raise KeyboardInterrupt
-        return inform(*arguments)
-
-    command = ["map", "fiducial", *THREE, "--draws", 3, "-o", tmp_path, "-q"]
-    with monkeypatch.context() as patch:
-        patch.setattr(cube, "inform", some)
-        assert run(*command) == 130
-    assert capsys.readouterr().err.strip() == (
-        f"lusee-bayes: interrupted; no results are written in '{tmp_path}'; the same command "
-        "continues from the finished channels"
-    )
-    assert made == [20, 25] and not (tmp_path / "posterior.nc").exists()
-    made.clear()
-    assert run(*command) == 0
-    assert made == [30]
-    assert not (tmp_path / "channels").exists()
-    # channels one after the other have two threads each for their sums, side by side they have one
-    xr.testing.assert_allclose(
-        posterior_of(tmp_path).drop_attrs(), posterior_of(independent).drop_attrs(), rtol=1e-12
-    )
-
-
-@pytest.mark.long
 def test_files_of_another_run_are_not_taken_up(tmp_path, made, monkeypatch, numbers_alone):
     # the channels' files stay
     monkeypatch.setattr(map_run, "CUBE", replace(map_run.CUBE, unfinished=""))
@@ -295,27 +259,6 @@ def test_a_run_with_a_channel_that_cannot_be_mapped_goes_on(
     assert made == [20, 30] and list(result.unmapped) == [25.0]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--frequencies", "20,60"], "less than or equal to 50"),
-        (["--frequencies", "20,10"], "expected growing MHz"),
-        (["--joint"], "joint needs frequencies_mhz"),
-        (["--workers", "2"], "give --frequencies"),
-        (["--cluster", "tcp://127.0.0.1:1"], "give --frequencies"),
-        (["--workers", "0", "--frequencies", "20,25"], "expected a whole number from 1"),
-        (["--frequencies", "20,25", "--covariance"], "--covariance is for a single frequency"),
-        (["--frequencies", "20,25", "--onto", "x"], "--onto is for a single frequency"),
-        (["--frequencies", "20,25", "--joint"], "need at least as many channels, got 2"),
-        (["--set", "spectral.components=[hot]", "--frequencies", "20,25"], "spectral.components"),
-    ],
-    ids=str,
-)
-def test_bad_input_is_one_sentence(arguments, message, tmp_path, capsys):
-    assert run("map", "fiducial", *SMALL, *arguments, "-o", tmp_path / "x", "-q") == 2
-    assert message in capsys.readouterr().err
-
-
 @pytest.mark.long
 def test_sampling_several_channels(tmp_path, capsys):
     few = ["--chains", 2, "--draws", 100, "--warmup", 100, "-q", "--set", "lmax=2"]
@@ -331,3 +274,70 @@ def test_sampling_several_channels(tmp_path, capsys):
     joint = ("--set", "joint=true", "--set", "spectral.components=[power_law]")
     assert run(*command, *joint) == 2
     assert "channels are sampled one by one" in capsys.readouterr().err
+
+
+POSITIVE = [
+    *("lmax=4", "observation.runs.0.cycles=0.1", "spectral.model=positive"),
+    *("spectral.fields=[level, index]", "joint=true"),
+]
+
+
+def scenario_of(*overrides, frequencies="[10, 20, 40]"):
+    return load_scenario("fiducial", [*POSITIVE, f"frequencies_mhz={frequencies}", *overrides])
+
+
+@pytest.mark.long
+def test_files_of_a_run_agree_with_each_other(tmp_path, capsys):
+    settings = [word for setting in POSITIVE[:-1] for word in ("--set", setting)]
+    command = ["map", "fiducial", *settings, "--frequencies", "10,20,40", "--joint"]
+    assert main([*command, "--draws", "3", "-o", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "spectral.model=positive" in said and "prior.model=isotropic is not used" in said
+    cube = xr.load_dataset(tmp_path / "out" / "posterior.nc", engine="h5netcdf")
+    assert cube["component_mean"].attrs["units"] == "1" and cube["mean"].attrs["units"] == "K"
+    assert cube["component_mean"].shape == (2, n_modes(6))  # 1.5 times the maps' lmax
+    skies = positive_skies(scenario_of("spectral.sources=false"))
+    exponents = cube["mixing"].values @ cube["component_mean"].values
+    for k, draws in enumerate(cube["draws"].values):
+        assert (skies.values(k, exponents[k]) > 0).all()
+        # what residuals and point sources, which this sky has not, add is small
+        common, mean = skies.modes(k, exponents[k]), cube["mean"].values[k]
+        assert np.abs(common - mean).max() < 0.1 * np.abs(mean).max()
+        # three draws of each mode are within five standard deviations of the mean
+        assert (np.abs(draws - mean) < 5.0 * cube["std"].values[k]).all()
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["joint"]["components"] == ["level", "index"]
+    assert "spectral.model=positive" in summary["joint"]["prior"]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "component maps: level, index" in page and "is not used" in page
+    assert main(["info", str(tmp_path / "out" / "posterior.nc")]) == 0
+    assert "25 modes (lmax 4) at 3 frequencies" in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_joint_maps_of_low_frequencies_are_no_worse_than_independent_ones(tmp_path):
+    """5 and 6 MHz, where absorption reddens the plane, and the errors towards the centre."""
+    frequencies = [5.0, 6.0, 8.0, 12.0, 20.0, 40.0]
+    scenario = load_scenario(
+        "fiducial",
+        ["lmax=10", "joint=true", "spectral.model=positive", f"frequencies_mhz={frequencies}"],
+    )
+    cube = cube_result(scenario, tmp_path)
+    mean, truth, independent = (cube.stacked(n) for n in ("mean", "truth", "independent"))
+    # but for the monopole, which all know well
+    worse = np.linalg.norm((independent - truth)[:, 1:], axis=1)
+    better = np.linalg.norm((mean - truth)[:, 1:], axis=1)
+    assert (worse / better > 1.0).all()
+    nside = scenario.map_nside
+    lon, lat = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)
+    centre = (np.abs((lon + 180.0) % 360.0 - 180.0) < 10.0) & (np.abs(lat) < 10.0)
+    for channel in cube.channels:
+        z = (modes_to_map(channel.mean - channel.truth, nside) / channel.pixel_std)[centre]
+        # lmax 10 resolves one or two places there: 3 sigma at most
+        assert np.sqrt((z**2).mean()) < 3.0
+
+
+def test_bad_input_is_refused_in_a_sentence():
+    with pytest.raises(InputError, match=r"lmax 80 have 13122 unknowns.*use lmax=69"):
+        lmax_of_fields(scenario_of("lmax=80"))
+    assert lmax_of_fields(scenario_of("lmax=60")) == 69

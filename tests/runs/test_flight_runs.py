@@ -83,27 +83,6 @@ def test_fits_and_a_gain_table_of_ones_own(tmp_path):
     assert "session_000.fits" not in names and {"clock.json", "gains.nc"} <= set(names)
 
 
-@pytest.mark.parametrize(
-    "changes, text",
-    [
-        (["flight.simulated={navgf: 5}"], "navgf"),
-        (["flight.simulated={burst_every_h: 1e-9}"], "burst_every_h"),
-        (["flight.gain_table=nowhere.nc"], "nowhere.nc"),
-    ],
-)
-def test_what_cannot_be_simulated_is_said_in_a_sentence(tmp_path, capsys, changes, text):
-    assert simulate(tmp_path / "a", *changes) == 2
-    assert text in capsys.readouterr().err
-    assert not (tmp_path / "a").exists() or not list((tmp_path / "a").iterdir())
-
-
-def test_a_file_is_no_folder_for_sessions(tmp_path, capsys):
-    (tmp_path / "a").write_text("kept")
-    assert simulate(tmp_path / "a") == 2
-    assert "is a file" in capsys.readouterr().err
-    assert (tmp_path / "a").read_text() == "kept"
-
-
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory):
     """The folder of a session; to be read only."""
@@ -112,33 +91,25 @@ def simulated(tmp_path_factory):
     return folder
 
 
-def test_simulated_data_replace_nothing_unasked(simulated, tmp_path, capsys):
-    before = (simulated / "session_000.h5").read_bytes()
+def test_files_are_replaced_only_if_it_is_asked_for(simulated, tmp_path, capsys):
+    out, session = tmp_path / "out.nc", simulated / "session_000.h5"
+    before = session.read_bytes()
     assert simulate(simulated) == 2
     told = f"'{simulated}' holds sessions already (session_000.h5); give -o another folder, or"
     assert told in capsys.readouterr().err
-    assert (simulated / "session_000.h5").read_bytes() == before
-    out = tmp_path / "data.nc"
-    out.write_bytes(b"mine")
-    command = ["simulate", "fiducial", "-q", "--set", "lmax=3"]
-    assert main([*command, "-o", str(out)]) == 2
-    assert "is there already; give -o another name, or --force" in capsys.readouterr().err
-    assert out.read_bytes() == b"mine"
-    assert main([*command, "-o", str(out), "--force"]) == 0
-    assert out.read_bytes() != b"mine"
-
-
-def test_reduced_spectra_are_reduced_once_and_not_replaced_unasked(simulated, tmp_path, capsys):
-    out = tmp_path / "r.nc"
-    reduce = ["reduce", "-q", str(simulated / "scenario.yaml")]
-    session = str(simulated / "session_000.h5")
-    assert main([*reduce, session, "-o", str(out)]) == 0
-    out.write_bytes(b"kept")
-    assert main([*reduce, session, "-o", str(out)]) == 2
-    assert "is there already; give -o another name, or --force" in capsys.readouterr().err
-    assert out.read_bytes() == b"kept"
-    assert main([*reduce, session, "-o", str(out), "--force"]) == 0
-    assert main([*reduce, str(out), "-o", str(tmp_path / "x.nc")]) == 2
+    assert session.read_bytes() == before
+    for command in (
+        ["simulate", "fiducial", "-q", "--set", "lmax=3"],
+        ["reduce", "-q", str(simulated / "scenario.yaml"), str(session)],
+    ):
+        out.write_bytes(b"mine")
+        assert main([*command, "-o", str(out)]) == 2
+        assert "is there already; give -o another name, or --force" in capsys.readouterr().err
+        assert out.read_bytes() == b"mine"
+        assert main([*command, "-o", str(out), "--force"]) == 0
+        assert out.read_bytes() != b"mine"
+    # and what is reduced is not reduced again
+    assert main([*command[:3], str(out), "-o", str(tmp_path / "x.nc")]) == 2
     told = f"lusee-bayes: '{out}' is reduced already; give it to lusee-bayes map --data\n"
     assert capsys.readouterr().err == told
 

@@ -15,8 +15,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from commands import content
 
-from lusee_bayes.core.files import LOCK, MANIFEST, SCRATCH, recover
+from lusee_bayes.core.files import MANIFEST, SCRATCH, recover
 
 pytestmark = pytest.mark.long
 
@@ -102,21 +103,15 @@ class Command:
         assert process.stdout.readline() == "started\n", process.communicate()[1]
         return process
 
-    def run(self, folder: Path, *more: str) -> tuple[int, str]:
-        process = self.start(folder, *more)
-        errors = process.communicate(timeout=600)[1]
-        return process.returncode, errors
+    def resumed(self, folder: Path) -> list[str]:
+        """--resume, where something was drawn."""
+        return ["--resume"] if self.name == "sample" and (folder / "chains").exists() else []
 
     def again(self, folder: Path) -> tuple[int, str]:
-        """What a user does who sees the folder: the same command, --resume for what was drawn."""
-        drawn = self.name == "sample" and (folder / "chains").exists()
-        return self.run(folder, *(["--resume"] if drawn else []))
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    """Of all files but the lock, which nobody holds once its process is killed."""
-    found = (path for path in folder.rglob("*") if path.is_file() and path.name != LOCK)
-    return {str(path.relative_to(folder)): path.read_bytes() for path in found}
+        """What a user does who sees the folder: the same command."""
+        process = self.start(folder, *self.resumed(folder))
+        errors = process.communicate(timeout=600)[1]
+        return process.returncode, errors
 
 
 def numbers(folder: Path) -> dict[str, np.ndarray]:
@@ -198,6 +193,13 @@ def test_a_kill_at_any_moment(command, with_earlier, number, tmp_path):
     print(f"{it.name}, earlier run {with_earlier}, at {moment:.2f} of its time: {state}")
     assert process.returncode != 0 or state == "new"
     if state != "new":
+        # and once more on the way, of which nothing is to be seen in the end
+        process = it.start(folder, *it.resumed(folder))
+        try:
+            process.wait(0.5 * it.seconds)
+        except subprocess.TimeoutExpired:
+            process.kill()
+        process.communicate()
         code, errors = it.again(folder)
         assert code == 0, errors
     assert_same_results(folder, it.folder)

@@ -9,7 +9,6 @@ import pytest
 from numpyro.infer.util import potential_energy
 
 import lusee_bayes as lb
-from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.results.sample_result import SampleResult
@@ -81,25 +80,6 @@ def test_samples_have_the_moments_of_weighted_draws(tmp_path):
     assert np.abs((found.mean(0) - expected) / std).max() < 4.5 * error
     # standard deviations of skewed distributions scatter by a few times 1 / sqrt(2 n)
     assert np.abs(found.std(0) / std - 1.0)[2:].max() < 4.5 * error
-
-
-@pytest.mark.parametrize(
-    ("section", "message"),
-    [
-        ("amplitude: 0, tilt: -2", "log_normal.amplitude"),
-        ("amplitude: -0.1, tilt: -2", "log_normal.amplitude"),
-        ("amplitude: 0.1", "give both amplitude and tilt, or neither"),
-        ("tilt: -2", "give both amplitude and tilt, or neither"),
-        ("scale_std: 0", "log_normal.scale_std"),
-    ],
-    ids=str,
-)
-def test_bad_input_is_one_sentence(section, message, tmp_path, capsys):
-    command = ["sample", "fiducial", "--model", "log_normal", "--set", f"log_normal={{{section}}}"]
-    assert main([*command, "-o", str(tmp_path / "x")]) == 2
-    said = capsys.readouterr().err
-    assert message in " ".join(said.split()) and said.count("\n") <= 2
-    assert not (tmp_path / "x").exists()
 
 
 def test_the_scenario_says_what_is_sampled():

@@ -3,10 +3,8 @@
 One run is killed with SIGKILL and resumed here, another is left alone; most tests look at these.
 """
 
-import csv
 import json
 import os
-import random
 import shutil
 import signal
 import subprocess
@@ -20,23 +18,18 @@ import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
-import xarray as xr
 from arviz_stats.base import array_stats
+from commands import content, run
 from reference_linear import z_of
 
 import lusee_bayes
-from lusee_bayes.cli.main import main
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import LOCK
-from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
-from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import Experiment, build, infer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.results import sample_result as results
-from lusee_bayes.results.channel import channel_of_posterior
-from lusee_bayes.runs import sample_run, validate_run
-from lusee_bayes.runs.folder import RunFolder, run_folder
-from lusee_bayes.runs.sample_run import SAMPLE
+from lusee_bayes.runs import validate_run
 from lusee_bayes.runs.sampling import sample_result
 from lusee_bayes.sampling import hmc
 from lusee_bayes.sampling.datatree import read_datatree
@@ -56,10 +49,6 @@ GROUPS = {
     "posterior", "sample_stats", "prior", "prior_predictive", "posterior_predictive",
     "observed_data", "constant_data",
 }  # fmt: skip
-
-
-def run(*arguments) -> int:
-    return main([str(a) for a in arguments])
 
 
 def start(folder, *extra, settings=SETTINGS):
@@ -146,14 +135,6 @@ def no_sampling(runs, monkeypatch):
     monkeypatch.setattr(results, "sample", fail)
 
 
-def content(folder):
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file() and path.name != LOCK
-    }
-
-
 def assert_one_sentence(capsys, *words):
     error = capsys.readouterr().err.strip()
     assert error.startswith("lusee-bayes: ")
@@ -187,8 +168,7 @@ def test_a_killed_run_leaves_its_draws_and_nothing_half_made(runs):
     assert SAMPLER.warmup + 3 * CHUNK <= max(done) < SAMPLER.warmup + SAMPLER.draws
 
 
-@pytest.mark.long
-def test_a_killed_run_resumes_to_the_draws_of_an_undisturbed_one(runs, killed, tree, monkeypatch):
+def test_a_killed_run_resumes_to_the_draws_of_an_undisturbed_one(killed, tree, monkeypatch):
     """Bit by bit, in another process, with nothing done twice."""
     before = {i: (p.stat().st_ino, p.stat().st_mtime_ns) for i, p in chunks(killed).items()}
     written, untouched = [], []
@@ -208,14 +188,6 @@ def test_a_killed_run_resumes_to_the_draws_of_an_undisturbed_one(runs, killed, t
     assert_same_trees(read_datatree(killed / "samples.nc"), tree)
     assert not (killed / "chains").exists()
     assert not list(killed.glob(".partial*"))
-    # what is made of the draws is the same, too, but for times, memory and speed
-    whole = runs[0]
-    assert {p.name for p in killed.iterdir()} == {p.name for p in whole.iterdir()}
-    assert (killed / "summary.csv").read_bytes() == (whole / "summary.csv").read_bytes()
-    for name in ("mean", "std", "lower", "upper"):
-        np.testing.assert_array_equal(
-            *(healpy.read_map(f / f"{name}.fits", dtype=np.float64) for f in (killed, whole))
-        )
 
 
 def test_starting_again_without_resume_is_refused_and_touches_nothing(killed, no_sampling, capsys):
@@ -226,17 +198,10 @@ def test_starting_again_without_resume_is_refused_and_touches_nothing(killed, no
     assert content(killed) == before
 
 
-def test_resuming_with_other_chains_is_refused(killed, no_sampling, capsys):
-    before = content(killed)
-    settings = ["--chains", "3", *SETTINGS[2:]]
-    assert run("sample", *SMALL, *settings, "-q", "-o", killed, "--resume") == 2
-    assert_one_sentence(capsys, "has another sampler's chains: 4, now 3", "delete the folder")
-    assert content(killed) == before
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"sampler": {"chains": 3}}, "another sampler's chains: 4, now 3"),
         ({"sampler": {"warmup": 150}}, "another sampler's warmup: 100, now 150"),
         ({"sampler": {"seed": 7}}, "another sampler's seed: 1, now 7"),
         ({"sampler": {"algorithm": "hmc"}}, "another sampler's algorithm: nuts, now hmc"),
@@ -283,62 +248,6 @@ def test_resuming_with_fewer_draws_takes_the_first_of_those_there_are(short, tre
     assert short.gradients_per_second is None  # nothing was drawn in this session
 
 
-def test_draws_stay_where_they_are_until_the_results_are_written(short, killed, tree, monkeypatch):
-    before = content(killed)
-
-    def interrupt(*_, **__):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(sample_run, "write_map", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            RunFolder(killed, SAMPLE, {}).write(short, Stages())
-    assert content(killed) == before
-    RunFolder(killed, SAMPLE, {}).write(short, Stages())
-    assert not (killed / "chains").exists()
-    written = read_datatree(killed / "samples.nc")["posterior"]["sky"]
-    np.testing.assert_array_equal(written, tree["posterior"]["sky"].values[:, :60])
-
-
-def test_results_can_be_written_twice(short, killed, tmp_path):
-    numbers = replace(SAMPLE, figures={}, name="without a page")
-    for folder in (killed, killed, tmp_path / "elsewhere"):
-        RunFolder(folder, numbers, {}).write(short, Stages())
-    assert (tmp_path / "elsewhere" / "samples.nc").exists()
-
-
-@pytest.mark.parametrize("deleted", [0, 1, 3])
-def test_a_kill_while_the_draws_are_removed_is_no_harm(
-    experiment, short, killed, tree, no_sampling, deleted
-):
-    """The results are there, ``deleted`` of the files that they were made of are not."""
-    left = deleted
-
-    def unlink(*args, real=os.unlink, **options):
-        nonlocal left
-        if left == 0:
-            raise KeyboardInterrupt
-        left -= 1
-        real(*args, **options)
-
-    n_chunks = len(chunks(killed))
-    numbers = replace(SAMPLE, figures={}, name="without a page")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "unlink", unlink)
-        patch.setattr(os, "remove", unlink)
-        with pytest.raises(KeyboardInterrupt):
-            RunFolder(killed, numbers, {}).write(short, Stages())
-    assert (killed / "samples.nc").exists()
-    # the marker of the run is a file, too
-    assert len(list((killed / "chains").iterdir())) == n_chunks + 1 - deleted
-    sampler = replace(SAMPLER, draws=60)
-    with run_folder(killed, numbers, {}) as run:
-        again = sample_result(experiment, load_program("sky"), sampler, run.path, resume=True)
-    assert not (killed / "chains").exists()
-    np.testing.assert_array_equal(again.skies, tree["posterior"]["sky"].values[:, :60])
-
-
-@pytest.mark.long
 def test_resuming_a_finished_run_takes_it_over(whole, tree, no_sampling):
     before = content(whole)
     summary = pd.read_csv(whole / "summary.csv", index_col="quantity")
@@ -362,25 +271,6 @@ def test_a_finished_run_with_other_settings_is_not_taken_over(
             experiment, load_program("sky"), replace(SAMPLER, **change), whole, resume=True
         )
     assert content(whole) == before
-
-
-@pytest.mark.long
-def test_a_run_that_is_killed_again_and_again_ends_with_the_same_draws(runs, tree, tmp_path):
-    """Wherever it is hit: in warmup, among the draws, or while results are made and written."""
-    folder = tmp_path / "unlucky"
-    rng = random.Random(5)
-    total = SAMPLER.warmup + SAMPLER.draws
-    for iteration, at_most_s in [(50, 0.05), (600, 0.1), (total, 5.0)]:
-        process = start(folder, "--resume")
-        killer = executioner(process, chunk_path(folder, iteration), rng.uniform(0, at_most_s))
-        assert killer.wait() == 0
-        assert process.wait() == -signal.SIGKILL, process.communicate()[1]
-        process.communicate()
-    process = start(folder, "--resume")
-    errors = process.communicate(timeout=600)[1]
-    assert process.returncode == 0, errors
-    assert_same_trees(read_datatree(folder / "samples.nc"), tree)
-    assert not (folder / "chains").exists()
 
 
 # ---- the files
@@ -423,28 +313,7 @@ def test_the_maps_are_those_of_the_draws(runs, tree):
     assert (header["COORDSYS"], header["ORDERING"], header["TUNIT1"]) == ("G", "RING", "K")
 
 
-def test_the_maps_agree_with_the_analytic_ones_to_monte_carlo_error(runs, tree, experiment):
-    """What lusee-bayes map writes beside what sample does, pixel by pixel; ESS by ArviZ."""
-    mean, std = maps_of(runs[0], "mean", "std")
-    inference = infer(experiment)
-    covariance = np.asarray(inference.posterior.covariance())
-    analytic = channel_of_posterior(experiment, inference, covariance).maps()
-    analytic_mean, analytic_std = analytic["mean"], analytic["std"]
-    values = tree["posterior"]["sky"].values @ pixel_matrix(NSIDE, 6).T
-    scaled = (values - analytic_mean) / analytic_std
-    # ESS itself scatters by a tenth at this length
-    limit = 1.1 * z_of(len(mean))
-    ess = array_stats.ess(scaled, chain_axis=0, draw_axis=1, method="mean")
-    assert np.abs((mean - analytic_mean) / analytic_std * np.sqrt(ess)).max() < limit
-    ess = array_stats.ess(scaled**2, chain_axis=0, draw_axis=1, method="mean")
-    assert ess.min() > 400
-    # a Gaussian's variance scatters by sqrt(2 / ess), its root by half of that
-    assert (np.abs(std / analytic_std - 1) * np.sqrt(2 * ess)).max() < limit
-    # a tenth too wide would not pass anywhere
-    assert (0.1 * np.sqrt(2 * ess)).min() > 0.5 * limit
-
-
-def test_the_analytic_posterior_is_in_the_samples(tree, experiment):
+def test_the_samples_hold_the_analytic_posterior_and_what_they_are(runs, tree, experiment, capsys):
     data, posterior = experiment.data, infer(experiment).posterior
     constants = tree["constant_data"]
     np.testing.assert_array_equal(constants["analytic_mean"], posterior.mean)
@@ -453,6 +322,11 @@ def test_the_analytic_posterior_is_in_the_samples(tree, experiment):
     np.testing.assert_array_equal(tree["observed_data"]["data"], data.data)
     assert tree.attrs["program"] == "sky"
     assert tree.attrs["scenario"] == experiment.scenario.to_yaml()
+    assert tree["posterior"]["sky"].dims == ("chain", "draw", "mode")
+    ell, m = (tree["posterior"][name].values for name in ("ell", "m"))
+    np.testing.assert_array_equal(ell**2 + ell + m, np.arange(N_MODES))
+    assert run("info", runs[0] / "samples.nc") == 0
+    assert "4 x 1000 draws of the program sky at 25 MHz" in capsys.readouterr().out
 
 
 def test_the_summary_tells_of_landmarks_powers_and_lowest_modes(runs, tree):
@@ -499,7 +373,6 @@ def test_sampling_json_tells_of_the_very_run(runs, tree):
     assert {"lusee_bayes", "jax", "numpyro", "arviz-stats"} <= set(figures["versions"])
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("program", ["sky_marginal", "prior_amplitude"])
 def test_programs_without_the_sky_get_their_maps_too(program, tmp_path):
     out = tmp_path / "out"
@@ -542,36 +415,6 @@ def model(coupling, prior, noise, data=None):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--model", "skies"], ["no program 'skies'", "prior_amplitude, sky, sky_marginal"]),
-        (["--model", "gone.py"], ["no program at 'gone.py'"]),
-        (["--draws", "0"], ["--draws: expected a whole number from 1", "got 0"]),
-        (["--draws", "many"], ["many"]),
-        (["--chains", "0"], ["--chains: expected a whole number from 1", "got 0"]),
-        (["--warmup", "3"], ["warmup must be at least 20, got 3"]),
-        (["--algorithm", "hcm"], ["hcm", "nuts"]),
-        (["--set", "lmaxx=3"], ["unknown key 'lmaxx'"]),
-        (["--data", "gone.nc"], ["no data at 'gone.nc'"]),
-        (["--colour", "blue"], ["--colour"]),
-    ],
-    ids=lambda value: " ".join(value),
-)
-def test_bad_options_are_one_sentence_and_exit_code_2(tmp_path, capsys, arguments, words):
-    out = tmp_path / "out"
-    assert run("sample", *SMALL, "-q", "-o", out, *arguments) == 2
-    assert_one_sentence(capsys, *words)
-    assert not out.exists()
-
-
-def test_a_scenario_is_needed_and_has_to_exist(tmp_path, capsys):
-    assert run("sample") == 2
-    assert_one_sentence(capsys, "scenario")
-    assert run("sample", "fiducal", "-q", "-o", tmp_path / "out") == 2
-    assert_one_sentence(capsys, "no scenario 'fiducal'", "did you mean 'fiducial'?")
-
-
-@pytest.mark.parametrize(
     ("text", "words"),
     [
         ("def model(data=None:\n", ["does not run"]),
@@ -609,36 +452,6 @@ def test_programs_that_cannot_be_sampled_are_refused_before_it(
     assert not begun
 
 
-@pytest.mark.parametrize("below", [False, True], ids=["a file", "below a file"])
-def test_an_output_that_is_a_file_is_refused_before_sampling(tmp_path, capsys, no_sampling, below):
-    (tmp_path / "x").write_text("mine")
-    out = tmp_path / "x" / "y" if below else tmp_path / "x"
-    assert run("sample", *SMALL, *SETTINGS, "-q", "-o", out) == 2
-    assert_one_sentence(capsys, str(tmp_path / "x"), "is a file; give a folder")
-    assert (tmp_path / "x").read_text() == "mine"
-
-
-def test_data_of_another_frequency_or_kind_are_refused(experiment, runs, tmp_path, capsys):
-    replace(experiment.data, frequency_mhz=30.0).write(tmp_path / "data.nc")
-    out = tmp_path / "out"
-    assert run("sample", *SMALL, "-q", "-o", out, "--data", tmp_path / "data.nc") == 2
-    assert_one_sentence(capsys, "the data are at 30.0 MHz, the scenario at 25.0")
-    assert run("sample", *SMALL, "-q", "-o", out, "--data", runs[0] / "samples.nc") == 2
-    assert_one_sentence(capsys, "holds nothing that can be mapped", "lusee_bayes samples 1")
-    assert not out.exists()
-
-
-def test_an_interrupt_is_exit_code_130_and_a_sentence(killed, tmp_path, capsys, monkeypatch):
-    def interrupt(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(sample_run, "sample_result", interrupt)
-    assert run("sample", *SMALL, "-q", "-o", tmp_path / "out") == 130
-    assert_one_sentence(capsys, f"interrupted; no results are written in '{tmp_path / 'out'}'")
-    assert run("sample", *SMALL, "-q", "-o", killed, "--resume") == 130
-    assert_one_sentence(capsys, f"no results are written in '{killed}'; go on with --resume")
-
-
 # ---- validation of the same draws
 
 
@@ -659,28 +472,18 @@ def test_validation_of_the_true_posterior_passes(validated):
         assert matplotlib.image.imread(folder / "figures" / f"{figure}.png").std() > 0.01
 
 
-def table_of(folder):
-    """Rows of validation.md's first table."""
-    lines = (folder / "validation.md").read_text().splitlines()
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if "|" in line]
-    first = rows.index(next(row for row in rows if row[0] == "check"))
-    names = [row[0] for row in rows[first:]]
-    return rows[first + 2 : first + names.index("quantity")]
-
-
 def consistent(folder):
     """validation.json, once it and validation.md are found to say the same."""
     report = json.loads((folder / "validation.json").read_text())
-    rows = table_of(folder)
-    assert len(rows) == len(report["checks"]) >= 10
-    for row, check in zip(rows, report["checks"], strict=True):
+    lines = (folder / "validation.md").read_text().splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if "|" in line]
+    said = {row[0]: row[3] for row in rows if len(row) == 5}
+    assert len(report["checks"]) >= 10
+    for check in report["checks"]:
         lower = -np.inf if check["lower"] is None else check["lower"]
         upper = np.inf if check["upper"] is None else check["upper"]
         assert check["passed"] == (lower <= check["value"] <= upper)
-        assert row[0] == check["name"]
-        assert float(row[1]) == pytest.approx(check["value"], rel=1e-3)
-        assert row[3] == ("ok" if check["passed"] else "**failed**")
-        assert row[4] == check["meaning"]
+        assert said[check["name"]] == ("ok" if check["passed"] else "**failed**")
     assert report["passed"] == all(check["passed"] for check in report["checks"])
     return report
 
@@ -733,34 +536,3 @@ def test_half_the_covariance_is_found_out_with_exit_code_1(validated, tmp_path, 
         2 * np.array(json.loads((validated[1] / "validation.json").read_text())["variance_ratio"]),
         rtol=1e-6,
     )
-
-
-def test_too_few_draws_or_simulations_are_refused_before_sampling(tmp_path, capsys, no_sampling):
-    out = tmp_path / "out"
-    assert run("validate", *SMALL, *SETTINGS, "--simulations", "99", "-q", "-o", out) == 2
-    assert_one_sentence(capsys, "at least 100 simulations", "got 99")
-    assert run("validate", *SMALL, "--draws", "99", "-q", "-o", out) == 2
-    assert_one_sentence(capsys, "100 draws of each chain, got 99")
-    assert not out.exists()
-
-
-def test_summary_csv_is_plain_csv(runs):
-    """Names hold commas: they are quoted, so that each row has as many cells as the header."""
-    with (runs[0] / "summary.csv").open(newline="") as file:
-        rows = list(csv.reader(file))
-    assert {len(row) for row in rows} == {len(rows[0])}
-    assert rows[0][0] == "quantity"
-    assert all(np.isfinite([float(cell) for cell in row[1:]]).all() for row in rows[1:])
-
-
-def test_info_says_what_the_samples_are(runs, capsys):
-    assert run("info", runs[0] / "samples.nc") == 0
-    out = capsys.readouterr().out
-    assert "4 x 1000 draws of the program sky at 25 MHz" in out
-
-
-def test_samples_open_with_xarray_alone(runs):
-    with xr.open_dataset(runs[0] / "samples.nc", group="posterior", engine="h5netcdf") as group:
-        assert group["sky"].dims == ("chain", "draw", "mode")
-        assert group["sky"].sel(chain=0, draw=3).sizes == {"mode": N_MODES}
-        np.testing.assert_array_equal(group["ell"] ** 2 + group["ell"] + group["m"], np.arange(49))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +13,9 @@ from scipy import stats
 
 from lusee_bayes.core.arrays import on_device
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, FLUCTUATION_RMS, galaxy_map
+from lusee_bayes.core.harmonics import map_to_modes, n_modes, synthesis_matrix
+from lusee_bayes.core.sphere_grid import SphereGrid
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galaxy_map
 from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
 from lusee_bayes.sky.template import EmbeddedTemplate, Template
 
@@ -104,14 +106,6 @@ def test_power_law_slopes_are_derivatives_of_the_root(sky):
     np.testing.assert_allclose(sky.power_law_slopes(), slopes, atol=1e-14)
 
 
-def test_the_embedded_template_is_the_galaxy_without_its_random_part():
-    """galaxy_map's texture is 1 on average, so that many seeds average to the template."""
-    template = EmbeddedTemplate(MHZ).pixels(8)
-    ratios = np.array([galaxy_map(MHZ, nside=8, seed=seed) for seed in range(40)]) / template
-    # 768 pixels of 40 seeds, whose texture has this rms at most
-    assert np.abs(ratios.mean(0) - 1.0).max() < 5.0 * FLUCTUATION_RMS / np.sqrt(40)
-
-
 def test_refusals():
     with pytest.raises(InputError, match="template must be positive"):
         LogNormalSky.of(Waves(0.0), SPECTRUM, MHZ, band=20)
@@ -124,3 +118,19 @@ def test_refusals():
             LogNormalSky.of(Waves(), spectrum, MHZ, band=20)
     with pytest.raises(InputError, match="does not hold harmonics"):
         LogNormalSky.of(Waves(), SPECTRUM, MHZ, band=LMAX - 1)
+
+
+def test_the_embedded_template_is_the_sky_without_its_random_part():
+    template = EmbeddedTemplate(25.0)
+    smooth = template.modes(8)
+    # with it, synchrotron emission, most of the sky's, is multiplied by exp(g), of rms 5 %
+    ratio = galaxy_map(25.0, 64, seed=3) / template.pixels(64)
+    assert abs(ratio.mean() - 1.0) < 0.01
+    assert 0.02 < np.log(ratio).std() < 0.05
+    # its values in directions, and on pixels, are those of the same sky, whose edges are sharp
+    grid = SphereGrid.of(8, 128)
+    values = template.at(*grid.directions()).reshape(grid.shape)
+    np.testing.assert_allclose(grid.analyse(values), smooth, atol=1e-3 * smooth[0])
+    np.testing.assert_allclose(map_to_modes(template.pixels(64), 8), smooth, rtol=1e-9)
+    at = template.at(*healpy.pix2ang(16, np.arange(healpy.nside2npix(16))))
+    np.testing.assert_allclose(at, template.pixels(16), rtol=1e-9)

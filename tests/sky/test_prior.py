@@ -1,18 +1,31 @@
-"""The prior on the sky: S = diag(C_ell) in coefficients, Y diag(C_ell) Y^T in pixels."""
+"""Priors on the sky: S in coefficients and in pixels, priors with a mean, families of priors."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import healpy as hp
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference_linear import posterior, random_covariance
+from reference_linear import assert_draws_follow, posterior, random_covariance
+from scipy.integrate import quad
 from scipy.special import eval_legendre
+from scipy.stats import multivariate_normal
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.core.harmonics import n_modes, per_mode, synthesis_matrix
+from lusee_bayes.core.sphere_grid import SphereGrid
+from lusee_bayes.experiment.model import base_model
+from lusee_bayes.instrument.coupling import DenseCoupling
+from lusee_bayes.judge.residuals import residuals
+from lusee_bayes.linear.model import LinearGaussian, updated
 from lusee_bayes.noise.covariance import DiagonalCovariance
+from lusee_bayes.noise.instrument_errors import beam_error_noise
+from lusee_bayes.priors.families import Hyperprior, IsotropicFamily, PriorFamily
+from lusee_bayes.priors.local_scales import embedded_local_scales, windows
+from lusee_bayes.sampling.distributions import Marginal, SkyPrior
 from lusee_bayes.sky.prior import DensePrior, HarmonicPrior, IndependentPrior, PixelPrior
 from lusee_bayes.testing.checks import check_prior
 
@@ -39,21 +52,6 @@ def harmonic():
 @pytest.fixture(scope="module")
 def pixel():
     return PixelPrior(jnp.asarray(SPECTRUM), NSIDE)
-
-
-def test_harmonic_covariance_is_c_ell_of_every_mode(harmonic):
-    assert (harmonic.size, harmonic.rank) == (16, 16)
-    # a square root squared: one rounding
-    np.testing.assert_allclose(harmonic.covariance(), np.diag(PER_MODE), rtol=4e-16)
-    np.testing.assert_array_equal(harmonic.variance(), PER_MODE)
-
-
-def test_pixel_covariance_obeys_the_addition_theorem(pixel):
-    assert (pixel.size, pixel.rank) == (48, 16)
-    expected = pixel_covariance()
-    # sums of 16 terms of order one
-    np.testing.assert_allclose(pixel.covariance(), expected, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(pixel.variance(), np.diag(expected), rtol=1e-14)
 
 
 def dense_covariance() -> np.ndarray:
@@ -173,9 +171,6 @@ def test_posterior_in_pixels_is_the_synthesised_harmonic_one(pixel, harmonic, n_
     np.testing.assert_allclose(on_coefficients.std_of(pixel.synthesis), naive.std, rtol=1e-11)
 
 
-# --- known problems of the package: remove the mark when they are mended --------------------------
-
-
 def test_a_prior_can_be_built_inside_jit_from_known_numbers():
     spectrum = jnp.asarray(SPECTRUM)
     got = jax.jit(lambda u: HarmonicPrior(spectrum).colour(u))(jnp.ones(16))
@@ -188,3 +183,274 @@ def test_an_ell_without_power_does_not_spoil_gradients():
 
     expected = np.sqrt(PER_MODE).sum() / 2.0  # d/da of sqrt(a) sum sqrt(C) at a = 1
     assert float(jax.jit(jax.grad(total))(jnp.asarray(1.0))) == pytest.approx(expected)
+
+
+POWER = np.array([4.0, 1.0, 0.5, 0.25])
+VARIANCES = np.repeat(POWER, [1, 3, 5, 7])
+RNG = np.random.default_rng(5)
+A = RNG.normal(size=(24, 16))
+VARIANCE = RNG.uniform(0.1, 0.3, 24)
+SKY_MEAN = 3.0 * RNG.normal(size=16)
+OFFSET = RNG.normal(size=24)
+DATA = (
+    A @ (SKY_MEAN + np.sqrt(VARIANCES) * RNG.normal(size=16)) + OFFSET + 0.4 * RNG.normal(size=24)
+)
+# condition numbers below 1e4 x 24 data x eps
+CLOSE = 1e-10
+
+
+def model(rows=slice(None)) -> LinearGaussian:
+    return LinearGaussian(
+        jnp.asarray(A[rows]),
+        HarmonicPrior(jnp.asarray(POWER), mean=jnp.asarray(SKY_MEAN)),
+        DiagonalCovariance(jnp.asarray(VARIANCE[rows])),
+        jnp.asarray(OFFSET[rows]),
+    )
+
+
+def expected(rows=slice(None)):
+    answer = posterior(
+        A[rows], np.diag(VARIANCES), np.diag(VARIANCE[rows]), (DATA - OFFSET - A @ SKY_MEAN)[rows]
+    )
+    return answer._replace(mean=answer.mean + SKY_MEAN)
+
+
+@pytest.mark.parametrize("form", ["map", "data", "root", "structured"])
+def test_every_form_gives_the_textbooks_posterior(form):
+    found, answer = model().condition(jnp.asarray(DATA), form), expected()
+    np.testing.assert_allclose(found.mean, answer.mean, atol=CLOSE)
+    np.testing.assert_allclose(found.std(), answer.std, rtol=CLOSE)
+    np.testing.assert_allclose(found.log_evidence, answer.log_prob, rtol=CLOSE)
+
+
+def test_chi2_is_of_the_deviation_from_the_prior():
+    """(d - A mu)^T (A S A^T + N)^-1 (d - A mu), with a solver that knows no prior."""
+    found = model().condition(jnp.asarray(DATA))
+    centred = DATA - OFFSET - A @ SKY_MEAN
+    direct = centred @ np.linalg.solve(A * VARIANCES @ A.T + np.diag(VARIANCE), centred)
+    told = model().chi2(found.mean, jnp.asarray(DATA)) + found.prior_chi2()
+    np.testing.assert_allclose(told, direct, rtol=CLOSE)
+
+
+def test_a_posterior_is_not_updated_under_another_mean():
+    earlier = model().condition(jnp.asarray(DATA), "root")
+    for mean in (None, jnp.asarray(SKY_MEAN + 1e-6)):
+        other = replace(model(), prior=HarmonicPrior(jnp.asarray(POWER), mean=mean))
+        with pytest.raises(InputError, match="another mean"):
+            updated(earlier, other, jnp.asarray(DATA))
+
+
+def test_updates_information_and_few_data():
+    first, rest = slice(0, 18), slice(18, 24)
+    earlier = model(first).condition(jnp.asarray(DATA[first]), "root")
+    found = updated(earlier, model(rest), jnp.asarray(DATA[rest]))
+    np.testing.assert_allclose(found.mean, expected().mean, atol=CLOSE)
+    np.testing.assert_allclose(found.log_evidence, expected().log_prob, rtol=CLOSE)
+    few = model(rest).condition(jnp.asarray(DATA[rest]))
+    assert few.basis is not None
+    np.testing.assert_allclose(few.mean, expected(rest).mean, atol=CLOSE)
+    # information knows no prior: with another one it gives that one's posterior
+    information, _ = model().inform(jnp.asarray(DATA))
+    without = replace(model(), prior=HarmonicPrior(jnp.asarray(POWER)))
+    np.testing.assert_allclose(
+        information.posterior(without.prior).mean,
+        without.condition(jnp.asarray(DATA)).mean,
+        atol=CLOSE,
+    )
+
+
+def test_draws_and_densities():
+    prior = model().prior
+    assert_draws_follow(prior.sample(jax.random.key(0), 4000), SKY_MEAN, np.diag(VARIANCES))
+    sky = SKY_MEAN + RNG.normal(size=16)
+    np.testing.assert_allclose(
+        SkyPrior(prior).log_prob(jnp.asarray(sky)),
+        multivariate_normal.logpdf(sky, SKY_MEAN, np.diag(VARIANCES)),
+        rtol=1e-12,
+    )
+    draws = SkyPrior(prior).sample(jax.random.key(1), (2, 3))
+    assert draws.shape == (2, 3, 16)
+    # ln p(d_i | the others) = ln p(d) - ln p(the others)
+    left_out = Marginal(model()).leave_one_out(jnp.asarray(DATA))
+    others = np.arange(24) != 7
+    np.testing.assert_allclose(
+        left_out[7], expected().log_prob - expected(others).log_prob, rtol=1e-8
+    )
+
+
+def test_a_beam_error_holds_the_mean_sky():
+    direction = RNG.normal(size=(24, 16))
+    found = beam_error_noise(DenseCoupling(jnp.asarray(direction)), model().prior).dense()
+    second_moment = np.diag(VARIANCES) + np.outer(SKY_MEAN, SKY_MEAN)
+    np.testing.assert_allclose(found, direction @ second_moment @ direction.T, atol=1e-10)
+
+
+def test_residuals_are_those_of_the_data_less_the_mean(small_experiment):
+    """The same posterior and the same verdicts as of d - A mu with a prior about zero."""
+    setup, data = small_experiment.setup, small_experiment.data
+    mean = 0.5 * np.asarray(setup.sky.modes)
+    about_zero = base_model(setup)
+    about_mean = replace(about_zero, prior=HarmonicPrior(setup.prior.spectrum, mean=mean))
+    less = replace(data, data=data.data - np.asarray(setup.coupling @ mean))
+    one, other = about_mean.condition(data.data), about_zero.condition(less.data)
+    sigma = np.asarray(one.std())
+    # both means are refined to 1e-6 sigma
+    assert np.abs((one.mean - mean - other.mean) / sigma).max() < 1e-5
+    first, second = (
+        residuals(model, p, d, float(model.chi2(p.mean, d.data) + p.prior_chi2()))
+        for model, p, d in ((about_mean, one, data), (about_zero, other, less))
+    )
+    for part in ("instrument", "prior"):
+        a, b = getattr(first.split, part), getattr(second.split, part)
+        np.testing.assert_allclose([a.chi2, a.degrees], [b.chi2, b.degrees], rtol=1e-5)
+    for a, b in zip(first.days + first.products, second.days + second.products, strict=True):
+        np.testing.assert_allclose(a.chi2, b.chi2, rtol=1e-5)
+
+
+def test_a_mean_that_the_spectrum_excludes_is_refused():
+    with pytest.raises(InputError, match="power at ell = 2, where C_ell is zero"):
+        HarmonicPrior(jnp.array([1.0, 1.0, 0.0, 1.0]), mean=jnp.asarray(SKY_MEAN))
+    with pytest.raises(InputError, match="the prior mean has shape"):
+        HarmonicPrior(jnp.asarray(POWER[:3]), mean=jnp.asarray(SKY_MEAN))
+
+
+FAMILY_LMAX = 5
+
+
+MAKE = {
+    "isotropic": lambda lmax: IsotropicFamily.around(2e4, lmax),
+    "local scales": lambda lmax: embedded_local_scales(25.0, lmax),
+}
+
+
+@pytest.fixture(scope="module", params=MAKE)
+def made(request):
+    """A family, and the same of a lower lmax."""
+    return MAKE[request.param](FAMILY_LMAX), MAKE[request.param](3)
+
+
+@pytest.fixture(scope="module")
+def family(made):
+    return made[0]
+
+
+def somewhere(family: PriorFamily) -> np.ndarray:
+    """Parameters away from the centre."""
+    start = family.hyperprior.start()
+    return start + 0.3 * np.random.default_rng(3).standard_normal(len(start))
+
+
+def test_derivatives_are_those_of_the_covariance(family):
+    """Central differences of step 1e-4: their error is 1e-8 of the third derivative, 1e-7 here."""
+    rng, theta = np.random.default_rng(1), somewhere(family)
+    n = n_modes(FAMILY_LMAX)
+    half = rng.standard_normal((n, n)) / np.sqrt(np.diagonal(family.at(theta).covariance))[:, None]
+    matrix, columns = half @ half.T, half[:, :2]
+    member = family.at(theta)
+    traces, forms = member.traces(matrix), member.forms(columns)
+    chosen = np.unique(np.linspace(0, len(theta) - 1, 25).astype(int))
+    for i in chosen:
+        step = np.zeros_like(theta)
+        step[i] = 1e-4
+        up, down = (family.at(theta + s).covariance for s in (step, -step))
+        slope = (up - down) / 2e-4
+        np.testing.assert_allclose(
+            traces[i], 0.5 * (slope * matrix).sum(), rtol=1e-6, atol=1e-7 * np.abs(traces).max()
+        )
+        np.testing.assert_allclose(
+            forms[i],
+            0.5 * np.einsum("ik,ij,jk->k", columns, slope, columns),
+            rtol=1e-6,
+            atol=1e-7 * np.abs(forms).max(),
+        )
+
+
+def test_averages_are_means_over_the_parameters(family):
+    """Without uncertainty S itself; with some, what each variance gains is exp(half of its own)."""
+    theta = somewhere(family)
+    alone = family.averaged(theta, lambda rows: np.zeros(len(rows)))
+    np.testing.assert_allclose(alone, family.at(theta).covariance, rtol=1e-12, atol=1e-6)
+    wider = family.averaged(theta, lambda rows: np.full(len(rows), 0.5))
+    gain = np.diagonal(wider)[1:] / np.diagonal(alone)[1:]
+    assert (gain <= np.exp(0.25) * (1 + 1e-12)).all()
+    assert gain.max() > 1.01
+
+
+def test_priors_of_a_family_have_its_covariance(family):
+    expected = family.at(family.hyperprior.start()).covariance
+    found = np.asarray(family.expected().covariance())
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-8 * expected.max())
+
+
+def test_an_even_texture_is_isotropic():
+    """Where no strength varies, the last term of the equation has the covariance diag(C_ell)."""
+    family = embedded_local_scales(25.0, FAMILY_LMAX)
+    theta = family.hyperprior.start()
+    power, fluxes, covariates, cells = family._split(theta)
+    even = np.concatenate([power, fluxes, 0.0 * covariates, cells])
+    member = family.at(even)
+    expected = np.diag(per_mode(np.where(np.arange(FAMILY_LMAX + 1) > 0, member.spectrum, 0.0)))
+    np.testing.assert_allclose(member.texture, expected, atol=1e-12 * expected.max())
+
+
+def test_the_texture_is_filtered_white_noise():
+    """R sum_j w_j Y^T diag(area v_j) Y w_j R, with dense harmonics at the grid's points."""
+    family = embedded_local_scales(25.0, FAMILY_LMAX)
+    member = family.at(somewhere(family))
+    expected = np.zeros((n_modes(FAMILY_LMAX),) * 2)
+    for band, strength in zip(family.bands, member.strengths, strict=True):
+        harmonics = synthesis_matrix(*band.grid.directions(), FAMILY_LMAX)
+        area = np.repeat(band.grid.weights, band.grid.n_phi)
+        scale = per_mode(band.window * np.sqrt(member.spectrum))
+        expected += scale[:, None] * ((harmonics.T * (area * strength)) @ harmonics) * scale
+    np.testing.assert_allclose(member.texture, expected, atol=1e-11 * expected.max())
+
+
+@pytest.mark.parametrize("lmax", [1, 2, 5, 31, 47])
+def test_windows_share_every_ell(lmax):
+    found = windows(lmax)
+    np.testing.assert_allclose((found**2).sum(0)[1:], 1.0, rtol=1e-14)
+    assert (found[:, 0] == 0.0).all()
+
+
+def test_the_diagonal_on_a_grid():
+    """y^T C y of dense harmonics, and the adjoint of multiplication by a field."""
+    rng = np.random.default_rng(5)
+    grid = SphereGrid.of(4, 7)
+    half = rng.standard_normal((25, 25))
+    matrix, field = half @ half.T, rng.standard_normal(grid.shape)
+    harmonics = synthesis_matrix(*grid.directions(), 4)
+    dense = np.einsum("pi,ij,pj->p", harmonics, matrix, harmonics).reshape(grid.shape)
+    np.testing.assert_allclose(grid.diagonal(matrix), dense, rtol=1e-12)
+    area = np.asarray(grid.weights)[:, None]
+    np.testing.assert_allclose(
+        (grid.product_matrix(field) * matrix).sum(),
+        (field * area * grid.diagonal(matrix)).sum(),
+        rtol=1e-11,
+    )
+
+
+def test_the_hyperprior_is_a_density():
+    """It integrates to one over a parameter and over a cell, and its gradient is its own."""
+    theta = Hyperprior(np.array([-2.7]), np.array([0.2]))
+    total, _ = quad(lambda x: np.exp(theta.log_density(np.array([x]))), -np.inf, np.inf)
+    assert total == pytest.approx(1.0, rel=1e-6)
+    cell = Hyperprior(np.zeros(0), np.zeros(0), 1)
+    total, _ = quad(lambda x: np.exp(cell.log_density(np.array([x]))), -8.0, 60.0, limit=200)
+    assert total == pytest.approx(1.0, rel=1e-6)
+    both = Hyperprior(np.array([1.0, -2.0]), np.array([0.5, 2.0]), 2)
+    at = np.array([1.4, -5.0, -0.3, 2.0])
+    for i in range(4):
+        step = np.zeros(4)
+        step[i] = 1e-5
+        slope = (both.log_density(at + step) - both.log_density(at - step)) / 2e-5
+        assert both.gradient(at)[i] == pytest.approx(slope, rel=1e-7)
+    assert (both.curvature(at) > 0.0).all()
+
+
+def test_a_coarse_start_keeps_what_both_have(made):
+    family, coarse = made
+    found = family.start_from(coarse, coarse.hyperprior.start() + 0.1)
+    assert len(found) == family.hyperprior.size
+    moved = found - family.hyperprior.start()
+    assert (np.abs(moved) > 0.05).sum() == coarse.hyperprior.size

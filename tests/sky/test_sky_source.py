@@ -1,4 +1,7 @@
-"""Every source of skies keeps the same contract; files of every layout are scaled alike."""
+"""Every source of skies keeps the same contract; files of every layout are scaled alike.
+
+And each layout by itself: maps, cubes of maps, coefficients.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +9,27 @@ import h5py
 import healpy
 import numpy as np
 import pytest
+from assertions import refused
 from astropy.io import fits
 from made_skies import SmoothSky, SpottySky
 from reference import real_harmonics
 
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import map_to_modes, modes_to_map, to_healpy
+import lusee_bayes as lb
+from lusee_bayes.core.harmonics import (
+    from_healpy,
+    map_to_modes,
+    modes_to_map,
+    synthesis_matrix,
+    to_healpy,
+)
+from lusee_bayes.report.describe import describe
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.sky.sky_files import SkyAlms, SkyCube, SkyMap, write_alms
 from lusee_bayes.sky.sky_source import (
     SKY_READERS,
     FileSource,
     GalaxySource,
+    galaxy_sky,
     read_sky_file,
     sky_from_file,
 )
@@ -164,12 +177,232 @@ def test_the_spotty_sky_has_a_steep_number_count():
     np.testing.assert_allclose(sky.modes, 3e5 * modes, rtol=0, atol=1e-9 * 3e5)
 
 
-@pytest.mark.parametrize("frequency", [0.0, -3.0, np.nan])
-def test_a_files_frequency_is_positive(frequency):
-    with pytest.raises(InputError, match="file_frequency_mhz must be positive"):
-        FileSource("nowhere.fits", file_frequency_mhz=frequency)
-
-
-def test_a_file_that_is_not_there():
-    with pytest.raises(InputError, match="no sky map at 'nowhere.fits'; check sky.file"):
+def test_a_file_is_there_and_its_frequency_positive():
+    for frequency in (0.0, -3.0, np.nan):
+        with refused("file_frequency_mhz must be positive"):
+            FileSource("nowhere.fits", file_frequency_mhz=frequency)
+    with refused("no sky map at 'nowhere.fits'; check sky.file"):
         FileSource("nowhere.fits").at(25.0, LMAX)
+
+
+@pytest.fixture
+def pixels():
+    rng = np.random.default_rng(3)
+    return 1e5 + 1e3 * rng.standard_normal(12 * NSIDE**2)
+
+
+def test_ulsa_file_is_read_as_it_is(test_data):
+    path = test_data / "ulsa" / "exp10.0MHz_sky_map_with_absorption.hdf5"
+    with h5py.File(path) as file:
+        expected = file["smooth_absorb"][...]
+    np.testing.assert_array_equal(read_sky_file(path).pixels, expected)
+    # the monopole is the mean pixel, but for what aliases into it from above lmax
+    sky = sky_from_file(path, 10.0, 47)
+    assert sky.mean_temperature == pytest.approx(expected.mean(), rel=1e-6)
+
+
+def test_a_point_source_shines_where_it_is():
+    # the band-limited image of a source peaks at its position with K sr (lmax + 1)^2 / 4 pi
+    lmax, source = 40, BRIGHT_SOURCES[0]
+    modes = source.modes(25.0, lmax)
+    l_deg, b_deg = source.galactic()
+    at = synthesis_matrix(np.radians([90 - b_deg, 80 - b_deg]), np.radians([l_deg] * 2), lmax)
+    values = at @ modes
+    flux = source.kelvin_steradian(25.0)
+    assert values[0] == pytest.approx(flux * (lmax + 1) ** 2 / (4 * np.pi), rel=1e-12)
+    assert abs(values[1]) < 0.1 * values[0]
+    # its integral over the sky is its flux
+    assert modes[0] * np.sqrt(4 * np.pi) == pytest.approx(flux, rel=1e-12)
+
+
+def test_sources_are_added_to_the_galaxy():
+    with_sources, without = galaxy_sky(25.0, 8), galaxy_sky(25.0, 8, sources=())
+    added = sum(source.modes(25.0, 8) for source in BRIGHT_SOURCES)
+    # the difference of numbers 1e5 times larger: rounding of the larger ones
+    np.testing.assert_allclose(
+        np.asarray(with_sources.modes) - np.asarray(without.modes), added, atol=1e-9
+    )
+
+
+def write_fits(path, pixels, unit="K", **keywords):
+    keywords = {"coord": "G"} | keywords
+    healpy.write_map(path, pixels, dtype=np.float64, column_units=unit, **keywords)
+
+
+def write_hdf5(path, **arrays):
+    with h5py.File(path, "w") as file:
+        file.update(arrays)
+
+
+def with_one(pixels, value):
+    return np.where(np.arange(pixels.size) == 7, value, pixels)
+
+
+BAD_MAPS = [
+    ("ORDERING is NESTED, expected RING", lambda to, x: write_fits(to, x, nest=True)),
+    ("COORDSYS is C, expected G", lambda to, x: write_fits(to, x, coord="C")),
+    ("NaN or infinity: nan at .7", lambda to, x: write_fits(to, with_one(x, np.nan))),
+    ("1 of 3072 pixels are UNSEEN", lambda to, x: write_fits(to, with_one(x, healpy.UNSEEN))),
+    ("unit is 'Jy', expected a temperature", lambda to, x: write_fits(to, x, "Jy")),
+    ("neither HDF5 nor FITS", lambda to, x: to.write_text("not a map")),
+    ("did you mean 'smooth_absorp'", lambda to, x: write_hdf5(to, smooth_absorp=x)),
+    ("not a HEALPix map", lambda to, x: write_hdf5(to, smooth_absorb=x[:-1])),
+]
+
+
+@pytest.mark.parametrize(("words", "make"), BAD_MAPS, ids=lambda one: str(one)[:20])
+def test_bad_maps_are_refused_in_one_sentence(tmp_path, pixels, make, words):
+    make(tmp_path / "map.fits", pixels)
+    with refused(words):
+        read_sky_file(tmp_path / "map.fits")
+
+
+def test_millikelvin_are_converted_and_lmax_has_to_fit(tmp_path, pixels):
+    path = tmp_path / "map.fits"
+    write_fits(path, pixels, "mK")
+    np.testing.assert_allclose(read_sky_file(path).pixels, pixels / 1e3, rtol=1e-14)
+    with refused("lmax = 48 is too large for a map of NSIDE 16"):
+        sky_from_file(path, 10.0, 48)
+
+
+CUBE_NSIDE = 8
+
+
+def write_cube(path, maps, start=1, end=None, step=1):
+    """The cards of ULSA_32_ddi_smooth.fits: integers, two of them beyond eight letters."""
+    hdu = fits.PrimaryHDU(maps)
+    hdu.header["HIERARCH FREQ_START"] = start
+    hdu.header["FREQ_END"] = start + step * (len(maps) - 1) if end is None else end
+    hdu.header["HIERARCH FREQ_STEP"] = step
+    hdu.header["NSIDE"] = CUBE_NSIDE
+    hdu.header["TYPE"] = "ulsa"
+    hdu.writeto(path)
+    return path
+
+
+@pytest.fixture
+def maps():
+    """Power laws of two indices, one for each half of the pixels."""
+    rng = np.random.default_rng(5)
+    at_one = 1e6 * (1.0 + rng.random(12 * CUBE_NSIDE**2))
+    index = np.where(np.arange(at_one.size) % 2, -2.5, -2.1)
+    return at_one * np.arange(1.0, 51.0)[:, None] ** index
+
+
+def test_fifty_maps_and_what_is_between_them(tmp_path, maps):
+    cube = SkyCube.read(write_cube(tmp_path / "ULSA_32_ddi_smooth.fits", maps))
+    np.testing.assert_array_equal(cube.frequencies_mhz, np.arange(1.0, 51.0))
+    np.testing.assert_array_equal(cube.map_at(25.0), maps[24])
+    np.testing.assert_array_equal(cube.map_at(50.0), maps[49])
+    index = np.where(np.arange(maps.shape[1]) % 2, -2.5, -2.1)
+    np.testing.assert_allclose(cube.map_at(7.3), maps[0] * 7.3**index, rtol=1e-13)
+
+
+def test_a_scenario_with_a_cube(tmp_path, maps):
+    path = write_cube(tmp_path / "cube.fits", maps)
+    scenario = lb.load_scenario("fiducial", ["lmax=4", f"sky.file={path}"])
+    sky = scenario.sky.source().at(scenario.frequency_mhz, scenario.lmax)
+    one = tmp_path / "one.fits"
+    healpy.write_map(one, maps[24], dtype=np.float64, column_units="K", coord="G")
+    np.testing.assert_array_equal(sky.modes, sky_from_file(one, 25.0, 4).modes)
+    # one of its maps, scaled
+    scaled = sky_from_file(path, 25.0, 4, file_frequency_mhz=10.0, spectral_index=-2.0)
+    ten = sky_from_file(path, 10.0, 4)
+    np.testing.assert_allclose(scaled.modes, ten.modes * 2.5**-2.0, rtol=1e-13)
+    assert "50 HEALPix sky maps, NSIDE 8" in describe(path)
+    assert "1 to 50 MHz" in describe(path)
+
+
+def test_cubes_that_cannot_be_used(tmp_path, maps):
+    cube = SkyCube.read(write_cube(tmp_path / "cube.fits", maps))
+    with refused("from 1 to 50 MHz, not at 50.5; set sky.file_freq"):
+        cube.map_at(50.5)
+    with refused("expected 60 maps for 1 to 60 MHz in steps of 1"):
+        SkyCube.read(write_cube(tmp_path / "long.fits", maps, end=60))
+    with refused("767 values are not a HEALPix map"):
+        SkyCube.read(write_cube(tmp_path / "odd.fits", maps[:, :-1]))
+    with refused("is this Hz"):
+        SkyCube.read(write_cube(tmp_path / "hz.fits", maps, start=1e6, step=1e6))
+    for unit, factor in (("mK", 1e-3), ("K", 1.0)):
+        path = write_cube(tmp_path / f"{unit}.fits", maps)
+        fits.setval(path, "BUNIT", value=unit)
+        np.testing.assert_allclose(SkyCube.read(path).pixels, factor * maps, rtol=1e-15)
+    fits.setval(path, "BUNIT", value="MJy/sr")
+    with refused("unit 'MJy/sr'"):
+        SkyCube.read(path)
+    holes = maps.copy()
+    holes[3, 5] = np.nan
+    with refused("NaN or infinity"):
+        SkyCube.read(write_cube(tmp_path / "holes.fits", holes))
+    negative = maps.copy()
+    negative[9, 5] = -1.0
+    cube = SkyCube.read(write_cube(tmp_path / "negative.fits", negative))
+    assert cube.map_at(10.0)[5] == -1.0
+    with refused("not positive at 9 or 10 MHz"):
+        cube.map_at(9.5)
+    path = tmp_path / "cube.fits"
+    path.write_bytes(path.read_bytes()[:10_000])
+    with refused("cut short"):
+        sky_from_file(path, 25.0, 4)
+
+
+# --- coefficients -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def coefficients():
+    return np.random.default_rng(6).standard_normal(81)
+
+
+def test_coefficients_through_healpy_bit_by_bit(tmp_path, coefficients):
+    modes = coefficients
+    path = write_alms(tmp_path / "alm.fits", modes, {"FREQ": 25.0})
+    ours = from_healpy(healpy.read_alm(path))
+    # sqrt(2) there and back again
+    np.testing.assert_allclose(ours, modes, rtol=4e-16)
+    np.testing.assert_array_equal(SkyAlms.read(path).modes[0], ours)
+    np.testing.assert_array_equal(sky_from_file(path, 25.0, 8).modes, ours)
+    # healpy's own file, and fewer coefficients than it has
+    theirs = tmp_path / "healpy.fits"
+    alm = healpy.map2alm(modes_to_map(modes, 16), lmax=8, iter=10)
+    healpy.write_alm(theirs, alm, out_dtype=np.float64)
+    np.testing.assert_array_equal(sky_from_file(theirs, 25.0, 5).modes, from_healpy(alm)[:36])
+    assert "coefficients of one sky up to ell = 8" in describe(theirs)
+
+
+def test_luseepys_coefficients_of_many_frequencies(test_data):
+    path = test_data / "luseepy" / "sky_alm.npz"
+    sky = sky_from_file(path, 25.0, 47)
+    with np.load(path) as file:
+        np.testing.assert_array_equal(sky.modes, from_healpy(file["alm"][4]))
+    with refused(r"no coefficients at 12 MHz \(it has 5, 10, 15"):
+        sky_from_file(path, 12.0, 47)
+    scaled = sky_from_file(path, 12.0, 47, file_frequency_mhz=10.0)
+    ten = sky_from_file(path, 10.0, 47)
+    np.testing.assert_allclose(scaled.modes, ten.modes * 1.2**-2.5, rtol=1e-13)
+    assert "coefficients of 10 skies up to ell = 47, 5, 10" in describe(path)
+
+
+def test_coefficients_that_cannot_be_used(tmp_path, coefficients):
+    path = write_alms(tmp_path / "alm.fits", coefficients, {})
+    with refused("up to ell = 8, not up to 9"):
+        sky_from_file(path, 25.0, 9)
+    with fits.open(path) as hdus:
+        table = hdus[1].data
+        fits.BinTableHDU(table[:-1], name="ALM").writeto(tmp_path / "short.fits")
+        bad = table.copy()
+        bad["index"][3] = 2  # ell = 1, m = -1
+        fits.BinTableHDU(bad, name="ALM").writeto(tmp_path / "negative.fits")
+    with refused("1 coefficients up to ell = 8 are missing"):
+        SkyAlms.read(tmp_path / "short.fits")
+    with refused("0 <= m <= ell"):
+        SkyAlms.read(tmp_path / "negative.fits")
+    np.savez(tmp_path / "a.npz", alm=np.zeros((2, 45), complex))
+    with refused(r"no freq \(it has alm\)"):
+        SkyAlms.read(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", alm=np.zeros((2, 44), complex), freq=[1.0, 2.0])
+    with refused("alm has 44 coefficients"):
+        SkyAlms.read(tmp_path / "b.npz")
+    (tmp_path / "c.npz").write_text("nothing")
+    with refused("cannot be read as coefficients"):
+        SkyAlms.read(tmp_path / "c.npz")

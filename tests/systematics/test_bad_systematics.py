@@ -42,54 +42,6 @@ def experiment(*overrides: str) -> lb.Experiment:
 # --- in the scenario ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (
-            ["sources.list=[{name: Cas A}, {name: Vir A}, {name: Cas A}]"],
-            "source 'Cas A' is there twice",
-        ),
-        (["sky.sources=true", CAS_A], "set sky.sources=false"),
-        (["sources.list=[{name: X, ra_deg: 10}]"], "give both ra_deg and dec_deg, or none"),
-        (["sources.list=[{name: X, dec_deg: 10}]"], "give both ra_deg and dec_deg, or none"),
-        (["sources.list=[{name: X, ra_deg: 10, dec_deg: 91}]"], "sources.list.0.dec_deg is 91,"),
-        (["sources.list=[{name: Cas A, stokes_v: 1.5}]"], "sources.list.0.stokes_v is 1.5, but"),
-        (["sources.list=[{name: Cas A, stokes_v: -1.01}]"], "stokes_v is -1.01, but .*greater"),
-        (["sources.list=[{name: Cas A, flux_jy: 0}]"], "flux_jy is 0, but .*greater than 0"),
-        (["sources.list=[{name: Cas A, relative_std: -1}]"], "relative_std is -1, but .*greater"),
-        (["sources.list=[{name: Cas A, block_h: 0}]"], "block_h is 0, but .*greater than 0"),
-        (["sources.list=[{name: Cas A, flux: 3}]"], "did you mean 'flux_jy'?"),
-        (["sources.list=[{flux_jy: 3}]"], "sources.list.0.name is missing"),
-        (["sources.treatment=[marginalised, sampled]"], r"sources.treatment is \['marginalised',"),
-        (["noise.gain.treatment=[marginalised, sampled]"], r"noise.gain.treatment is"),
-        (
-            ["noise.beam={shift_mhz: 4, treatment: [marginalised, sampled]}"],
-            r"noise.beam.treatment is \['marginalised', 'sampled'\], but .*'sampled' or 'ignored'",
-        ),
-        (["noise.gain.log_sigma_std=0.5"], "log_sigma_std .* need treatment 'sampled'"),
-        (
-            ["noise.gain={log_correlation_std: 0.5, treatment: marginalised}"],
-            "log_correlation_std need treatment 'sampled'",
-        ),
-        (
-            ["noise.gain={log_correlation_std: 1.5, treatment: sampled}"],
-            "log_correlation_std is 1.5",
-        ),
-        (["prior.band_edges=[3, 3]"], "band_edges must grow from one to the next"),
-        (["prior.band_edges=[4, 2]"], "band_edges must grow from one to the next"),
-        (["prior.band_edges=[0, 2]"], "band_edges.0 is 0, but .*greater than or equal to 1"),
-        (["prior.band_edges=[2, 4]", "prior.tilt_std=0.5"], "give either band_edges or"),
-        (["prior={band_edges: [2, 4], log_amplitude_std: 0.5}"], "give either band_edges or"),
-        (["prior.tilt_std=0"], "prior.tilt_std is 0, but .*greater than 0"),
-        (["noise.radiometer.log_factor_std=-1"], "log_factor_std is -1, but .*greater than 0"),
-        (["noise.beam.parameters={length_m: 0}"], "length_m is 0, but .*greater than 0"),
-    ],
-)
-def test_scenarios_that_contradict_themselves(overrides, message):
-    with refused(message):
-        lb.load_scenario("fiducial", ["sky.sources=false", *overrides])
-
-
 # --- sources --------------------------------------------------------------------------------------
 
 

@@ -1,10 +1,11 @@
-"""Levels and spectra that are not known, and the general program, against hand-made densities.
+"""Levels and spectra that are not known, noise of one's own kind, and the general program.
 
 Small dense models against scipy; a scenario's own, of condition 1e12, against decimal arithmetic.
 """
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from assertions import within
 from experiments import density, program_arguments, small_experiment
 from numpyro import handlers
 from numpyro.infer import init_to_median
-from reference_linear import exact_posterior, random_covariance
+from reference_linear import random_covariance
 from scipy.stats import lognorm, multivariate_normal, norm
 
 import lusee_bayes as lb
@@ -20,11 +21,17 @@ from lusee_bayes.experiment.model import full_model, model_to_sample, radiometer
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.sky_terms import point_sources
 from lusee_bayes.experiment.term import Around
+from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise.instrument_errors import difference
-from lusee_bayes.sampling.programs import latent_sites, numpyro_promotion
+from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.systematics.instrument_unknowns import NoiseLevel
 from lusee_bayes.systematics.sky_unknowns import PointSources, PowerSpectrum, Source, SpectrumBands
-from lusee_bayes.systematics.systematic import Marginalised, uncertain_scale
+from lusee_bayes.systematics.systematic import (
+    MOST_COLLAPSED,
+    AdditiveNoise,
+    Marginalised,
+    uncertain_scale,
+)
 
 LMAX, N_DATA = 4, 40
 ELLS = np.arange(LMAX + 1)
@@ -216,39 +223,6 @@ def matrices(setup: Setup):
     )
 
 
-@pytest.mark.long
-def test_all_that_a_scenario_samples():
-    """d ~ N(T f, (A + b dA) S (A + b dA)^T + level N_0), for values far from the medians."""
-    e = small_experiment(*ALL)
-    setup, data, program = e.setup, e.data, lb.load_program("systematics")
-    arguments = program_arguments(program, e)
-    latent = latent_sites(program.model, arguments)
-    sites = ["noise_level", "band_power", "beam_amplitude", "flux_Cas_A", "flux_For_A"]
-    assert latent == sites
-    a, da, s, n = matrices(setup)
-    sources = point_sources(setup).sources
-    t = np.stack([np.asarray(r).reshape(-1) for r in setup.responses], axis=1)
-    level, power, amplitude = 1.8, np.array([0.7, 2.2, 0.9]), -0.6
-    flux = np.array([source.mean + 0.7 * source.std for source in sources])
-    s = s * np.repeat(power, [4, 21, 24])
-    d = np.asarray(data.data) - t @ flux
-    expected = exact_posterior(a + amplitude * da, s, np.diag(level * n), d).log_prob
-    expected += lognorm.logpdf(level, 0.5) + lognorm.logpdf(power, 0.8).sum()
-    expected += norm.logpdf(amplitude) + norm.logpdf(0.7) * 2
-    expected -= sum(np.log(source.std) for source in sources)
-    values = {
-        "noise_level": level,
-        "band_power": power,
-        "beam_amplitude": amplitude,
-        "flux_Cas_A": flux[0],
-        "flux_For_A": flux[1],
-    }
-    got, _ = density(program, arguments, values)
-    # 49 logarithms of squeezed modes with 1e-6 each, and chi^2 of which A, by two compilations,
-    # has its share of rounding: 1e-13 of 2e4 K against 0.2 K
-    assert got == pytest.approx(expected, rel=1e-8, abs=1e-4)
-
-
 def test_the_level_is_that_of_the_radiometer_only():
     """A sampled noise level leaves a marginalised beam error as it is, and marginalised sources."""
     sources = ALL[4].replace("sampled", "marginalised")
@@ -276,3 +250,102 @@ def test_the_level_is_that_of_the_radiometer_only():
     within(full_model(setup).noise.dense(), plain, 1e-13 * term.max())
     # and in simulated data it is the drawn one
     assert set(true_values(setup)) == {"noise_level", "beam_amplitude", "flux_Cas_A", "flux_For_A"}
+
+
+N_PRODUCTS, N_TIMES, N_MODES = 4, 20, 9
+
+
+class Pickup(AdditiveNoise):
+    """Known patterns with unknown amplitudes."""
+
+    patterns: jax.Array
+
+    def covariance(self) -> lb.Covariance:
+        return lb.LowRankCovariance(self.patterns, "the pickup")
+
+
+class Correlated(AdditiveNoise):
+    """Noise that lasts a while, of every product by itself."""
+
+    hours: jax.Array
+
+    def covariance(self) -> lb.Covariance:
+        lag = self.hours[:, None] - self.hours[None]
+        kernel = jnp.exp(-jnp.abs(lag) / 3.0)
+        return lb.DenseCovariance(jnp.kron(jnp.eye(self.layout.n_products), kernel), "the hum")
+
+
+@pytest.fixture(scope="module")
+def model():
+    rng = np.random.default_rng(0)
+    return lb.LinearGaussian(
+        jnp.asarray(rng.normal(size=(N_PRODUCTS * N_TIMES, N_MODES))),
+        lb.HarmonicPrior(jnp.ones(3)),
+        lb.DiagonalCovariance(jnp.full(N_PRODUCTS * N_TIMES, 0.1)),
+    )
+
+
+def terms():
+    layout = DataLayout(N_PRODUCTS, N_TIMES)
+    patterns = np.random.default_rng(1).normal(size=(layout.size, 2))
+    return [
+        Pickup("pickup", layout, jnp.asarray(patterns)),
+        Correlated("hum", layout, jnp.arange(float(N_TIMES))),
+    ]
+
+
+@pytest.mark.parametrize("term", terms(), ids=lambda term: term.name)
+def test_marginalised_and_sampled_are_one_distribution(model, term):
+    """The offset is linear in the site's normals, with the covariance that N is given."""
+    dense = np.asarray(term.covariance().dense())
+    added = np.asarray(term.marginalised(model).noise.dense() - model.noise.dense())
+    np.testing.assert_allclose(added, dense, rtol=0, atol=1e-13)
+    rank = term.covariance().rank
+
+    def offset(z):
+        with handlers.seed(rng_seed=0), handlers.substitute(data={f"{term.name}_noise": z}):
+            return term.sampled(model).offset
+
+    with handlers.seed(rng_seed=0), handlers.trace() as trace:
+        term.sampled(model)
+    fn = trace[f"{term.name}_noise"]["fn"]
+    z = jnp.arange(float(rank))
+    expected = -0.5 * (z**2).sum() - 0.5 * rank * np.log(2.0 * np.pi)
+    assert float(fn.log_prob(z)) == pytest.approx(float(expected), rel=1e-13)
+    root = np.asarray(jax.jit(jax.jacfwd(offset))(jnp.zeros(rank)))
+    np.testing.assert_allclose(root @ root.T, dense, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(offset(jnp.zeros(rank)), 0.0)
+    assert term.needs_sky == (rank > MOST_COLLAPSED)
+    assert not term.changes_coupling
+
+
+def test_sampled_noise_is_added_to_what_is_there(model):
+    background = jnp.arange(float(model.n_data))
+    given = lb.LinearGaussian(model.coupling, model.prior, model.noise, background)
+    term = terms()[0]
+    with handlers.seed(rng_seed=0), handlers.trace() as trace:
+        sampled = term.sampled(given)
+    expected = background + term.patterns @ trace["pickup_noise"]["value"]
+    np.testing.assert_allclose(sampled.offset, expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("term", terms(), ids=lambda term: term.name)
+def test_simulated_data_hold_a_draw_of_it(term):
+    grid = jnp.ones((N_PRODUCTS, N_TIMES))
+    key = jax.random.key(3)
+    drawn = np.asarray(term.layout.gather(term.distort(grid, key) - grid))
+    np.testing.assert_allclose(drawn, term.covariance().sample(key), rtol=0, atol=1e-14)
+    # the covariance of 400 draws: each of 3240 entries within 5.5 of its standard errors
+    draws = np.asarray(term.covariance().sample(key, 400))
+    dense = np.asarray(term.covariance().dense())
+    error = np.sqrt((np.outer(np.diag(dense), np.diag(dense)) + dense**2) / 400)
+    assert np.abs((draws.T @ draws / 400 - dense) / error).max() < 5.5
+
+
+def test_samples_that_are_not_there_stay_as_they_are():
+    flags = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
+    flags[1, 3:5] = True
+    layout = DataLayout.from_flags(flags)
+    term = Pickup("pickup", layout, jnp.ones((layout.size, 1)))
+    changed = np.asarray(term.distort(jnp.zeros(flags.shape), jax.random.key(0)))
+    np.testing.assert_array_equal(changed == 0.0, flags)

@@ -8,10 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from arviz_stats.base import array_stats
 from experiments import density, program_arguments, small_experiment
 from jax.flatten_util import ravel_pytree
-from reference_linear import exact_posterior, z_of
+from reference_linear import exact_posterior
 from scipy.stats import lognorm, loguniform, norm, truncnorm, uniform
 
 import lusee_bayes as lb
@@ -71,42 +70,6 @@ def test_white_noise_makes_drifts_of_the_right_covariance():
         expected = 4e-4 * np.exp(-(lag**2) / (2 * correlation_h**2))
         cut = np.exp(-2 * (60.0 / correlation_h) ** 2)
         np.testing.assert_allclose(root.T @ root, expected, rtol=0, atol=4e-4 * (1e-14 + cut))
-
-
-def sampled(e, seed=3):
-    program, inference = lb.load_program("gains"), lb.infer(e)
-    posterior = inference.posterior
-    pieces = program.arguments(inference.model, program_pieces(e))
-    arguments = {**pieces, "data": e.data.data}
-    approximation = lb.laplace_approximation(program.model, arguments, {"sky": posterior.mean})
-    assert bool(approximation.converged)
-    sampler = lb.Sampler(draws=1500, seed=seed)
-    return lb.sample(program.model, arguments, sampler, approximation.whitening), posterior
-
-
-@pytest.mark.long
-def test_small_gains_marginalised_and_sampled_give_the_same_sky():
-    """sigma_g = 1e-3: mean and variance of every mode to Monte Carlo error.
-
-    What first order leaves out is of order sigma_g of an uncertainty: 1e-3 of a standard deviation,
-    a tenth of the Monte Carlo error of 6000 draws.
-    """
-    e = experiment(1e-3, "sampled", "posterior")
-    setup, data = e.setup, e.data
-    chains, posterior = sampled(e)
-    assert not chains.statistics["diverging"].any()
-    std = np.asarray(posterior.std())
-    z = (chains.sites["sky"] - np.asarray(posterior.mean)) / std
-    limit = z_of(2 * z.shape[-1])
-    for mode in range(z.shape[-1]):
-        for values, expected in [(z[..., mode], 0.0), (z[..., mode] ** 2, 1.0)]:
-            ess = array_stats.ess(values, chain_axis=0, draw_axis=1, method="mean")
-            off = (values.mean() - expected) / (values.std() / np.sqrt(ess))
-            assert abs(off) < limit, (mode, expected, off)
-    # and not the sky without gains: the test can tell
-    bare = lb.LinearGaussian(setup.coupling, setup.prior, radiometer(setup)).condition(data.data)
-    assert np.abs((np.asarray(bare.mean) - np.asarray(posterior.mean)) / std).max() > 1.0
-    assert (np.asarray(bare.std()) / std).min() < 0.8
 
 
 # --- coordinates for sky and gains together -------------------------------------------------------

@@ -1,4 +1,4 @@
-"""From a sky to counts and back: what was simulated is what the reduction finds."""
+"""Data of the spectrometer: from a sky to counts and back; maps of files and of data in kelvin."""
 
 from __future__ import annotations
 
@@ -6,22 +6,29 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from naive_flight import naive_band
 
+import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build, infer
-from lusee_bayes.experiment.flight_data import reduce_files, visibilities_of
+from lusee_bayes.experiment.flight_data import per_kelvin_of, reduce_files, visibilities_of
 from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.leave_out import without
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.scenario import load_scenario
+from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.flight.gain_model import synthetic_gains
 from lusee_bayes.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED
 from lusee_bayes.flight.session import CHANNEL_MHZ
 from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.flight.synthesis import Disturbances
-from lusee_bayes.instrument.products import all_products
+from lusee_bayes.instrument.products import all_products, auto_indices, labels
+from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.noise.radiometer import exact_blocks
+from lusee_bayes.results.unknowns import unknowns_report
 from lusee_bayes.runs.data_run import run_simulate_flight
+from lusee_bayes.testing.checks import assert_refused
 
 FREQUENCIES = [10.0, 25.0]
 SMALL = ["lmax=4", f"frequencies_mhz={FREQUENCIES}", "flight={per_kelvin_v2_hz: 1e-21}"]
@@ -253,14 +260,6 @@ def test_a_tone_that_no_bin_holds_is_refused():
         drawn(1003)
 
 
-@pytest.mark.parametrize(
-    "change", ["navgf=5", "levels=MMMX", "levels=MMM", "kind=netcdf", "saturated_share=0.9"]
-)
-def test_impossible_states_are_refused(change):
-    with pytest.raises(InputError):
-        load_scenario("fiducial", [*SMALL, "flight.simulated={}", f"flight.simulated.{change}"])
-
-
 def test_gains_are_off_as_they_are_said_to_be(tmp_path):
     """By the table the values are those of gains that are off by what the truth says."""
     off = "flight.gain_std=0.02", "flight.component_std=[0.01, 0.02]", "noise.gain_table={}"
@@ -292,3 +291,140 @@ def test_gains_are_off_as_they_are_said_to_be(tmp_path):
         found = sum(z[name] * slope[name] for name in names)
         # the mean of log(f / 20 MHz) / 5 over the band is 1e-4 below that in its middle
         np.testing.assert_allclose(found, eps[port, 0], rtol=0.0, atol=1e-5)
+
+
+NAMES = "abcd"
+
+
+@pytest.fixture(scope="module")
+def truth(flight):
+    return dict(np.load(flight / "truth.npz"))
+
+
+def scenario_of(flight, *changes):
+    luseepy = flight.parent / "luseepy"
+    given = [
+        "frequency_mhz=10.0",
+        "lmax=32",
+        "observation={timestamp: instant}",
+        f"beam={{model: response, file: {luseepy / 'synthetic_response_v3.fits'}, receiver: jfet, "
+        "moon_temperature_k: 250.0}",
+        f"sky={{model: file, file: {luseepy / 'sky_alm.npz'}}}",
+        "prior={model: isotropic, spectrum: sky}",
+        "noise={radiometer: {form: exact, temperature: measured}, "
+        "receiver: {power_v2_hz: 4.0e-20, relative_std: 0.1}}",
+        f"flight={{gain_table: {flight / 'gain'}, bin_origin: centre}}",
+    ]
+    return lb.load_scenario("fiducial", [*given, *changes])
+
+
+def files(flight):
+    return [flight / f"session_{name}.h5" for name in NAMES]
+
+
+@pytest.fixture(scope="module")
+def mapped(flight):
+    """One map of the four sessions, with everything that is done to them."""
+    scenario = scenario_of(flight)
+    experiment = build(scenario, read_data(files(flight), scenario))
+    return experiment, infer(experiment)
+
+
+def test_what_the_comb_spoils_and_nothing_else_is_left_out(mapped, truth):
+    """Of bins that hold four channels each, the comb is no line: only the others tell."""
+    experiment, _ = mapped
+    comb = [(s, int(r)) for s, r in truth["comb"] if s == "c"]
+    saturated = {(s, int(r)) for s, r in truth["saturated"]}
+    names = [(s, int(r)) for s, r in zip(truth["session"], truth["row"], strict=True)]
+    times = [name for name in names if name not in saturated]
+    flagged = [times[k] for k in np.flatnonzero(experiment.fitting.times)]
+    assert flagged == comb
+    assert "3 of 124 times" in experiment.fitting.remark
+
+
+def test_the_map_is_that_of_the_same_data_in_kelvin(flight, truth, mapped):
+    """Data that are made by hand, a sum for each product, and know nothing of sessions."""
+    _, found = mapped
+    per_kelvin = truth["per_kelvin_v2_hz"][0]
+    scale = np.sqrt([per_kelvin[int(x[0])] * per_kelvin[int(x[1])] for x in labels()])
+    bad = {(s, int(r)) for s, r in [*truth["comb"], *truth["saturated"]] if s == "c"}
+    names = [(s, int(r)) for s, r in zip(truth["session"], truth["row"], strict=True)]
+    keep = [k for k, name in enumerate(names) if name not in bad]
+    combs = [("d", 4), ("d", 5)]
+    made = [naive_band(flight, *names[k], 10.0, comb=names[k] in combs) for k in keep]
+    data = lb.Visibilities.from_arrays(
+        np.array([values for values, _ in made]) / scale,
+        truth["times_utc"][keep],
+        10.0,
+        products=list(labels()),
+        site=(float(truth["lon_deg"]), float(truth["lat_deg"])),
+        timestamp="instant",
+        step_s=float(truth["integration_s"]),
+    )
+    # how many samples there are is not said by times
+    data = replace(data, calibration=Calibration(np.array([n for _, n in made])))
+    plain = scenario_of(flight, "flight.leave_out=false")
+    other = infer(build(plain, data)).posterior
+    std = np.asarray(other.std())
+    moved = (np.asarray(found.posterior.mean) - np.asarray(other.mean)) / std
+    assert np.abs(moved).max() < 0.01
+    np.testing.assert_allclose(np.asarray(found.posterior.std()), std, rtol=1e-3)
+
+
+def test_the_known_sky_is_within_the_error_bars(mapped):
+    experiment, found = mapped
+    sky = np.asarray(experiment.setup.sky.modes)
+    off = found.posterior.whiten(sky[None])[0]
+    # an isotropic prior of the sky's own C_ell: chi^2 of the modes scatters by sqrt(2 n)
+    n = len(off)
+    assert np.sum(off**2) == pytest.approx(n, abs=5.0 * np.sqrt(2.0 * n))
+    report = unknowns_report(experiment, found)
+    told = report.table.set_index("unknown")
+    truth_k = 4e-20 / per_kelvin_of(experiment.scenario)
+    for port in range(4):
+        row = told.loc[f"receiver_{port}_k"]
+        assert abs(row["value"] - truth_k[port]) < 5.0 * row["std"]
+        assert row["std"] < 0.1 * row["prior_std"]
+
+
+ASKED = [
+    ("flight.gain_table=null", "names no gain table"),
+    ("flight.bin_origin=null", "flight.bin_origin=centre"),
+    ("observation.timestamp=null", "observation.timestamp=middle"),
+    ("flight=null", "give it a section flight"),
+]
+
+
+@pytest.mark.parametrize(("change", "told"), ASKED)
+def test_what_files_leave_open_is_asked_for_by_name(flight, change, told):
+    scenario = scenario_of(flight, change)
+    with pytest.raises(InputError, match=told):
+        read_data(files(flight)[:1], scenario)
+
+
+def test_beams_have_to_know_volts(flight):
+    embedded = scenario_of(flight, "beam={model: monopole}", "noise.receiver=null")
+    with pytest.raises(InputError, match="these beams know no volts"):
+        read_data(files(flight)[:1], embedded)
+    volts = "flight.per_kelvin_v2_hz=5.0e-23"
+    said = scenario_of(flight, "beam={model: monopole}", "noise.receiver=null", volts)
+    data = read_data(files(flight)[:1], said)
+    autos = data.grid()[auto_indices()]
+    assert 1e5 < autos.min() < autos.max() < 2e5
+    assert_refused(lambda: read_data(files(flight)[:1], scenario_of(flight, volts)))
+
+
+def test_a_session_is_given_once_and_other_files_are_not_mixed(flight):
+    scenario = scenario_of(flight)
+    one = files(flight)[0]
+    assert_refused(lambda: reduce_files([one, one], scenario))
+    assert_refused(lambda: read_data([one, flight / "truth.npz"], scenario))
+
+
+def test_another_site_is_named(flight):
+    elsewhere = scenario_of(flight, "observation.lat_deg=-20.0")
+    data = read_data(files(flight)[:1], elsewhere)
+    with pytest.raises(InputError, match="use --set observation"):
+        set_up(elsewhere, data)
+    ours = scenario_of(flight, "observation.lat_deg=-20.0", "flight.site=scenario")
+    assert read_data(files(flight)[:1], ours).observation.lat_deg == -20.0

@@ -1,13 +1,28 @@
-"""Declared layouts: what is not as declared is said, and what is comes back in its own kind."""
+"""Files: layouts that are declared, HDF5 on which its library runs for ever or dies, and YAML."""
+
+import faulthandler
+import os
+import time
 
 import h5py
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from lusee_bayes.core import layouts
+from lusee_bayes.core import formats, layouts
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.formats import require_readable_hdf5
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
-from lusee_bayes.core.reading import read_arrays, read_json, read_table, require_file
+from lusee_bayes.core.reading import (
+    as_yaml,
+    parse_yaml,
+    read_arrays,
+    read_json,
+    read_table,
+    read_yaml,
+    require_file,
+)
 
 LAYOUT = Layout(
     "an example",
@@ -76,8 +91,6 @@ def test_what_no_memory_holds_is_not_read(tmp_path, monkeypatch):
 
 
 def test_pipes_and_folders_are_no_files(tmp_path):
-    import os
-
     os.mkfifo(tmp_path / "pipe")
     for path, message in ((tmp_path / "pipe", "neither a file"), (tmp_path, "is a folder")):
         with pytest.raises(InputError, match=message):
@@ -97,3 +110,86 @@ def test_tables_objects_and_arrays(tmp_path):
     np.save(tmp_path / "a.npz", np.ones(3))
     with pytest.raises(InputError, match="a.npz"):
         read_arrays(tmp_path / "a.npz.npy", Layout("arrays"))
+
+
+@pytest.fixture
+def path(tmp_path):
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file["data"] = np.arange(1000.0)
+        file["data"].attrs["unit"] = "K"
+    return tmp_path / "x.h5"
+
+
+def test_a_whole_file_is_readable(path):
+    require_readable_hdf5(path)
+
+
+def test_a_file_without_end_is_refused(path, monkeypatch):
+    monkeypatch.setattr(formats, "LIMIT_S", 0.2)
+    monkeypatch.setattr(formats, "_read_all", lambda path, size: time.sleep(60))
+    start = time.monotonic()
+    with pytest.raises(InputError, match="does not come to an end with it within 0.2 s"):
+        require_readable_hdf5(path)
+    assert time.monotonic() - start < 30
+
+
+def test_a_file_that_ends_the_process_is_refused(path, monkeypatch):
+    def end(path, size):
+        faulthandler.disable()  # of pytest, which would print where
+        os.abort()
+
+    monkeypatch.setattr(formats, "_read_all", end)
+    with pytest.raises(InputError, match="HDF5's library fails on it"):
+        require_readable_hdf5(path)
+
+
+TEXT = st.text(max_size=10)
+LEAVES = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(allow_nan=False), TEXT)
+TREES = st.recursive(
+    LEAVES,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(TEXT, inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=50, database=None, deadline=None, derandomize=True)
+@given(TREES)
+def test_what_is_written_comes_back(tree):
+    assert parse_yaml(as_yaml(tree), "the text") == tree
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e6", 1e6), ("-1E-3", -1e-3), ("010", 10), ("1:30", "1:30"), ("2027-02-30", "2027-02-30"),
+        ("2027-01-15T00:00:00Z", "2027-01-15T00:00:00Z"), (".5", 0.5), ("5.", 5.0), ("yes", "yes"),
+        ("true", True), ("~", None),
+    ],
+)  # fmt: skip
+def test_numbers_are_decimal_and_dates_are_text(text, value):
+    found = parse_yaml(text, "the text")
+    assert (type(found), found) == (type(value), value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: 1\nb: 2\na: 3", r"duplicate key \"a\".* \(line 3\)"),
+        ("[" * 500 + "]" * 500, "is not valid YAML"),
+        ("a: [1", "is not valid YAML"),
+        ("!!python/object:os.system {}", "is not valid YAML"),
+        ("a\0b", "is not valid YAML"),
+    ],
+)
+def test_what_is_not_valid_is_refused(text, message):
+    with pytest.raises(InputError, match=message):
+        parse_yaml(text, "the text")
+
+
+def test_files_are_utf8(tmp_path):
+    path = tmp_path / "x.yaml"
+    path.write_bytes("a: é".encode("latin-1"))
+    with pytest.raises(InputError, match=r"x.yaml cannot be read as a scenario: .*utf-8"):
+        read_yaml(path, "a scenario")
+    path.write_bytes(b"\xef\xbb\xbfa: 1")
+    assert read_yaml(path, "a scenario") == {"a": 1}

@@ -1,0 +1,133 @@
+"""What figures and pages are drawn with: Mollweide views, the beam of maps, warnings, ticks."""
+
+from __future__ import annotations
+
+import healpy
+import numpy as np
+import pytest
+from matplotlib.projections.geo import MollweideAxes
+
+from lusee_bayes.core.harmonics import map_to_modes, modes_to_map
+from lusee_bayes.report.figures.drawing import (
+    LEFT_AT_LMAX,
+    WIDTH,
+    number_of_tick,
+    shown,
+    taper,
+    taper_fwhm_deg,
+    unprojected,
+    view,
+)
+from lusee_bayes.results.draws import warnings_of
+
+
+def test_points_lie_where_matplotlib_puts_them():
+    transform = MollweideAxes.MollweideTransform(1)
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(-1.0, 1.0, (2, 4000))
+    inside = np.hypot(x, y) < 0.999
+    lon, lat = unprojected(x[inside], y[inside])
+    # matplotlib's longitude grows to the right; its ellipse is sqrt(2) times (2, 1)
+    theirs = transform.transform(np.radians(np.stack([-lon, lat], axis=1)))
+    # its own iteration for the latitude stops at 1e-3 radians
+    expected = np.sqrt(2.0) * np.stack([2.0 * x[inside], y[inside]], axis=1)
+    np.testing.assert_allclose(theirs, expected, atol=3e-3)
+
+
+def test_views_have_equal_areas():
+    """Mollweide keeps areas: the share of the ellipse above 30 degrees is that of the sphere."""
+    y = (np.arange(100_000) + 0.5) / 50_000.0 - 1.0
+    lat = unprojected(np.zeros_like(y), y)[1]
+    width = np.sqrt(1.0 - y**2)
+    share = width[lat > 30.0].sum() / width.sum()
+    np.testing.assert_allclose(share, (1.0 - np.sin(np.radians(30.0))) / 2.0, atol=1e-4)
+
+
+def test_a_map_of_longitude_and_latitude_comes_out_as_it_went_in():
+    nside = 64
+    lon, lat = healpy.pix2ang(nside, np.arange(12 * nside**2), lonlat=True)
+    seen = {
+        name: view(f)
+        for name, f in {
+            "x": np.cos(np.radians(lat)) * np.cos(np.radians(lon)),
+            "y": np.cos(np.radians(lat)) * np.sin(np.radians(lon)),
+            "z": np.sin(np.radians(lat)),
+        }.items()
+    }
+    middle, quarter = WIDTH // 4, WIDTH // 4
+    # the centre of the view is l = 0; halfway to the left l = 90 degrees; the top is the pole
+    np.testing.assert_allclose(seen["x"][middle, WIDTH // 2], 1.0, atol=2e-2)
+    np.testing.assert_allclose(seen["y"][middle, quarter], 1.0, atol=2e-2)
+    np.testing.assert_allclose(seen["z"][-1, WIDTH // 2], 1.0, atol=2e-2)
+    # a unit vector stays one, up to what bilinear interpolation loses
+    length = sum(v**2 for v in seen.values())
+    np.testing.assert_allclose(length, 1.0, atol=2e-3)
+
+
+@pytest.mark.parametrize("lmax", [1, 8, 47])
+def test_the_taper_is_healpys_gaussian_beam(lmax):
+    beam = healpy.gauss_beam(np.radians(taper_fwhm_deg(lmax)), lmax)
+    np.testing.assert_allclose(taper(lmax), beam, rtol=1e-12)
+    assert taper(lmax)[-1] == pytest.approx(LEFT_AT_LMAX)
+
+
+def test_a_sky_of_one_mode_is_shown():
+    np.testing.assert_allclose(taper(0), [1.0])
+    np.testing.assert_allclose(shown(np.array([2.0]), 4), 2.0 / np.sqrt(4.0 * np.pi))
+
+
+@pytest.mark.parametrize("lmax", [12, 47])
+def test_an_edge_has_no_rings(lmax):
+    # A belt of 10 on a sky of 1, |b| < 5 degrees. Cut at lmax it swings to both sides; seen
+    # through a positive beam it stays between 1 and 10. A tenth of the highest ell is left, so
+    # that a tenth of the swing is allowed.
+    pixels = np.ones(12 * 64**2)
+    lat = healpy.pix2ang(64, np.arange(pixels.size), lonlat=True)[1]
+    pixels[np.abs(lat) < 5.0] = 10.0
+    modes = map_to_modes(pixels, lmax)
+    swing = 1.0 - modes_to_map(modes, 64).min()
+    assert swing > 0.5
+    assert shown(modes, 64).min() > 1.0 - 0.1 * swing
+    # the mean is kept
+    assert shown(modes, 64).mean() == pytest.approx(pixels.mean(), rel=1e-3)
+
+
+GOOD = {"r_hat": [1.0, 1.005], "ess_bulk": [900.0, 800.0], "ess_tail": [700.0, 600.0]}
+SAMPLED = {"chains": 4, "draws": 500, "divergences": 0}
+
+
+def warned(sampling=None, **columns):
+    table = {name: np.array(values) for name, values in (GOOD | columns).items()}
+    names = np.array(["T(centre) [K]", "C_5 [K2]"])
+    return warnings_of({"quantity": names, **table}, SAMPLED | (sampling or {}))
+
+
+def test_good_draws_are_not_warned_of():
+    assert warned() == []
+    # what too few draws cannot tell is no reason
+    assert warned(r_hat=[np.nan, np.nan]) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"r_hat": [1.002, 1.09]}, ("Not converged", "(1.090)")),
+        ({"r_hat": [np.inf, 1.0]}, ("Not converged", "(inf)")),
+        ({"r_hat": [1.002, 1.03]}, ("R-hat", "1 of 2", "C_5 [K2] (1.030)", "--draws")),
+        ({"ess_bulk": [399.0, 900.0]}, ("bulk", "below 400", "T(centre) [K] (399)")),
+        ({"ess_tail": [399.0, 12.0]}, ("tail", "2 of 2", "C_5 [K2] (12)")),
+        ({"sampling": {"divergences": 3}}, ("3 trajectories diverged", "--warmup")),
+    ],
+)
+def test_every_warning_has_its_reason(change, words):
+    (found,) = warned(**change)
+    assert all(word in found for word in words)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0"), (12500.0, "12,500"), (0.25, "0.25"), (1.5e10, "1.5e10"), (-2e-5, "-2e-5")],
+)
+def test_ticks_are_short(value, text):
+    assert number_of_tick(value) == text
+    assert float(text.replace(",", "")) == value
