@@ -18,7 +18,7 @@ from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.term import Around
 from lusee_bayes.sampling.hmc import WHITE_SUFFIX, whitened
 from lusee_bayes.sampling.programs import Program, latent_sites, numpyro_promotion
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 # nothing of these enters a setup (test_experiment.py checks it), only the data and N; the mean of
 # noise.receiver does

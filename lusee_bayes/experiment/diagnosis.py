@@ -44,7 +44,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.chi2 import WIDER, ChiSquare, expected_chi2, stands_out, two_sided, with_sky
 from lusee_bayes.judge.residuals import Residuals
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import HarmonicPrior
 

@@ -25,7 +25,7 @@ from lusee_bayes.experiment.term import Around, Truth, noise_visibilities, radio
 from lusee_bayes.experiment.terms import TERMS
 from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance
 from lusee_bayes.noise.radiometer import radiometer_noise
 from lusee_bayes.systematics.systematic import Marginalised, Systematic

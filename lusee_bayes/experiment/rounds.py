@@ -38,7 +38,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.measures import data_freedom
 from lusee_bayes.linear.amplitudes import template_amplitudes, weighted_residual
 from lusee_bayes.linear.information import Information, integrated_out
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.priors.learning import Learned, learn_whatever_fits

@@ -69,7 +69,7 @@ from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.core.linalg import cholesky, inverse_from_cholesky, solve_lower
 from lusee_bayes.instrument.coupling import CouplingMatrix, turned_about_pole
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.normal_matrix import summed
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import Covariance, LowRankUpdate

@@ -29,7 +29,7 @@ from lusee_bayes.core.arrays import Array, DataVector, Modes, ModesMatrix, Pixel
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.judge.coverage import latitudes, multipoles
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 
 # directions of the sky that are seen at once, and entries of A up to which it is made a matrix:

@@ -43,7 +43,7 @@ from lusee_bayes.judge.left_out import (
     StructuredLeftOut,
     base_and_templates,
 )
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 
 # a larger A is not formed, and its groups of data are not judged: 60,000 data at lmax 47

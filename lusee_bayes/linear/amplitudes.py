@@ -49,7 +49,7 @@ from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 
 

@@ -238,13 +238,13 @@ def solve_directly(
     for channel, information in enumerate(channels):
         if channel >= prior.n_channels:
             raise InputError(f"there are more channels than the prior's {prior.n_channels}")
-        sums, count = summed(sums, prior, channel, information), channel + 1
+        sums, count = summed_information(sums, prior, channel, information), channel + 1
     if count != prior.n_channels:
         raise InputError(f"there are {count} channels, the prior is for {prior.n_channels}")
     return component_posterior(sums.information(), prior)
 
 
-def summed(
+def summed_information(
     sums: ComponentSums, prior: SpectralPrior, channel: int, information: Information
 ) -> ComponentSums:
     """Add a channel to the sums.

@@ -91,7 +91,7 @@ class ChannelsInMemory:
         """What a function of every channel's information says of the component maps."""
         sums = joint.ComponentSums.empty(prior, reference)
         for k, information in enumerate(self.informations):
-            sums = joint.summed(sums, prior, k, function(k, information))
+            sums = joint.summed_information(sums, prior, k, function(k, information))
         return sums.information()
 
 

@@ -29,7 +29,7 @@ from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.judge.chi2 import LEVELS, RULE, effective_resolution_deg
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.linear.amplitudes import template_amplitudes
-from lusee_bayes.linear.model import composed, deviation_model
+from lusee_bayes.linear.linear_gaussian import composed, deviation_model
 from lusee_bayes.results.channel import ChannelResult, channel_of_posterior
 from lusee_bayes.results.diagnostics import diagnostics
 from lusee_bayes.results.saved import JUDGED

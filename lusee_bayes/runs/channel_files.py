@@ -29,7 +29,7 @@ from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.judge.chi2 import ChiSquare, Split
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.joint import ComponentSums, summed
+from lusee_bayes.linear.joint import ComponentSums, summed_information
 from lusee_bayes.results.channel import Observed
 from lusee_bayes.results.unknowns import Unknowns
 from lusee_bayes.sky.spectral_prior import SpectralPrior
@@ -202,7 +202,7 @@ class ChannelsInFiles:
         found = self.engine.each(tasks, self.stages, "joint sums")
         return {name: np.stack([np.asarray(one[name]) for one in found]) for name in shapes}
 
-    def summed(
+    def summed_information(
         self,
         prior: SpectralPrior,
         reference: Float[np.ndarray, "channels modes"],
@@ -215,7 +215,7 @@ class ChannelsInFiles:
             sums = ComponentSums.empty(prior, reference)
             for number in numbers:
                 information = function(number, _information(files, channels[number]))
-                sums = summed(sums, prior, number, information)
+                sums = summed_information(sums, prior, number, information)
             return on_host(sums)
 
         # the same blocks, and the same tree of them, whatever carries out the tasks

@@ -23,8 +23,8 @@ from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import (
     SCENARIO,
     Output,
-    Run,
     RunKind,
+    RunOutcome,
     json_file,
     require_marginal,
     require_single_frequency,
@@ -41,7 +41,7 @@ def run_compare(
     *,
     replace: bool = False,
     stages: Stages | None = None,
-) -> Run[list[FinishedRun]]:
+) -> RunOutcome[list[FinishedRun]]:
     """Set finished map runs side by side, and write page, table and figures in one transaction.
 
     Parameters
@@ -90,7 +90,7 @@ def run_compare_priors(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> Run[PriorComparison]:
+) -> RunOutcome[PriorComparison]:
     """Map one data set under several priors, and say which of them it prefers.
 
     A, N and the data are the same for all; what :func:`run_map` would find is found for each. The

@@ -142,7 +142,7 @@ class RunInterrupted(KeyboardInterrupt):
 
 
 @dataclass(frozen=True)
-class Run(Generic[Result]):
+class RunOutcome(Generic[Result]):
     """A finished run.
 
     Attributes
@@ -254,7 +254,7 @@ class RunFolder:
 
     def write(
         self, result: Result, stages: Stages, provenance: Provenance | None = None
-    ) -> Run[Result]:
+    ) -> RunOutcome[Result]:
         """Draw all figures and write all files of a run, in one transaction.
 
         Parameters
@@ -290,7 +290,7 @@ class RunFolder:
                     page = PAGES[kind.name](stage, folder.resolve().name)
                     _write_text(stage / REPORT, page)
             files = sorted(path.relative_to(stage) for path in stage.rglob("*") if path.is_file())
-        return Run(result, folder, [folder / name for name in files])
+        return RunOutcome(result, folder, [folder / name for name in files])
 
 
 @contextmanager

@@ -36,7 +36,7 @@ from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.judge.chi2 import effective_resolution_deg, prior_fraction_per_ell
 from lusee_bayes.linear.amplitudes import template_amplitudes
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation
 from lusee_bayes.runs.cost import duration

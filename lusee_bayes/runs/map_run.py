@@ -20,7 +20,7 @@ from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.flight_data import visibilities_of
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.flight.reduced import Reduced, write_reduced
-from lusee_bayes.report.figures import checks, maps
+from lusee_bayes.report.figures import judgement, maps
 from lusee_bayes.results.cube import CubeResult
 from lusee_bayes.results.diagnostics import write_diagnostics
 from lusee_bayes.results.finished_runs import Provenance
@@ -28,13 +28,13 @@ from lusee_bayes.results.map_files import cards, write_cube, write_map, write_po
 from lusee_bayes.results.map_result import MapResult, map_result
 from lusee_bayes.results.saved import REDUCED
 from lusee_bayes.runs.channel_files import CHANNELS
+from lusee_bayes.runs.channels import cube_result
 from lusee_bayes.runs.cost import measured_experiment, posterior_cost, require_fits
-from lusee_bayes.runs.cube import cube_result
 from lusee_bayes.runs.folder import (
     SCENARIO,
     Output,
-    Run,
     RunKind,
+    RunOutcome,
     json_file,
     require_marginal,
     require_single_frequency,
@@ -56,7 +56,7 @@ def run_map(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> Run[MapResult | CubeResult]:
+) -> RunOutcome[MapResult | CubeResult]:
     """Make a posterior map of a scenario, or of given data, and write its folder.
 
     The folder is written in one transaction. A run of several frequencies that was stopped goes on
@@ -194,8 +194,8 @@ SHARED = (
 )
 
 FLIGHT_FIGURES = {
-    "flight_time_line": lambda r: r.reduced and checks.time_line(r.reduced),
-    "flight_calibration": lambda r: r.reduced and checks.calibration(r.reduced),
+    "flight_time_line": lambda r: r.reduced and judgement.time_line(r.reduced),
+    "flight_calibration": lambda r: r.reduced and judgement.calibration(r.reduced),
 }
 
 # what the folder of a map holds; a new file is one line here
@@ -220,12 +220,12 @@ MAP = RunKind(
         "beams": lambda result: maps.beams(result.experiment.setup),
         "fidelity": lambda result: maps.map_fidelity(result.channel),
         "spectra": lambda result: maps.sky_spectra(result.channel),
-        "draws": lambda result: checks.draws_of_posterior(result.diagnostics),
-        "residuals": lambda result: checks.residuals_by_product(result.diagnostics),
+        "draws": lambda result: judgement.draws_of_posterior(result.diagnostics),
+        "residuals": lambda result: judgement.residuals_by_product(result.diagnostics),
         "pointing": lambda result: (
-            result.pointing and checks.pointing_by_day(result.pointing.preferred)
+            result.pointing and judgement.pointing_by_day(result.pointing.preferred)
         ),
-        "flight_waterfall": lambda r: r.reduced and checks.waterfall(r.reduced, r.band),
+        "flight_waterfall": lambda r: r.reduced and judgement.waterfall(r.reduced, r.band),
         **FLIGHT_FIGURES,
     },
 )
@@ -243,7 +243,7 @@ CUBE = RunKind(
         "spectra": maps.channel_spectra,
         "fidelity": maps.channel_fidelity,
         "chi2": maps.chi2,
-        "unknowns": lambda r: r.unknowns and checks.unknowns_by_frequency(r.unknowns),
+        "unknowns": lambda r: r.unknowns and judgement.unknowns_by_frequency(r.unknowns),
         **FLIGHT_FIGURES,
     },
     unfinished=CHANNELS,

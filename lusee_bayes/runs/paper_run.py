@@ -14,7 +14,7 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios, read_case
 from lusee_bayes.paper.claims import Cases, claim_table, claims_as_markdown
 from lusee_bayes.paper.figures import FIGURES
-from lusee_bayes.runs.folder import Output, Run, RunKind, rows_file, run_folder, text_file
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, rows_file, run_folder, text_file
 
 CASES, UNFINISHED = "cases", "unfinished-cases"
 
@@ -34,7 +34,7 @@ def run_paper(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> Run[Cases]:
+) -> RunOutcome[Cases]:
     """Compute what is missing of the paper's cases, then draw the figures and judge the claims.
 
     Cases that were computed before with the same scenario and version are kept. The folder changes
@@ -81,7 +81,7 @@ def run_paper(
         engine.each(Tasks(compute, names, names), stages, "cases")
         paths = {name: path_of(name) for name in names}
         cases = {name: read_case(path) for name, path in paths.items()}
-        return Run(cases, run.path, run.write(_Computed(cases, paths), stages).files)
+        return RunOutcome(cases, run.path, run.write(_Computed(cases, paths), stages).files)
 
 
 def _write_cases(computed: _Computed, folder: Path) -> None:

@@ -12,7 +12,7 @@ from lusee_bayes.core.reading import naming
 from lusee_bayes.report.figures.plans import forecasts
 from lusee_bayes.results.forecast import Forecast, Variation, forecast_rows
 from lusee_bayes.runs.cost import posterior_cost, require_fits
-from lusee_bayes.runs.folder import Run, RunKind, inputs_of, origin_of, rows_file, run_folder
+from lusee_bayes.runs.folder import RunKind, RunOutcome, inputs_of, origin_of, rows_file, run_folder
 from lusee_bayes.runs.forecasting import ForecastFiles, forecasts_of
 
 UNFINISHED = "unfinished-forecasts"
@@ -25,7 +25,7 @@ def run_plan(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> Run[list[Forecast]]:
+) -> RunOutcome[list[Forecast]]:
     """Forecast the information in every variation, and write table and figure in one transaction.
 
     A plan that was stopped goes on with the same call.

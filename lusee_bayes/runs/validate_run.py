@@ -14,9 +14,8 @@ from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.sample_result import CHAINS
 from lusee_bayes.results.validation_result import ValidationResult
 from lusee_bayes.runs.cost import demand_of, measured_experiment, posterior_cost
-from lusee_bayes.runs.folder import Output, Run, RunKind, json_file, text_file
-from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_folder
-from lusee_bayes.runs.sampling import sample_result
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, json_file, text_file
+from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_folder, sample_result
 from lusee_bayes.sampling.hmc import Sampler, require_draws, require_simulations
 from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.validation import BATCH, N_DRAWS, calibrate_sky, validate_draws
@@ -39,7 +38,7 @@ def run_validate(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> Run[ValidationResult]:
+) -> RunOutcome[ValidationResult]:
     """Check the analytic posterior of a scenario by HMC and by simulated data sets.
 
     The folder is written in one transaction.

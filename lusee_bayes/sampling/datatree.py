@@ -17,7 +17,7 @@ from lusee_bayes.core.harmonics import lmax_of, mode_numbers
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import reading, require_file
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling.hmc import Chains
 from lusee_bayes.sampling.programs import Program, collapsed_draws, is_collapsed, numpyro_promotion

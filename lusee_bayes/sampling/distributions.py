@@ -24,7 +24,7 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, Factor
 from lusee_bayes.sky.prior import Prior
 

@@ -17,7 +17,7 @@ from numpyro.infer.util import log_density
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.sampling.datatree import DATA
 from lusee_bayes.sampling.hmc import WHITE_SUFFIX
 from lusee_bayes.sampling.programs import Program, numpyro_promotion, traced

@@ -28,7 +28,7 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.reading import read_text, require_file
 from lusee_bayes.core.version import printable
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.sampling.distributions import Prediction
 
 

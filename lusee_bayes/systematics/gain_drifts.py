@@ -13,7 +13,7 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.instrument_errors import GainDrift, white_grid, with_gains
 from lusee_bayes.systematics.systematic import (
     SKY,

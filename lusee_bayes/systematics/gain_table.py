@@ -36,7 +36,7 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.instrument.products import DataLayout, ports
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankCovariance
 from lusee_bayes.systematics.systematic import Expanded, Systematic, multiplied, with_added
 

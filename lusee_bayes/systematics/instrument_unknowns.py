@@ -26,7 +26,7 @@ from lusee_bayes.instrument.beams.monopoles import parameter
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
 from lusee_bayes.instrument.instrument import Instrument
 from lusee_bayes.instrument.pointing import turned_by_offsets
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankCovariance
 from lusee_bayes.noise.instrument_errors import beam_error_noise, derivative
 from lusee_bayes.systematics.systematic import (

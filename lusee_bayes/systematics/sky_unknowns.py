@@ -18,7 +18,7 @@ from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.checks import require_finite, require_positive, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import dist, numpyro
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankCovariance
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.systematic import (

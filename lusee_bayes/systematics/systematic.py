@@ -27,7 +27,7 @@ from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, LowRankCovariance
 
 

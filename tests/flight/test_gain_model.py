@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.flight.gain_model import GainModel, read_gain_table, write_gain_table
-from lusee_bayes.testing.checks import assert_refused
+from lusee_bayes.testing.contracts import assert_refused
 
 ANCHORS = np.array([0.1, 1.1, 5.1, 10.1, 20.1, 30.1, 50.1, 70.1])
 TERMS = {

@@ -18,7 +18,7 @@ from lusee_bayes.core.harmonics import Rotation, n_modes, turn_about_z
 from lusee_bayes.instrument.coupling import BeamOperator, CouplingMatrix, DenseCoupling, as_coupling
 from lusee_bayes.instrument.products import DataLayout, auto_indices, labels, to_matrix
 from lusee_bayes.systematics.instrument_unknowns import BeamError, InstrumentParameters
-from lusee_bayes.testing.checks import check_coupling
+from lusee_bayes.testing.contracts import check_coupling
 
 LMAX = 8
 SITE = {"lon_deg": 182.258, "lat_deg": -23.814}

@@ -27,7 +27,7 @@ from lusee_bayes.instrument.beams.monopoles import (
 )
 from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.products import labels, to_matrix, to_real
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 VACUUM = physical_constants["characteristic impedance of vacuum"][0]
 LMAX, MOON = 47, 250.0

@@ -11,7 +11,7 @@ from lusee_bayes.core.arrays import on_device, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear import joint
 from lusee_bayes.linear.joint import channel_sky, paired, solve_directly
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.sky.spectral_prior import SpectralPrior

@@ -10,7 +10,7 @@ import pytest
 import lusee_bayes as lb
 from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
-from lusee_bayes.report.figures.checks import calibration
+from lusee_bayes.report.figures.judgement import calibration
 from lusee_bayes.report.sections import flight_section
 from lusee_bayes.runs.data_run import reduced_lines, run_simulate_flight
 

@@ -20,7 +20,7 @@ from lusee_bayes.experiment.sky_terms import point_sources
 from lusee_bayes.sampling.programs import latent_sites
 from lusee_bayes.systematics.sky_unknowns import Source, SpectrumBands
 from lusee_bayes.systematics.systematic import normal_within
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 CAS_A = "sources.list=[{name: Cas A}]"
 

@@ -34,7 +34,7 @@ from lusee_bayes.experiment.sky_terms import point_sources
 from lusee_bayes.experiment.term import Around
 from lusee_bayes.results.map_result import flux_table
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 # Cas A is up, For A has an amplitude for every two of the six samples, and the last lies near the
 # north pole of the Moon, 24 degrees below the horizon for ever
