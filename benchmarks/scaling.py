@@ -33,7 +33,7 @@ from lusee_bayes.experiment.experiment import inform
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.experiment.term import Around
-from lusee_bayes.linear.joint import ComponentSums, summed
+from lusee_bayes.linear.joint import ComponentSums, summed_information
 from lusee_bayes.linear.normal_matrix import normal_matrix
 from lusee_bayes.noise.radiometer import radiometer_noise
 
@@ -162,7 +162,7 @@ def tasks_of_joint_run(lmax: int) -> dict:
     prior = scenario.spectral.prior(frequencies, reference)
     sums = ComponentSums.empty(prior, reference)
     start = time.perf_counter()
-    sums = jax.block_until_ready(summed(sums, prior, 1, known))
+    sums = jax.block_until_ready(summed_information(sums, prior, 1, known))
     sum_s = time.perf_counter() - start
     start = time.perf_counter()
     sums.plus(sums)

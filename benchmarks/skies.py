@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from made_skies import SmoothSky, SpottySky
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -34,7 +35,6 @@ from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.draws import deviations
 from lusee_bayes.results.map_result import map_result
 from lusee_bayes.sky.sky_source import FileSource, GalaxySource, SkySource
-from lusee_bayes.testing.cases import SmoothSky, SpottySky
 
 # each takes a seed
 NAMED: dict[str, Callable[[int], SkySource]] = {

@@ -7,6 +7,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpyro.infer.util import log_density
@@ -16,8 +18,9 @@ from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.term import Around
-from lusee_bayes.sampling.programs import Program, numpyro_promotion
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.sampling.hmc import WHITE_SUFFIX, whitened
+from lusee_bayes.sampling.programs import Program, latent_sites, numpyro_promotion
+from lusee_bayes.testing.scenarios import small_scenario
 
 # nothing of these enters a setup (test_experiment.py checks it), only the data and N; the mean of
 # noise.receiver does
@@ -66,3 +69,31 @@ def parts(setup: Setup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     variances = setup.prior.variance(), radiometer(setup).diagonal()
     prior, noise = (np.sqrt(np.asarray(variance)) for variance in variances)
     return np.asarray(setup.coupling.dense()), prior, noise
+
+
+def draw_within(program, arguments, key, sampler, whitening=None, thin=1) -> dict[str, Any]:
+    """One chain inside a JAX program, every ``thin``-th draw; many data sets can be mapped over it.
+
+    The sampler's ``chains`` and ``seed`` are not used.
+    """
+    run = program if whitening is None else whitened(program, whitening)
+    white = set() if whitening is None else set(whitening.names)
+    all_white = set(latent_sites(program, arguments)) == white
+    dynamic, static = eqx.partition(arguments, eqx.is_array)
+    kernel = sampler.kernel(
+        lambda dynamic: run(**eqx.combine(dynamic, static)),
+        whitening.root.shape[1] if all_white else None,
+    )
+
+    def iterate(n, state):
+        return jax.lax.fori_loop(0, n, lambda _, s: kernel.sample(s, (dynamic,), {}), state)
+
+    def step(state, _):
+        state = iterate(thin, state)
+        return state, state.z
+
+    with numpyro_promotion():
+        state = iterate(sampler.warmup, kernel.init(key, sampler.warmup, None, (dynamic,), {}))
+        _, z = jax.lax.scan(step, state, None, length=sampler.draws)
+        sites = jax.vmap(kernel.postprocess_fn((dynamic,), {}))(z)
+    return {name: values for name, values in sites.items() if not name.endswith(WHITE_SUFFIX)}

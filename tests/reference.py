@@ -35,6 +35,11 @@ def vectors(theta, phi):
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
 
 
+def unit_vectors(grid):
+    """Unit vectors of a grid of theta and phi, components first."""
+    return np.moveaxis(vectors(*np.meshgrid(grid.theta, grid.phi, indexing="ij")), -1, 0)
+
+
 def steep_sky(lmax, seed=0, monopole=1e4):
     """Modes of a sky as steep as the Galaxy's: C_ell ~ (1 + ell)^-2.5 around a monopole, in K."""
     ell = np.repeat(np.arange(lmax + 1), 2 * np.arange(lmax + 1) + 1)

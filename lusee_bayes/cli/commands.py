@@ -5,15 +5,12 @@ They are not in the docstrings of the commands: ``lusee-bayes --help`` imports n
 
 from __future__ import annotations
 
-# where a command stands that is not in look_commands
+# the module of each
 MODULES = {
-    "simulate": "map_commands",
-    "average": "map_commands",
-    "reduce": "map_commands",
-    "map": "map_commands",
-    "sample": "sample_commands",
-    "validate": "sample_commands",
-    "plan": "plan_command",
+    "map_commands": ("map", "simulate", "reduce", "average"),
+    "sample_commands": ("sample", "validate"),
+    "plan_command": ("plan",),
+    "look_commands": ("compare", "compare-priors", "report", "info", "keys", "paper"),
 }
 # the summary, what else there is to know, and examples
 COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {

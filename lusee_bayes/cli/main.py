@@ -20,7 +20,7 @@ from threading import current_thread, main_thread
 from cyclopts import App, CycloptsError, Parameter
 from rich.console import Console
 
-from lusee_bayes.cli.commands import COMMANDS, MODULES, help_of
+from lusee_bayes.cli.commands import MODULES, help_of
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.version import COMMAND, printable, release
@@ -43,10 +43,10 @@ app = App(
 )
 app.register_install_completion_command()
 # named by path: each is imported when called, so that --help and completion answer at once
-for _name in COMMANDS:
-    _command = f"{_name.replace('-', '_')}_command"
-    _module = MODULES.get(_name, "look_commands")
-    app.command(f"lusee_bayes.cli.{_module}:{_command}", name=_name, help=help_of(_name))
+for _module, _names in MODULES.items():
+    for _name in _names:
+        _command = f"lusee_bayes.cli.{_module}:{_name.replace('-', '_')}_command"
+        app.command(_command, name=_name, help=help_of(_name))
 
 
 # beginnings of messages of RuntimeErrors for want of memory: of XLA, and of Python's threads
@@ -95,15 +95,17 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _run(arguments: list[str], came: list[int]) -> int:
-    errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
+    def refused(sentence: object, code: int) -> int:
+        errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
+        errors.print(f"lusee-bayes: {sentence}")
+        return code
+
     try:
         code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except InputError as error:
-        errors.print(f"lusee-bayes: {error}")
-        return 2
+        return refused(error, 2)
     except CycloptsError as error:
-        errors.print(f"lusee-bayes: {' '.join(str(error).split())}")
-        return 2
+        return refused(" ".join(str(error).split()), 2)
     except BrokenPipeError:
         # whoever was to read the output has gone: head has its lines
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -112,23 +114,21 @@ def _run(arguments: list[str], came: list[int]) -> int:
         if error.errno is None:
             raise
         at = f" ('{error.filename}')" if error.filename else ""
-        errors.print(f"lusee-bayes: {error.strerror}{at}; {UNCHANGED}")
-        return 1
+        return refused(f"{error.strerror}{at}; {UNCHANGED}", 1)
     except WorkersLost as error:
-        errors.print(f"lusee-bayes: {error}")
-        return 1
+        return refused(error, 1)
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not str(error).startswith(NO_MEMORY):
             raise
         why = " ".join(str(error).split())[:200]
-        errors.print(
-            f"lusee-bayes: not enough memory{f' ({why})' if why else ''}; {UNCHANGED}. Use a "
-            "smaller lmax, fewer times or fewer draws, or a machine with more memory"
+        return refused(
+            f"not enough memory{f' ({why})' if why else ''}; {UNCHANGED}. Use a smaller lmax, "
+            "fewer times or fewer draws, or a machine with more memory",
+            1,
         )
-        return 1
     except KeyboardInterrupt as interrupt:
         # runs say what their folder holds
         held = str(interrupt) or "nothing has been written"
-        errors.print(f"lusee-bayes: {'terminated' if came else 'interrupted'}; {held}")
-        return 128 + (came or [signal.SIGINT])[0]
+        how = "terminated" if came else "interrupted"
+        return refused(f"{how}; {held}", 128 + (came or [signal.SIGINT])[0])
     return code if isinstance(code, int) else 0

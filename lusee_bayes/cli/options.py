@@ -1,14 +1,11 @@
-"""Options that commands share, and the tables that they print.
-
-What commands have in common: options that mean the same everywhere.
-
-The tables that commands print.
-"""
+"""What commands share: options that mean the same everywhere, and how a command prints."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from itertools import pairwise
 from math import inf, isclose
 from pathlib import Path
@@ -19,25 +16,11 @@ from rich.console import Console
 from rich.table import Table
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.progress import Stages
 
 if TYPE_CHECKING:
+    from lusee_bayes.core.engine import Demand, Engine
     from lusee_bayes.experiment.scenario import Scenario
-
-
-Overrides = Annotated[list[str], Parameter(name="--set", negative="")]
-Quiet = Annotated[
-    bool, Parameter(name=["--quiet", "-q"], negative="", help="Print nothing but errors.")
-]
-# 10,25 or 5:50:5
-Frequencies = Annotated[str | None, Parameter(name="--frequencies")]
-Verbose = Annotated[
-    bool,
-    Parameter(
-        name=["--verbose", "-v"],
-        negative="",
-        help="Print the memory in use after every stage.",
-    ),
-]
 
 
 def _whole(least: int) -> Callable[[object, Sequence[Token]], int]:
@@ -57,31 +40,158 @@ def _whole(least: int) -> Callable[[object, Sequence[Token]], int]:
 # so many of something: none of them is possible, or at least one
 Number = Annotated[int, Parameter(converter=_whole(0))]
 Count = Annotated[int, Parameter(converter=_whole(1))]
-# what carries out the tasks of a run
-Workers = Annotated[int | None, Parameter(name="--workers", converter=_whole(1))]
-Cluster = Annotated[str | None, Parameter(name="--cluster")]
 Flag = Annotated[bool, Parameter(negative="")]
-# one file of visibilities, or sessions of the spectrometer
-DataFiles = Annotated[
-    tuple[Path, ...] | None, Parameter(name="--data", consume_multiple=True, negative="")
-]
-Clock = Annotated[
-    str | None,
-    Parameter(
-        name="--clock",
-        help="Clock reference in JSON, for sessions with no absolute time, or to correct the UTC "
-        "that they state (flight.clock).",
-    ),
-]
-Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
-# to replace the results of a run, or a file
-Force = Annotated[
-    bool,
-    Parameter(name="--force", negative="", help="Replace results of another run in the folder."),
-]
-ForceFile = Annotated[
-    bool, Parameter(name="--force", negative="", help="Replace what is there already.")
-]
+# one or many, or all that follow the option
+Many = Parameter(consume_multiple=True, negative="", show_default=False)
+Output = Annotated[Path, Parameter(name=["--output", "-o"])]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Options:
+    """What every command takes that writes results.
+
+    Attributes
+    ----------
+    force
+        Replace what is there already: a file, or results of another run in the folder.
+    quiet
+        Print nothing but errors.
+    verbose
+        Print the memory in use after every stage.
+    """
+
+    force: Flag = False
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")] = False
+    verbose: Annotated[bool, Parameter(name=["--verbose", "-v"], negative="")] = False
+
+    @property
+    def console(self) -> Console:
+        """Where the command prints."""
+        return Console(quiet=self.quiet, soft_wrap=True)
+
+    def stages(self) -> Stages:
+        """What shows and times the stages of the run."""
+        return Stages(self.console, verbose=self.verbose)
+
+    def say(self, *lines: object) -> None:
+        """Print lines as they are."""
+        say(self.console, *lines)
+
+    def tell(self, files: Sequence[Path], *lines: object, table: Table | None = None) -> None:
+        """Print which files were written, a table, and what else there is to say."""
+        self.say(*(f"  {path}" for path in files))
+        if table is not None:
+            show(self.console, table)
+        self.say(*lines)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ScenarioOptions(Options):
+    """What commands take that read a scenario.
+
+    Attributes
+    ----------
+    set_
+        key.path=value; overrides an entry of the scenario, as often as needed.
+    """
+
+    set_: Annotated[tuple[str, ...], Parameter(name="--set", negative="", show_default=False)] = ()
+
+    def load(
+        self,
+        source: str,
+        frequencies: str | None = None,
+        replaces: Path | None = None,
+        **flags: str | int | bool | None,
+    ) -> Scenario:
+        """The scenario of the command, with ``--set`` and with what options say of it.
+
+        Parameters
+        ----------
+        source : str
+            A YAML file or the name of a scenario.
+        frequencies : str
+            See :func:`parse_frequencies`.
+        replaces : Path
+            The folder or file of the results: with ``--force`` not one that the scenario is in.
+        **flags
+            Values of entries, dots written as ``__``; those that are None or False are left alone.
+
+        Raises
+        ------
+        InputError
+            As :func:`.load_scenario`, and as :func:`.require_apart`.
+        """
+        from lusee_bayes.core.files import require_apart
+        from lusee_bayes.experiment.scenario import load_scenario
+
+        if replaces is not None and self.force:
+            require_apart(replaces, [source])
+        overrides = list(self.set_)
+        if frequencies is not None:
+            overrides.append(f"frequencies_mhz={parse_frequencies(frequencies)}")
+        for name, value in flags.items():
+            if value is not None and value is not False:
+                overrides.append(f"{name.replace('__', '.')}={str(value).lower()}")
+        return load_scenario(source, overrides)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class DataOptions(ScenarioOptions):
+    """What commands take that work on data.
+
+    Attributes
+    ----------
+    data
+        Visibilities to use, of a file of simulate or reduce, a waterfall of luseepy, or sessions of
+        its lusee.ingest, one or many; without them the scenario's own are simulated.
+    clock
+        Clock reference in JSON, for sessions with no absolute time, or to correct the UTC that they
+        state (flight.clock).
+    output
+        Folder for the results; by default output/NAME, with the command's own ending.
+    """
+
+    data: Annotated[tuple[Path, ...] | None, Many] = None
+    clock: str | None = None
+    output: Output | None = None
+
+    def loaded(
+        self, source: str, frequencies: str | None = None, **flags: str | int | bool | None
+    ) -> Scenario:
+        """The scenario with its clock. InputError as :meth:`load`."""
+        return self.load(source, frequencies, self.output, flight__clock=self.clock, **flags)
+
+    def folder(self, source: str, suffix: str = "") -> Path:
+        """Where the results of a scenario go."""
+        return self.output or Path("output") / f"{Path(source).stem}{suffix}"
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class EngineOptions:
+    """What carries out the tasks of a run.
+
+    Attributes
+    ----------
+    workers
+        Processes of this machine that share out the work; by default one.
+    cluster
+        Address of a Dask scheduler, as tcp://host:8786, whose workers share out the work; by
+        default DASK_SCHEDULER_ADDRESS.
+    """
+
+    workers: Count | None = None
+    cluster: str | None = None
+
+    def open(self, demand: Demand) -> AbstractContextManager[Engine]:
+        """Start it for the block. InputError as :func:`.open_engine`."""
+        from lusee_bayes.core.engines import open_engine
+
+        return open_engine(demand, self.workers, self.cluster)
 
 
 # a number and its unit
@@ -91,52 +201,6 @@ SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 # channels of one run: far more than 25 kHz apart over the band
 MOST_CHANNELS = 4096
-
-
-def load(
-    source: str,
-    set_: list[str] | None,
-    frequencies: str | None = None,
-    replaces: Path | None = None,
-    **flags: str | int | bool | None,
-) -> Scenario:
-    """The scenario of a command, with its ``--set`` and with what options say of it.
-
-    Parameters
-    ----------
-    source : str
-        A YAML file or the name of a scenario.
-    set_ : list of str
-        ``key.path=value``.
-    frequencies : str
-        See :func:`parse_frequencies`.
-    replaces : Path
-        A folder or file that is to be replaced: not where the scenario is in it.
-    **flags
-        Values of entries, dots written as ``__``; those that are None or False are left alone.
-
-    Raises
-    ------
-    InputError
-        As :func:`.load_scenario`, and as :func:`.require_apart`.
-    """
-    from lusee_bayes.core.files import require_apart
-    from lusee_bayes.experiment.scenario import load_scenario
-
-    if replaces is not None:
-        require_apart(replaces, [source])
-    overrides = list(set_ or [])
-    if frequencies is not None:
-        overrides.append(f"frequencies_mhz={parse_frequencies(frequencies)}")
-    for name, value in flags.items():
-        if value is not None and value is not False:
-            overrides.append(f"{name.replace('__', '.')}={str(value).lower()}")
-    return load_scenario(source, overrides)
-
-
-def default_folder(source: str, suffix: str = "") -> Path:
-    """Where the results of a scenario go that are not told where."""
-    return Path("output") / f"{Path(source).stem}{suffix}"
 
 
 def say(console: Console, *lines: object) -> None:

@@ -1,31 +1,17 @@
-"""The command plan.
-
-lusee-bayes plan: a forecast of the information in observations, before there are data.
-
-What ``lusee-bayes plan`` plans, and what it says of it.
-"""
+"""The command ``plan``: what it forecasts, and what it says of it."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 from rich.console import Console
 
-from lusee_bayes.cli.options import (
-    Cluster,
-    Force,
-    Overrides,
-    Quiet,
-    Verbose,
-    Workers,
-    say,
-    show,
-)
+from lusee_bayes.cli.options import EngineOptions, Output, ScenarioOptions, say
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation, baseline
@@ -35,14 +21,10 @@ from lusee_bayes.runs.forecasting import default_variations
 def plan_command(
     scenario: str,
     *others: str,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("output/plan"),
-    vary: Annotated[list[str] | None, Parameter(negative="")] = None,
-    set_: Overrides | None = None,
-    workers: Workers = None,
-    cluster: Cluster = None,
-    force: Force = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    output: Output = Path("output/plan"),
+    vary: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = (),
+    options: ScenarioOptions = ScenarioOptions(),
+    engine: EngineOptions = EngineOptions(),
 ) -> None:
     """Forecast information, modes with SNR > 1 and ell_cross of observations, without data.
 
@@ -57,42 +39,33 @@ def plan_command(
     vary
         key.path=value,value,...; an entry of the scenario and the values to try, as often as
         needed, instead of turntable, duration, nights, duty cycle and lost antennas.
-    set_
-        key.path=value; overrides an entry of every scenario, as often as needed.
-    workers
-        Processes of this machine that share out the variations; by default one.
-    cluster
-        Address of a Dask scheduler, as tcp://host:8786, whose workers share out the variations; by
-        default DASK_SCHEDULER_ADDRESS.
     """
     from lusee_bayes.cli.tables import forecast_table
-    from lusee_bayes.core.engines import open_engine
-    from lusee_bayes.results.forecast import baseline
     from lusee_bayes.runs.cost import demand_of, posterior_cost
     from lusee_bayes.runs.plan_run import run_plan
 
-    console = Console(quiet=quiet, soft_wrap=True)
     sources = [scenario, *others]
     if len(set(sources)) < len(sources):
         twice = next(s for s in sources if sources.count(s) > 1)
         raise InputError(f"the scenario '{twice}' is given twice; give each once")
-    variations = [v for s in sources for v in variations_of(s, vary, set_ or [], console)]
-    stages = Stages(console, verbose=verbose)
+    variations = [v for s in sources for v in variations_of(s, vary, options.set_, options.console)]
     demand = demand_of([posterior_cost(v.scenario) for v in variations])
-    with open_engine(demand, workers, cluster) as engine:
-        run = run_plan(variations, output, engine=engine, replace=force, stages=stages)
+    given = {"replace": options.force, "stages": options.stages()}
+    with engine.open(demand) as opened:
+        run = run_plan(variations, output, engine=opened, **given)
     for source in sources:
-        show(console, forecast_table([f for f in run.result if f.variation.source == source]))
-    say(console, *(f"  {path}" for path in run.files))
+        table = forecast_table([f for f in run.result if f.variation.source == source])
+        options.tell((), table=table)
+    options.tell(run.files)
     for source in sources:
-        say(console, headline(run.result, source))
+        options.say(headline(run.result, source))
         if offsets := baseline(run.result, source).offsets_line():
-            say(console, f"{source}: {offsets}")
-    say(console, f"look at {run.folder}/figures/plan.png")
+            options.say(f"{source}: {offsets}")
+    options.say(f"look at {run.folder}/figures/plan.png")
 
 
 def variations_of(
-    source: str, vary: list[str] | None, overrides: list[str], console: Console
+    source: str, vary: Sequence[str], overrides: Sequence[str], console: Console
 ) -> list[Variation]:
     """The variations of a scenario: those asked for, or else the default ones that are possible.
 
@@ -103,7 +76,7 @@ def variations_of(
     return possible(default_variations(source, load_scenario(source, overrides)), console)
 
 
-def own_variations(source: str, vary: list[str], overrides: list[str]) -> list[Variation]:
+def own_variations(source: str, vary: Sequence[str], overrides: Sequence[str]) -> list[Variation]:
     """The scenario as baseline, and with every value of every ``key.path=value,value,...``.
 
     InputError if one of them is not of that form, or its values are not the scenario's.
@@ -134,7 +107,7 @@ def possible(variations: list[Variation], console: Console) -> list[Variation]:
             kept.append(variation)
         else:
             what = f"{variation.source}, {variation.family}, {variation.name}"
-            console.print(f"  left out: {what}: {obstacle}", highlight=False, markup=False)
+            say(console, f"  left out: {what}: {obstacle}")
     return kept
 
 

@@ -25,9 +25,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 from platformdirs import user_cache_path
 
 Array = jax.Array | np.ndarray
+# arrays that recur, with their shapes
+DataVector = Float[Array, " data"]
+Grid = Float[Array, "products times"]
+GridFlags = Bool[np.ndarray, "products times"]
+TimeFlags = Bool[np.ndarray, " times"]
+Modes = Float[Array, " modes"]
+ModesMatrix = Float[Array, "modes modes"]
+Draws = Float[np.ndarray, "draws modes"]
+Ells = Float[np.ndarray, " ells"]
+Pixels = Float[np.ndarray, " pixels"]
+Vector = Float[np.ndarray, " n"]
+Square = Float[np.ndarray, "n n"]
 
 # rows that are added at once
 ACCUMULATED = 16
@@ -46,6 +59,11 @@ def as_complex(real: Array, imaginary: Array) -> Array:
     if namespace(real, imaginary) is np:
         return real + 1j * imaginary
     return jax.lax.complex(jnp.asarray(real), jnp.asarray(imaginary))
+
+
+def scalar(value: Any) -> Array:
+    """Convert a number to a float64 array of JAX: a run value that it traces, not structure."""
+    return jnp.asarray(value, dtype=jnp.float64)
 
 
 def compiled(function: F) -> F:

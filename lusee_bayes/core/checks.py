@@ -123,6 +123,25 @@ def require_finite(name: str, array: Any) -> None:
         )
 
 
+def require_array(name: str, array: Any, shape: tuple[int | None, ...] | None = None) -> None:
+    """Check that an array holds finite 64-bit floats, and its shape where one is given.
+
+    Parameters
+    ----------
+    name, array, shape
+        As of :func:`require_float64`, :func:`require_shape` and :func:`require_finite`.
+
+    Raises
+    ------
+    InputError
+        As these do.
+    """
+    require_float64(name, array)
+    if shape is not None:
+        require_shape(name, array, shape)
+    require_finite(name, array)
+
+
 def require_positive(name: str, array: Any, hint: str = "") -> None:
     """Check that every entry is positive and finite.
 

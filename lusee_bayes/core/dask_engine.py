@@ -70,7 +70,7 @@ class DaskEngine(Engine):
     def work_in(self, folder: Path) -> None:
         self._folder = folder.resolve()
         answers = self.client.run(
-            refusal_of, versions(), self._folder, self._demand, on_error="return"
+            refusal_of, code_versions(), self._folder, self._demand, on_error="return"
         )
         for worker, answer in answers.items():
             if answer is not None:
@@ -216,7 +216,7 @@ def _read_job(path: Path) -> tuple[Callable[..., Any], Any, Any]:
     return tuple(job)
 
 
-def versions() -> str:
+def code_versions() -> str:
     """Those that code is sent between processes by."""
     return f"lusee_bayes {__version__} and Python {sys.version_info.major}.{sys.version_info.minor}"
 
@@ -229,15 +229,15 @@ def refusal_of(
     Parameters
     ----------
     wanted : str
-        The command's :func:`versions`.
+        The command's :func:`code_versions`.
     folder : Path
         Of the run.
     demand : Demand or None
     dask_worker : distributed.Worker
         Dask gives the worker to an argument of this name.
     """
-    if versions() != wanted:
-        return f"it has {versions()}, the command {wanted}; install the same on both"
+    if code_versions() != wanted:
+        return f"it has {code_versions()}, the command {wanted}; install the same on both"
     limit, n = dask_worker.memory_manager.memory_limit, dask_worker.state.nthreads
     if demand is not None and limit and demand.process_bytes(n) > limit:
         return (

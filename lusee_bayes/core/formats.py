@@ -15,7 +15,7 @@ import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cached_property, lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ import h5py
 import numpy as np
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.layouts import Content, Layout
+from lusee_bayes.core.layouts import Content, Layout, Unloaded
 from lusee_bayes.core.lazy import astropy_exceptions, fits
 from lusee_bayes.core.lazy import xarray as xr
 from lusee_bayes.core.reading import reading, require_file
@@ -313,24 +313,10 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
                 for number, column in enumerate(hdu.columns):
                     put(f"{hdu.name}.{column.name}", hdu.data.field(number), column.unit)
             elif hdu.header.get("NAXIS", 0):
-                put(hdu.name, _Image(hdu), hdu.header.get("BUNIT"))
+                dtype = np.dtype(IMAGE_DTYPES[hdu.header["BITPIX"]])
+                image = Unloaded(tuple(hdu.shape), dtype, partial(getattr, hdu, "data"))
+                put(hdu.name, image, hdu.header.get("BUNIT"))
         return layout.checked(path, arrays, said)
-
-
-class _Image:
-    """An image that is read when it is asked for."""
-
-    def __init__(self, hdu: fits.PrimaryHDU | fits.ImageHDU):
-        self._hdu = hdu
-        self.shape = tuple(hdu.shape)
-        self.dtype = np.dtype(IMAGE_DTYPES[hdu.header["BITPIX"]])
-
-    @cached_property
-    def _values(self) -> np.ndarray:
-        return np.asarray(self._hdu.data)
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return self._values.astype(self.dtype if dtype is None else dtype)
 
 
 @contextmanager

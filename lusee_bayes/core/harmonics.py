@@ -74,9 +74,7 @@ def mode_numbers(lmax: int) -> tuple[np.ndarray, np.ndarray]:
     return ell, m
 
 
-def from_healpy(
-    alm: Complex[np.ndarray, "*batch alms"],
-) -> Float[np.ndarray, "*batch modes"]:
+def from_healpy(alm: Complex[np.ndarray, "*batch alms"]) -> Float[np.ndarray, "*batch modes"]:
     """Convert complex coefficients in healpy's packing (m >= 0, m-major) to real packed ones."""
     lmax = healpy.Alm.getlmax(alm.shape[-1])
     ell, m = mode_numbers(lmax)
@@ -198,12 +196,10 @@ def columns_to_maps(
     lmax = lmax_of(modes.shape[0])
     theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
     heights, first = np.unique(theta, return_index=True)
-    _, m = mode_numbers(lmax)
-    by_order = np.argsort(m, kind="stable")
-    starts = np.searchsorted(m[by_order], np.arange(-lmax, lmax + 2))
+    by_order, starts = modes_by_order(lmax)
     polar, packed = polar_functions(heights, lmax)[:, by_order], modes[by_order]
     waves = np.empty((len(heights), 2 * lmax + 1, modes.shape[1]))
-    for order, (begin, end) in enumerate(pairwise(starts)):
+    for order, (begin, end) in enumerate(pairwise([*starts, len(modes)])):
         np.matmul(polar[:, begin:end], packed[begin:end], out=waves[:, order])
     azimuth = azimuth_functions(phi, lmax)
     maps = np.empty((len(phi), modes.shape[1]))

@@ -10,7 +10,7 @@ Files may state units (:func:`factor_to`); Hz in place of MHz is a mistake that 
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -104,6 +104,18 @@ class Unread(Protocol):
 
     shape: tuple[int, ...]
     dtype: np.dtype
+
+
+@dataclass(frozen=True)
+class Unloaded:
+    """An array of an open file, of which the header alone has been read."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    load: Callable[[], np.ndarray]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self.load(), dtype=self.dtype if dtype is None else dtype)
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ def _in_place(name: str, letters: bytes, matrix: Float[np.ndarray, "n n"]) -> in
     return info.value
 
 
-def factorise(matrix: Float[np.ndarray, "n n"]) -> bool:
+def factorise_in_place(matrix: Float[np.ndarray, "n n"]) -> bool:
     """Put L, with L L^T the matrix, into its lower triangle, and zeros above.
 
     Parameters
@@ -77,11 +77,6 @@ def factorise(matrix: Float[np.ndarray, "n n"]) -> bool:
 def invert_factorised(lower: Float[np.ndarray, "n n"]) -> None:
     """Put (L L^T)^-1 into the lower triangle of L, in C order; above it nothing is changed."""
     _in_place("dpotri", b"U", lower)
-
-
-def invert_triangle(lower: Float[np.ndarray, "n n"]) -> None:
-    """Put L^-1 into the lower triangle of L, in C order; above it nothing is changed."""
-    _in_place("dtrtri", b"UN", lower)
 
 
 def solve_triangle(
@@ -137,7 +132,7 @@ def cholesky(
         if matrix.ndim > 2:
             return np.stack([cholesky(block) for block in matrix])
         lower = np.ascontiguousarray(matrix) if overwrite else matrix.copy(order="C")
-        return lower if factorise(lower) else np.full(matrix.shape, np.nan)
+        return lower if factorise_in_place(lower) else np.full(matrix.shape, np.nan)
     return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 
@@ -283,7 +278,7 @@ def invert_lower(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Return L^-1 for lower triangular L; entries above the diagonal are not read."""
     if namespace(lower) is np:
         inverse = np.tril(lower)
-        invert_triangle(inverse)
+        _in_place("dtrtri", b"UN", inverse)
         return inverse
     n = lower.shape[0]
     if n <= MAX_SUBSTITUTED:

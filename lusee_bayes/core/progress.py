@@ -7,7 +7,7 @@ import resource
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -23,6 +23,8 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+from lusee_bayes.core.version import versions
 
 # limits of the process's control group, of either version
 CGROUP_LIMITS = (
@@ -131,6 +133,15 @@ def peak_memory_gb() -> float:
     """Return the largest resident size of this process so far, in GB (10^9 bytes)."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e9 if sys.platform == "darwin" else peak * 1024 / 1e9
+
+
+def about_run(seconds: Mapping[str, float]) -> dict[str, object]:
+    """What a file of results says of the run itself: seconds by stage, memory, versions."""
+    return {
+        "seconds": {name: round(s, 3) for name, s in seconds.items()},
+        "peak_memory_gb": round(peak_memory_gb(), 3),
+        "versions": versions(),
+    }
 
 
 @lru_cache(maxsize=1)

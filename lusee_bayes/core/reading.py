@@ -12,6 +12,7 @@ import stat
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from ruamel.yaml.constructor import SafeConstructor
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import user_path
-from lusee_bayes.core.layouts import Content, Layout
+from lusee_bayes.core.layouts import Content, Layout, Unloaded
 
 # a text file that is larger is none that a person or this package has written
 LARGEST_TEXT = 50_000_000
@@ -221,26 +222,19 @@ def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
     ):
         if not isinstance(arrays, np.lib.npyio.NpzFile):
             raise InputError(f"{path} holds a single array; expected {layout.what}")
-        there = {name: _Member(arrays, name) for name in arrays.files}
+        there = {name: _unloaded(arrays, name) for name in arrays.files}
         values = {name: arrays[name] for name in layout.attributes if name in there}
         return layout.checked(path, there, values)
 
 
-class _Member:
-    """An array of an .npz file, of which the header alone has been read."""
-
-    def __init__(self, arrays: np.lib.npyio.NpzFile, name: str):
-        self._arrays, self._name = arrays, name
-        with arrays.zip.open(f"{name}.npy") as file:
-            version = np.lib.format.read_magic(file)
-            header = {
-                (1, 0): np.lib.format.read_array_header_1_0,
-                (2, 0): np.lib.format.read_array_header_2_0,
-            }[version](file)
-        self.shape, _, self.dtype = header
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.asarray(self._arrays[self._name], dtype=dtype)
+def _unloaded(arrays: np.lib.npyio.NpzFile, name: str) -> Unloaded:
+    with arrays.zip.open(f"{name}.npy") as file:
+        version = np.lib.format.read_magic(file)
+        header = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }[version](file)
+    return Unloaded(header[0], header[2], partial(arrays.__getitem__, name))
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:

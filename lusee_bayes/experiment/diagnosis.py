@@ -1,29 +1,20 @@
 """Usual mistakes in data and model: which of them would make the data fit.
 
-The usual mistakes in data and models, each as what would undo it.
+Where no sky explains data, each of the usual mistakes is undone, and the residual chi^2 of that,
+what a prior wide enough for any sky leaves (:mod:`lusee_bayes.judge.chi2`), tells whether the data
+would fit. A mistake in the data is undone by mixing the products of every time. One in the model is
+undone by other beams, or by another observation: other times, angles or another site.
 
-A mistake in the data is undone by mixing the products of every time. One in the model is undone by
-other beams, or by another observation: other times, angles or another site.
-
-The residual chi^2 of data, what no sky absorbs, with the data or the model changed.
-
-Changes of data that mix the products of each time, and their residual chi^2, all at once.
-
-d' = sum_jk W_jk x_jk, where x_jk has product k in the place of product j. With K the covariance of
-the data under a prior that allows any sky, and b the model without a sky, ::
+Changes of data that mix the products of each time are tried all at once: d' = sum_jk W_jk x_jk,
+where x_jk has product k in the place of product j. With K the covariance of the data under a prior
+that allows any sky, and b the model without a sky, ::
 
     chi^2(W) = (X w - b)^T K^-1 (X w - b) = (w, -1)^T Q (w, -1),    Q = (X, b)^T K^-1 (X, b).
 
 With Q at hand exchanges, signs and reversals cost nothing; factors and constants are solved for.
 
-Did you mean, for data: the usual mistakes, tried where no sky explains the data.
-
-Each is undone, and its residual chi^2, what a prior wide enough for any sky leaves
-(:mod:`lusee_bayes.judge.chi2`), tells whether the data would fit.
-
-Changes of the data cost one matrix together (:mod:`.diagnosis`). A change of the model needs a
-normal matrix of its own; these are compared up to ``SCREENED_LMAX`` first. The best of both are
-computed as the scenario has it, with N for the changed data.
+A change of the model needs a normal matrix of its own; these are compared up to ``SCREENED_LMAX``
+first. The best of both are computed as the scenario has it, with N for the changed data.
 """
 
 from __future__ import annotations
@@ -35,7 +26,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.arrays import Ells, Grid, Square, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, mode_numbers, n_modes, turn_about_z
 from lusee_bayes.core.linalg import solve_lower
@@ -47,15 +38,18 @@ from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.pointing import Pointing, kind_of, offset_names, with_offsets
+from lusee_bayes.instrument.pointing import Pointing, offset_kind, offset_names, with_offsets
 from lusee_bayes.instrument.products import all_products, auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.chi2 import WIDER, ChiSquare, expected_chi2, stands_out, two_sided, with_sky
 from lusee_bayes.judge.residuals import Residuals
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import HarmonicPrior
+
+# arrays that recur
+Products = Float[np.ndarray, " products"]
 
 Mixing = Float[np.ndarray, "products products"]
 
@@ -91,13 +85,11 @@ class DataMistake:
     words: str
     remedy: str
     mixing: Mixing
-    constant: Float[np.ndarray, " products"] | None = None
+    constant: Products | None = None
     time: int | None = None
     reverses: bool = False
 
-    def undone(
-        self, grid: Float[np.ndarray, "products times"]
-    ) -> Float[np.ndarray, "products times"]:
+    def undone(self, grid: Grid) -> Grid:
         """The visibilities without the mistake, in K."""
         grid = grid[:, ::-1] if self.reverses else grid
         mixed = self.mixing @ grid
@@ -270,7 +262,7 @@ class UnderAnySky:
     setup: Setup
     data: Visibilities
     model: LinearGaussian
-    spectrum: Float[np.ndarray, " ells"]
+    spectrum: Ells
 
     @classmethod
     def of(cls, setup: Setup, data: Visibilities, model: LinearGaussian) -> UnderAnySky:
@@ -320,7 +312,7 @@ class UnderAnySky:
         return replace(self, data=data, model=model).wide(model.coupling)[0]
 
 
-def _any_sky(setup: Setup, data: Visibilities) -> Float[np.ndarray, " ells"]:
+def _any_sky(setup: Setup, data: Visibilities) -> Ells:
     """C_ell of a prior that allows any sky, as bright as the data ask for, in K^2."""
     prior = on_host(setup.prior if setup.family is None else setup.family.expected())
     power = np.asarray(prior.variance())
@@ -332,7 +324,7 @@ def _any_sky(setup: Setup, data: Visibilities) -> Float[np.ndarray, " ells"]:
     return mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2
 
 
-def filled(data: Visibilities) -> Float[np.ndarray, "products times"]:
+def filled(data: Visibilities) -> Grid:
     """The data on the full grid, absent samples interpolated in time."""
     grid = np.array(data.grid())
     times = np.arange(grid.shape[1])
@@ -356,7 +348,7 @@ class MixedProducts:
 
     here: UnderAnySky
     posterior: Posterior
-    grid: Float[np.ndarray, "products times"]
+    grid: Grid
     q: Float[np.ndarray, "columns columns"]
 
     @classmethod
@@ -399,9 +391,7 @@ class MixedProducts:
         yield self._constant(np.flatnonzero(autos))
         yield from self._times()
 
-    def _factor(
-        self, name: str, which: Float[np.ndarray, " products"]
-    ) -> tuple[float, DataMistake]:
+    def _factor(self, name: str, which: Products) -> tuple[float, DataMistake]:
         """A factor of some products: chi^2 is a parabola in what is missing."""
         whole = self.vector(np.eye(len(which)))
         step = self.vector(np.diag(which), 0.0)
@@ -414,7 +404,7 @@ class MixedProducts:
             np.diag(1.0 + missing * which),
         )
 
-    def _gain(self, port: int, powers: Float[np.ndarray, " products"]) -> tuple[float, DataMistake]:
+    def _gain(self, port: int, powers: Products) -> tuple[float, DataMistake]:
         """A gain of a port's voltage, squared in its auto: chi^2 is of fourth order in it."""
         parts = [self.vector(np.diag((powers == k) * 1.0), -1.0 * (k == 0)) for k in range(3)]
         gram = np.array([[u @ self.q @ v for v in parts] for u in parts])
@@ -484,9 +474,7 @@ def _number(factor: float, std: float) -> str:
     return f"{factor:.5g} +- {std * factor**2:.1g}"
 
 
-def _gram(
-    here: UnderAnySky, posterior: Posterior, columns: Float[np.ndarray, "data n"]
-) -> Float[np.ndarray, "n n"]:
+def _gram(here: UnderAnySky, posterior: Posterior, columns: Float[np.ndarray, "data n"]) -> Square:
     """X^T K^-1 X, K^-1 = N^-1 - N^-1 A C A^T N^-1."""
     solved = np.asarray(here.model.noise.factor().solve(columns))
     seen = np.stack([np.asarray(here.model.coupling.transpose_mv(x)) for x in solved.T])
@@ -674,7 +662,7 @@ def _offsets(here: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMis
             if curvature > 0.0:
                 value += reach * np.clip(0.5 * (seen[0] - seen[2]) / curvature, -3.0, 3.0)
             chi2 = min(seen)
-        section, kind = setup.scenario.noise.pointing, kind_of(name)
+        section, kind = setup.scenario.noise.pointing, offset_kind(name)
         remedy = f"give noise.pointing.{kind}"
         if section is not None and kind in section.kinds:
             remedy = f"widen its prior, noise.pointing.{kind}, or set treatment=sampled"

@@ -1,10 +1,7 @@
 """A scenario with its data, ready to be mapped or sampled.
 
-An experiment: a setup and the data that were taken with it.
-
-From an experiment to the posterior over its sky.
-
-What programs can ask an experiment for.
+An :class:`Experiment` is a setup and the data that were taken with it, measured or simulated. It
+gives the posterior over its sky, and the pieces that programs can ask for.
 """
 
 from __future__ import annotations

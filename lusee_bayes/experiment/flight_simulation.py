@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+from lusee_bayes.core.arrays import Grid
 from lusee_bayes.core.engine import in_threads, processors
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
@@ -22,25 +23,11 @@ from lusee_bayes.experiment.instrument_sections import FlightSection, FlightSimu
 from lusee_bayes.experiment.model import true_signal, true_values
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.flight import synthesis
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
 from lusee_bayes.flight.gain_model import GainModel, draw_gains, synthetic_gains
-from lusee_bayes.flight.session import (
-    ADC_HIGH,
-    ADC_LOW,
-    FRAME_S,
-    PORTS,
-    BinOrigin,
-    channel_mhz,
-)
+from lusee_bayes.flight.session import ADC_HIGH, ADC_LOW, FRAME_S, PORTS, BinOrigin, channel_mhz
 from lusee_bayes.flight.session_files import SessionRows
-from lusee_bayes.flight.synthesis import (
-    SATURATED_FACTOR,
-    ChannelSpectra,
-    Counting,
-    Disturbances,
-    bit_slices,
-    rounded,
-)
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import (
     CONVENTIONS,
@@ -88,7 +75,7 @@ class FlightSimulation:
         Where the visibilities are those of the sky; others lie smoothly between.
     visibilities : (nodes, products, rows) array
         Without noise, in V^2/Hz.
-    disturbances : Disturbances
+    disturbances : synthesis.Disturbances
     table : GainModel
         By which the counts are to be divided.
     gains : GainModel
@@ -107,7 +94,7 @@ class FlightSimulation:
     observation: Observation
     frequencies_mhz: Float[np.ndarray, " nodes"]
     visibilities: Float[np.ndarray, "nodes products rows"]
-    disturbances: Disturbances
+    disturbances: synthesis.Disturbances
     table: GainModel
     gains: GainModel
     gain_errors: dict[str, float]
@@ -121,8 +108,8 @@ class FlightSimulation:
         return 2.0**self.navg_shift
 
     @cached_property
-    def _spectra(self) -> ChannelSpectra:
-        return ChannelSpectra.of(self.frequencies_mhz, channel_mhz(self.origin))
+    def _spectra(self) -> synthesis.ChannelSpectra:
+        return synthesis.ChannelSpectra.of(self.frequencies_mhz, channel_mhz(self.origin))
 
     @cached_property
     def _hours(self) -> Float[np.ndarray, " rows"]:
@@ -204,9 +191,9 @@ class FlightSimulation:
         levels = "".join(self.disturbances.level[rows.start])
         counts = self._counting(levels)(to_real(t), self._telemetry(rows))
         saturated = self.disturbances.saturated[rows]
-        counts[saturated] *= SATURATED_FACTOR
+        counts[saturated] *= synthesis.SATURATED_FACTOR
         bitslice = np.broadcast_to(self._slices[levels], counts.shape[:2])
-        found = rounded(counts, bitslice)
+        found = synthesis.rounded(counts, bitslice)
         found[self.disturbances.absent[rows]] = np.nan
         return found
 
@@ -216,12 +203,13 @@ class FlightSimulation:
         first, at = slice(0, 1), self._telemetry(slice(0, 1))
         states = {"".join(one) for one in np.unique(self.disturbances.level, axis=0)}
         return {
-            levels: bit_slices(self._counting(levels)(self.spectra(first), at)) for levels in states
+            levels: synthesis.bit_slices(self._counting(levels)(self.spectra(first), at))
+            for levels in states
         }
 
-    def _counting(self, levels: str) -> Counting:
+    def _counting(self, levels: str) -> synthesis.Counting:
         sign = int(CONVENTIONS[flight_of(self.scenario).convention])
-        return Counting(self.gains, levels, self.section.navgf, self.origin, sign)
+        return synthesis.Counting(self.gains, levels, self.section.navgf, self.origin, sign)
 
     def _telemetry(self, rows: slice) -> Mapping[str, Float[np.ndarray, " _"]]:
         hours = self._hours[rows]
@@ -268,7 +256,7 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
     origin = flight.bin_origin or "centre"
     nodes = np.array(scenario.frequencies_mhz or (scenario.frequency_mhz,))
     hours = observation.hours
-    made = Disturbances.drawn(
+    made = synthesis.Disturbances.drawn(
         hours - hours[0], step_s, origin, scenario.seed, **section.disturbances()
     )
     visibilities = true_visibilities(scenario, observation, stages)
@@ -378,9 +366,7 @@ def _volts_per_kelvin(scenario: Scenario) -> Float[np.ndarray, " products"]:
     return np.sqrt([per_kelvin[p.i] * per_kelvin[p.j] for p in all_products()])
 
 
-def _true_kelvin(
-    scenario: Scenario, observation: Observation
-) -> Float[np.ndarray, "products times"]:
+def _true_kelvin(scenario: Scenario, observation: Observation) -> Grid:
     layout = DataLayout.from_flags(np.zeros((len(all_products()), observation.n_times), dtype=bool))
     nothing = Visibilities(np.zeros(layout.size), layout, observation, scenario.frequency_mhz)
     setup = set_up(scenario, nothing)

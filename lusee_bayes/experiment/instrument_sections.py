@@ -1,26 +1,17 @@
 """Sections of a scenario on the instrument and its data.
 
-Where, when and with which turntable angles.
-
-What is not known about clock and pointing.
-
-What is connected to the ports of a response: one section for each kind, told by ``model``.
-
-The beams: one section for each kind, selected by ``model``.
-
-A new kind is a class here, with its :class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
-
-Sessions of the spectrometer that are simulated, and what disturbs them.
-
-How sessions of the spectrometer become visibilities.
+They say where, when and with which turntable angles; what is not known about clock and pointing;
+the beams, and what is connected to their ports; and how sessions of the spectrometer become
+visibilities, or are simulated. Beams and receivers have one section for each kind, told by
+``model``. A new kind of beams is a class here, with its :class:`BeamSource`, and its name in
+``BEAM_SECTIONS``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache, reduce
-from operator import or_
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -34,6 +25,9 @@ from lusee_bayes.experiment.section import (
     Section,
     Temperature,
     Treatment,
+    kinds_of,
+    one_of,
+    requires,
     without_other_kinds,
 )
 from lusee_bayes.instrument.beams.fields import Interpolation
@@ -46,7 +40,7 @@ from lusee_bayes.instrument.beams.monopoles import (
     Regolith,
     read_receiver,
 )
-from lusee_bayes.instrument.beams.sampled import SampledFileBeams, kind_of, read_sampled
+from lusee_bayes.instrument.beams.sampled import SampledFileBeams, beam_kind, read_sampled
 from lusee_bayes.instrument.beams.source import (
     BeamSource,
     EmbeddedBeams,
@@ -128,11 +122,10 @@ class ObservationSection(Section):
             return {**tree, "window": "instant"}
         return tree
 
-    @model_validator(mode="after")
-    def _a_fixed_axis_has_instants(self) -> ObservationSection:
-        if self.fixed_axis and self.window != "instant":
-            raise ValueError("fixed_axis is for samples that are instants; add window: instant")
-        return self
+    _a_fixed_axis_has_instants = requires(
+        lambda section: not section.fixed_axis or section.window == "instant",
+        "fixed_axis is for samples that are instants; add window: instant",
+    )
 
     @model_validator(mode="after")
     def _a_schedule_has_all_dates(self) -> ObservationSection:
@@ -163,24 +156,11 @@ class ObservationSection(Section):
 @lru_cache(maxsize=2)
 def _observation(section: ObservationSection, intervals: tuple[Interval, ...]) -> Observation:
     """One for all channels, with their times' orientations."""
+    common = section.model_dump(include={"step_s", "lon_deg", "lat_deg", "fixed_axis", "window"})
     if intervals:
-        return Observation.from_schedule(
-            intervals,
-            step_s=section.step_s,
-            lon_deg=section.lon_deg,
-            lat_deg=section.lat_deg,
-            fixed_axis=section.fixed_axis,
-            window=section.window,
-        )
-    return Observation.from_runs(
-        tuple(Run(r.cycles, r.turntable_deg, r.night_only) for r in section.runs),
-        start=section.start,
-        step_s=section.step_s,
-        lon_deg=section.lon_deg,
-        lat_deg=section.lat_deg,
-        fixed_axis=section.fixed_axis,
-        window=section.window,
-    )
+        return Observation.from_schedule(intervals, **common)
+    runs = tuple(Run(r.cycles, r.turntable_deg, r.night_only) for r in section.runs)
+    return Observation.from_runs(runs, start=section.start, **common)
 
 
 # wider priors are none: the sky looks nothing like it did
@@ -228,11 +208,10 @@ class PointingSection(Section):
     around: Literal["posterior", "model"] = "posterior"
     true_values: dict[str, Annotated[float, Field(ge=-1e6, le=1e6)]] = Field(default_factory=dict)
 
-    @model_validator(mode="after")
-    def _something_is_not_known(self) -> PointingSection:
-        if not self.kinds:
-            raise ValueError(f"give a standard deviation of at least one of {', '.join(OFFSETS)}")
-        return self
+    _something_is_not_known = requires(
+        lambda section: section.kinds,
+        f"give a standard deviation of at least one of {', '.join(OFFSETS)}",
+    )
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -282,8 +261,8 @@ class JFETSection(Section):
     skin_ohm: _ports(NotNegative) = _JFET.skin_ohm
     skin_power: _ports(Annotated[float, Field(ge=-10, le=10)]) = _JFET.skin_power
 
-    def receiver(self) -> Receiver | None:
-        """The receiver, or None for open ports."""
+    def receiver(self) -> Receiver:
+        """The receiver."""
         return JFETReceiver(**self.model_dump(exclude={"model"}))
 
 
@@ -365,6 +344,9 @@ class MonopoleBeamSection(Section):
     """
 
     is_file: ClassVar[bool] = False
+    # for the header of a file, and number of antennas
+    label: ClassVar[str] = "monopole"
+    n_ports: ClassVar[int] = N_ANTENNAS
 
     model: Literal["monopole"] = "monopole"
     length_m: Positive = 3.0
@@ -375,28 +357,12 @@ class MonopoleBeamSection(Section):
     loss_tangent: Annotated[float, Field(ge=0, le=1e6)] = 0.01
     turntable_offset_deg: Angle = 0.0
 
-    @property
-    def label(self) -> str:
-        """Which antennas, for the header of a file."""
-        return self.model
-
-    @property
-    def n_ports(self) -> int:
-        """Number of antennas."""
-        return N_ANTENNAS
-
     def source(self) -> BeamSource:
         """The antennas."""
+        ground = ("surface_permittivity", "deep_permittivity", "loss_tangent")
+        regolith = Regolith(*(getattr(self, name) for name in ground))
         return EmbeddedBeams(
-            Monopoles(
-                regolith=Regolith(
-                    self.surface_permittivity, self.deep_permittivity, self.loss_tangent
-                ),
-                length_m=self.length_m,
-                zenith_angle_deg=self.zenith_angle_deg,
-                height_m=self.height_m,
-                turntable_offset_deg=self.turntable_offset_deg,
-            )
+            Monopoles(regolith=regolith, **self.model_dump(exclude={"model", *ground}))
         )
 
 
@@ -415,6 +381,14 @@ class _FileSection(Section):
     def label(self) -> str:
         """Which antennas, for the header of a file."""
         return Path(self.file).name
+
+    def turned(self) -> dict[str, Any]:
+        """What is said of every file, as its beams take it."""
+        return {
+            "turntable_offset_deg": self.turntable_offset_deg,
+            "luseepy_quadrature": self.quadrature == "luseepy",
+            "moon_k": self.moon_temperature_k,
+        }
 
 
 class ScalarBeamSection(_FileSection):
@@ -453,11 +427,9 @@ class ScalarBeamSection(_FileSection):
         """The pattern of the file, turned to every angle."""
         return ScalarFileBeams(
             replace(read_scalar_beam(self.file), interpolation=self.interpolation),
-            turntable_offset_deg=self.turntable_offset_deg,
             taper=self.taper,
             rotations_deg=self.rotations_deg,
-            luseepy_quadrature=self.quadrature == "luseepy",
-            moon_k=self.moon_temperature_k,
+            **self.turned(),
         )
 
 
@@ -484,14 +456,10 @@ class ResponseSection(_FileSection):
         Temperature of the antennas' losses, which add their own radiation.
     """
 
+    n_ports: ClassVar[int] = N_ANTENNAS
     model: Literal["response"] = "response"
     receiver: ReceiverSection | None = None
     antenna_temperature_k: Temperature = 0.0
-
-    @property
-    def n_ports(self) -> int:
-        """Number of ports."""
-        return N_ANTENNAS
 
     def source(self) -> BeamSource:
         """The response of the file, with its receivers."""
@@ -501,10 +469,8 @@ class ResponseSection(_FileSection):
         return ResponseBeams(
             response,
             receiver_said=self.receiver is not None,
-            turntable_offset_deg=self.turntable_offset_deg,
-            luseepy_quadrature=self.quadrature == "luseepy",
-            moon_k=self.moon_temperature_k,
             antenna_k=self.antenna_temperature_k,
+            **self.turned(),
         )
 
 
@@ -543,10 +509,9 @@ class SampledBeamSection(Section):
         return SampledFileBeams(read_sampled(self.file), self.turntable_offset_deg, self.normalise)
 
 
-BEAM_SECTIONS = {
-    section.model_fields["model"].default: section
-    for section in (MonopoleBeamSection, ScalarBeamSection, ResponseSection, SampledBeamSection)
-}
+BEAM_SECTIONS = kinds_of(
+    MonopoleBeamSection, ScalarBeamSection, ResponseSection, SampledBeamSection
+)
 
 
 def _one_kind(value: Any) -> Any:
@@ -558,7 +523,7 @@ def _one_kind(value: Any) -> Any:
     tree["model"] = tree.get("model") or default
     file = tree.get("file")
     if tree["model"] == default and file is not None:
-        tree["model"] = kind_of(file) if isinstance(file, str) else "luseepy"
+        tree["model"] = beam_kind(file) if isinstance(file, str) else "luseepy"
     if tree["model"] != "response" and tree.get("receiver") == "jfet":
         del tree["receiver"]  # scenarios of 0.1 held all keys of all kinds
     temperatures = ("moon_temperature_k", "antenna_temperature_k")
@@ -575,14 +540,12 @@ def _one_kind(value: Any) -> Any:
     return without_other_kinds(tree, BEAM_SECTIONS, strict=True)
 
 
-BeamSection = Annotated[
-    reduce(or_, BEAM_SECTIONS.values()), Field(discriminator="model"), BeforeValidator(_one_kind)
-]
+BeamSection = one_of(BEAM_SECTIONS, _one_kind)
 
 
 def section_of_file(file: str, like: Any) -> Any:
     """The section of another beam file, turned as the beams of ``like`` are."""
-    kind = BEAM_SECTIONS[kind_of(file)]
+    kind = BEAM_SECTIONS[beam_kind(file)]
     shared = {
         name: value
         for name, value in like.model_dump().items()
@@ -736,8 +699,7 @@ class FlightSection(Section):
     leave_out: bool = True
     simulated: FlightSimulatedSection | None = None
 
-    @model_validator(mode="after")
-    def _one_kind_of_error(self) -> FlightSection:
-        if self.gain_std is not None and self.gain_std >= 1.0:
-            raise ValueError("gain_std is relative to the gain; give a number below 1")
-        return self
+    _gains_are_positive = requires(
+        lambda section: section.gain_std is None or section.gain_std < 1.0,
+        "gain_std is relative to the gain; give a number below 1",
+    )

@@ -1,44 +1,35 @@
-"""Terms of N from the instrument: beams, pointing, gains.
+"""Terms of N from the instrument.
 
-Beams that differ from the model's in the data: shifted, from another file, or other antennas.
-
-Clock and pointing that are off.
-
-Drifts of the antennas' gains.
-
-Errors of the gain table.
+Beams that differ from the model's in the data: shifted, from another file, or other antennas; clock
+and pointing that are off; drifts of the antennas' gains; and errors of the gain table.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import DataVector, Grid, Modes
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.lazy import numpyro
 from lusee_bayes.core.reading import naming
 from lusee_bayes.experiment.instrument_sections import section_of_file
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.section import is_modelled
 from lusee_bayes.experiment.setup import Setup, expected_signal, mean_flux, source_responses
 from lusee_bayes.experiment.term import Around, Term, Truth, gains_about, noise_visibilities
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import placed
+from lusee_bayes.instrument.beams.monopoles import with_values
 from lusee_bayes.instrument.beams.source import BeamSource, EmbeddedBeams
 from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.pointing import CLOCK, Pointing, kind_of, offset_names, with_offsets
+from lusee_bayes.instrument.pointing import CLOCK, Pointing, offset_kind, offset_names, with_offsets
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.noise.instrument_errors import (
-    GainDrift,
-    derivative,
-    difference,
-    rms_difference,
-    with_gains,
-)
+from lusee_bayes.noise import instrument_errors
 from lusee_bayes.systematics.gain_drifts import GainDrifts
 from lusee_bayes.systematics.gain_table import GAIN_TABLE, GainTable, TableErrors
 from lusee_bayes.systematics.instrument_unknowns import (
@@ -57,24 +48,16 @@ class BeamErrorTerm(Term):
 
     key = "noise.beam"
 
-    def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
-        beam = setup.scenario.noise.beam
-        if beam is None or beam.treatment == "ignored":
-            return []
-        if beam.treatment == "sampled" and beam.parameters:
-            return [("sampled", InstrumentParameters.centred(setup.prepared, beam.parameters))]
-        return [
-            (beam.treatment, BeamError(setup.instrument.coupling_of(direction)))
-            for direction in beam_directions(setup)
-        ]
+    def systematics(self, setup: Setup, section: Any, around: Around) -> list[Systematic]:
+        if section.treatment == "sampled" and section.parameters:
+            return [InstrumentParameters.centred(setup.prepared, section.parameters)]
+        coupling_of = setup.instrument.coupling_of
+        return [BeamError(coupling_of(direction)) for direction in beam_directions(setup)]
 
-    def truth(self, setup: Setup, key: PRNGKeyArray) -> Truth:
-        beam = setup.scenario.noise.beam
-        if beam is None:
-            return {}
-        if not beam.parameters:
+    def drawn(self, setup: Setup, section: Any, key: PRNGKeyArray) -> Truth:
+        if not section.parameters:
             return {"beam_amplitude": 1.0}
-        priors = InstrumentParameters.centred(setup.instrument, beam.parameters).priors()
+        priors = InstrumentParameters.centred(setup.instrument, section.parameters).priors()
         keys = jax.random.split(jax.random.fold_in(key, BEAM_DRAW), len(priors))
         return {
             name: float(prior.sample(k))
@@ -82,20 +65,11 @@ class BeamErrorTerm(Term):
         }
 
 
-@dataclass(frozen=True)
-class TrueInstrument:
+class TrueInstrument(NamedTuple):
     """What simulated data are taken with: beams of a source at a frequency."""
 
     source: BeamSource
     frequency_mhz: float
-
-    def beams(self, lmax: int) -> ProductBeams:
-        """Beams of all products."""
-        return self.source.beams(self.frequency_mhz, lmax)
-
-    def background(self) -> Float[Array, " products"]:
-        """Visibilities without any sky, in K."""
-        return self.source.background(self.frequency_mhz)
 
 
 def true_instrument(setup: Setup) -> TrueInstrument:
@@ -110,14 +84,15 @@ def true_instrument(setup: Setup) -> TrueInstrument:
         other = section_of_file(error.file, scenario.beam).source().behind(setup.receiver)
         return TrueInstrument(other, frequency)
     truth = BeamErrorTerm().truth(setup, jax.random.key(scenario.seed))
-    return TrueInstrument(EmbeddedBeams(placed(source.monopoles, truth)), frequency)
+    return TrueInstrument(EmbeddedBeams(with_values(source.monopoles, truth)), frequency)
 
 
 def true_beams(setup: Setup) -> ProductBeams:
     """The beams that simulated data are taken with."""
     if setup.scenario.noise.beam is None:
         return setup.beams
-    return true_instrument(setup).beams(setup.scenario.lmax)
+    true = true_instrument(setup)
+    return true.source.beams(true.frequency_mhz, setup.scenario.lmax)
 
 
 def beam_directions(setup: Setup) -> list[ProductBeams]:
@@ -126,11 +101,11 @@ def beam_directions(setup: Setup) -> list[ProductBeams]:
     if beam is None:
         return []
     if not beam.parameters:
-        return [difference(true_beams(setup), setup.beams)]
+        return [instrument_errors.difference(true_beams(setup), setup.beams)]
     frequency, lmax = setup.scenario.frequency_mhz, setup.scenario.lmax
     directions = []
     for name, sigma in beam.parameters.items():
-        slope = derivative(name, frequency, lmax, setup.instrument.monopoles)
+        slope = instrument_errors.derivative(name, frequency, lmax, setup.instrument.monopoles)
         directions.append(ProductBeams(sigma * slope.modes, frequency))
     return directions
 
@@ -139,7 +114,7 @@ def beam_rms_difference(setup: Setup) -> float | None:
     """RMS difference of the true beams and the model's, over the model's; None if the same."""
     if setup.scenario.noise.beam is None:
         return None
-    return rms_difference(true_beams(setup), setup.beams)
+    return instrument_errors.rms_difference(true_beams(setup), setup.beams)
 
 
 # what the scenario's seed is folded with
@@ -153,15 +128,10 @@ class PointingTerm(Term):
     remedy = "smaller standard deviations in noise.pointing, or its treatment=sampled"
 
     def moves(self, scenario: Scenario) -> bool:
-        section = scenario.noise.pointing
-        return (
-            section is not None and section.treatment != "ignored" and section.around == "posterior"
-        )
+        section = self.section(scenario)
+        return is_modelled(section) and section.around == "posterior"
 
-    def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
-        section = setup.scenario.noise.pointing
-        if section is None or section.treatment == "ignored":
-            return []
+    def systematics(self, setup: Setup, section: Any, around: Around) -> list[Systematic]:
         beam = setup.scenario.noise.beam
         makes_a = beam is not None and bool(beam.parameters) and beam.treatment == "sampled"
         if section.treatment == "sampled" and makes_a:
@@ -169,12 +139,9 @@ class PointingTerm(Term):
                 "noise.pointing and the parameters of noise.beam cannot both be sampled: each of "
                 "them makes A anew; set the treatment of one to marginalised"
             )
-        return [(section.treatment, pointing_offsets(setup, around))]
+        return [pointing_offsets(setup, around)]
 
-    def truth(self, setup: Setup, key: PRNGKeyArray) -> Truth:
-        section = setup.scenario.noise.pointing
-        if section is None:
-            return {}
+    def drawn(self, setup: Setup, section: Any, key: PRNGKeyArray) -> Truth:
         names = offset_names(section.kinds, setup.observation.n_runs)
         for name in section.true_values:
             if name not in names:
@@ -205,19 +172,12 @@ def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
         pointing = Pointing.of(observation, setup.scenario.lmax, pole_frame=frame)
     else:  # the sky turns as before
         pointing = setup.pointing.placed(observation)
-    coupling = CouplingMatrix.build(setup.beams, pointing, setup.layout)
-    responses = setup.responses
-    if responses:
-        responses = source_responses(
-            setup.scenario, observation, setup.beam_source.monopoles, setup.scenario.frequency_mhz
-        )
-    instrument = replace(setup.instrument, pointing=pointing)
     return replace(
         setup,
         observation=observation,
-        instrument=instrument,
-        coupling=coupling,
-        responses=responses,
+        instrument=replace(setup.instrument, pointing=pointing),
+        coupling=CouplingMatrix.build(setup.beams, pointing, setup.layout),
+        responses=source_responses(setup.scenario, observation, setup.beam_source),
     )
 
 
@@ -249,10 +209,7 @@ def pointing_offsets(setup: Setup, around: Around) -> PointingOffsets:
 
 
 def offsets_about(
-    setup: Setup,
-    stds: Mapping[str, float],
-    sky: Float[np.ndarray, " modes"],
-    centre: Mapping[str, float],
+    setup: Setup, stds: Mapping[str, float], sky: Modes, centre: Mapping[str, float]
 ) -> PointingOffsets:
     """Offsets with templates about a sky and values: half the difference at +-1 standard deviation.
 
@@ -290,9 +247,7 @@ def offsets_about(
     )
 
 
-def second_order(
-    setup: Setup, stds: Mapping[str, float], sky: Float[np.ndarray, " modes"]
-) -> dict[str, Float[np.ndarray, " data"]]:
+def second_order(setup: Setup, stds: Mapping[str, float], sky: Modes) -> dict[str, DataVector]:
     """What offsets of one standard deviation do to the data beyond first order, in K."""
     middle = sum(_seen(setup, sky))
     return {
@@ -302,9 +257,7 @@ def second_order(
     }
 
 
-def _seen(
-    setup: Setup, sky: Float[np.ndarray, " modes"]
-) -> tuple[Float[np.ndarray, " data"], Float[np.ndarray, " data"]]:
+def _seen(setup: Setup, sky: Modes) -> tuple[DataVector, DataVector]:
     """What the data are of the sky, and of the sources with their mean fluxes."""
     sources = np.zeros(setup.layout.size)
     for section, response in zip(setup.scenario.sources.list, setup.responses, strict=True):
@@ -315,7 +268,7 @@ def _seen(
 
 def _stds(setup: Setup, names: tuple[str, ...]) -> Float[np.ndarray, " offsets"]:
     section = setup.scenario.noise.pointing
-    return np.array([float(getattr(section, kind_of(name))) for name in names])
+    return np.array([float(getattr(section, offset_kind(name))) for name in names])
 
 
 # what the scenario's seed is folded with: for the drifts, and for their scales
@@ -327,32 +280,19 @@ class GainTerm(Term):
 
     key = "noise.gain"
 
-    def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
-        gain = setup.scenario.noise.gain
-        if gain is None or gain.treatment == "ignored":
-            return []
-        return [(gain.treatment, gain_drifts(setup, around))]
+    def systematics(self, setup: Setup, section: Any, around: Around) -> list[Systematic]:
+        return [gain_drifts(setup, around)]
 
-    def truth(self, setup: Setup, key: PRNGKeyArray) -> Truth:
-        if setup.scenario.noise.gain is None:
-            return {}
+    def drawn(self, setup: Setup, section: Any, key: PRNGKeyArray) -> Truth:
         # the scales where they are not known; the prior is the program's own
         with numpyro.handlers.seed(rng_seed=jax.random.fold_in(key, SCALE_DRAW)):
             drift = gain_drifts(setup, Around()).scales()
         return {"gain_sigma": float(drift.sigma), "gain_correlation_h": float(drift.correlation_h)}
 
-    def distort(
-        self,
-        visibilities: Float[Array, "products times"],
-        setup: Setup,
-        truth: Truth,
-        key: PRNGKeyArray,
-    ) -> Float[Array, "products times"]:
-        if "gain_sigma" not in truth:
-            return visibilities
-        drift = GainDrift(truth["gain_sigma"], truth["gain_correlation_h"])
+    def distorted(self, visibilities: Grid, setup: Setup, truth: Truth, key: PRNGKeyArray) -> Grid:
+        drift = instrument_errors.GainDrift(truth["gain_sigma"], truth["gain_correlation_h"])
         gains = drift.sample(jax.random.fold_in(key, GAIN_DRAW), setup.observation.hours)
-        return with_gains(visibilities, gains)
+        return instrument_errors.with_gains(visibilities, gains)
 
 
 def gain_drifts(setup: Setup, around: Around) -> GainDrifts:
@@ -361,7 +301,7 @@ def gain_drifts(setup: Setup, around: Around) -> GainDrifts:
     if gain is None:
         raise InputError("the scenario has no noise.gain that could be sampled")
     return GainDrifts.of(
-        GainDrift(gain.sigma, gain.correlation_h),
+        instrument_errors.GainDrift(gain.sigma, gain.correlation_h),
         noise_visibilities(setup, around, gains_about(setup)),
         setup.observation.hours,
         setup.layout,
@@ -383,12 +323,9 @@ class GainTableTerm(Term):
     remedy = "noise.gain_table.treatment=sampled"
 
     def moves(self, scenario: Scenario) -> bool:
-        section = scenario.noise.gain_table
-        return section is not None and section.treatment != "ignored"
+        return is_modelled(self.section(scenario))
 
-    def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
-        if not self.moves(setup.scenario):
-            return []
+    def systematics(self, setup: Setup, section: Any, around: Around) -> list[Systematic]:
         errors = table_errors(setup)
         centre = _centre(errors, around)
         seen = around.seen
@@ -396,26 +333,13 @@ class GainTableTerm(Term):
             # those of some sky: what gains make of the data is none, and to first order would be
             # explained by gains that take all of the data away
             seen = setup.layout.gather(setup.signal)
-        treatment = setup.scenario.noise.gain_table.treatment
-        return [(treatment, GainTable(errors, centre, np.asarray(seen), around.freedom))]
+        return [GainTable(errors, centre, np.asarray(seen), around.freedom)]
 
-    def truth(self, setup: Setup, key: PRNGKeyArray) -> Truth:
-        if setup.scenario.noise.gain_table is None:
-            return {}
-        shape = (len(table_errors(setup).names),)
-        return {
-            GAIN_TABLE: np.asarray(jax.random.normal(jax.random.fold_in(key, TABLE_DRAW), shape))
-        }
+    def drawn(self, setup: Setup, section: Any, key: PRNGKeyArray) -> Truth:
+        own, shape = jax.random.fold_in(key, TABLE_DRAW), (len(table_errors(setup).names),)
+        return {GAIN_TABLE: np.asarray(jax.random.normal(own, shape))}
 
-    def distort(
-        self,
-        visibilities: Float[Array, "products times"],
-        setup: Setup,
-        truth: Truth,
-        key: PRNGKeyArray,
-    ) -> Float[Array, "products times"]:
-        if setup.scenario.noise.gain_table is None:
-            return visibilities
+    def distorted(self, visibilities: Grid, setup: Setup, truth: Truth, key: PRNGKeyArray) -> Grid:
         whole = DataLayout(setup.layout.n_products, setup.layout.n_times)
         errors = replace(table_errors(setup), layout=whole)
         return visibilities * whole.scatter(errors.factors(np.asarray(truth[GAIN_TABLE])))
@@ -469,7 +393,7 @@ def table_errors(setup: Setup) -> TableErrors:
     return TableErrors(names, tuple(port.tolist()), slope, setup.layout)
 
 
-def table_factors(setup: Setup, around: Around) -> Float[np.ndarray, " data"] | None:
+def table_factors(setup: Setup, around: Around) -> DataVector | None:
     """Gains of the errors that terms of N are built around; None where these are none."""
     if not around.values or not GainTableTerm().moves(setup.scenario):
         return None

@@ -1,11 +1,8 @@
 """Data that disagree with all others, and the fit without them.
 
-Times, values, products and days of data against what the model predicts from all others.
-
-Data that do not fit what all others predict for them, found one after the other.
-
-The worst times are flagged, or a single product of theirs without which the time fits; what is left
-is compared again under the same model, and so on, until none has a chi^2 that noise gives with less
+Times, values, products and days are compared with what the model predicts from all others. The
+worst times are flagged, or a single product of theirs without which the time fits; what is left is
+compared again under the same model, and so on, until none has a chi^2 that noise gives with less
 than the rate of false alarms. Then products and days are compared in the same way. A bad product or
 day spoils the predictions of all times: where more times do not fit than may be flagged, it goes
 first. What is left is fitted again, since N is built around the data, until nothing more goes.
@@ -18,18 +15,20 @@ fits no data; so before much is flagged, higher ones are tried.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.arrays import Grid, GridFlags, TimeFlags, Vector, on_host
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.progress import Stages, memory_limit
 from lusee_bayes.experiment.rounds import model_about, rebuilds, settled
+from lusee_bayes.experiment.section import is_modelled
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import DataLayout, all_products
@@ -37,7 +36,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.chi2 import WIDER, Split
 from lusee_bayes.judge.left_out import DenseLeftOut, Missed
 from lusee_bayes.judge.residuals import HOURS_A_DAY
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 
 # of the times beyond the limit, those within this share of the worst go in one round
@@ -46,7 +45,7 @@ WORST = 0.3
 ARRAYS, MOST_MEMORY = 5, 0.5
 
 
-class Group(NamedTuple):
+class ComparedGroup(NamedTuple):
     """A product or a day.
 
     Attributes
@@ -61,12 +60,12 @@ class Group(NamedTuple):
 
     kind: str
     name: str
-    data: Bool[np.ndarray, "products times"]
+    data: GridFlags
     of: int
 
 
 @dataclass(frozen=True)
-class Comparison:
+class GroupsCompared:
     """Times and data against their prediction by all others.
 
     Attributes
@@ -84,10 +83,10 @@ class Comparison:
     left_out: DenseLeftOut
     chi2: Float[np.ndarray, " times"]
     degrees: Float[np.ndarray, " times"]
-    z: Float[np.ndarray, "products times"]
+    z: Grid
 
     @classmethod
-    def of(cls, left_out: DenseLeftOut, data: Visibilities) -> Comparison:
+    def of(cls, left_out: DenseLeftOut, data: Visibilities) -> GroupsCompared:
         """Leave out every time, one after the other."""
         layout, n = left_out.layout, data.layout.n_times
         counts = np.bincount(layout.time, minlength=n)
@@ -100,9 +99,9 @@ class Comparison:
         known = np.asarray(layout.present) & np.isfinite(z) & (degrees > 0.0)
         return cls(data, left_out, chi2, degrees, np.where(known, z, 0.0))
 
-    def without(self, gone: Bool[np.ndarray, "products times"]) -> Comparison:
+    def without(self, gone: GridFlags) -> GroupsCompared:
         """Compare the others, with the same model."""
-        return Comparison.of(self.left_out.without(gone), self.data)
+        return GroupsCompared.of(self.left_out.without(gone), self.data)
 
     @property
     def ratio(self) -> Float[np.ndarray, " times"]:
@@ -114,7 +113,7 @@ class Comparison:
         """By how much times, or one of their data, stand out: chi^2 over its mean."""
         return np.maximum(self.ratio, (self.z**2).max(axis=0) / len(self.z))
 
-    def worst(self, false_alarm: float, least: float = 0.0) -> Bool[np.ndarray, "products times"]:
+    def worst(self, false_alarm: float, least: float = 0.0) -> GridFlags:
         """The worst of what stands out: whole times, or a value without which its time fits.
 
         chi^2 of a time less z^2 of one of its data is that of its other data.
@@ -143,7 +142,7 @@ class Comparison:
         found[product[alone], np.flatnonzero(alone)] = True
         return found
 
-    def worst_group(self, false_alarm: float) -> Group | None:
+    def worst_group(self, false_alarm: float) -> ComparedGroup | None:
         """Find the product or day that stands out and without which chi^2 falls most.
 
         Parameters
@@ -164,11 +163,10 @@ class Comparison:
         for number in np.unique(layout.product).tolist():
             mine = np.arange(shape[0])[:, None] == number
             groups.append(("product", self.data.labels[number], np.broadcast_to(mine, shape)))
-            leave.append(lambda number=number: left_out.product(number))
+            leave.append(partial(left_out.product, number))
         for number in np.unique(day[layout.time]).tolist():
-            mine = day == number
-            groups.append(("day", str(number), np.broadcast_to(mine, shape)))
-            leave.append(lambda mine=mine: left_out.stretch(mine))
+            groups.append(("day", str(number), np.broadcast_to(day == number, shape)))
+            leave.append(partial(left_out.stretch, day == number))
         counts = np.array([int((mine & np.asarray(layout.present)).sum()) for _, _, mine in groups])
         # one that holds all data has nothing to be compared with
         some = np.flatnonzero(counts < layout.size)
@@ -178,12 +176,10 @@ class Comparison:
         if not out.any():
             return None
         kind, name, mine = groups[some[np.where(out, chi2 - degrees, -np.inf).argmax()]]
-        return Group(kind, name, mine, sum(of == kind for of, _, _ in groups))
+        return ComparedGroup(kind, name, mine, sum(of == kind for of, _, _ in groups))
 
 
-def _judged(
-    missed: list[Missed], counts: Int[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def _judged(missed: list[Missed], counts: Int[np.ndarray, " n"]) -> tuple[Vector, Vector]:
     """chi^2 of groups and its means; 0 where the others tell less than half a datum."""
     chi2, new = np.array([(m.chi2, m.directions) for m in missed]).reshape(-1, 2).T
     degrees = counts - np.clip(new, 0.0, counts)
@@ -191,16 +187,14 @@ def _judged(
     return np.where(told, chi2, 0.0), np.where(told, degrees, 0.0)
 
 
-def _tail(
-    chi2: Float[np.ndarray, " n"], degrees: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
+def _tail(chi2: Vector, degrees: Vector) -> Vector:
     """Probability of this chi^2 or more; 1 where there are no degrees of freedom."""
     some = degrees > 0.0
     found = special.chdtrc(np.where(some, degrees, 1.0), np.maximum(chi2, 0.0))
     return np.where(some, found, 1.0)
 
 
-def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Comparison | None:
+def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> GroupsCompared | None:
     """Leave out every time.
 
     Under a prior that is wide enough for any sky (:mod:`lusee_bayes.judge.residuals`), so that
@@ -229,13 +223,12 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Compar
         model = on_host(model_about(setup, Around(data))[0])
         prior = model.prior.widened(WIDER)
     left_out = DenseLeftOut(replace(model, prior=prior), data.data, data.layout)
-    return Comparison.of(left_out, data)
+    return GroupsCompared.of(left_out, data)
 
 
 def _memory(setup: Setup, data: Visibilities) -> float:
     """Bytes; where N couples times, it is a matrix of all data, too."""
-    n, gain = data.layout.size, setup.scenario.noise.gain
-    across = gain is not None and gain.treatment != "ignored"
+    n, across = data.layout.size, is_modelled(setup.scenario.noise.gain)
     return 8.0 * ARRAYS * n * (setup.prior.size + (n if across else 0))
 
 
@@ -293,17 +286,17 @@ class Fitting:
         Why good data do not fit, where that was found: also why a map of them may fail.
     """
 
-    flagged: Bool[np.ndarray, "products times"]
+    flagged: GridFlags
     rounds: int
     chi2: Float[np.ndarray, " times"]
     remark: str = ""
-    groups: tuple[Group, ...] = ()
+    groups: tuple[ComparedGroup, ...] = ()
     share: float = 0.0
     refused: bool = False
     cause: str = ""
 
     @property
-    def times(self) -> Bool[np.ndarray, " times"]:
+    def times(self) -> TimeFlags:
         """Times of which every product is flagged."""
         return self.flagged.all(axis=0)
 
@@ -358,12 +351,13 @@ def _found(setup: Setup, data: Visibilities, false_alarm: float, stages: Stages)
         kept = kept or auto
         if more is None:
             break
-        gone, groups = gone | more.flagged, (*groups, *more.groups)
+        flagged, blamed = more
+        gone, groups = gone | flagged, (*groups, *blamed)
         stages.say(
             f"  times compared at lmax={setup.scenario.lmax}, round {rounds}: "
             f"{limits.count(gone)} of {data.layout.size} values flagged"
         )
-        if not more.flagged.any():
+        if not flagged.any():
             share = limits.count(gone) / data.layout.size
             remark = " ".join(filter(None, [_remark(gone, groups, share, false_alarm), kept]))
             return Fitting(gone, rounds, before, remark, groups, share)
@@ -419,7 +413,7 @@ class _Limits:
     present : (products, times) array of bool; values : number of values
     """
 
-    present: Bool[np.ndarray, "products times"]
+    present: GridFlags
     values: float
 
     @classmethod
@@ -430,21 +424,17 @@ class _Limits:
         left = (MOST - lost) / (1.0 - lost) * n
         return cls(np.asarray(data.layout.present), max(left, SMALL * n, data.layout.n_products))
 
-    def count(self, gone: Bool[np.ndarray, "products times"]) -> int:
+    def count(self, gone: GridFlags) -> int:
         """Number of values that there were."""
         return int((gone & self.present).sum())
 
-    def broken(
-        self,
-        gone: Bool[np.ndarray, "products times"],
-        groups: Bool[np.ndarray, "products times"],
-    ) -> bool:
+    def broken(self, gone: GridFlags, groups: GridFlags) -> bool:
         """Whether too much goes, ``groups`` as a whole, or an auto without its port's crosses."""
         times = (gone & ~groups).any(axis=0).sum()
         too_many = times > max(MOST * gone.shape[1], 1.0) or self.count(gone) > self.values
         return bool(too_many) or self.auto_alone(gone) is not None
 
-    def auto_alone(self, gone: Bool[np.ndarray, "products times"]) -> int | None:
+    def auto_alone(self, gone: GridFlags) -> int | None:
         """The port whose auto goes while crosses stay."""
         products = all_products(round(np.sqrt(len(gone))))
         left = (self.present & ~gone).any(axis=1)
@@ -457,22 +447,14 @@ class _Limits:
         return None
 
 
-@dataclass(frozen=True)
-class _Eliminated:
-    """What goes, groups among it."""
-
-    flagged: Bool[np.ndarray, "products times"]
-    groups: tuple[Group, ...]
-
-
 def _one_by_one(
-    start: Comparison,
-    gone: Bool[np.ndarray, "products times"],
-    groups: Bool[np.ndarray, "products times"],
+    start: GroupsCompared,
+    gone: GridFlags,
+    groups: GridFlags,
     limits: _Limits,
     false_alarm: float,
     least: float,
-) -> tuple[Comparison, Bool[np.ndarray, "products times"] | None]:
+) -> tuple[GroupsCompared, GridFlags | None]:
     """Flag times and values, the worst first; ``groups`` are among what is ``gone`` from ``start``.
 
     Of what is left, and what goes in all; or of what was left before that was too much, and None.
@@ -487,11 +469,8 @@ def _one_by_one(
 
 
 def _eliminated(
-    start: Comparison,
-    gone: Bool[np.ndarray, "products times"],
-    limits: _Limits,
-    false_alarm: float,
-) -> tuple[_Eliminated | None, str]:
+    start: GroupsCompared, gone: GridFlags, limits: _Limits, false_alarm: float
+) -> tuple[tuple[GridFlags, tuple[ComparedGroup, ...]] | None, str]:
     """What goes under one model, besides what is ``gone``; None if that is too much.
 
     And what is to be said of an auto that cannot go.
@@ -503,7 +482,7 @@ def _eliminated(
         found, flagged = _one_by_one(
             base, gone | of_groups, gone | of_groups, limits, false_alarm, least
         )
-        result = None if flagged is None else _Eliminated(flagged & ~gone, groups)
+        result = None if flagged is None else (flagged & ~gone, groups)
         first = first if groups else result
         if result is not None and found.worst(false_alarm).any():
             return result, ""
@@ -528,10 +507,7 @@ def _about_auto(port: int | None) -> str:
 
 
 def _remark(
-    gone: Bool[np.ndarray, "products times"],
-    groups: tuple[Group, ...],
-    share: float,
-    false_alarm: float,
+    gone: GridFlags, groups: tuple[ComparedGroup, ...], share: float, false_alarm: float
 ) -> str:
     single = gone & ~np.any([np.zeros_like(gone), *(group.data for group in groups)], axis=0)
     whole = gone.all(axis=0) & single.any(axis=0)
@@ -550,9 +526,7 @@ def _remark(
     )
 
 
-def without(
-    setup: Setup, data: Visibilities, gone: Bool[np.ndarray, "products times"]
-) -> tuple[Setup, Visibilities]:
+def without(setup: Setup, data: Visibilities, gone: GridFlags) -> tuple[Setup, Visibilities]:
     """Setup and data without some of the data.
 
     Raises

@@ -1,8 +1,7 @@
 """The model of a setup, and data simulated from it.
 
-d = A m + n of a setup: with radiometer noise alone, or with every systematic.
-
-Simulated data: the true instrument, its drifts and fluxes, drawn with the scenario's seed.
+d = A m + n has radiometer noise alone, or every systematic. Simulated data hold the true
+instrument, its drifts and fluxes, drawn with the scenario's seed.
 """
 
 from __future__ import annotations
@@ -11,9 +10,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import jax
-from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, on_device
+from lusee_bayes.core.arrays import Grid, on_device
 from lusee_bayes.experiment.instrument_terms import (
     PointingTerm,
     pointed,
@@ -27,7 +25,7 @@ from lusee_bayes.experiment.term import Around, Truth, noise_visibilities, radio
 from lusee_bayes.experiment.terms import TERMS
 from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance
 from lusee_bayes.noise.radiometer import radiometer_noise
 from lusee_bayes.systematics.systematic import Marginalised, Systematic
@@ -42,23 +40,12 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
     section = setup.scenario.noise.radiometer
     visibilities = noise_visibilities(setup, around or Around(), radiometer_about(setup))
     if setup.calibration is not None:
-        return radiometer_noise(
-            visibilities,
-            setup.layout,
-            bandwidth_hz=1.0,
-            step_s=setup.calibration.n_averaged,
-            form=section.form,
-            factor=section.factor,
-        )
-    return radiometer_noise(
-        visibilities,
-        setup.layout,
-        bandwidth_hz=section.bandwidth_hz,
-        step_s=setup.observation.live_s,
-        form=section.form,
-        duty_cycle=section.duty_cycle,
-        factor=section.factor,
-    )
+        given = {"bandwidth_hz": 1.0, "step_s": setup.calibration.n_averaged}
+    else:
+        given = section.model_dump(include={"bandwidth_hz", "duty_cycle"})
+        given["step_s"] = setup.observation.live_s
+    common = {"form": section.form, "factor": section.factor}
+    return radiometer_noise(visibilities, setup.layout, **given, **common)
 
 
 def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, Systematic]]:
@@ -127,13 +114,14 @@ def true_values(setup: Setup) -> Truth:
     return {name: value for term in TERMS for name, value in term.truth(setup, key).items()}
 
 
-def true_signal(setup: Setup, truth: Truth) -> Float[Array, "products times"]:
+def true_signal(setup: Setup, truth: Truth) -> Grid:
     """Visibilities of sky, ground and systematics with the true instrument and values, in K."""
     key = jax.random.key(setup.scenario.seed)
     setup = true_setup(setup, truth)
     true = CouplingMatrix.build(true_beams(setup), setup.pointing)
     visibilities = true.layout.scatter(true @ setup.sky.modes)
-    visibilities = visibilities + true_instrument(setup).background()[:, None]
+    source, frequency_mhz = true_instrument(setup)
+    visibilities = visibilities + source.background(frequency_mhz)[:, None]
     for term in TERMS:
         visibilities = term.distort(visibilities, setup, truth, key)
     return visibilities

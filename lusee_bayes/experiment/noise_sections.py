@@ -1,18 +1,13 @@
-"""Sections of a scenario on N and the unknowns in it.
-
-What is not known about receivers, ground and gain table.
-
-The terms of N.
-"""
+"""Sections of a scenario on the terms of N, receivers, ground and gain table among them."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from lusee_bayes.experiment.instrument_sections import PointingSection
-from lusee_bayes.experiment.section import Megahertz, Positive, Section, Seed, Treatment
+from lusee_bayes.experiment.section import Megahertz, Positive, Section, Seed, Treatment, requires
 
 
 class ReceiverNoiseSection(Section):
@@ -50,11 +45,10 @@ class ReceiverNoiseSection(Section):
     smooth_seed: Seed | None = None
     treatment: Treatment = "marginalised"
 
-    @model_validator(mode="after")
-    def _one_power(self) -> ReceiverNoiseSection:
-        if (self.power_v2_hz is None) == (self.power_k is None):
-            raise ValueError("give either power_v2_hz or power_k")
-        return self
+    _one_power = requires(
+        lambda section: (section.power_v2_hz is None) != (section.power_k is None),
+        "give either power_v2_hz or power_k",
+    )
 
 
 class RegolithSection(Section):
@@ -155,15 +149,14 @@ class GainSection(Section):
     treatment: Treatment = "marginalised"
     visibilities: NoiseAbout | None = None
 
-    @model_validator(mode="after")
-    def _scales_are_sampled(self) -> GainSection:
-        known = self.log_sigma_std is None and self.log_correlation_std is None
-        if not known and self.treatment == "marginalised":
-            raise ValueError(
-                "log_sigma_std and log_correlation_std need treatment 'sampled': a covariance "
-                "has to know its scales"
-            )
-        return self
+    _scales_are_sampled = requires(
+        lambda section: (
+            section.treatment != "marginalised"
+            or (section.log_sigma_std is None and section.log_correlation_std is None)
+        ),
+        "log_sigma_std and log_correlation_std need treatment 'sampled': a covariance has to know "
+        "its scales",
+    )
 
 
 class BeamErrorSection(Section):
@@ -188,11 +181,12 @@ class BeamErrorSection(Section):
     parameters: dict[str, Positive] = Field(default_factory=dict)
     treatment: Treatment = "marginalised"
 
-    @model_validator(mode="after")
-    def _one_direction(self) -> BeamErrorSection:
-        if (self.shift_mhz is not None) + (self.file is not None) + bool(self.parameters) != 1:
-            raise ValueError("give either shift_mhz, file or parameters")
-        return self
+    _one_direction = requires(
+        lambda section: (
+            [section.shift_mhz, section.file, section.parameters or None].count(None) == 2
+        ),
+        "give either shift_mhz, file or parameters",
+    )
 
 
 class NoiseSection(Section):

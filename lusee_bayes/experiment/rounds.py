@@ -1,10 +1,7 @@
 """Inference in rounds: the prior, and N about the map, until neither moves.
 
-N that is built around what the data tell, in rounds, and the posterior of each.
-
-A prior whose parameters the data of an experiment tell.
-
-Priors by name, for a comparison under which of them data are most probable.
+N may be built around what the data tell, and the parameters of the prior be told by the data.
+Priors also come by name, for a comparison under which of them data are most probable.
 """
 
 from __future__ import annotations
@@ -15,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.arrays import DataVector, Grid, Vector, on_host
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.instrument_terms import pointed
@@ -27,6 +24,7 @@ from lusee_bayes.experiment.model import (
     systematics,
 )
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.section import is_modelled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.sky_sections import (
     IsotropicPriorSection,
@@ -40,7 +38,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.measures import data_freedom
 from lusee_bayes.linear.amplitudes import template_amplitudes, weighted_residual
 from lusee_bayes.linear.information import Information, integrated_out
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.priors.learning import Learned, learn_whatever_fits
@@ -160,11 +158,11 @@ class _Step:
     swing : how much of it is gone unless it is far; size : how much of it is gone
     """
 
-    whole: Float[np.ndarray, " n"] | None = None
+    whole: Vector | None = None
     swing: float = 1.0
     size: float = 1.0
 
-    def after(self, whole: Float[np.ndarray, " n"]) -> _Step:
+    def after(self, whole: Vector) -> _Step:
         """The next step: a smaller part if it turns back without becoming short."""
         back = (
             self.whole is not None
@@ -225,8 +223,8 @@ def _before_gains(
     found: Inference,
     table: GainTable,
     z: Float[np.ndarray, " errors"],
-    solved: Float[np.ndarray, " data"],
-) -> Float[np.ndarray, " data"]:
+    solved: DataVector,
+) -> DataVector:
     """What the data tell of the visibilities before the gains: less radiometer noise, and gains."""
     data = found.around.data
     noise = np.asarray(on_host(radiometer(setup, found.around)).mv(solved))
@@ -268,8 +266,7 @@ def first_order(setup: Setup) -> tuple[Term, ...]:
 
 def rebuilds_gains(setup: Setup) -> bool:
     """Whether the gain term is built around the posterior's own prediction."""
-    gain = setup.scenario.noise.gain
-    return gain is not None and gain.treatment != "ignored" and gains_about(setup) == "posterior"
+    return is_modelled(setup.scenario.noise.gain) and gains_about(setup) == "posterior"
 
 
 def rebuilds_visibilities(setup: Setup) -> bool:
@@ -277,9 +274,7 @@ def rebuilds_visibilities(setup: Setup) -> bool:
     return rebuilds_gains(setup) or radiometer_about(setup) == "posterior"
 
 
-def prediction(
-    setup: Setup, found: Inference, solved: Float[np.ndarray, " data"]
-) -> Float[Array, "products times"]:
+def prediction(setup: Setup, found: Inference, solved: DataVector) -> Grid:
     """Visibilities of the mean map, with all else that N holds but drifts and noise, in K.
 
     Parameters

@@ -1,12 +1,7 @@
-"""Scenarios: read, overridden, validated.
+"""A scenario: everything that determines a run, as YAML, validated before anything is computed.
 
-``--set key.path=value``: changing one entry of a tree of keys and values.
-
-What is wrong with a scenario, in one sentence.
-
-A scenario: everything that determines a run, as YAML, validated before anything is computed.
-
-Unknown keys are errors that name the nearest known one. ``to_yaml`` writes the resolved scenario,
+``--set key.path=value`` changes one entry. What is wrong with a scenario is said in one sentence;
+unknown keys are errors that name the nearest known one. ``to_yaml`` writes the resolved scenario,
 defaults included; running that file again gives the same numbers.
 """
 
@@ -30,7 +25,14 @@ from lusee_bayes.experiment.instrument_sections import (
     ObservationSection,
 )
 from lusee_bayes.experiment.noise_sections import NoiseSection
-from lusee_bayes.experiment.section import Frequency, OutputSection, Section, Seed
+from lusee_bayes.experiment.section import (
+    Frequency,
+    OutputSection,
+    Section,
+    Seed,
+    is_modelled,
+    requires,
+)
 from lusee_bayes.experiment.sky_sections import (
     GalaxySection,
     IsotropicPriorSection,
@@ -225,14 +227,11 @@ class Scenario(Section):
             raise ValueError("a power of two is expected, as HEALPix's ring maps have it")
         return nside
 
-    @model_validator(mode="after")
-    def _sources_are_there_once(self) -> Scenario:
-        if self.sky.sources and self.sources.list:
-            raise ValueError(
-                "the embedded sky holds the catalogue's sources already; with sources.list of "
-                "its own, set sky.sources=false"
-            )
-        return self
+    _sources_are_there_once = requires(
+        lambda scenario: not (scenario.sky.sources and scenario.sources.list),
+        "the embedded sky holds the catalogue's sources already; with sources.list of its own, set "
+        "sky.sources=false",
+    )
 
     @model_validator(mode="after")
     def _files_have_no_parameters(self) -> Scenario:
@@ -262,23 +261,18 @@ class Scenario(Section):
             )
         return self
 
-    @model_validator(mode="after")
-    def _smooth_receivers_are_gaussian(self) -> Scenario:
-        if not self.ties_receivers:
-            return self
-        if self.joint:
-            raise ValueError(
-                "noise.receiver.smooth_octaves ties the receivers of channels that have a "
-                "posterior each; with joint, leave it out"
-            )
-        return self
+    _joint_channels_are_not_tied = requires(
+        lambda scenario: not (scenario.joint and scenario.ties_receivers),
+        "noise.receiver.smooth_octaves ties the receivers of channels that have a posterior each; "
+        "with joint, leave it out",
+    )
 
     @property
     def ties_receivers(self) -> bool:
         """Whether receivers' powers of several frequencies are inferred as smooth spectra."""
         receiver = self.noise.receiver
-        smooth = receiver is not None and receiver.smooth_octaves is not None
-        return smooth and receiver.treatment != "ignored" and bool(self.frequencies_mhz)
+        smooth = is_modelled(receiver) and receiver.smooth_octaves is not None
+        return smooth and bool(self.frequencies_mhz)
 
     def channels(self) -> tuple[Scenario, ...]:
         """The scenario of every channel; draws of each have a seed of their own, one further."""

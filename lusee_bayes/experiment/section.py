@@ -1,14 +1,11 @@
-"""What every section of a scenario has in common.
-
-What all sections of a scenario have in common.
-
-What a map run writes besides its maps.
-"""
+"""What all sections of a scenario have in common: types of entries, validators, kinds."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import reduce
+from operator import or_
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -47,15 +44,7 @@ Treatment = Literal["marginalised", "sampled", "ignored"]
 
 
 # entries that name files; one that has its default names none
-FILES = (
-    "clock",
-    "file",
-    "gain_table",
-    "lines",
-    "mean_file",
-    "schedule",
-    "spectrum_file",
-)
+FILES = ("clock", "file", "gain_table", "lines", "mean_file", "schedule", "spectrum_file")
 
 
 class Section(BaseModel):
@@ -88,9 +77,31 @@ class Section(BaseModel):
         return found | {key: str(user_path(n)) for key, n in names.items() if n.startswith("~")}
 
 
-def known_keys(kinds: Mapping[str, type[Section]]) -> set[str]:
-    """Every key of a section that comes in several kinds."""
-    return {name for kind in kinds.values() for name in kind.model_fields}
+def requires(holds: Callable[[Any], Any], message: str) -> Any:
+    """A validator of a section: ValueError with this message unless a rule holds of it."""
+
+    def checked(section: Any) -> Any:
+        if not holds(section):
+            raise ValueError(message)
+        return section
+
+    return model_validator(mode="after")(checked)
+
+
+def kinds_of(*sections: type[Section]) -> dict[str, type[Section]]:
+    """The kinds that a section comes in, by what their ``model`` says."""
+    return {section.model_fields["model"].default: section for section in sections}
+
+
+def one_of(kinds: Mapping[str, type[Section]], completed: Callable[[Any], Any]) -> Any:
+    """The type of a section that comes in kinds, with what is done to a tree before it is read."""
+    kind = Field(discriminator="model")
+    return Annotated[reduce(or_, kinds.values()), kind, BeforeValidator(completed)]
+
+
+def is_modelled(section: Any) -> bool:
+    """Whether there is a section, and what it has is not ignored."""
+    return section is not None and section.treatment != "ignored"
 
 
 def without_other_kinds(
@@ -131,16 +142,13 @@ def without_other_kinds(
             continue
         theirs = others[0]
         default = theirs.model_fields[key].get_default(call_default_factory=True)
-        same = value is None or value == default or value == _plain(default)
+        # YAML has lists where sections have tuples
+        plain = list(default) if isinstance(default, tuple) else default
+        same = value is None or value in (default, plain)
         if strict and not same:
             names = ", ".join(name for name, kind in kinds.items() if kind in others)
             raise ValueError(f"{key} is an entry of model {names}, not of {tree['model']}")
     return kept
-
-
-def _plain(value: Any) -> Any:
-    """As YAML has it."""
-    return list(value) if isinstance(value, tuple) else value
 
 
 class OutputSection(Section):

@@ -1,8 +1,6 @@
-"""A, S, the sky and what is known of the instrument, from a scenario.
+"""A scenario's instrument pointed at its sky: all that is fixed before there are data.
 
-What a scenario's antennas and receivers add to every visibility, whatever the sky.
-
-A scenario's instrument pointed at its sky: all that is fixed before there are data.
+That is A, S, the sky, and what antennas and receivers add to every visibility, whatever the sky.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, DataVector, Grid
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
@@ -145,9 +143,9 @@ class Setup:
     beams: ProductBeams
     coupling: CouplingMatrix
     prior: Prior
-    responses: tuple[Float[Array, "products times"], ...]
+    responses: tuple[Grid, ...]
     background: Float[Array, " products"]
-    signal: Float[Array, "products times"]
+    signal: Grid
     receiver: Receiver | None = None
     family: PriorFamily | None = None
     calibration: Calibration | None = None
@@ -164,7 +162,7 @@ class Setup:
         return self.coupling.layout
 
     @property
-    def offset(self) -> Float[Array, " data"] | None:
+    def offset(self) -> DataVector | None:
         """The background in every datum, in K; None where there is none."""
         if not np.any(self.background):
             return None
@@ -238,12 +236,7 @@ def set_up(
         source = scenario.beam.source().behind(receiver)
         beams = source.beams(scenario.frequency_mhz, scenario.lmax)
         background = background_of(scenario, source)
-        # sources need the exact pattern, which only the embedded antennas have
-        responses: tuple[Float[Array, "products times"], ...] = ()
-        if scenario.sources.list:
-            responses = source_responses(
-                scenario, observation, source.monopoles, scenario.frequency_mhz
-            )
+        responses = source_responses(scenario, observation, source)
     if data is not None and data.layout.n_products != beams.n_products:
         raise InputError(
             f"the data have {data.layout.n_products} products, the beams supply "
@@ -321,23 +314,31 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
 
 
 def source_responses(
-    scenario: Scenario, observation: Observation, antennas: Monopoles, frequency_mhz: float
-) -> tuple[Float[Array, "products times"], ...]:
-    """Response to 1 K sr of each of the scenario's sources, with these antennas, in K.
+    scenario: Scenario,
+    observation: Observation,
+    beams: BeamSource,
+    frequency_mhz: float | None = None,
+) -> tuple[Grid, ...]:
+    """Response to 1 K sr of each of the scenario's sources, with these beams, in K.
+
+    Sources need the exact pattern, which only the embedded antennas have.
 
     Their means over the windows, by instants: a source may rise and set within one.
     """
+    if not scenario.sources.list:
+        return ()
+    frequency_mhz = scenario.frequency_mhz if frequency_mhz is None else frequency_mhz
     instants, sample, weight = observation.at_nodes(SOURCE_NODES)
     first = np.searchsorted(sample, np.arange(observation.n_times))
     responses = (
         source_response(
             instants,
-            _direction(source, instants),
+            _direction(one, instants),
             frequency_mhz,
-            antennas,
-            stokes_v=source.stokes_v,
+            beams.monopoles,
+            stokes_v=one.stokes_v,
         )
-        for source in scenario.sources.list
+        for one in scenario.sources.list
     )
     return tuple(np.add.reduceat(np.asarray(r) * weight, first, axis=1) for r in responses)
 
@@ -362,8 +363,8 @@ def expected_signal(
     complete: CouplingMatrix,
     sky: Sky,
     background: Float[Array, " products"],
-    responses: tuple[Float[Array, "products times"], ...],
-) -> Float[Array, "products times"]:
+    responses: tuple[Grid, ...],
+) -> Grid:
     """Visibilities of sky, background and sources with their mean fluxes, in K.
 
     Parameters

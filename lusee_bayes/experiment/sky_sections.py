@@ -1,26 +1,17 @@
 """Sections of a scenario on skies and priors.
 
-The sky: one section for each kind, selected by ``model``.
-
-A new kind is a class here, with its :class:`SkySource`, and its name in ``SKY_SECTIONS``.
-
-Point sources that are not part of the map.
-
-The prior on the sky: one section for each kind, selected by ``model``.
-
-A new kind is a class here, which makes its :class:`Prior`, and its name in ``PRIOR_SECTIONS``.
-
-The prior on skies of several frequencies.
+Sky and prior have one section for each kind, selected by ``model``. A new kind is a class here,
+with its :class:`SkySource` or :class:`Prior`, and its name in ``SKY_SECTIONS`` or
+``PRIOR_SECTIONS``. Point sources that are not part of the map, and the prior on skies of several
+frequencies, have sections of their own.
 """
 
 from __future__ import annotations
 
-from functools import reduce
-from operator import or_
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from lusee_bayes.experiment.section import (
     Megahertz,
@@ -28,17 +19,20 @@ from lusee_bayes.experiment.section import (
     Section,
     Seed,
     Treatment,
+    kinds_of,
+    one_of,
+    requires,
     without_other_kinds,
 )
 from lusee_bayes.priors.families import IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales
-from lusee_bayes.sampling.log_normal import LogNormalPrior
+from lusee_bayes.sampling.log_normal_program import LogNormalPrior
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
-from lusee_bayes.sky.positive_skies import check_fields
+from lusee_bayes.sky.positive_skies import FIELDS, FIELDS_OF
 from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_mean, read_spectrum
 from lusee_bayes.sky.sky_source import FileSource, GalaxySource, Sky, SkySource
-from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components
+from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components, require_names
 from lusee_bayes.sky.template import EmbeddedTemplate
 
 
@@ -52,8 +46,6 @@ class GalaxySection(Section):
     sources : bool
         Add the brightest point sources.
     """
-
-    has_sources: ClassVar[bool] = True
 
     model: Literal["galaxy"] = "galaxy"
     seed: Seed = 1
@@ -80,30 +72,20 @@ class FileSkySection(Section):
         Scales the sky from ``file_frequency_mhz`` to the scenario's frequency.
     """
 
+    # whether the catalogue's sources are added: they are in the file, if at all
+    sources: ClassVar[bool] = False
     model: Literal["file"] = "file"
     file: str
     dataset: str | None = None
     file_frequency_mhz: Megahertz | None = None
     spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
 
-    @property
-    def sources(self) -> bool:
-        """Whether the catalogue's sources are added: they are in the file, if at all."""
-        return False
-
     def source(self) -> SkySource:
         """The file."""
-        return FileSource(
-            self.file,
-            dataset=self.dataset,
-            file_frequency_mhz=self.file_frequency_mhz,
-            spectral_index=self.spectral_index,
-        )
+        return FileSource(self.file, **self.model_dump(exclude={"model", "file"}))
 
 
-SKY_SECTIONS = {
-    section.model_fields["model"].default: section for section in (GalaxySection, FileSkySection)
-}
+SKY_SECTIONS = kinds_of(GalaxySection, FileSkySection)
 
 
 def _kind_of_sky(value: Any) -> Any:
@@ -119,9 +101,7 @@ def _kind_of_sky(value: Any) -> Any:
     return without_other_kinds(tree, SKY_SECTIONS, strict=False)
 
 
-SkySection = Annotated[
-    reduce(or_, SKY_SECTIONS.values()), Field(discriminator="model"), BeforeValidator(_kind_of_sky)
-]
+SkySection = one_of(SKY_SECTIONS, _kind_of_sky)
 
 
 class SourceSection(Section):
@@ -153,11 +133,10 @@ class SourceSection(Section):
     stokes_v: Annotated[float, Field(ge=-1, le=1)] = 0.0
     block_h: Positive | None = None
 
-    @model_validator(mode="after")
-    def _both_coordinates(self) -> SourceSection:
-        if (self.ra_deg is None) != (self.dec_deg is None):
-            raise ValueError("give both ra_deg and dec_deg, or none")
-        return self
+    _both_coordinates = requires(
+        lambda section: (section.ra_deg is None) == (section.dec_deg is None),
+        "give both ra_deg and dec_deg, or none",
+    )
 
 
 class SourcesSection(Section):
@@ -245,18 +224,24 @@ class IsotropicPriorSection(Section):
         known = any(value.get(name) for name in acting)
         return {**value, "spectrum": "sky" if known else "learned"}
 
-    @model_validator(mode="after")
-    def _one_parameterisation(self) -> IsotropicPriorSection:
-        if self.band_edges and (self.log_amplitude_std or self.tilt_std):
-            raise ValueError("give either band_edges or log_amplitude_std and tilt_std")
-        if self.is_learned and (self.samples or self.scale != 1.0 or self.mean_file is not None):
-            raise ValueError(
-                "a learned C_ell has no scale, no mean_file and nothing to sample; give "
-                "spectrum=sky or a spectrum_file with them"
-            )
-        if list(self.band_edges) != sorted(set(self.band_edges)):
-            raise ValueError("band_edges must grow from one to the next")
-        return self
+    _one_parameterisation = requires(
+        lambda section: (
+            not (section.band_edges and (section.log_amplitude_std or section.tilt_std))
+        ),
+        "give either band_edges or log_amplitude_std and tilt_std",
+    )
+    _known_where_it_is_changed = requires(
+        lambda section: (
+            not section.is_learned
+            or (not section.samples and section.scale == 1.0 and section.mean_file is None)
+        ),
+        "a learned C_ell has no scale, no mean_file and nothing to sample; give spectrum=sky or a "
+        "spectrum_file with them",
+    )
+    _bands_grow = requires(
+        lambda section: list(section.band_edges) == sorted(set(section.band_edges)),
+        "band_edges must grow from one to the next",
+    )
 
     @property
     def is_learned(self) -> bool:
@@ -313,41 +298,20 @@ class LocalScalesPriorSection(Section):
         Allow for the catalogue's sources.
     """
 
+    # as of the isotropic one
+    origin: ClassVar[str] = LEARNED
+    has_files: ClassVar[bool] = False
+    samples: ClassVar[bool] = False
+    is_learned: ClassVar[bool] = True
     model: Literal["local_scales"] = "local_scales"
     sources: bool = True
-
-    @property
-    def origin(self) -> str:
-        """Where C_ell comes from."""
-        return LEARNED
-
-    @property
-    def has_files(self) -> bool:
-        """Whether the prior is read from files, which are of one frequency."""
-        return False
-
-    @property
-    def samples(self) -> bool:
-        """Whether something of the prior is to be sampled."""
-        return False
-
-    @property
-    def is_learned(self) -> bool:
-        """Whether the data tell C_ell."""
-        return True
 
     def family(self, frequency_mhz: float, lmax: int) -> PriorFamily:
         """The family that data choose a prior of, up to an ell."""
         return embedded_local_scales(frequency_mhz, lmax, BRIGHT_SOURCES if self.sources else ())
 
 
-PRIOR_SECTIONS = {
-    section.model_fields["model"].default: section
-    for section in (
-        LocalScalesPriorSection,
-        IsotropicPriorSection,
-    )
-}
+PRIOR_SECTIONS = kinds_of(LocalScalesPriorSection, IsotropicPriorSection)
 
 
 def _kind_of_prior(value: Any) -> Any:
@@ -369,11 +333,7 @@ def _mean_temperature(frequency_mhz: float) -> float:
     return float(EmbeddedTemplate(frequency_mhz).modes(0)[0] / np.sqrt(4.0 * np.pi))
 
 
-PriorSection = Annotated[
-    reduce(or_, PRIOR_SECTIONS.values()),
-    Field(discriminator="model"),
-    BeforeValidator(_kind_of_prior),
-]
+PriorSection = one_of(PRIOR_SECTIONS, _kind_of_prior)
 
 
 class LogNormalSection(Section):
@@ -399,11 +359,10 @@ class LogNormalSection(Section):
     scale_std: Positive = 0.5
     sources: bool = True
 
-    @model_validator(mode="after")
-    def _both_or_neither(self) -> LogNormalSection:
-        if (self.amplitude is None) != (self.tilt is None):
-            raise ValueError("give both amplitude and tilt, or neither, and they are sampled")
-        return self
+    _both_or_neither = requires(
+        lambda section: (section.amplitude is None) == (section.tilt is None),
+        "give both amplitude and tilt, or neither, and they are sampled",
+    )
 
     def prior(self, frequency_mhz: float, lmax: int) -> LogNormalPrior:
         """The prior up to an ell."""
@@ -470,7 +429,7 @@ class SpectralSection(Section):
         if self.model == "components":
             check_components(self.components, n, self.residual)
         if self.model == "positive":
-            check_fields(self.fields, n)
+            require_names("field", FIELDS_OF, self.fields, FIELDS, n)
 
     def n_maps(self, frequencies_mhz: tuple[float, ...]) -> int:
         """How many maps the skies of these channels are made of."""
@@ -484,17 +443,9 @@ class SpectralSection(Section):
 
     def prior(self, frequencies_mhz: np.ndarray, skies: np.ndarray) -> SpectralPrior:
         """The prior on linear skies of all channels; ``skies`` (channels, modes) model them."""
-        common = {"index": self.index, "reference_mhz": self.reference_mhz}
+        used = {"index", "reference_mhz"}
         if self.model == "components":
-            return SpectralPrior.components(
-                frequencies_mhz,
-                skies,
-                self.components,
-                turnover_mhz=self.turnover_mhz,
-                residual=self.residual,
-                **common,
-            )
-        residual = {} if self.residual is None else {"residual": self.residual}
-        return SpectralPrior.kernel(
-            frequencies_mhz, skies, length=self.length, **common, **residual
-        )
+            given = self.model_dump(include=used | {"turnover_mhz", "residual"})
+            return SpectralPrior.components(frequencies_mhz, skies, self.components, **given)
+        given = self.model_dump(include=used | {"length", "residual"}, exclude_none=True)
+        return SpectralPrior.kernel(frequencies_mhz, skies, **given)

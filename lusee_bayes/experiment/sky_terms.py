@@ -1,25 +1,21 @@
-"""Terms of N from sky, ground, receivers, and the level of the noise.
+"""Terms of N from receivers, ground, sources, prior, and the level of the noise.
 
-Noise of the receivers.
-
-The temperature of the ground.
-
-Point sources beside the map.
-
-The power spectrum of the prior, where it is not known.
-
-The level of the radiometer noise, where it is not known.
+Receivers, ground and sources are Gaussian amplitudes of templates. The prior's power spectrum and
+the level of the radiometer noise can only be sampled.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Grid
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.instrument_terms import true_instrument
+from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import (
     Setup,
     block_of_times,
@@ -28,7 +24,7 @@ from lusee_bayes.experiment.setup import (
     receiver_powers,
     source_responses,
 )
-from lusee_bayes.experiment.term import Around, Term, Truth
+from lusee_bayes.experiment.term import Around, Term, Treated, Truth
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.systematics.instrument_unknowns import NoiseLevel
 from lusee_bayes.systematics.sky_unknowns import PointSources, PowerSpectrum, Source, SpectrumBands
@@ -48,16 +44,13 @@ class ReceiverTerm(Term):
 
     key = "noise.receiver"
 
-    def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
-        section = setup.scenario.noise.receiver
-        if section is None or section.treatment == "ignored":
-            return []
-        return [(section.treatment, _receivers(setup))]
+    def systematics(self, setup: Setup, section: Any, around: Around) -> list[Systematic]:
+        means = receiver_powers(setup.scenario, setup.beam_source)
+        stds = section.relative_std * means
+        own = np.asarray(setup.layout.product)[:, None] == auto_indices(len(means))[None]
+        return [LinearUnknowns(_names(len(means)), means, stds, own * stds[None])]
 
-    def truth(self, setup: Setup, key: PRNGKeyArray) -> Truth:
-        section = setup.scenario.noise.receiver
-        if section is None:
-            return {}
+    def drawn(self, setup: Setup, section: Any, key: PRNGKeyArray) -> Truth:
         mean = receiver_powers(setup.scenario, setup.beam_source)
         if section.smooth_octaves is None:
             z = np.asarray(jax.random.normal(jax.random.fold_in(key, RECEIVER_DRAW), mean.shape))
@@ -69,15 +62,7 @@ class ReceiverTerm(Term):
         powers = mean * (1.0 + section.relative_std * z)
         return dict(zip(_names(len(mean)), powers.tolist(), strict=True))
 
-    def distort(
-        self,
-        visibilities: Float[Array, "products times"],
-        setup: Setup,
-        truth: Truth,
-        key: PRNGKeyArray,
-    ) -> Float[Array, "products times"]:
-        if setup.scenario.noise.receiver is None:
-            return visibilities
+    def distorted(self, visibilities: Grid, setup: Setup, truth: Truth, key: PRNGKeyArray) -> Grid:
         n_ports = setup.beam_source.n_ports
         added = np.zeros((n_ports**2, 1))
         added[auto_indices(n_ports), 0] = [truth[name] for name in _names(n_ports)]
@@ -108,14 +93,6 @@ def _names(n_ports: int) -> tuple[str, ...]:
     return tuple(f"receiver_{port}_k" for port in range(n_ports))
 
 
-def _receivers(setup: Setup) -> LinearUnknowns:
-    means = receiver_powers(setup.scenario, setup.beam_source)
-    stds = setup.scenario.noise.receiver.relative_std * means
-    autos = auto_indices(len(means))
-    own = np.asarray(setup.layout.product)[:, None] == autos[None]
-    return LinearUnknowns(_names(len(means)), means, stds, own * stds[None])
-
-
 # what the scenario's seed is folded with
 GROUND_DRAW = 9
 NAME = "regolith_k"
@@ -126,32 +103,17 @@ class RegolithTerm(Term):
 
     key = "noise.regolith"
 
-    def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
-        section = setup.scenario.noise.regolith
-        if section is None or section.treatment == "ignored":
-            return []
+    def systematics(self, setup: Setup, section: Any, around: Around) -> list[Systematic]:
         added = ground_per_kelvin(setup.beam_source, setup.scenario.frequency_mhz)
         template = added[np.asarray(setup.layout.product), None] * section.std_k
         mean = np.array([setup.scenario.beam.moon_temperature_k])
-        ground = LinearUnknowns((NAME,), mean, np.array([section.std_k]), template)
-        return [(section.treatment, ground)]
+        return [LinearUnknowns((NAME,), mean, np.array([section.std_k]), template)]
 
-    def truth(self, setup: Setup, key: PRNGKeyArray) -> Truth:
-        section = setup.scenario.noise.regolith
-        if section is None:
-            return {}
+    def drawn(self, setup: Setup, section: Any, key: PRNGKeyArray) -> Truth:
         z = float(jax.random.normal(jax.random.fold_in(key, GROUND_DRAW)))
         return {NAME: setup.scenario.beam.moon_temperature_k + section.std_k * z}
 
-    def distort(
-        self,
-        visibilities: Float[Array, "products times"],
-        setup: Setup,
-        truth: Truth,
-        key: PRNGKeyArray,
-    ) -> Float[Array, "products times"]:
-        if setup.scenario.noise.regolith is None:
-            return visibilities
+    def distorted(self, visibilities: Grid, setup: Setup, truth: Truth, key: PRNGKeyArray) -> Grid:
         true = true_instrument(setup)
         warmer = truth[NAME] - setup.scenario.beam.moon_temperature_k
         return visibilities + warmer * ground_per_kelvin(true.source, true.frequency_mhz)[:, None]
@@ -166,15 +128,13 @@ class SourcesTerm(Term):
 
     key = "sources"
 
-    def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
-        treatment = setup.scenario.sources.treatment
-        if not setup.responses or treatment == "ignored":
-            return []
-        return [(treatment, point_sources(setup))]
+    def section(self, scenario: Scenario) -> Any:
+        return scenario.sources if scenario.sources.list else None
 
-    def truth(self, setup: Setup, key: PRNGKeyArray) -> Truth:
-        if not setup.responses:
-            return {}
+    def systematics(self, setup: Setup, section: Any, around: Around) -> list[Systematic]:
+        return [point_sources(setup)]
+
+    def drawn(self, setup: Setup, section: Any, key: PRNGKeyArray) -> Truth:
         sources = point_sources(setup).sources
         keys = jax.random.split(jax.random.fold_in(key, SOURCE_DRAW), len(sources))
         truth: Truth = {}
@@ -184,21 +144,12 @@ class SourcesTerm(Term):
             truth[source.site] = float(flux[0]) if source.n_blocks == 1 else flux
         return truth
 
-    def distort(
-        self,
-        visibilities: Float[Array, "products times"],
-        setup: Setup,
-        truth: Truth,
-        key: PRNGKeyArray,
-    ) -> Float[Array, "products times"]:
-        sections = setup.scenario.sources.list
-        if not sections:
-            return visibilities
+    def distorted(self, visibilities: Grid, setup: Setup, truth: Truth, key: PRNGKeyArray) -> Grid:
         true = true_instrument(setup)
         responses = source_responses(
-            setup.scenario, setup.observation, true.source.monopoles, true.frequency_mhz
+            setup.scenario, setup.observation, true.source, true.frequency_mhz
         )
-        for section, response in zip(sections, responses, strict=True):
+        for section, response in zip(setup.scenario.sources.list, responses, strict=True):
             flux = np.atleast_1d(truth[f"flux_{section.name.replace(' ', '_')}"])
             block = block_of_times(section, setup.observation)
             visibilities = visibilities + np.asarray(flux)[block][None] * response
@@ -213,13 +164,9 @@ def point_sources(setup: Setup) -> PointSources:
     for section, response in zip(setup.scenario.sources.list, setup.responses, strict=True):
         flux = mean_flux(section, setup.scenario.frequency_mhz)
         block = block_of_times(section, setup.observation)
-        columns = [
-            setup.layout.gather(np.where((block == b)[None], response, 0.0))
-            for b in range(block.max() + 1)
-        ]
-        sources.append(
-            Source(np.stack(columns, axis=1), flux, section.relative_std * flux, section.name)
-        )
+        of_blocks = [np.where((block == b)[None], response, 0.0) for b in range(block.max() + 1)]
+        columns = np.stack([setup.layout.gather(seen) for seen in of_blocks], axis=1)
+        sources.append(Source(columns, flux, section.relative_std * flux, section.name))
     return PointSources(tuple(sources))
 
 
@@ -228,7 +175,7 @@ class PriorSpectrumTerm(Term):
 
     key = "prior"
 
-    def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
+    def build(self, setup: Setup, around: Around) -> Treated:
         prior = setup.scenario.prior
         if not prior.samples:
             return []
@@ -246,7 +193,7 @@ class NoiseLevelTerm(Term):
 
     key = "noise.radiometer"
 
-    def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
+    def build(self, setup: Setup, around: Around) -> Treated:
         std = setup.scenario.noise.radiometer.log_factor_std
         return [] if std is None else [("sampled", NoiseLevel(std))]
 

@@ -1,21 +1,20 @@
-"""What every term of N answers, and which sky N is built about.
+"""What every term of N answers, and the visibilities that N is built around.
 
-What a scenario says of one systematic: its treatment, and what simulated data hold of it.
+A term says of one systematic how the model treats it, and what simulated data hold of it.
 
-The visibilities that radiometer noise and gain drifts are built around.
-
-Those of the modelled sky are right where it is the true one, as for simulated data. Measured
-visibilities hold their own noise: N is small where an auto came out low, and the map is pulled
-there. With n times of B tau samples each, and the exact covariance of p antennas' products, a
-common amplitude moves by up to 4 p sqrt(n / (B tau)) of its standard deviation. Drifts are not
-small, and stay in the measured visibilities. What neither troubles is the map's own prediction,
-in rounds (:mod:`lusee_bayes.experiment.rounds`).
+Radiometer noise and gain drifts are built around visibilities. Those of the modelled sky are right
+where it is the true one, as for simulated data. Measured visibilities hold their own noise: N is
+small where an auto came out low, and the map is pulled there. With n times of B tau samples each,
+and the exact covariance of p antennas' products, a common amplitude moves by up to
+4 p sqrt(n / (B tau)) of its standard deviation. Drifts are not small, and stay in the measured
+visibilities. What neither troubles is the map's own prediction, in rounds
+(:mod:`lusee_bayes.experiment.rounds`).
 """
 
 from __future__ import annotations
 
 import zlib
-from abc import ABC, abstractmethod
+from abc import ABC
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
@@ -23,12 +22,13 @@ from typing import Any, ClassVar
 
 import jax
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import DataVector, Grid, Modes
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.noise_sections import NoiseAbout
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.section import is_modelled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.instrument.products import all_products, auto_indices
 from lusee_bayes.instrument.schedule import without_gaps
@@ -37,6 +37,8 @@ from lusee_bayes.systematics.systematic import AdditiveNoise, Systematic
 
 # true values of what simulated data hold, by the names of their sites
 Truth = dict[str, float | np.ndarray]
+# systematics, each with what is done about it
+Treated = list[tuple[str, Systematic]]
 
 
 @dataclass(frozen=True)
@@ -61,20 +63,23 @@ class Around:
     """
 
     data: Visibilities | None = None
-    visibilities: Float[Array, "products times"] | None = None
-    sky: Float[Array, " modes"] | None = None
+    visibilities: Grid | None = None
+    sky: Modes | None = None
     values: Mapping[str, float] | None = None
-    seen: Float[Array, " data"] | None = None
-    freedom: Float[Array, " data"] | None = None
+    seen: DataVector | None = None
+    freedom: DataVector | None = None
 
 
 class Term(ABC):
     """One systematic of a scenario.
 
+    A subclass has :meth:`systematics`, and for simulated data :meth:`drawn` and :meth:`distorted`,
+    which are asked where the scenario has its section; or it has the methods that ask them.
+
     Attributes
     ----------
     key : str
-        Where a scenario says it, such as ``noise.gain``.
+        Path of its section in a scenario, such as ``noise.gain``.
     remedy : str
         What may help where it :meth:`moves` and rounds do not settle.
     """
@@ -82,9 +87,20 @@ class Term(ABC):
     key: ClassVar[str]
     remedy: ClassVar[str] = ""
 
-    @abstractmethod
-    def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
+    def section(self, scenario: Scenario) -> Any:
+        """What the scenario says of it; None if it has nothing of it."""
+        return attrgetter(self.key)(scenario)
+
+    def build(self, setup: Setup, around: Around) -> Treated:
         """Treatment and systematic, for all that the scenario has of it and does not ignore."""
+        section = self.section(setup.scenario)
+        if not is_modelled(section):
+            return []
+        return [(section.treatment, found) for found in self.systematics(setup, section, around)]
+
+    def systematics(self, setup: Setup, section: Any, around: Around) -> list[Systematic]:
+        """All that the model has of it."""
+        raise NotImplementedError
 
     def moves(self, scenario: Scenario) -> bool:
         """Tell whether it is to first order about values that the data tell, found in rounds."""
@@ -99,16 +115,21 @@ class Term(ABC):
         key : PRNG key
             Of the scenario's seed; each term folds it with a number of its own.
         """
+        section = self.section(setup.scenario)
+        return {} if section is None else self.drawn(setup, section, key)
+
+    def drawn(self, setup: Setup, section: Any, key: PRNGKeyArray) -> Truth:
+        """:meth:`truth` of its section."""
         return {}
 
-    def distort(
-        self,
-        visibilities: Float[Array, "products times"],
-        setup: Setup,
-        truth: Truth,
-        key: PRNGKeyArray,
-    ) -> Float[Array, "products times"]:
+    def distort(self, visibilities: Grid, setup: Setup, truth: Truth, key: PRNGKeyArray) -> Grid:
         """The visibilities in K that the true values make of those without them."""
+        if self.section(setup.scenario) is None:
+            return visibilities
+        return self.distorted(visibilities, setup, truth, key)
+
+    def distorted(self, visibilities: Grid, setup: Setup, truth: Truth, key: PRNGKeyArray) -> Grid:
+        """:meth:`distort` where the scenario has its section."""
         return visibilities
 
 
@@ -127,24 +148,12 @@ class AdditiveTerm(Term):
         self.key = key
         self._make = make
 
-    def build(self, setup: Setup, around: Around) -> list[tuple[str, Systematic]]:
-        section = attrgetter(self.key)(setup.scenario)
-        if section is None or section.treatment == "ignored":
-            return []
-        return [(section.treatment, self._make(setup, section))]
+    def systematics(self, setup: Setup, section: Any, around: Around) -> list[Systematic]:
+        return [self._make(setup, section)]
 
-    def distort(
-        self,
-        visibilities: Float[Array, "products times"],
-        setup: Setup,
-        truth: Truth,
-        key: PRNGKeyArray,
-    ) -> Float[Array, "products times"]:
-        section = attrgetter(self.key)(setup.scenario)
-        if section is None:
-            return visibilities
+    def distorted(self, visibilities: Grid, setup: Setup, truth: Truth, key: PRNGKeyArray) -> Grid:
         own = jax.random.fold_in(key, zlib.crc32(self.key.encode()))
-        return self._make(setup, section).distort(visibilities, own)
+        return self._make(setup, self.section(setup.scenario)).distort(visibilities, own)
 
 
 # in standard deviations of a common amplitude
@@ -154,20 +163,15 @@ HARMLESS_BIAS = 0.1
 def radiometer_about(setup: Setup) -> NoiseAbout:
     """Which visibilities set the level of the radiometer noise."""
     chosen = setup.scenario.noise.radiometer.temperature
-    if chosen is not None:
-        return chosen
-    if not setup.measured:
-        return "model"
+    if chosen is not None or not setup.measured:
+        return chosen or "model"
     harmless = _has_autos(setup) and common_bias(setup) < HARMLESS_BIAS
     return "measured" if harmless else "posterior"
 
 
 def gains_about(setup: Setup) -> NoiseAbout:
     """Which visibilities the covariance of gain drifts is built around."""
-    chosen = setup.scenario.noise.gain.visibilities
-    if chosen is not None:
-        return chosen
-    return "posterior" if setup.measured else "model"
+    return setup.scenario.noise.gain.visibilities or ("posterior" if setup.measured else "model")
 
 
 def common_bias(setup: Setup) -> float:
@@ -184,20 +188,13 @@ def common_bias(setup: Setup) -> float:
 
 def _has_autos(setup: Setup) -> bool:
     """Whether every port that was used has its auto somewhere."""
-    seen = np.asarray(setup.layout.present).any(1)
-    n = setup.beam_source.n_ports
-    used = {
-        port
-        for product, some in zip(all_products(n), seen, strict=True)
-        if some
-        for port in product[:2]
-    }
+    seen, n = np.asarray(setup.layout.present).any(1), setup.beam_source.n_ports
+    products = np.array(all_products(n), dtype=object)
+    used = set(products[seen, :2].ravel())
     return all(seen[k] for port, k in enumerate(auto_indices(n)) if port in used)
 
 
-def noise_visibilities(
-    setup: Setup, around: Around, about: NoiseAbout
-) -> Float[Array, "products times"]:
+def noise_visibilities(setup: Setup, around: Around, about: NoiseAbout) -> Grid:
     """The visibilities that a term of N is built around, in K.
 
     Before there is a prediction it is the measured ones', or, if autos that noise depends on were
@@ -212,9 +209,7 @@ def noise_visibilities(
     return measured_visibilities(around.data, setup.signal)
 
 
-def measured_visibilities(
-    data: Visibilities, model: Float[Array, "products times"]
-) -> Float[Array, "products times"]:
+def measured_visibilities(data: Visibilities, model: Grid) -> Grid:
     """Visibilities that set a noise level: the measured ones, absent samples interpolated.
 
     A time without any sample takes the model's (it enters nothing).

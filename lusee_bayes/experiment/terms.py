@@ -1,6 +1,4 @@
-"""All terms of N by the section that asks for them.
-
-The systematics of a scenario: how each is built, and what simulated data hold of it.
+"""The systematics of a scenario, by the sections that ask for them.
 
 A new one is a :class:`Systematic`, its section in the schema, and its line in ``TERMS``.
 """
@@ -20,9 +18,7 @@ from lusee_bayes.experiment.sky_terms import (
     RegolithTerm,
     SourcesTerm,
 )
-from lusee_bayes.experiment.term import (
-    Term,
-)
+from lusee_bayes.experiment.term import Term
 
 # in the order in which they are applied to the model, and to simulated visibilities
 TERMS: tuple[Term, ...] = (

@@ -196,10 +196,7 @@ def _require_known(where: str | Path, found: dict[str, Any], known: Iterable[str
 
 
 def clock_of(
-    path: str | Path,
-    said: Clock | None,
-    given: Clock | None,
-    raw_s: Float[np.ndarray, " times"],
+    path: str | Path, said: Clock | None, given: Clock | None, raw_s: Float[np.ndarray, " times"]
 ) -> Clock:
     """Return the clock of a session: its own, a clock file's, or its own as corrected by the file.
 

@@ -31,6 +31,22 @@ from lusee_bayes.core.reading import read_table
 from lusee_bayes.flight.bands import ChannelBand
 from lusee_bayes.flight.session import CHANNEL_MHZ, Averaging
 
+# of spectra in bands: of rows, autos and points of a curve; in time: of one span, rows as points
+Autos = Float[np.ndarray, "rows autos points"]
+Points = Bool[np.ndarray, "rows points"]
+Basis = Float[np.ndarray, "points terms"]
+Rows = Float[np.ndarray, " rows"]
+Bins = Bool[np.ndarray, "rows bins"]
+Spectra = Float[np.ndarray, "rows ports bins"]
+Levels = Float[np.ndarray, "rows ports"]
+Seconds = Float[np.ndarray, " span"]
+Span = Bool[np.ndarray, " span"]
+OneRow = Float[np.ndarray, "1 ports span"]
+Distances = Float[np.ndarray, "ports span"]
+Terms = Float[np.ndarray, "span terms"]
+Sums = Float[np.ndarray, "ports ends"]
+Ends = Float[np.ndarray, " ends"]
+
 # of the points beyond the threshold, those within this share of the worst go in one round
 WORST = 0.5
 MAX_ROUNDS = 60
@@ -52,12 +68,8 @@ def threshold(false_alarm: float, n_tests: int) -> float:
 
 
 def outliers(
-    values: Float[np.ndarray, "rows autos points"],
-    noise: Float[np.ndarray, "rows autos points"],
-    good: Bool[np.ndarray, "rows points"],
-    basis: Float[np.ndarray, "points terms"],
-    limit: float,
-) -> tuple[Bool[np.ndarray, "rows points"], Float[np.ndarray, "rows autos points"]]:
+    values: Autos, noise: Autos, good: Points, basis: Basis, limit: float
+) -> tuple[Points, Autos]:
     """Find points off a curve, in every row on its own.
 
     Parameters
@@ -101,13 +113,7 @@ def outliers(
     return good & ~kept, z
 
 
-def distances(
-    values: Float[np.ndarray, "rows autos points"],
-    noise: Float[np.ndarray, "rows autos points"],
-    good: Bool[np.ndarray, "rows points"],
-    kept: Bool[np.ndarray, "rows points"],
-    basis: Float[np.ndarray, "points terms"],
-) -> Float[np.ndarray, "rows autos points"]:
+def distances(values: Autos, noise: Autos, good: Points, kept: Points, basis: Basis) -> Autos:
     """Return how far points are from the curve through some of them.
 
     Parameters
@@ -129,10 +135,8 @@ def distances(
 
 
 def fitted_curves(
-    values: Float[np.ndarray, "rows autos points"],
-    kept: Bool[np.ndarray, "rows points"],
-    basis: Float[np.ndarray, "points terms"],
-) -> tuple[Float[np.ndarray, "rows autos points"], Float[np.ndarray, "rows points"]]:
+    values: Autos, kept: Points, basis: Basis
+) -> tuple[Autos, Float[np.ndarray, "rows points"]]:
     """Return the curve through some points, and its variance in units of that of a point.
 
     Parameters
@@ -150,9 +154,7 @@ def fitted_curves(
     return curve, leverage
 
 
-def robust_scale(
-    z: Float[np.ndarray, "rows points"], good: Bool[np.ndarray, "rows points"]
-) -> float:
+def robust_scale(z: Float[np.ndarray, "rows points"], good: Points) -> float:
     """Return the standard deviation of distances by their median; NaN if there are none."""
     return float(MAD * np.median(np.abs(z[good]))) if good.any() else np.nan
 
@@ -219,11 +221,8 @@ def comb_bins(averaging: Averaging) -> Bool[np.ndarray, " bins"]:
 
 
 def comb_strength(
-    autos: Float[np.ndarray, "rows ports bins"],
-    frames: Float[np.ndarray, " rows"],
-    averaging: Averaging,
-    middles_mhz: Float[np.ndarray, " channels"],
-) -> Float[np.ndarray, " rows"]:
+    autos: Spectra, frames: Rows, averaging: Averaging, middles_mhz: Float[np.ndarray, " channels"]
+) -> Rows:
     """Return by how many standard deviations the comb's channels differ from their neighbours.
 
     Parameters
@@ -259,12 +258,8 @@ def comb_strength(
 
 
 def line_flags(
-    band: ChannelBand,
-    autos: Float[np.ndarray, "rows ports bins"],
-    frames: Float[np.ndarray, " rows"],
-    good: Bool[np.ndarray, "rows bins"],
-    limit: float,
-) -> tuple[Bool[np.ndarray, "rows bins"], Float[np.ndarray, "rows ports bins"]]:
+    band: ChannelBand, autos: Spectra, frames: Rows, good: Bins, limit: float
+) -> tuple[Bins, Spectra]:
     """Find bins of a band that do not lie on a smooth spectrum, in each spectrum on its own.
 
     Parameters
@@ -307,11 +302,7 @@ def n_tests(ports: int) -> int:
 
 
 def burst_flags(
-    seconds: Float[np.ndarray, " rows"],
-    autos: Float[np.ndarray, "rows ports"],
-    noise: Float[np.ndarray, "rows ports"],
-    good: Bool[np.ndarray, " rows"],
-    false_alarm: float,
+    seconds: Rows, autos: Levels, noise: Levels, good: Bool[np.ndarray, " rows"], false_alarm: float
 ) -> tuple[Bool[np.ndarray, " rows"], Float[np.ndarray, " spans"]]:
     """Find spectra off a smooth curve in time.
 
@@ -346,11 +337,7 @@ def burst_flags(
     return flagged, np.array(scatter)
 
 
-def _filled(
-    seconds: Float[np.ndarray, " rows"],
-    autos: Float[np.ndarray, "rows ports"],
-    known: Bool[np.ndarray, "rows ports"],
-) -> Float[np.ndarray, "rows ports"]:
+def _filled(seconds: Rows, autos: Levels, known: Bool[np.ndarray, "rows ports"]) -> Levels:
     """Autos with what lies between their neighbours in place of others, so as to bend no curve."""
     found = autos.copy()
     for port, at in enumerate(known.T):
@@ -359,7 +346,7 @@ def _filled(
     return found
 
 
-def _spans(seconds: Float[np.ndarray, " rows"]) -> list[np.ndarray]:
+def _spans(seconds: Rows) -> list[np.ndarray]:
     """Rows of spans of equal length, none longer than ``SPAN_S``."""
     whole = seconds[-1] - seconds[0]
     n = max(1, int(np.ceil(whole / SPAN_S - 1e-9)))
@@ -368,12 +355,12 @@ def _spans(seconds: Float[np.ndarray, " rows"]) -> list[np.ndarray]:
 
 
 def _one_span(
-    seconds: Float[np.ndarray, " span"],
+    seconds: Seconds,
     autos: Float[np.ndarray, "span ports"],
     noise: Float[np.ndarray, "span ports"],
-    good: Bool[np.ndarray, " span"],
+    good: Span,
     limit: float,
-) -> tuple[Bool[np.ndarray, " span"], float]:
+) -> tuple[Span, float]:
     x = np.polynomial.chebyshev.chebvander(
         2.0 * (seconds - seconds[0]) / max(seconds[-1] - seconds[0], 1.0) - 1.0, DEGREE
     )
@@ -402,22 +389,14 @@ def _one_span(
     return good & ~kept, float(np.median(scale))
 
 
-def _from_neighbours(
-    z: Float[np.ndarray, "ports span"], good: Bool[np.ndarray, " span"]
-) -> Float[np.ndarray, " ports"]:
+def _from_neighbours(z: Distances, good: Span) -> Float[np.ndarray, " ports"]:
     """Standard deviation of each port, by differences of one spectrum and the next."""
     both = (good[1:] & good[:-1])[None]
     steps = np.diff(z, axis=1) / np.sqrt(2.0)
     return np.array([robust_scale(port[None], both) for port in steps])
 
 
-def _without_the_highest(
-    values: Float[np.ndarray, "1 ports span"],
-    sigma: Float[np.ndarray, "1 ports span"],
-    good: Bool[np.ndarray, " span"],
-    x: Float[np.ndarray, "span terms"],
-    limit: float,
-) -> Bool[np.ndarray, " span"]:
+def _without_the_highest(values: OneRow, sigma: OneRow, good: Span, x: Terms, limit: float) -> Span:
     """Good spectra but those above the curve, which bursts pull up when they are long."""
     kept = good.copy()
     for _ in range(MAX_ROUNDS):
@@ -431,13 +410,8 @@ def _without_the_highest(
 
 
 def _with_what_fits(
-    values: Float[np.ndarray, "1 ports span"],
-    sigma: Float[np.ndarray, "1 ports span"],
-    good: Bool[np.ndarray, " span"],
-    kept: Bool[np.ndarray, " span"],
-    x: Float[np.ndarray, "span terms"],
-    limit: float,
-) -> Bool[np.ndarray, " span"]:
+    values: OneRow, sigma: OneRow, good: Span, kept: Span, x: Terms, limit: float
+) -> Span:
     """Spectra that are kept, and others on the curve through them, alone and in stretches.
 
     Where the curve is not known well, as at the ends of a span, they come back one after the other.
@@ -454,19 +428,13 @@ def _with_what_fits(
     return kept
 
 
-def _curve_is_known(
-    values: Float[np.ndarray, "1 ports span"],
-    kept: Bool[np.ndarray, " span"],
-    x: Float[np.ndarray, "span terms"],
-) -> Bool[np.ndarray, " span"]:
+def _curve_is_known(values: OneRow, kept: Span, x: Terms) -> Span:
     """Where the error of the curve, which a stretch has in common, is below its sum's noise."""
     _, leverage = fitted_curves(values, kept[None], x)
     return leverage[0] <= 1.0 / LENGTHS[-1]
 
 
-def _about_stretches(
-    z: Float[np.ndarray, "ports span"], kept: Bool[np.ndarray, " span"], limit: float
-) -> Bool[np.ndarray, " span"]:
+def _about_stretches(z: Distances, kept: Span, limit: float) -> Span:
     """All stretches whose sum is beyond the limit, and so more than is off."""
     sums, counts = _sums(z, kept)
     found = np.zeros(len(kept), dtype=bool)
@@ -477,9 +445,7 @@ def _about_stretches(
     return found & kept
 
 
-def _flagged_stretches(
-    z: Float[np.ndarray, "ports span"], good: Bool[np.ndarray, " span"], limit: float
-) -> Bool[np.ndarray, " span"]:
+def _flagged_stretches(z: Distances, good: Span, limit: float) -> Span:
     """Those in stretches whose sum is beyond the limit, the furthest first, and no more."""
     left = good.copy()
     lengths = [length for length in LENGTHS[1:] if length <= len(good) // 2]
@@ -496,25 +462,19 @@ def _flagged_stretches(
     return good & ~left
 
 
-def _sums(
-    z: Float[np.ndarray, "ports span"], good: Bool[np.ndarray, " span"]
-) -> tuple[Float[np.ndarray, "ports ends"], Float[np.ndarray, " ends"]]:
+def _sums(z: Distances, good: Span) -> tuple[Sums, Ends]:
     """Of all before each spectrum, and their number."""
     sums = np.cumsum(np.pad(np.where(good, z, 0.0), ((0, 0), (1, 0))), axis=1)
     return sums, np.cumsum(np.pad(good, (1, 0)).astype(float))
 
 
-def _sizes_of(
-    sums: Float[np.ndarray, "ports ends"], counts: Float[np.ndarray, " ends"], length: int
-) -> Float[np.ndarray, "ports starts"]:
+def _sizes_of(sums: Sums, counts: Ends, length: int) -> Float[np.ndarray, "ports starts"]:
     """By how much stretches of a length stand out; 0 where half of them are missing."""
     n = counts[length:] - counts[:-length]
     return _sizes(sums[:, length:] - sums[:, :-length], np.where(n > length / 2, n, np.inf))
 
 
-def _part(
-    sums: Float[np.ndarray, " ends"], counts: Float[np.ndarray, " ends"], limit: float
-) -> tuple[int, int]:
+def _part(sums: Ends, counts: Ends, limit: float) -> tuple[int, int]:
     """First and last end of the part of a stretch that stands out most.
 
     Not of two parts with a gap between them that fits, if they lower chi^2 by more than the limit

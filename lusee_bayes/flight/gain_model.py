@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.checks import require_positive, require_shape
@@ -70,14 +70,11 @@ class GainModel:
     kind: str = "made"
 
     def __post_init__(self):
-        lead = (len(LETTERS), PORTS)
-        require_shape(f"{self.path}: mean", self.mean, (*lead, None))
-        anchors = self.mean.shape[2]
-        require_shape(f"{self.path}: anchor_mhz", self.anchor_mhz, (*lead, anchors))
-        shape = (*lead, N_COMPONENTS, anchors)
-        require_shape(f"{self.path}: component", self.component, shape)
-        shape = (*lead, N_COMPONENTS, N_TERMS)
-        require_shape(f"{self.path}: coefficient", self.coefficient, shape)
+        require_shape(f"{self.path}: mean", self.mean, (len(LETTERS), PORTS, None))
+        *lead, anchors = self.mean.shape
+        shapes = {"anchor_mhz": [anchors], "component": [N_COMPONENTS, anchors]}
+        for name, shape in (shapes | {"coefficient": [N_COMPONENTS, N_TERMS]}).items():
+            require_shape(f"{self.path}: {name}", getattr(self, name), (*lead, *shape))
         if not (np.diff(self.anchor_mhz, axis=2) > 0.0).all():
             raise InputError(f"{self.path}: the frequencies of the gains do not grow")
         require_mhz(f"{self.path}: the frequencies of the gains", self.anchor_mhz)
@@ -316,15 +313,8 @@ def read_gain_table(path: str | Path, model: str = "quadratic") -> GainModel:
     found = read_netcdf(path, formats.GAINS, LAYOUT, HINT).arrays
     if tuple(map(str, found["level"])) != LETTERS:
         raise InputError(f"{path}: levels are {found['level']}; expected {', '.join(LETTERS)}")
-    return GainModel(
-        str(path),
-        found["anchor_mhz"],
-        found["mean"],
-        found["components"],
-        found["coefficient"],
-        found.get("component_std"),
-        "netCDF",
-    )
+    tables = (found[name] for name in ("anchor_mhz", "mean", "components", "coefficient"))
+    return GainModel(str(path), *tables, found.get("component_std"), "netCDF")
 
 
 def write_gain_table(path: str | Path, table: GainModel) -> Path:

@@ -8,7 +8,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
-import astropy.units as u
 import numpy as np
 from astropy.time import Time
 from jaxtyping import Int
@@ -21,7 +20,7 @@ from lusee_bayes.flight.gain_model import GainModel
 from lusee_bayes.flight.session import BinOrigin, Session
 from lusee_bayes.instrument.averaging import bins_of
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.times import TO_MIDDLE, Timestamp, Windows, unannounced_leap_seconds
+from lusee_bayes.instrument.times import TO_MIDDLE, Timestamp, Windows, later
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,20 +168,13 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
     )
     windows = None
     if recipe.timestamp != "instant":
-        with unannounced_leap_seconds():
-            times = times + TO_MIDDLE[recipe.timestamp] * window * u.s
+        times = later(times, TO_MIDDLE[recipe.timestamp] * window)
         windows = Windows.whole(-window / 2.0, window / 2.0, share * window)
     state = _states(ordered)
     with naming(", ".join(str(s.path) for s in ordered)):
-        observation = Observation(
-            lon,
-            lat,
-            times,
-            state,
-            (recipe.turntable_deg,) * (int(state[-1]) + 1),
-            float(window.max()),
-            windows=windows,
-        )
+        angles = (recipe.turntable_deg,) * (int(state[-1]) + 1)
+        longest = float(window.max())
+        observation = Observation(lon, lat, times, state, angles, longest, windows=windows)
     bin_of = np.arange(len(state))
     if recipe.average_s is not None:
         bin_of = bins_of(observation, windows.bounds_s, recipe.average_s)

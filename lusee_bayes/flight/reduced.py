@@ -22,11 +22,11 @@ from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.version import __version__
 from lusee_bayes.flight.gain_model import LETTERS, N_COMPONENTS, Curves
-from lusee_bayes.flight.session import AUTOS, N_PRODUCTS, NO_LEVEL, PORTS
+from lusee_bayes.flight.session import AUTOS, FIRST_PORT, N_PRODUCTS, NO_LEVEL, PORTS, SECOND_PORT
 from lusee_bayes.instrument.averaging import binned
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import DataLayout, all_products, labels
+from lusee_bayes.instrument.products import DataLayout, labels, runs_of
 from lusee_bayes.instrument.times import JD_SCALES, Windows, utc_of_jd
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
 
@@ -323,8 +323,7 @@ class Reduced(Described):
             observation = self.observation.select(keep)
         else:
             observation = binned(self.observation, left, bin_of_left, self.average_s)
-        products = all_products()
-        scale = np.sqrt([per_kelvin[p.i] * per_kelvin[p.j] for p in products])
+        scale = np.sqrt(per_kelvin[FIRST_PORT] * per_kelvin[SECOND_PORT])
         values = np.where(present, self.values[band], 0.0)[:, bins] / scale[:, None]
         layout = DataLayout.from_flags(~present[:, bins])
         return Visibilities(
@@ -389,17 +388,8 @@ def _mean_abs(bend: Float[np.ndarray, "ports bins"]) -> float:
 def _one_run_an_angle(observation: Observation) -> Observation:
     """The same with a run for each stretch of one turntable angle, whatever the gains were."""
     angles = np.array(observation.turntable_deg)[observation.run]
-    run = np.concatenate([[0], np.cumsum(np.diff(angles) != 0.0)]).astype(np.int64)
-    first = np.searchsorted(run, np.arange(run[-1] + 1))
-    return Observation(
-        observation.lon_deg,
-        observation.lat_deg,
-        observation.times,
-        run,
-        tuple(angles[first].tolist()),
-        observation.step_s,
-        windows=observation.windows,
-    )
+    run, turntable_deg = runs_of(angles, observation.n_times)
+    return replace(observation, run=run, turntable_deg=turntable_deg)
 
 
 HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."
@@ -461,7 +451,7 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
     scenario : str
         Text of the scenario that they were reduced with.
     """
-    seen = reduced.observation
+    seen, meanings = reduced.observation, {"flag_meanings": ", ".join(REASONS)}
     variables = {
         "visibility": (BAND_DIMS, reduced.values, {"units": "V^2/Hz"}),
         "before_flags": (BAND_DIMS, reduced.before.astype(np.float32), {"units": "V^2/Hz"}),
@@ -480,11 +470,7 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
         "run": (("spectrum",), seen.run.astype(np.int32)),
         "bin_of": (("spectrum",), reduced.bin_of.astype(np.int32)),
         "turntable_deg": (("run_number",), np.array(seen.turntable_deg)),
-        "reason": (
-            ("frequency", "spectrum"),
-            reduced.reason,
-            {"flag_meanings": ", ".join(REASONS)},
-        ),
+        "reason": (("frequency", "spectrum"), reduced.reason, meanings),
         "line_share": (("frequency", "spectrum"), reduced.lines),
     }
     if seen.windows is not None:
@@ -548,15 +534,9 @@ def read_reduced(path: str | Path) -> Reduced:
             windows = Windows.whole(
                 here["window_start_s"], here["window_end_s"], here.get("live_s")
             )
-        observation = Observation(
-            said["lon_deg"],
-            said["lat_deg"],
-            utc_of_jd(found),
-            here["run"],
-            tuple(here["turntable_deg"].tolist()),
-            said["step_s"],
-            windows=windows,
-        )
+        site, angles = (said["lon_deg"], said["lat_deg"]), tuple(here["turntable_deg"].tolist())
+        runs = here["run"], angles, said["step_s"]
+        observation = Observation(*site, utc_of_jd(found), *runs, windows=windows)
     if here["bin_of"].max() >= found.sizes["bin"]:
         raise InputError(f"{path}: bin_of goes beyond the {found.sizes['bin']} bins")
     return Reduced(

@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import astropy.units as u
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
@@ -32,7 +31,7 @@ from lusee_bayes.flight.flags import (
     robust_scale,
     threshold,
 )
-from lusee_bayes.flight.gain_model import NANO2, Curves, gain_curves
+from lusee_bayes.flight.gain_model import NANO2, gain_curves
 from lusee_bayes.flight.recipe import Recipe, Timeline, timeline
 from lusee_bayes.flight.reduced import (
     BURST,
@@ -59,7 +58,7 @@ from lusee_bayes.flight.session import (
     channel_mhz,
 )
 from lusee_bayes.instrument.averaging import by_the_rule
-from lusee_bayes.instrument.times import unannounced_leap_seconds
+from lusee_bayes.instrument.times import seconds_from
 
 # spectra that are worked on at once, and at least how many make a piece between two bins
 SLAB, PIECE = 128, 1024
@@ -131,26 +130,21 @@ def reduce_sessions(
 
 def _in_common(line: Timeline, recipe: Recipe) -> dict[str, Any]:
     """What does not depend on the spectra."""
+    levels = np.concatenate([s.level for s in line.sessions])
+    telemetry = {
+        name: np.concatenate([s.telemetry[name] for s in line.sessions])
+        for name in line.sessions[0].telemetry
+    }
     return {
         "frequencies_mhz": np.array(recipe.frequencies_mhz),
         "bandwidth_mhz": recipe.bandwidth_mhz,
         "average_s": recipe.average_s,
         "component_std": recipe.table.component_std,
         "gain_std": recipe.gain_std,
-        "curves": _curves(line, recipe),
+        "curves": gain_curves(recipe.table, recipe.gain_std, levels, telemetry),
         "sessions": tuple(_said_of(s, recipe) for s in line.sessions),
         "recipe": recipe.words(),
     }
-
-
-def _curves(line: Timeline, recipe: Recipe) -> Curves:
-    sessions = line.sessions
-    telemetry = {
-        name: np.concatenate([s.telemetry[name] for s in sessions])
-        for name in sessions[0].telemetry
-    }
-    levels = np.concatenate([s.level for s in sessions])
-    return gain_curves(recipe.table, recipe.gain_std, levels, telemetry)
 
 
 def _pieces(line: Timeline) -> list[slice]:
@@ -292,7 +286,9 @@ def _slab(
     telemetry = {name: values[here] for name, values in session.telemetry.items()}
     notched = np.zeros(len(counts), dtype=bool)
     if session.notch is not None:
-        notched = _notched(session.notch[here])
+        # the mean of the comb's channels is subtracted, unless bit 4 says that it is not
+        notch = session.notch[here]
+        notched = ((notch & 0b111) > 0) & ((notch & 0b10000) == 0)
     try:
         strengths = state.strengths(telemetry, len(counts))
     except InputError as error:
@@ -300,11 +296,6 @@ def _slab(
     frames = session.frames[here]
     lines = state.lines(counts, frames, notched)
     return partial(_calibrate, state, counts, frames, strengths, lines, session.saturated[here])
-
-
-def _notched(notch: Int[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
-    """Whether the mean of the comb's channels is subtracted: bit 4 says that it is not."""
-    return ((notch & 0b111) > 0) & ((notch & 0b10000) == 0)
 
 
 def _calibrate(
@@ -411,9 +402,8 @@ def _finish(
 
 def _flag_bursts(spectra: Reduced, false_alarm: float, number: int) -> Float[np.ndarray, " spans"]:
     """Flag spectra that do not fit those before and after; the scatter over the noise, by span."""
-    with unannounced_leap_seconds():
-        times = spectra.observation.times
-        seconds = (times - times[0]).to_value(u.s)
+    times = spectra.observation.times
+    seconds = seconds_from(times[0], times)
     autos, noise = spectra.values[number, AUTOS].T, spectra.noise(number).T
     # what is absent neither stands out nor tells
     there = np.isfinite(autos)

@@ -21,7 +21,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Attribute, Content, Unread, Variable
 from lusee_bayes.core.reading import reading
 from lusee_bayes.flight.clock import Clock
-from lusee_bayes.instrument.products import all_products, auto_indices, labels
+from lusee_bayes.instrument.products import auto_indices, labels, ports
 
 N_CHANNELS = 2048
 CHANNEL_MHZ = 0.025
@@ -42,9 +42,7 @@ N_PRODUCTS = len(FLIGHT_PRODUCTS)
 # where the products of the package's order are in the spectrometer's, and what each of them is
 OF_FLIGHT = np.array([FLIGHT_PRODUCTS.index(label) for label in labels()])
 AUTOS = auto_indices()
-FIRST_PORT = np.array([p.i for p in all_products()])
-SECOND_PORT = np.array([p.j for p in all_products()])
-IMAGINARY = np.array([p.part == "I" for p in all_products()])
+FIRST_PORT, SECOND_PORT, IMAGINARY = ports()
 
 BinOrigin = Literal["centre", "edge"]
 
@@ -98,14 +96,7 @@ def channel_mhz(origin: BinOrigin) -> Float[np.ndarray, " channels"]:
 
 
 # what the gain table asks of the telemetry
-TELEMETRY = (
-    "THERM_FPGA",
-    "SPE_ADC0_T",
-    "SPE_ADC1_T",
-    "SPE_1VAD8_V",
-    "VMON_1V2D",
-    "SPE_1VAD8_C",
-)
+TELEMETRY = ("THERM_FPGA", "SPE_ADC0_T", "SPE_ADC1_T", "SPE_1VAD8_V", "VMON_1V2D", "SPE_1VAD8_C")
 # counts of spectra [first:last] of all products and channels
 Read = Callable[[int, int], Float32[np.ndarray, "rows products channels"]]
 
@@ -335,6 +326,7 @@ def session_of(
             f"({n}, 16, {N_CHANNELS}) real numbers"
         )
     none = np.zeros((n, PORTS), dtype=np.int64)
+    said = found.values.get("session_invariants.software_version", "unknown")
     shift2 = rows[f"{META}/Navg2_shift"]
     share = np.ones(n)
     if (weight := rows.get(f"{META}/weight")) is not None:
@@ -360,15 +352,11 @@ def session_of(
         clock=clock,
         lon_deg=found.values["constants.lun_long_deg"],
         lat_deg=found.values["constants.lun_lat_deg"],
-        software=_version(found.values.get("session_invariants.software_version", "unknown")),
+        # as versions of the flight software are written: 0x307 for the number 775
+        software=f"{int(said):#x}" if said.isascii() and said.isdigit() else said,
         opener=opener,
         unused=unused or {},
     )
-
-
-def _version(text: str) -> str:
-    """A version of the flight software as it is written: 0x307 for the number 775."""
-    return f"{int(text):#x}" if text.isascii() and text.isdigit() else text
 
 
 def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> Shaped[np.ndarray, "rows ports"]:

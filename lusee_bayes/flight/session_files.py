@@ -23,22 +23,9 @@ from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.formats import has_words, is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.reading import reading, require_file
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
-from lusee_bayes.flight.layout_3 import (
-    INTERPOLATED,
-    UNKNOWN,
-    session_of_fits,
-    session_of_hdf5,
-)
+from lusee_bayes.flight.layout_3 import INTERPOLATED, UNKNOWN, session_of_fits, session_of_hdf5
 from lusee_bayes.flight.layout_4 import session_of_4
-from lusee_bayes.flight.session import (
-    LEVELS,
-    META,
-    N_CHANNELS,
-    N_PRODUCTS,
-    PORTS,
-    Read,
-    Session,
-)
+from lusee_bayes.flight.session import LEVELS, META, N_CHANNELS, N_PRODUCTS, PORTS, Read, Session
 
 HDF5, FITS = (f"a session of lusee.ingest in {kind}" for kind in ("HDF5", "FITS"))
 NEWEST = 4

@@ -360,25 +360,11 @@ class Disturbances:
             here = slice(first, max(first + 1, np.searchsorted(hours, at + length_s / 3600.0)))
             burst[here] = True
             phase[here] = generator.uniform(0.0, 2.0 * np.pi, PORTS)
-        return cls(
-            level,
-            absent,
-            saturated,
-            tone,
-            tones,
-            comb,
-            burst,
-            phase,
-            tone_factor,
-            comb_factor,
-            burst_factor,
-        )
+        factors = tone_factor, comb_factor, burst_factor
+        return cls(level, absent, saturated, tone, tones, comb, burst, phase, *factors)
 
     def add(
-        self,
-        t: Complex[np.ndarray, "antennas antennas rows channels"],
-        rows: slice,
-        frames: float,
+        self, t: Complex[np.ndarray, "antennas antennas rows channels"], rows: slice, frames: float
     ) -> None:
         """Add tones, comb and bursts to the covariance of the voltages of some spectra, in place.
 

@@ -1,7 +1,6 @@
 """Averages over longer times, of data and of what the model predicts.
 
-What A knows of time: the fewest functions that give every sample's mean over its window.
-
+**What A knows of time** are the fewest functions that give every sample's mean over its window.
 With W_p the tilted copies of a beam (``rotations.tilts``), a row of A at one instant is the sum
 over p and the orders m of e_p(t) exp(i m phi(t)) W_p,m. Its mean over a window, where phi is
 phi_mean + delta, has the factors ::
@@ -17,9 +16,8 @@ The beams take up G, and time enters A through u_j(t) and exp(i m phi_mean) alon
 one length the first function stands for the mean over a turn about a fixed axis, which is a factor
 for each order m; others for the wandering of the axis, and for windows that are partly filled.
 
-Means of data over longer times.
-
-A is exact for a mean if all products of a sample have the same window. In each bin:
+**Means of data over longer times.** A is exact for a mean if all products of a sample have the same
+window. In each bin:
 
 1. samples in which every product is flagged are left out;
 2. a product that is present for less than half of the live time of the others is left out: it is
@@ -35,7 +33,6 @@ from __future__ import annotations
 from dataclasses import replace
 from math import factorial, lgamma
 
-import astropy.units as u
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from threadpoolctl import threadpool_limits
@@ -45,7 +42,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import tilt_powers
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.instrument.times import ROUNDING_S, Windows, unannounced_leap_seconds
+from lusee_bayes.instrument.times import ROUNDING_S, Windows, later, seconds_from
 from lusee_bayes.instrument.visibilities import Visibilities
 
 # of what is left out of any sample, relative to its visibility if what a beam sees of the sky falls
@@ -299,7 +296,7 @@ def bins_of(
             f"the data are to be averaged over {to_s:g} s, {to_s / 86400.0:g} days; give at most "
             f"{LONGEST_S / 86400.0:g} days, in which the Moon turns once"
         )
-    seconds = _seconds(observation)
+    seconds = seconds_from(observation.times[0], observation.times)
     start, end = seconds + bounds_s[:, 0], seconds + bounds_s[:, 1]
     origin = start[np.searchsorted(observation.run, observation.run)]
     place = np.floor((start - origin + ROUNDING_S) / to_s)
@@ -312,11 +309,6 @@ def bins_of(
         else:
             bin_of[k], begins = bin_of[k - 1] + 1, k
     return bin_of
-
-
-def _seconds(observation: Observation) -> Float[np.ndarray, " times"]:
-    with unannounced_leap_seconds():
-        return (observation.times - observation.times[0]).to_value(u.s)
 
 
 def by_the_rule(
@@ -367,7 +359,8 @@ def binned(
     keep = np.isin(np.arange(observation.n_times), left)
     here = observation.select(keep)
     windows = here.windows
-    offset = _seconds(here)[windows.sample]
+    seconds = seconds_from(here.times[0], here.times)
+    offset = seconds[windows.sample]
     start, end = windows.start_s + offset, windows.end_s + offset
     bin_of_piece, share = bin_of_left[windows.sample], windows.live_s / (end - start)
     gap = start[1:] - end[:-1]
@@ -383,8 +376,7 @@ def binned(
     begin = np.searchsorted(bin_of_piece, np.arange(len(first)))
     last = np.append(begin[1:], len(start)) - 1
     middle = (start[begin] + end[last]) / 2.0
-    with unannounced_leap_seconds():
-        times = here.times[first] + (middle - _seconds(here)[first]) * u.s
+    times = later(here.times[first], middle - seconds[first])
     offset = middle[bin_of_piece]
     return replace(
         here,

@@ -1,19 +1,12 @@
 """A, of any kind: A m, A^T d, and what is made of them.
 
-The protocol that every coupling matrix A obeys.
-
 A new kind is one file: implement the abstract methods here. ``lusee_bayes.testing.check_coupling``
 tells whether it keeps the contract.
 
-Beams on the Moon: turned by the turntable, leaning with the lander, tilted with the pole.
-
-A coupling matrix that is given as an array of numbers.
-
-A of the beams of an observation: from sky coefficients to visibilities.
-
-With b_rk the coefficients of product k in run r, turned into the Moon-fixed frame, and W_j what the
-pointing's function of time u_j has of its tilted copies (:mod:`.averaging`), a visibility, the
-mean over its window, is ::
+**A of an observation** takes sky coefficients to visibilities. Its beams are turned by the
+turntable, lean with the lander and are tilted with the pole. With b_rk the coefficients of product
+k in run r, turned into the Moon-fixed frame, and W_j what the pointing's function of time u_j has
+of its tilted copies (:mod:`.averaging`), a visibility, the mean over its window, is ::
 
     V_k(t) = [ D_z(-phi(t)) sum_j u_j(t) W_j ] . a             (a: the sky in the mean-pole frame)
            = sum_j u_j(t) sum_m ( cos m phi(t) X_jm + sin m phi(t) Y_jm ),
@@ -22,13 +15,10 @@ mean over its window, is ::
 Time enters only through exp(i m phi) and the slow scalars u_j, beams only through b: a product of
 A with a vector never forms A, and nothing in it but the last sum grows with the number of times.
 
-The coupling matrix A, from sky coefficients to visibilities: one protocol, two kinds.
-
-A as a linear function of the beams, for fixed orientations and beams that change.
-
-Row t of product k is b_k R(t), with R(t) block diagonal in ell: one rotation matrix for each ell
-and sample, computed once. Then A costs 16 products with (2 ell + 1)^2 numbers per ell and sample,
-and derivatives cost no more.
+**A as a linear function of the beams**, for fixed orientations and beams that change
+(:class:`BeamOperator`): row t of product k is b_k R(t), with R(t) block diagonal in ell: one
+rotation matrix for each ell and sample, computed once. Then A costs 16 products with (2 ell + 1)^2
+numbers per ell and sample, and derivatives cost no more.
 """
 
 from __future__ import annotations
@@ -42,7 +32,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lusee_bayes.core.arrays import Array, compiled, namespace
-from lusee_bayes.core.checks import Described, require_finite, require_float64, require_shape
+from lusee_bayes.core.checks import Described, require_array, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import (
     lmax_of,
@@ -181,9 +171,7 @@ class Coupling(Described, eqx.Module):
         InputError
             If ``factors`` is not float64, not finite, or of another length.
         """
-        require_float64("the response", factors)
-        require_shape("the response", factors, (self.shape[0],))
-        require_finite("the response", factors)
+        require_array("the response", factors, (self.shape[0],))
         factors = factors if self.response is None else self.response * factors
         return replace(self, response=factors)
 
@@ -264,9 +252,7 @@ class DenseCoupling(Coupling):
         *,
         response: Float[Array, " data"] | None = None,
     ):
-        require_float64("the coupling matrix", matrix)
-        require_shape("the coupling matrix", matrix, (None, None))
-        require_finite("the coupling matrix", matrix)
+        require_array("the coupling matrix", matrix, (None, None))
         self.matrix = jnp.asarray(matrix)
         self.response = response
 
@@ -322,10 +308,7 @@ class CouplingMatrix(Coupling):
 
     @classmethod
     def build(
-        cls,
-        beams: ProductBeams,
-        pointing: Pointing,
-        layout: DataLayout | None = None,
+        cls, beams: ProductBeams, pointing: Pointing, layout: DataLayout | None = None
     ) -> CouplingMatrix:
         """Build A from beams and orientations.
 
@@ -361,10 +344,7 @@ class CouplingMatrix(Coupling):
 
     @classmethod
     def of_modes(
-        cls,
-        modes: Float[Array, "beams modes"],
-        pointing: Pointing,
-        layout: DataLayout,
+        cls, modes: Float[Array, "beams modes"], pointing: Pointing, layout: DataLayout
     ) -> CouplingMatrix:
         """Build A of any number of beams from their coefficients; nothing is checked.
 
@@ -473,15 +453,55 @@ class CouplingMatrix(Coupling):
             blocks.append(self._block(run, times)[product[here], position])
         return namespace(*blocks).concatenate(blocks)[np.argsort(np.concatenate(places))]
 
+    @compiled
     def dense(self) -> Float[Array, "data modes"]:
         """A as a matrix (96 MB for 5232 x 2304)."""
-        return _dense(self)
+        blocks = [self._block(run, span) for run, span in self.pointing.runs()]
+        rows = self.layout.gather(namespace(*blocks).concatenate(blocks, axis=1))
+        return rows if self.response is None else rows * self.response[:, None]
 
-    def _forward(self, sky):
-        return _forward(self, sky)
+    @compiled
+    def _forward(self, sky: Float[Array, " modes"]) -> Float[Array, " data"]:
+        n_products, n_functions = self.body_beams.shape[1:3]
+        pairs = _pairs(self.pointing.pole_from_galactic(sky), self.lmax)
+        plus, minus = pairs[: self.lmax + 1], pairs[self.lmax + 1 :]
+        xp = namespace(self, sky)
+        zero_order = np.arange(self.lmax + 1)[None] == 0
+        crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
+        both = xp.stack([pairs.T, crossed.T], axis=-1)
+        cosine, sine = _phases(self.pointing, self.lmax)
+        functions = self.pointing.functions
+        grids = []
+        for run, span in self.pointing.runs():
+            x_and_y = self.by_order[run] @ both
+            over_time = cosine[span] @ x_and_y[..., 0] + sine[span] @ x_and_y[..., 1]
+            over_time = over_time.reshape(-1, n_products, n_functions)
+            grids.append((over_time * functions[span][:, None]).sum(-1).T)
+        data = self.layout.gather(xp.concatenate(grids, axis=1))
+        return data if self.response is None else data * self.response
 
-    def _backward(self, data):
-        return _backward(self, data)
+    @compiled
+    def _backward(self, data: Float[Array, " data"]) -> Float[Array, " modes"]:
+        """The transpose of :func:`_forward`, step by step."""
+        n = self.lmax + 1
+        data = data if self.response is None else data * self.response
+        grid = self.layout.scatter(data)
+        cosine, sine = _phases(self.pointing, self.lmax)
+        functions = self.pointing.functions
+        both = 0.0
+        for run, span in self.pointing.runs():
+            weighted = grid[:, span].T[:, :, None] * functions[span][:, None]
+            weighted = weighted.reshape(weighted.shape[0], -1)
+            x_and_y = namespace(weighted).stack(
+                [cosine[span].T @ weighted, sine[span].T @ weighted], axis=-1
+            )
+            both = both + self.by_order[run].swapaxes(1, 2) @ x_and_y
+        # (orders, degrees): of pairs, and of what they are crossed to
+        straight, crossed = both[..., 0], both[..., 1]
+        plus, minus = straight[:, :n] - crossed[:, n:], straight[:, n:] + crossed[:, :n]
+        ell, m = mode_numbers(self.lmax)
+        packed = namespace(both).where(m >= 0, plus[np.abs(m), ell], minus[np.abs(m), ell])
+        return self.pointing.pole_from_galactic.T(packed)
 
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:
         """Rows of all products for some samples of one run; times: a slice or numbers."""
@@ -517,13 +537,6 @@ def turned_about_pole(
     return beams * cosine[None, :, np.abs(m)] - mirrored * signed[None]
 
 
-@compiled
-def _dense(coupling: CouplingMatrix) -> Float[Array, "data modes"]:
-    blocks = [coupling._block(run, span) for run, span in coupling.pointing.runs()]
-    rows = coupling.layout.gather(namespace(*blocks).concatenate(blocks, axis=1))
-    return rows if coupling.response is None else rows * coupling.response[:, None]
-
-
 def _phases(pointing: Pointing, lmax: int) -> tuple[Array, Array]:
     """cos m phi(t) and sin m phi(t), each (times, orders)."""
     xp = namespace(pointing.azimuth)
@@ -553,51 +566,6 @@ def _pairs(modes: Float[Array, "*batch modes"], lmax: int) -> Float[Array, "*bat
     inside = (ell >= m) & (m > 0)
     minus = xp.where(inside, modes[..., np.where(inside, centre - m, 0)], 0.0)
     return xp.concatenate([plus, minus], axis=-2)
-
-
-@compiled
-def _forward(coupling: CouplingMatrix, sky: Float[Array, " modes"]) -> Float[Array, " data"]:
-    n_products, n_functions = coupling.body_beams.shape[1:3]
-    pairs = _pairs(coupling.pointing.pole_from_galactic(sky), coupling.lmax)
-    plus, minus = pairs[: coupling.lmax + 1], pairs[coupling.lmax + 1 :]
-    xp = namespace(coupling, sky)
-    zero_order = np.arange(coupling.lmax + 1)[None] == 0
-    crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
-    both = xp.stack([pairs.T, crossed.T], axis=-1)
-    cosine, sine = _phases(coupling.pointing, coupling.lmax)
-    functions = coupling.pointing.functions
-    grids = []
-    for run, span in coupling.pointing.runs():
-        x_and_y = coupling.by_order[run] @ both
-        over_time = cosine[span] @ x_and_y[..., 0] + sine[span] @ x_and_y[..., 1]
-        over_time = over_time.reshape(-1, n_products, n_functions)
-        grids.append((over_time * functions[span][:, None]).sum(-1).T)
-    data = coupling.layout.gather(xp.concatenate(grids, axis=1))
-    return data if coupling.response is None else data * coupling.response
-
-
-@compiled
-def _backward(coupling: CouplingMatrix, data: Float[Array, " data"]) -> Float[Array, " modes"]:
-    """The transpose of :func:`_forward`, step by step."""
-    n = coupling.lmax + 1
-    data = data if coupling.response is None else data * coupling.response
-    grid = coupling.layout.scatter(data)
-    cosine, sine = _phases(coupling.pointing, coupling.lmax)
-    functions = coupling.pointing.functions
-    both = 0.0
-    for run, span in coupling.pointing.runs():
-        weighted = grid[:, span].T[:, :, None] * functions[span][:, None]
-        weighted = weighted.reshape(weighted.shape[0], -1)
-        x_and_y = namespace(weighted).stack(
-            [cosine[span].T @ weighted, sine[span].T @ weighted], axis=-1
-        )
-        both = both + coupling.by_order[run].swapaxes(1, 2) @ x_and_y
-    # (orders, degrees): of pairs, and of what they are crossed to
-    straight, crossed = both[..., 0], both[..., 1]
-    plus, minus = straight[:, :n] - crossed[:, n:], straight[:, n:] + crossed[:, :n]
-    ell, m = mode_numbers(coupling.lmax)
-    packed = namespace(both).where(m >= 0, plus[np.abs(m), ell], minus[np.abs(m), ell])
-    return coupling.pointing.pole_from_galactic.T(packed)
 
 
 # unit beams that are rotated at once

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, placed
+from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, with_values
 from lusee_bayes.instrument.coupling import BeamOperator, CouplingMatrix
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
@@ -94,28 +94,8 @@ class Instrument(eqx.Module):
         InputError
             If there is no parameter of that name.
         """
-        antennas = placed(self.monopoles, values or {})
+        antennas = with_values(self.monopoles, values or {})
         return monopole_beams(self.frequency_mhz, self.lmax, antennas, nodes=self.nodes)
-
-    def coupling(self, values: Mapping[str, Float[Array, ""]] | None = None) -> CouplingMatrix:
-        """Compute A with its structure in time.
-
-        Parameters
-        ----------
-        values : mapping of str to () array, optional
-            Values of some parameters (``beams.PARAMETERS``); the others keep theirs.
-
-        Returns
-        -------
-        CouplingMatrix
-            Differentiable in the values.
-
-        Raises
-        ------
-        InputError
-            If there is no parameter of that name.
-        """
-        return self.coupling_of(self.beams(values))
 
     def dense(self, values: Mapping[str, Float[Array, ""]]) -> Float[Array, "data modes"]:
         """Compute A as a matrix, of a :meth:`prepared` instrument.

@@ -1,16 +1,13 @@
 """An observation: where the sky stands in the antennas' frame at every time.
 
-Site, times, windows and turntable angles of an observation.
-
 Frames: Galactic (of the sky), MCMF (fixed to the Moon, from lunarsky), topocentric (x East,
 y North, z up). Orientations come from lunarsky's own coordinate transformation at every time:
 nothing assumes that the Moon turns about a fixed axis, unless ``fixed_axis`` asks for it.
 
-Directions and distances of the Sun, the Earth and the planets, seen from the lander.
-
-Positions come from ERFA's analytical series (astropy's ``builtin``; nothing is downloaded): the
-Earth to 1e-7 au and the Moon to 10 arcseconds, the Sun as good as the Earth, Jupiter, Saturn and
-Uranus to 90 arcseconds, the other planets to 20 (notes of erfa.epv00, moon98 and plan94).
+Where the Sun, the Earth and the planets stand, seen from the lander, comes from ERFA's analytical
+series (astropy's ``builtin``; nothing is downloaded): the Earth to 1e-7 au and the Moon to 10
+arcseconds, the Sun as good as the Earth, Jupiter, Saturn and Uranus to 90 arcseconds, the other
+planets to 20 (notes of erfa.epv00, moon98 and plan94).
 """
 
 from __future__ import annotations
@@ -26,24 +23,23 @@ from astropy.constants import c
 from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_body_barycentric
 from astropy.time import Time, TimeDelta
 from jaxtyping import Bool, Float, Int
+from lunarsky import MCMF
+from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.core.checks import Described, listed, require_finite, require_positive
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.instrument.schedule import (
-    Cuts,
-    Interval,
-    Run,
-    about_fixed_axis,
-    cut_intervals,
-    cut_runs,
-    lean,
-    mcmf_from_galactic,
-    sun_direction,
-    topocentric_from_mcmf,
+from lusee_bayes.instrument.schedule import Cuts, Interval, Run, cut_intervals, cut_runs
+from lusee_bayes.instrument.times import (
+    Windows,
+    later,
+    require_ephemeris,
+    seconds_from,
+    unannounced_leap_seconds,
 )
-from lusee_bayes.instrument.times import Windows, require_ephemeris, unannounced_leap_seconds
 
 ONE_CYCLE = (Run(),)
+# period after which the sky repeats itself in luseepy's engine croissant
+LUSEEPY_MONTH_HOURS = 655.72
 
 
 @dataclass(frozen=True, repr=False)
@@ -99,8 +95,7 @@ class Observation(Described):
                 f"times {self.times.shape} and run {self.run.shape} must be two lists of the "
                 "same length, with at least one sample"
             )
-        with unannounced_leap_seconds():
-            back = np.flatnonzero(~((self.times[1:] - self.times[:-1]).to_value(u.s) > 0.0))
+        back = np.flatnonzero(~(seconds_from(self.times[:-1], self.times[1:]) > 0.0))
         if back.size:
             before, after = self.times[back[0]].isot, self.times[back[0] + 1].isot
             raise InputError(
@@ -234,11 +229,7 @@ class Observation(Described):
         """Of samples by night alone where asked for, at their times or from end to end."""
         times, windows = cuts.samples(window)
         observation = cls(
-            times=times,
-            run=cuts.run,
-            turntable_deg=cuts.turntable_deg,
-            windows=windows,
-            **others,
+            times=times, run=cuts.run, turntable_deg=cuts.turntable_deg, windows=windows, **others
         )
         if not any(cuts.night_only):
             return observation
@@ -248,8 +239,7 @@ class Observation(Described):
         dark = self.sun_altitude_deg() < 0.0
         if throughout and self.windows is not None:
             for offset_s in self.windows.bounds_s.T:
-                with unannounced_leap_seconds():
-                    times = self.times + offset_s * u.s
+                times = later(self.times, offset_s)
                 dark &= replace(self, times=times, windows=None).sun_altitude_deg() < 0.0
         return dark
 
@@ -311,8 +301,7 @@ class Observation(Described):
         if self.windows is None:
             return self, np.arange(self.n_times), np.ones(self.n_times)
         sample, offset_s, weight = self.windows.nodes(n)
-        with unannounced_leap_seconds():
-            times = self.times[sample] + offset_s * u.s
+        times = later(self.times[sample], offset_s)
         instants = replace(self, times=times, run=self.run[sample], windows=None)
         return instants, sample, weight
 
@@ -330,7 +319,9 @@ class Observation(Described):
     @cached_property
     def _mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
         if self.fixed_axis:
-            rotations = about_fixed_axis(self.times, self.hours)
+            angle = 2.0 * np.pi * self.hours / LUSEEPY_MONTH_HOURS
+            about_z = SpatialRotation.from_rotvec(np.outer(-angle, [0.0, 0.0, 1.0])).as_matrix()
+            rotations = about_z @ mcmf_from_galactic(self.times[:1])[0]
         else:
             rotations = mcmf_from_galactic(self.times)
         rotations.setflags(write=False)  # all channels share them
@@ -338,11 +329,20 @@ class Observation(Described):
 
     def topocentric_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from MCMF to the East, North and up of the site, its rows."""
-        return topocentric_from_mcmf(self.lon_deg, self.lat_deg)
+        lon, lat = np.radians(self.lon_deg), np.radians(self.lat_deg)
+        up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+        east = np.array([-np.sin(lon), np.cos(lon), 0.0])
+        return np.array([east, np.cross(up, east), up])
 
     def lander_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
-        """Return the rotation from MCMF to the lander's axes: East, North and up if it is level."""
-        return lean(self.tilt_deg) @ self.topocentric_from_mcmf()
+        """Return the rotation from MCMF to the lander's axes: East, North and up if it is level.
+
+        It leans first towards North, about East, then towards East, about North.
+        """
+        east, north = np.radians(self.tilt_deg)
+        turned = SpatialRotation.from_rotvec([0.0, east, 0.0])
+        turned *= SpatialRotation.from_rotvec([-north, 0.0, 0.0])
+        return turned.inv().as_matrix() @ self.topocentric_from_mcmf()
 
     def zenith_galactic(self) -> Float[np.ndarray, "times 3"]:
         """Return the Galactic unit vector of the zenith at every time."""
@@ -354,17 +354,30 @@ class Observation(Described):
         return np.degrees(np.arcsin(height))
 
 
-BODIES = (
-    "Sun",
-    "Mercury",
-    "Venus",
-    "Earth",
-    "Mars",
-    "Jupiter",
-    "Saturn",
-    "Uranus",
-    "Neptune",
-)
+def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:
+    """Return the rotations that take Galactic unit vectors to MCMF ones.
+
+    The three Galactic axes go through lunarsky's ICRS -> MCMF transformation in one call.
+    """
+    axes = Galactic(CartesianRepresentation(np.eye(3)[:, :, None])).transform_to(ICRS())
+    icrs = ICRS(CartesianRepresentation(axes.cartesian.xyz.value))
+    with unannounced_leap_seconds():
+        turned = icrs.transform_to(MCMF(obstime=times))
+    return np.moveaxis(turned.cartesian.xyz.value, 2, 0)
+
+
+def sun_direction(times: Time) -> Float[np.ndarray, "times 3"]:
+    """Return Galactic unit vectors from the Moon's centre to where the Sun's is at the time."""
+    with unannounced_leap_seconds():
+        sun = get_body_barycentric("sun", times, ephemeris="builtin")
+        moon = get_body_barycentric("moon", times, ephemeris="builtin")
+    direction = (sun - moon).xyz.to_value(u.km)
+    galactic = ICRS(CartesianRepresentation(direction)).transform_to(Galactic())
+    vector = galactic.cartesian.xyz.value
+    return (vector / np.linalg.norm(vector, axis=0)).T
+
+
+BODIES = ("Sun", "Mercury", "Venus", "Earth", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")
 
 MOON_RADIUS_KM = 1737.4  # IAU mean radius
 LIGHT_KM_PER_S = c.to_value(u.km / u.s)
@@ -395,19 +408,6 @@ def body_direction(body: str, observation: Observation) -> Float[np.ndarray, "ti
     InputError
         If the body is unknown.
     """
-    vector = _from_lander_km(body, observation)
-    return vector / np.linalg.norm(vector, axis=1, keepdims=True)
-
-
-def body_distance_au(body: str, observation: Observation) -> Float[np.ndarray, " times"]:
-    """Return the distance in au that the light of a body has travelled to the lander.
-
-    Parameters and errors as of :func:`body_direction`.
-    """
-    return (np.linalg.norm(_from_lander_km(body, observation), axis=1) * u.km).to_value(u.au)
-
-
-def _from_lander_km(body: str, observation: Observation) -> Float[np.ndarray, "times 3"]:
     known = {name.lower(): name for name in BODIES}
     if body.lower() not in known:
         hint = nearest(body.capitalize(), BODIES)
@@ -420,7 +420,7 @@ def _from_lander_km(body: str, observation: Observation) -> Float[np.ndarray, "t
         departure = arrival - TimeDelta(light_time, format="sec", scale="tdb")
         vector = _barycentric_km(body.lower(), departure) - lander
         light_time = np.linalg.norm(vector, axis=1) / LIGHT_KM_PER_S
-    return vector
+    return vector / np.linalg.norm(vector, axis=1, keepdims=True)
 
 
 def _barycentric_km(body: str, times: Time) -> Float[np.ndarray, "times 3"]:

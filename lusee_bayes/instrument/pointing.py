@@ -1,8 +1,7 @@
 """Pointing: turntable, tilt, azimuth and clock, and how far each may be off.
 
-The orientation of the lander at every time, split so that time enters only through scalars.
-
-In the frame P whose z axis is the mean pole of the Moon over the samples, the rotation to the
+The orientation of the lander at every time is split so that time enters only through scalars. In
+the frame P whose z axis is the mean pole of the Moon over the samples, the rotation to the
 Moon-fixed frame is a turn phi(t) about z followed by a small tilt, exactly::
 
     MCMF <- P  at t  =  exp(ex(t) K_x + ey(t) K_y)  exp(phi(t) K_z).
@@ -11,9 +10,8 @@ The pole wanders by 0.04 degrees over one cycle, so the tilt is expanded in powe
 order is chosen such that the largest neglected term is below ``TILT_TOLERANCE`` of any mode.
 Means over windows, and what of all this depends on time, are left to :mod:`.averaging`.
 
-Offsets of clock and pointing: by what times, turntable angles and the site may be off.
-
-Each is what has to be added to the value that data or scenario say. They shift an observation
+**Offsets** of clock and pointing are by what times, turntable angles and the site may be off. Each
+is what has to be added to the value that data or scenario say. They shift an observation
 exactly (:func:`with_offsets`: times, turntable angles, site and lean of the lander), or a pointing
 inside a compiled function (:func:`turned_by_offsets`), where the Moon turns at a constant rate
 about a pole that does not wander within the clock's offset: that errs by less than 1e-3 of what
@@ -26,7 +24,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 
-import astropy.units as u
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -38,7 +35,7 @@ from lusee_bayes.core.harmonics import Rotation
 from lusee_bayes.instrument.averaging import sufficient_nodes, windowed
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.schedule import CYCLE_DAYS
-from lusee_bayes.instrument.times import Windows, unannounced_leap_seconds
+from lusee_bayes.instrument.times import Windows, later
 
 # bound on the relative error of a mode at lmax, and least order for any lmax
 TILT_TOLERANCE = 1e-7
@@ -272,7 +269,7 @@ def offset_names(kinds: tuple[str, ...], n_runs: int) -> tuple[str, ...]:
     return tuple(names)
 
 
-def kind_of(name: str) -> str:
+def offset_kind(name: str) -> str:
     """Return the key of ``OFFSETS`` that an offset's name belongs to."""
     return "turntable_deg" if name.startswith("turntable_") else name
 
@@ -300,8 +297,7 @@ def with_offsets(observation: Observation, values: Values) -> Observation:
     drift = given.get("clock_drift_s_per_day", 0.0)
     stretch = 1.0 + drift / 86400.0
     late = given.get("clock_s", 0.0) + drift * observation.hours / 24.0
-    with unannounced_leap_seconds():
-        times = observation.times + late * u.s
+    times = later(observation.times, late)
     angles = zip(observation.turntable_deg, _of_runs(observation.n_runs), strict=True)
     windows = observation.windows
     if windows is not None:
@@ -316,10 +312,7 @@ def with_offsets(observation: Observation, values: Values) -> Observation:
         turntable_deg=tuple(angle + given.get(name, 0.0) for angle, name in angles),
         step_s=observation.step_s * stretch,
         windows=windows,
-        tilt_deg=(
-            east + given.get("tilt_east_deg", 0.0),
-            north + given.get("tilt_north_deg", 0.0),
-        ),
+        tilt_deg=(east + given.get("tilt_east_deg", 0.0), north + given.get("tilt_north_deg", 0.0)),
     )
 
 

@@ -1,26 +1,23 @@
 """Products of pairs of antennas, their correlations, and the layout of data.
 
-The correlation products of n antennas: their order and their labels.
-
 Voltages s_i give V_ij = <s_i conj(s_j)>: one real number for each antenna (auto), two for
 each pair (Re, Im). They are ordered and labelled as in luseepy:
 ``00R, 01R, 01I, 02R, 02I, 03R, 03I, 11R, 12R, ... 33R``, n^2 real products in all.
 
-Arrays of measured correlations, as instruments and their software have them.
+Arrays of measured correlations come as instruments and their software have them: names of products,
+signs of imaginary parts, sites and angles are said in many ways, which
+:meth:`.Visibilities.from_arrays` takes through the functions of this module.
 
-Names of products, signs of imaginary parts, sites and angles are said in many ways;
-:meth:`.Visibilities.from_arrays` takes them through the functions of this module.
-
-Where each entry of the data vector d belongs: which product, which time.
-
-d is stacked product by product with time running fastest. Samples that are flagged or were
-never taken are not in d at all, so the positions are explicit.
+A :class:`DataLayout` says where each entry of the data vector d belongs: which product, which time.
+d is stacked product by product with time running fastest. Samples that are flagged or were never
+taken are not in d at all, so the positions are explicit.
 """
 
 from __future__ import annotations
 
 import re
 from functools import lru_cache
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -68,11 +65,17 @@ def auto_indices(n_antennas: int = N_ANTENNAS) -> np.ndarray:
     return np.array([k for k, p in enumerate(all_products(n_antennas)) if p.i == p.j])
 
 
+@lru_cache
+def ports(n_antennas: int = N_ANTENNAS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the two ports of every product, and whether it is an imaginary part."""
+    i, j, part = zip(*all_products(n_antennas), strict=True)
+    return np.array(i), np.array(j), np.array(part) == "I"
+
+
 def to_real(matrix: Complex[Array, "antennas antennas *rest"]) -> Float[Array, "products *rest"]:
     """Return the products of a Hermitian matrix V_ij (first two axes), in luseepy's order."""
-    products = all_products(matrix.shape[0])
-    picked = matrix[np.array([p.i for p in products]), np.array([p.j for p in products])]
-    imaginary = np.array([p.part == "I" for p in products])
+    i, j, imaginary = ports(matrix.shape[0])
+    picked = matrix[i, j]
     imaginary = imaginary.reshape(-1, *(1,) * (picked.ndim - 1))
     return namespace(matrix).where(imaginary, picked.imag, picked.real)
 
@@ -105,11 +108,7 @@ NAME = re.compile(r"\s*(\d)\s*[-_x, ]?\s*(\d)\s*([RI]?)\s*", re.IGNORECASE)
 
 
 def real_products(
-    data: Any,
-    products: Any,
-    flags: Any,
-    convention: str,
-    n_antennas: int,
+    data: Any, products: Any, flags: Any, convention: str, n_antennas: int
 ) -> tuple[Float[np.ndarray, "products times"], Bool[np.ndarray, "products times"]]:
     """Return the real products of arrays of correlations in the package's order.
 
@@ -285,17 +284,23 @@ def site_of(site: Any) -> tuple[float, float]:
     return lon, lat
 
 
-def numbers_of_times(name: str, values: Any, n_times: int) -> Float[np.ndarray, " times"]:
-    """Return a finite number for each time. InputError, with the name, if there are others."""
+def numbers_of_times(
+    name: str, values: Any, n_times: int, *, or_one: bool = False
+) -> Float[np.ndarray, " times"]:
+    """Return a finite number for each time. InputError, with the name, if there are others.
+
+    With ``or_one`` a single number may stand for all times.
+    """
+    alone = "one number, or one for each" if or_one else "a number for each"
     try:
         numbers = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is {values!r}; give a number for each time") from error
-    if numbers.shape != (n_times,) or not np.isfinite(numbers).all():
-        raise InputError(
-            f"{name} has shape {numbers.shape}; give a finite number for each of {n_times} times"
-        )
-    return numbers
+        raise InputError(f"{name} is {values!r}; give {alone} time") from error
+    fits = numbers.shape == (n_times,) or (or_one and not numbers.ndim)
+    if not fits or not np.isfinite(numbers).all():
+        several = alone.replace("number", "finite number")
+        raise InputError(f"{name} has shape {numbers.shape}; give {several} of {n_times} times")
+    return np.broadcast_to(numbers, (n_times,))
 
 
 def runs_of(turntable_deg: Any, n_times: int) -> tuple[np.ndarray, tuple[float, ...]]:
@@ -312,16 +317,7 @@ def runs_of(turntable_deg: Any, n_times: int) -> tuple[np.ndarray, tuple[float, 
     InputError
         If there are neither one angle nor as many as times, or they are not finite.
     """
-    try:
-        angles = np.asarray(turntable_deg, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"turntable_deg is {turntable_deg!r}; give angles in degrees") from error
-    if angles.shape not in ((), (n_times,)) or not np.isfinite(angles).all():
-        raise InputError(
-            f"turntable_deg has shape {angles.shape}; give one finite angle in degrees, or one "
-            f"for each of {n_times} times"
-        )
-    angles = np.broadcast_to(angles, (n_times,))
+    angles = numbers_of_times("turntable_deg", turntable_deg, n_times, or_one=True)
     run = np.concatenate([[0], np.cumsum(np.diff(angles) != 0.0)]).astype(np.int64)
     return run, tuple(angles[np.searchsorted(run, np.arange(run[-1] + 1))].tolist())
 
@@ -399,11 +395,8 @@ class DataLayout(Described, eqx.Module):
         InputError
             If it does not.
         """
-        same = (self.n_products, self.n_times, self.size) == (
-            other.n_products,
-            other.n_times,
-            other.size,
-        )
+        sizes = attrgetter("n_products", "n_times", "size")
+        same = sizes(self) == sizes(other)
         if same and self.index is not None and other.index is not None:
             same = is_traced(self.index, other.index) or np.array_equal(self.index, other.index)
         if not same:

@@ -1,21 +1,14 @@
-"""When is observed: runs, cuts, gaps and schedules in files.
-
-Orientations of the Moon, from lunarsky's own coordinate transformation, and on it; the Sun.
-
-Stretches of observing and the samples that they are cut into.
+"""When is observed: runs, the intervals of a schedule, and the samples that they are cut into.
 
 Runs follow one another and are told by their length; the intervals of a schedule have dates, and
-time may pass between them.
-
-Schedules in files: tables of intervals in CSV, and command tables of LuSEE-Night's OpSim.
+time may pass between them. Schedules are tables of intervals in CSV, or command tables of
+LuSEE-Night's OpSim.
 
 OpSim (https://github.com/lusee-night/opsim) has its schedules in YAML: ``config/comtable-*.yml``,
 and the same with the states of battery and storage in the logs of its simulator. An entry holds a
 ``start`` (MJD, UTC) and a ``mode`` of the spacecraft, which lasts until the start of the next
 entry. In one mode alone, ``science``, the spectrometer takes data (``config/modes.yml`` and
 ``devices.yml`` there). Such a table knows of no turntable.
-
-Visibilities on the full grid, where some samples are absent and noise levels are needed.
 """
 
 from __future__ import annotations
@@ -28,13 +21,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
-import astropy.units as u
 import numpy as np
-from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_body_barycentric
 from astropy.time import Time
 from jaxtyping import Bool, Float, Int
-from lunarsky import MCMF
-from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import is_traced, require_positive
@@ -45,73 +34,15 @@ from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.instrument.times import (
     ROUNDING_S,
     Windows,
+    later,
     require_ephemeris,
+    seconds_from,
     unannounced_leap_seconds,
     utc_from_text,
 )
 
 # a sidereal month
 CYCLE_DAYS = 27.321661
-# period after which the sky repeats itself in luseepy's engine croissant
-LUSEEPY_MONTH_HOURS = 655.72
-
-
-def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:
-    """Return the rotations that take Galactic unit vectors to MCMF ones.
-
-    The three Galactic axes go through lunarsky's ICRS -> MCMF transformation in one call.
-    """
-    axes = Galactic(CartesianRepresentation(np.eye(3)[:, :, None])).transform_to(ICRS())
-    icrs = ICRS(CartesianRepresentation(axes.cartesian.xyz.value))
-    with unannounced_leap_seconds():
-        turned = icrs.transform_to(MCMF(obstime=times))
-    return np.moveaxis(turned.cartesian.xyz.value, 2, 0)
-
-
-def about_fixed_axis(
-    times: Time, hours: Float[np.ndarray, " times"]
-) -> Float[np.ndarray, "times 3 3"]:
-    """Return the same of a Moon that turns evenly about the axis of the first time.
-
-    Parameters
-    ----------
-    times : (times,) Time
-    hours : (times,) array
-        Since the first one.
-    """
-    angle = 2.0 * np.pi * hours / LUSEEPY_MONTH_HOURS
-    about_z = SpatialRotation.from_rotvec(np.outer(-angle, [0.0, 0.0, 1.0])).as_matrix()
-    return about_z @ mcmf_from_galactic(times[:1])[0]
-
-
-def topocentric_from_mcmf(lon_deg: float, lat_deg: float) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation from MCMF to the East, North and up of a site, its rows."""
-    lon, lat = np.radians(lon_deg), np.radians(lat_deg)
-    up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
-    east = np.array([-np.sin(lon), np.cos(lon), 0.0])
-    return np.array([east, np.cross(up, east), up])
-
-
-def lean(tilt_deg: tuple[float, float]) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation from East, North and up to the axes of a lander.
-
-    It leans first towards North, about East, then towards East, about North.
-    """
-    east, north = np.radians(tilt_deg)
-    turned = SpatialRotation.from_rotvec([0.0, east, 0.0])
-    turned *= SpatialRotation.from_rotvec([-north, 0.0, 0.0])
-    return turned.inv().as_matrix()
-
-
-def sun_direction(times: Time) -> Float[np.ndarray, "times 3"]:
-    """Return Galactic unit vectors from the Moon's centre to where the Sun's is at the time."""
-    with unannounced_leap_seconds():
-        sun = get_body_barycentric("sun", times, ephemeris="builtin")
-        moon = get_body_barycentric("moon", times, ephemeris="builtin")
-    direction = (sun - moon).xyz.to_value(u.km)
-    galactic = ICRS(CartesianRepresentation(direction)).transform_to(Galactic())
-    vector = galactic.cartesian.xyz.value
-    return (vector / np.linalg.norm(vector, axis=0)).T
 
 
 @dataclass(frozen=True)
@@ -189,8 +120,7 @@ class Interval:
     @cached_property
     def length_s(self) -> float:
         """Length in seconds, the time without integration among them."""
-        with unannounced_leap_seconds():
-            return float((self._date("end", self.end) - self.start_time).to_value(u.s))
+        return float(seconds_from(self.start_time, self._date("end", self.end)))
 
     def n_samples(self, step_s: float) -> int:
         """Count the samples of a step, by day and night; the last one may be shorter."""
@@ -266,8 +196,7 @@ class Cuts:
                 "samples that are instants have no duty cycle; take windows "
                 "(observation.window=mean), or leave out the schedule's duty_cycle"
             )
-        with unannounced_leap_seconds():
-            return self.t0 + seconds * u.s, windows
+        return later(self.t0, seconds), windows
 
     def by_night(self, dark: Bool[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
         """Return the samples that are left where nights alone are wanted.
@@ -347,7 +276,7 @@ def cut_intervals(intervals: Sequence[Interval], step_s: float) -> Cuts:
         n = interval.n_samples(step_s)
         begins = step_s * np.arange(n)
         length = np.diff(begins, append=interval.length_s)
-        starts.append(_seconds_between(t0, interval.start_time) + begins)
+        starts.append(seconds_from(t0, interval.start_time) + begins)
         lengths.append(length)
         live.append(interval.duty_cycle * length)
         numbers.append(np.full(n, number))
@@ -385,7 +314,7 @@ def require_sequence(intervals: Sequence[Interval]) -> None:
     names = _names(intervals)
     for number, after in enumerate(intervals[1:]):
         before = intervals[number]
-        ahead = _seconds_between(before.start_time, after.start_time)
+        ahead = seconds_from(before.start_time, after.start_time)
         if ahead < 0.0:
             raise InputError(
                 f"{names[number + 1]}: the interval from {after.start} begins before the one that "
@@ -397,11 +326,6 @@ def require_sequence(intervals: Sequence[Interval]) -> None:
                 f"{names[number + 1]}: the interval from {after.start} begins {overlap:g} s before "
                 f"the one that precedes it ends, {before.end}; give each stretch of time once"
             )
-
-
-def _seconds_between(first: Time, second: Time) -> float:
-    with unannounced_leap_seconds():
-        return float((second - first).to_value(u.s))
 
 
 WHAT = "a schedule, a table in CSV or OpSim's in YAML"

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
+from lusee_bayes.core.checks import is_traced, require_array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
 from lusee_bayes.instrument.observation import Observation
@@ -41,22 +41,15 @@ def antenna_directions(
     InputError
         Unless ``galactic`` is a finite float64 array of such a shape.
     """
-    leaning = observation.lander_from_mcmf() @ observation.topocentric_from_mcmf().T
-    east, north, up = leaning @ _topocentric(observation, galactic).T
+    require_array("galactic", galactic, (3,) if galactic.ndim == 1 else (observation.n_times, 3))
+    vectors = np.broadcast_to(galactic, (observation.n_times, 3))
+    mcmf = np.einsum("tij,tj->ti", observation.mcmf_from_galactic(), vectors)
+    topocentric_from_mcmf = observation.topocentric_from_mcmf()
+    leaning = observation.lander_from_mcmf() @ topocentric_from_mcmf.T
+    east, north, up = leaning @ (mcmf @ topocentric_from_mcmf.T).T
     turned = np.radians(np.asarray(observation.turntable_deg, dtype=np.float64))[observation.run]
     cos, sin = np.cos(turned), np.sin(turned)
     return np.stack([cos * east + sin * north, cos * north - sin * east, up], axis=1)
-
-
-def altitude_deg(
-    observation: Observation, galactic: Float[np.ndarray, "..."]
-) -> Float[np.ndarray, " times"]:
-    """Return the altitude of a source above the horizon at every sample, in degrees.
-
-    Parameters and errors as of :func:`antenna_directions`.
-    """
-    east, north, up = _topocentric(observation, galactic).T
-    return np.degrees(np.arctan2(up, np.hypot(east, north)))
 
 
 def source_response(
@@ -106,14 +99,3 @@ def source_response(
         return response
     circular = beams_towards(frequency_mhz, directions, monopoles, stokes="V")
     return response + stokes_v * circular
-
-
-def _topocentric(
-    observation: Observation, galactic: Float[np.ndarray, "..."]
-) -> Float[np.ndarray, "times 3"]:
-    require_float64("galactic", galactic)
-    require_shape("galactic", galactic, (3,) if galactic.ndim == 1 else (observation.n_times, 3))
-    require_finite("galactic", galactic)
-    vectors = np.broadcast_to(galactic, (observation.n_times, 3))
-    mcmf = np.einsum("tij,tj->ti", observation.mcmf_from_galactic(), vectors)
-    return mcmf @ observation.topocentric_from_mcmf().T

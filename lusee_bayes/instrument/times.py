@@ -1,19 +1,17 @@
 """Times of data: leap seconds, the ephemeris' reach, windows and what a stamp stands for.
 
-Times in UTC, of whatever kind files and users give them.
+Times are in UTC, of whatever kind files and users give them.
 
-The windows over which samples were integrated: what a visibility is the mean of.
+**Windows** are what samples were integrated over: what a visibility is the mean of. A sample has
+one or more pieces, within each of which its live time is spread evenly: one piece where the
+spectrometer integrated without a gap, or with a duty cycle far faster than the sky turns; several
+where something was left out. The mean over a window is that over its pieces, each with the weight
+of its live time.
 
-A sample has one or more pieces, within each of which its live time is spread evenly: one piece
-where the spectrometer integrated without a gap, or with a duty cycle far faster than the sky turns;
-several where something was left out. The mean over a window is that over its pieces, each with the
-weight of its live time.
-
-What the times of samples are: starts, middles or ends of their windows, or instants.
-
-Times and bounds that were rounded, such as single-precision seconds or Julian dates in one number,
-make windows overlap by as much. Such overlaps are halved between the two samples, and a live time
-that is longer than its window by as little is that of the window.
+The times of samples are starts, middles or ends of their windows, or instants. Times and bounds
+that were rounded, such as single-precision seconds or Julian dates in one number, make windows
+overlap by as much. Such overlaps are halved between the two samples, and a live time that is longer
+than its window by as little is that of the window.
 """
 
 from __future__ import annotations
@@ -50,6 +48,18 @@ def unannounced_leap_seconds() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)
         yield
+
+
+def seconds_from(origin: Time, times: Time) -> Any:
+    """Return the seconds from one time, or several, to others; leap seconds are counted."""
+    with unannounced_leap_seconds():
+        return (times - origin).to_value(u.s)
+
+
+def later(times: Time, seconds: Any) -> Time:
+    """Return the times so many seconds later."""
+    with unannounced_leap_seconds():
+        return times + seconds * u.s
 
 
 def utc_from_text(name: str, text: str) -> Time:
@@ -205,8 +215,7 @@ def step_of(times: Time, step_s: float | None) -> float:
         return float(step_s)
     if len(times) < 2:
         raise InputError("the integration time of a single sample is not known; give step_s")
-    with unannounced_leap_seconds():
-        return float(np.median(np.abs((times[1:] - times[:-1]).to_value(u.s))))
+    return float(np.median(np.abs(seconds_from(times[:-1], times[1:]))))
 
 
 # times of a Julian date in two parts are exact to less than a nanosecond, others to a few of them
@@ -254,39 +263,24 @@ class Windows(Described):
         for name in ("start_s", "end_s", "live_s"):
             require_finite(f"{name} of the windows", getattr(self, name))
         length = self.end_s - self.start_s
-        self._refuse(
-            ~(length > 0.0),
-            "ends {0:g} s from its time, not after its start at {1:g} s; windows need a start and "
-            "then an end",
-            self.end_s,
-            self.start_s,
-        )
-        self._refuse(
-            self.live_s > length + ROUNDING_S,
-            "was live for {0:g} s of a window of {1:g} s; live time cannot be longer than the "
-            "window",
-            self.live_s,
-            length,
-        )
-        self._refuse(
-            ~(self.live_s > 0.0),
-            "has a live time of {0:g} s; leave out samples in which nothing was integrated",
-            self.live_s,
-        )
         same = np.zeros(len(length), dtype=bool)
         same[1:] = (steps == 0) & (self.start_s[1:] < self.end_s[:-1] - ROUNDING_S)
-        self._refuse(
-            same,
-            "has a piece that begins at {0:g} s, before the one before it has ended; pieces of a "
-            "window must not overlap",
-            self.start_s,
-        )
-
-    def _refuse(self, wrong: Bool[np.ndarray, " pieces"], text: str, *values: np.ndarray) -> None:
-        if wrong.any():
-            first = int(np.argmax(wrong))
-            what = text.format(*(float(value[first]) for value in values))
-            raise InputError(f"sample {self.sample[first]} {what}")
+        rules = (
+            (~(length > 0.0), "ends {end:g} s from its time, not after its start at {start:g} s; "
+             "windows need a start and then an end"),
+            (self.live_s > length + ROUNDING_S, "was live for {live:g} s of a window of {length:g} "
+             "s; live time cannot be longer than the window"),
+            (~(self.live_s > 0.0), "has a live time of {live:g} s; leave out samples in which "
+             "nothing was integrated"),
+            (same, "has a piece that begins at {start:g} s, before the one before it has ended; "
+             "pieces of a window must not overlap"),
+        )  # fmt: skip
+        values = {"start": self.start_s, "end": self.end_s, "live": self.live_s, "length": length}
+        for wrong, text in rules:
+            if wrong.any():
+                first = int(np.argmax(wrong))
+                here = {name: float(value[first]) for name, value in values.items()}
+                raise InputError(f"sample {self.sample[first]} {text.format(**here)}")
 
     @classmethod
     def whole(
@@ -348,9 +342,7 @@ class Windows(Described):
                 f"the window of sample {longest} lasts {length[longest]:g} s, longer than the step "
                 f"of {step_s:g} s from sample to sample; check the bounds, or give the step"
             )
-        with unannounced_leap_seconds():
-            seconds = (times - times[0]).to_value(u.s)
-        gaps = np.diff(seconds) + bounds[1:, 0] - bounds[:-1, 1]
+        gaps = np.diff(seconds_from(times[0], times)) + bounds[1:, 0] - bounds[:-1, 1]
         if (gaps < -ROUNDING_S).any():
             first = int(np.argmax(gaps < -ROUNDING_S))
             raise InputError(
@@ -399,10 +391,7 @@ ROUNDED_S, ROUNDED_SHARE = 1e-3, 1e-4
 
 
 def stamped(
-    times: Time,
-    timestamp: str,
-    step_s: float,
-    live_s: Float[np.ndarray, " times"] | None = None,
+    times: Time, timestamp: str, step_s: float, live_s: Float[np.ndarray, " times"] | None = None
 ) -> tuple[Time, Windows | None]:
     """Return the middles and the windows of samples that last for a step each.
 
@@ -439,11 +428,9 @@ def stamped(
         raise InputError(
             f"unknown timestamp '{timestamp}'; {nearest(timestamp, [*TO_MIDDLE, 'instant'])}"
         )
-    with unannounced_leap_seconds():
-        middles = times + TO_MIDDLE[timestamp] * step_s * u.s
-        seconds = (times - times[0]).to_value(u.s)
-    half = np.full(len(seconds), step_s / 2.0)
-    return middles, _windows(seconds, -half, half, step_s, live_s)
+    middles = later(times, TO_MIDDLE[timestamp] * step_s)
+    half = np.full(len(times), step_s / 2.0)
+    return middles, _windows(seconds_from(times[0], times), -half, half, step_s, live_s)
 
 
 def bounded(
@@ -471,11 +458,9 @@ def bounded(
         For a time outside its bounds, without a step for a single sample, and as
         :class:`.Windows`.
     """
-    with unannounced_leap_seconds():
-        start = (bounds[:, 0] - times).to_value(u.s)
-        end = (bounds[:, 1] - times).to_value(u.s)
-        middles = times + (start + end) / 2.0 * u.s
-        seconds = (middles - middles[0]).to_value(u.s)
+    start, end = (seconds_from(times, bounds[:, k]) for k in (0, 1))
+    middles = later(times, (start + end) / 2.0)
+    seconds = seconds_from(middles[0], middles)
     length = end - start
     step = step_of(times, float(length[0]) if step_s is None and len(times) == 1 else step_s)
     rounding = _rounding(step)

@@ -1,20 +1,14 @@
-"""Visibilities: data of all products and times, calibration, and their file.
+"""Visibilities: the data set d of one frequency with its times, products and flags, and its file.
 
-Windows of samples in netCDF files, and what files without them say of their times.
+The file is netCDF. Of the windows of samples, ``time_bounds`` is that of the CF conventions, for
+people and other software, and ``live_time`` goes with it. The pieces are exact: seconds from the
+time of their sample. Instants are declared by the attribute ``window``. A file with none of these
+does not say what its times are.
 
-``time_bounds`` is that of the CF conventions, for people and other software, and ``live_time`` goes
-with it. The pieces are exact: seconds from the time of their sample. Instants are declared by the
-attribute ``window``. A file with none of these does not say what its times are.
-
-What is left of a spectrometer's spectra in their averages: how many samples, and which gains.
-
-An average over channels and spectra has the radiometer noise of the independent samples of the
-voltages that it is the mean of; its gain is off by the errors of the gain table, which all spectra
-of one level of one port share.
-
-The data set d: visibilities of one frequency with their times, products and flags.
-
-Read the package's own files of visibilities.
+A :class:`Calibration` is what is left of a spectrometer's spectra in their averages. An average
+over channels and spectra has the radiometer noise of the independent samples of the voltages that
+it is the mean of; its gain is off by the errors of the gain table, which all spectra of one level
+of one port share.
 """
 
 from __future__ import annotations
@@ -24,7 +18,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import astropy.units as u
 import numpy as np
 import xarray as xr
 from astropy.time import Time
@@ -36,8 +29,8 @@ from lusee_bayes.core.checks import (
     Described,
     extent,
     listed,
+    require_array,
     require_finite,
-    require_float64,
     require_positive,
     require_shape,
 )
@@ -48,7 +41,7 @@ from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Variable, require_mhz
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
-from lusee_bayes.instrument.beams.monopoles import MeasuredReceiver
+from lusee_bayes.instrument.beams.monopoles import MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import (
     N_ANTENNAS,
@@ -63,9 +56,10 @@ from lusee_bayes.instrument.times import (
     JD_SCALES,
     Windows,
     bounded,
+    later,
+    seconds_from,
     stamped,
     step_of,
-    unannounced_leap_seconds,
     utc_bounds,
     utc_of_datetimes,
     utc_of_jd,
@@ -73,23 +67,10 @@ from lusee_bayes.instrument.times import (
 )
 
 PIECES = ("piece_sample", "piece_start_s", "piece_end_s", "piece_live_s")
-VARIABLES = {
-    "time_bounds": Variable(("time", 2), "time", optional=True),
-    "live_time": Variable(("time",), optional=True),
-    "piece_sample": Variable(("piece",), "integer", low=0.0, optional=True),
-    **{name: Variable(("piece",), optional=True) for name in PIECES[1:]},
-}
-ATTRIBUTES = {"window": Attribute("text", choices=("mean", "instant"), optional=True)}
 # times for people are written to the millisecond
 EYE = {"units": "milliseconds since 1970-01-01", "calendar": "proleptic_gregorian"}
 ENCODING = EYE | {"dtype": "int64"}
 EYE_S = 0.01
-
-
-def coordinate(observation: Observation) -> tuple[Any, ...]:
-    """Return the coordinate ``time`` of a Dataset, for the reader's eye."""
-    attrs = {} if observation.windows is None else {"bounds": "time_bounds"}
-    return ("time",), _datetimes(observation.times), attrs, ENCODING
 
 
 def window_variables(observation: Observation) -> dict[str, tuple[Any, ...]]:
@@ -97,8 +78,7 @@ def window_variables(observation: Observation) -> dict[str, tuple[Any, ...]]:
     windows = observation.windows
     if windows is None:
         return {}
-    with unannounced_leap_seconds():
-        bounds = observation.times[:, None] + windows.bounds_s * u.s
+    bounds = later(observation.times[:, None], windows.bounds_s)
     values = (windows.sample, windows.start_s, windows.end_s, windows.live_s)
     return {
         "time_bounds": (("time", "bounds"), _datetimes(bounds), {}, ENCODING),
@@ -115,18 +95,13 @@ def _datetimes(times: Time) -> np.ndarray:
     return times.isot.astype("datetime64[ms]")
 
 
-def attributes(observation: Observation) -> dict[str, str]:
-    """Return the attribute of a file that says whether its samples are means or instants."""
-    return {"window": "instant" if observation.windows is None else "mean"}
-
-
 def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, bool]:
     """Return what a file says of the windows of its samples.
 
     Parameters
     ----------
     found : Content
-        Of a layout with ``VARIABLES`` and ``ATTRIBUTES``, and an attribute ``step_s``.
+        Of :data:`LAYOUT`.
     times : (times,) Time
         Of its samples.
 
@@ -174,9 +149,7 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, boo
 
 
 def _require_same(windows: Windows, times: Time, there: np.ndarray) -> None:
-    bounds = utc_of_datetimes(there)
-    with unannounced_leap_seconds():
-        seconds = (bounds - times[:, None]).to_value(u.s)
+    seconds = seconds_from(times[:, None], utc_of_datetimes(there))
     if windows.n_samples != len(times):
         return  # an Observation says so
     off = np.abs(seconds - windows.bounds_s).max(axis=1)
@@ -279,9 +252,7 @@ class Visibilities(Described):
     calibration: Calibration | None = None
 
     def __post_init__(self):
-        require_float64("the data", self.data)
-        require_shape("the data", self.data, (self.layout.size,))
-        require_finite("the data", self.data)
+        require_array("the data", self.data, (self.layout.size,))
         if self.layout.n_times != self.observation.n_times:
             raise InputError(
                 f"the data have {self.layout.n_times} times, the observation "
@@ -466,19 +437,20 @@ class Visibilities(Described):
         # two parts keep the times exact
         variables["jd1"] = (("time",), observation.times.jd1, {"scale": "utc"})
         variables["jd2"] = (("time",), observation.times.jd2, {"scale": "utc"})
+        instants = observation.windows is None
+        for_eyes = {} if instants else {"bounds": "time_bounds"}
+        time = (("time",), _datetimes(observation.times), for_eyes, ENCODING)
+        said = {"window": "instant" if instants else "mean"} if self.says_window else {}
         return xr.Dataset(
             variables,
-            coords={
-                "product": list(self.labels),
-                "time": coordinate(observation),
-            },
+            coords={"product": list(self.labels), "time": time},
             attrs={
                 "format": formats.VISIBILITIES,
                 "frequency_mhz": self.frequency_mhz,
                 "lon_deg": observation.lon_deg,
                 "lat_deg": observation.lat_deg,
                 "step_s": observation.step_s,
-                **(attributes(observation) if self.says_window else {}),
+                **said,
                 "lusee_bayes_version": __version__,
             },
         )
@@ -512,7 +484,10 @@ LAYOUT = Layout(
         "jd2": Variable(("time",)),
         "run": Variable(("time",), "integer", low=0.0),
         "turntable_deg": Variable(("run_number",)),
-        **VARIABLES,
+        "time_bounds": Variable(("time", 2), "time", optional=True),
+        "live_time": Variable(("time",), optional=True),
+        "piece_sample": Variable(("piece",), "integer", low=0.0, optional=True),
+        **{name: Variable(("piece",), optional=True) for name in PIECES[1:]},
         "truth": Variable(("mode",), optional=True, unit="K"),
         # the receivers' loads ZL, where they are known
         "load_frequency_mhz": Variable(
@@ -525,7 +500,7 @@ LAYOUT = Layout(
         "lon_deg": Attribute(low=-360.0, high=360.0),
         "lat_deg": Attribute(low=-90.0, high=90.0),
         "step_s": Attribute(low=0.0),
-        **ATTRIBUTES,
+        "window": Attribute("text", choices=("mean", "instant"), optional=True),
         **JD_SCALES,
     },
 )
@@ -568,29 +543,15 @@ def read_visibilities(path: str | Path) -> Visibilities:
         layout = DataLayout.from_flags(flags)
         utc = utc_of_jd(found)
         times, windows, says_window = read_windows(found, utc)
-        observation = Observation(
-            found.values["lon_deg"],
-            found.values["lat_deg"],
-            times,
-            here["run"],
-            tuple(here["turntable_deg"].tolist()),
-            found.values["step_s"],
-            windows=windows,
-        )
+        said, angles = found.values, tuple(here["turntable_deg"].tolist())
+        runs, site = (here["run"], angles, said["step_s"]), (said["lon_deg"], said["lat_deg"])
+        observation = Observation(*site, times, *runs, windows=windows)
         return Visibilities(
             layout.gather(values),
             layout,
             observation,
-            found.values["frequency_mhz"],
+            said["frequency_mhz"],
             here.get("truth"),
-            _receiver(path, here),
+            receiver_of(path, here, "load_frequency_mhz", *LOADS),
             says_window,
         )
-
-
-def _receiver(path: str | Path, here: dict[str, np.ndarray]) -> MeasuredReceiver | None:
-    names = ("load_frequency_mhz", *LOADS)
-    if not set(names) <= set(here):
-        return None
-    frequencies, real, imaginary = (here[name] for name in names)
-    return MeasuredReceiver(str(path), frequencies, real + 1j * imaginary)

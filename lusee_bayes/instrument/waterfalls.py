@@ -1,38 +1,25 @@
 """luseepy's waterfalls: files of many frequencies, read and written.
 
-Visibilities of several frequencies, as files hold them.
+They hold visibilities of all times, products and frequencies.
 
-Where luseepy's ranges of time begin: the word LUNAR_DAY of its waterfalls.
+**LUNAR_DAY** says where luseepy's ranges of time begin. It is "UTC to UTC"; a calendar year, CY2026
+or CY26, which luseepy begins at one o'clock on the first of January; a fiscal year, FY2026 or FY26,
+from the first of October of the year before; or the number of a lunar day: 2603 is the fourth of
+those that begin in 2026. A lunar day begins when the Sun is highest at 180 degrees of longitude on
+the Moon's equator. luseepy finds that to a few seconds, and so does this module.
 
-It is "UTC to UTC"; a calendar year, CY2026 or CY26, which luseepy begins at one o'clock on the
-first of January; a fiscal year, FY2026 or FY26, from the first of October of the year before; or
-the number of a lunar day: 2603 is the fourth of those that begin in 2026. A lunar day begins when
-the Sun is highest at 180 degrees of longitude on the Moon's equator. luseepy finds that to a few
-seconds, and so does this module.
+**Those of its scalar simulator** are in K. FITS: image ``data`` (time, product, frequency),
+``freq`` in MHz, ``combinations`` (pairs of ports; an auto has one column, a cross two, Re and Im).
+Header: LUNAR_DAY, DELTAT_SEC, LUN_LAT_DEG, LUN_LONG_DEG; times are start + k DELTAT_SEC. Impedances
+of the ports in Ohm, ZRe_i and ZIm_i, are there for luseepy's conversion to V^2/Hz.
 
-Waterfalls of luseepy's scalar simulator: visibilities in K.
-
-FITS: image ``data`` (time, product, frequency), ``freq`` in MHz, ``combinations`` (pairs of ports;
-an auto has one column, a cross two, Re and Im). Header: LUNAR_DAY (:mod:`.waterfalls`), DELTAT_SEC,
-LUN_LAT_DEG, LUN_LONG_DEG; times are start + k DELTAT_SEC. Impedances of the ports in Ohm, ZRe_i and
-ZIm_i, are there for luseepy's conversion to V^2/Hz.
-
-Waterfalls of luseepy's four-port simulator: covariances at the receivers' inputs, in V^2/Hz.
-
-FITS version 3: image ``data`` (time, product, frequency); ``freq`` in MHz; ``time`` (JD1, JD2) in
+**Those of its four-port simulator** are covariances at the receivers' inputs, in V^2/Hz. FITS
+version 3: image ``data`` (time, product, frequency); ``freq`` in MHz; ``time`` (JD1, JD2) in
 the scale TIMESYS; table ``products`` with a column ``label``; U (frequency, port, port), the
 covariance that an enclosure of 1 K makes, as ``blackbody_normalization``; the receivers' loads ZL
 (frequency, port, port) in Ohm. Header: LUN_LAT_DEG, LUN_LONG_DEG, DELTAT_SEC, TMOON_K, TANT_K and
 FREQINT, the interpolation of the response between its frequencies. Divided by sqrt(U_aa U_bb),
 visibilities are in K.
-
-Read the waterfalls of luseepy, scalar or four-port.
-
-Write waterfalls in luseepy's layouts: what its scalar and its four-port files share.
-
-Write waterfalls as luseepy's four-port simulator does.
-
-Waterfalls in luseepy's layouts: visibilities of all times, products and frequencies.
 """
 
 from __future__ import annotations
@@ -44,7 +31,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import astropy.units as u
 import numpy as np
 from astropy.io import fits
 from astropy.time import Time
@@ -58,7 +44,7 @@ from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ, Interpolation
-from lusee_bayes.instrument.beams.monopoles import LOADS, Circuit, MeasuredReceiver
+from lusee_bayes.instrument.beams.monopoles import LOADS, Circuit, MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation, body_direction
 from lusee_bayes.instrument.products import (
     N_ANTENNAS,
@@ -66,12 +52,14 @@ from lusee_bayes.instrument.products import (
     Product,
     all_products,
     labels,
+    ports,
     to_matrix,
 )
 from lusee_bayes.instrument.times import (
+    later,
     require_ephemeris,
     scale_of,
-    unannounced_leap_seconds,
+    seconds_from,
     utc_from_text,
     utc_of,
 )
@@ -292,9 +280,7 @@ def read_scalar(path: Path) -> Waterfall:
     grid = np.full((len(places), len(data), len(frequencies)), np.nan)
     for column, (product, sign) in enumerate(columns):
         grid[places[product]] = sign * data[:, column]
-    return Waterfall(
-        str(path), grid, frequencies, _scalar_observation(path, found.values, len(data))
-    )
+    return Waterfall(str(path), grid, frequencies, _observation(path, found.values, len(data)))
 
 
 def _columns(path: Path, combinations: Int[np.ndarray, "pairs 2"]) -> list[tuple[Product, float]]:
@@ -311,20 +297,19 @@ def _columns(path: Path, combinations: Int[np.ndarray, "pairs 2"]) -> list[tuple
     return columns
 
 
-def _scalar_observation(path: Path, said: dict[str, Any], n_times: int) -> Observation:
+def _observation(
+    path: Path, said: dict[str, Any], n_times: int, jd: Float[np.ndarray, "times 2"] | None = None
+) -> Observation:
+    """Samples of a file: at the times that it gives, or in steps from the first one."""
     with naming(path):
-        first = start_of(said["LUNAR_DAY"])
-        require_ephemeris(first.jd + np.array([(n_times - 1) * said["DELTAT_SEC"] / 86400.0]))
-        with unannounced_leap_seconds():
-            times = first + said["DELTAT_SEC"] * np.arange(n_times) * u.s
-        return Observation(
-            said["LUN_LONG_DEG"],
-            said["LUN_LAT_DEG"],
-            times,
-            np.zeros(n_times, dtype=int),
-            (0.0,),
-            said["DELTAT_SEC"],
-        )
+        if jd is not None:
+            times = utc_of(jd[:, 0], jd[:, 1], scale_of("TIMESYS", said.get("TIMESYS", "UTC")))
+        else:
+            first, step_s = start_of(said["LUNAR_DAY"]), said["DELTAT_SEC"]
+            require_ephemeris(first.jd + np.array([(n_times - 1) * step_s / 86400.0]))
+            times = later(first, step_s * np.arange(n_times))
+        site, zeros = (said["LUN_LONG_DEG"], said["LUN_LAT_DEG"]), np.zeros(n_times, dtype=int)
+        return Observation(*site, times, zeros, (0.0,), said["DELTAT_SEC"])
 
 
 UNIT = "V^2/Hz"
@@ -389,20 +374,13 @@ def read_four_port(path: Path) -> Waterfall:
         str(path),
         grid,
         frequencies,
-        _four_port_observation(path, said, images["time"]),
+        _observation(path, said, len(data), images["time"]),
         per_kelvin,
         said["TMOON_K"],
         said.get("TANT_K", 0.0),
-        _receiver(path, images),
+        receiver_of(path, images, "freq", *LOADS),
         said.get("FREQINT"),
     )
-
-
-def _receiver(path: Path, images: dict[str, np.ndarray]) -> MeasuredReceiver | None:
-    if not set(LOADS) <= set(images):
-        return None
-    real, imaginary = (images[name] for name in LOADS)
-    return MeasuredReceiver(str(path), images["freq"], real + 1j * imaginary)
 
 
 def _places(path: Path, products: np.ndarray) -> list[int]:
@@ -416,21 +394,6 @@ def _places(path: Path, products: np.ndarray) -> list[int]:
     if len(set(named)) < len(named):
         raise InputError(f"{path}: products names the same product twice")
     return [known.index(label) for label in named]
-
-
-def _four_port_observation(
-    path: Path, said: dict[str, Any], times: Float[np.ndarray, "times 2"]
-) -> Observation:
-    with naming(path):
-        scale = scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
-        return Observation(
-            said["LUN_LONG_DEG"],
-            said["LUN_LAT_DEG"],
-            utc_of(times[:, 0], times[:, 1], scale),
-            np.zeros(len(times), dtype=int),
-            (0.0,),
-            said["DELTAT_SEC"],
-        )
 
 
 def read_waterfall(path: str | Path) -> Waterfall:
@@ -498,8 +461,7 @@ def write_waterfall(
             "--frequencies, or write netCDF (a name that does not end in .fits)"
         )
     grid = grid_of(path, channels)
-    with unannounced_leap_seconds():
-        seconds = (first.times - first.times[0]).to_value(u.s)
+    seconds = seconds_from(first.times[0], first.times)
     # the time of a Julian date in two parts is exact to less than a nanosecond
     if np.abs(seconds - first.step_s * np.arange(first.n_times)).max() > 1e-6:
         raise InputError(
@@ -550,9 +512,8 @@ def grid_of(
 
 def site_and_times(observation: Observation) -> dict[str, Any]:
     """Return the words of the header that say where and when."""
-    with unannounced_leap_seconds():
-        # luseepy counts steps up to the end: half a step less leaves no room for rounding
-        end = observation.times[-1] - 0.5 * observation.step_s * u.s
+    # luseepy counts steps up to the end: half a step less leaves no room for rounding
+    end = later(observation.times[-1], -0.5 * observation.step_s)
     return {
         "LUNAR_DAY": f"{_written(observation.times[0])} to {_written(end)}",
         "LUN_LAT_DEG": observation.lat_deg,
@@ -653,7 +614,7 @@ def write_four_port(
     kelvin = grid_of(path, channels)
     enclosure = np.array([circuit.per_kelvin for circuit in circuits])
     root = np.sqrt(enclosure.diagonal(axis1=1, axis2=2).real)
-    i, j = (np.array([getattr(p, end) for p in all_products()]) for end in ("i", "j"))
+    i, j, _ = ports()
     data = kelvin * (root[:, i] * root[:, j]).T
     matrices = {
         "ZA": [c.antenna_ohm for c in circuits],
@@ -681,13 +642,15 @@ def write_four_port(
     ratio = np.divide(eigenvalues[..., 0], largest, out=np.zeros_like(largest), where=largest > 0)
     # visibilities are real products of a Hermitian matrix
     none = np.zeros_like(ratio)
+    names = receiver.luseepy_parameters
+    parameters = json.dumps({k: getattr(receiver, own) for k, own in names.items()}, sort_keys=True)
     hdus += [
         _image("loading_condition_number", condition, "1"),
         _image("covariance_antihermitian_absolute", none, UNIT),
         _image("covariance_antihermitian_relative", none, "1"),
         _image("covariance_eigenvalues", eigenvalues, UNIT),
         _image("covariance_minimum_eigenvalue_ratio", ratio, "1"),
-        _image("receiver_params", _bytes(receiver.luseepy_parameters()), "1"),
+        _image("receiver_params", np.frombuffer(parameters.encode(), dtype=np.uint8), "1"),
     ]
     header = {
         "VERSION": 3,
@@ -734,8 +697,3 @@ def _eigenvalues(
     values = np.full((*complete.shape, covariance.shape[-1]), np.nan)
     values[complete] = np.linalg.eigvalsh(covariance[complete])
     return values
-
-
-def _bytes(parameters: dict[str, tuple[float, ...]]) -> np.ndarray:
-    text = json.dumps({name: list(values) for name, values in parameters.items()}, sort_keys=True)
-    return np.frombuffer(text.encode(), dtype=np.uint8)

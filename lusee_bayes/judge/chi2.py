@@ -1,7 +1,5 @@
 """chi^2 of data and maps: tests at one rate of false alarms, and what no sky explains.
 
-Whether data fit: chi^2 tests, one rate of false alarms for all of them, and words.
-
 If a model holds, chi^2 of n degrees of freedom has ::
 
     p = 2 min(P(chi^2_n > chi^2), P(chi^2_n < chi^2)),
@@ -11,9 +9,7 @@ probabilities is judged by k p, which is below any bound at most that often, how
 one another (Bonferroni). A report makes all of its tests at one rate, so that a report of data that
 fit says otherwise at most once in 1 / ``FALSE_ALARM``.
 
-Quality of a map: its fidelity to a known truth, and measures that need no truth.
-
-chi^2 of data in two parts: what no sky explains, and what the prior does not expect.
+Maps are judged by their fidelity to a known truth, and by measures that need none.
 
 chi^2 of all data under the model, (d - A mu)^T (A S A^T + N)^-1 (d - A mu), mixes up instrument and
 prior. Give the sky a prior k times as wide, and ::
@@ -39,9 +35,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.arrays import Ells, Modes, Pixels, Square, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mean_over_m, sum_over_m
 from lusee_bayes.core.lazy import healpy, special
@@ -150,9 +145,7 @@ def probability(p: float) -> str:
     return f"= {p:.2g}" if p > 0 else "< 1e-300"
 
 
-def correlation(
-    mean: Float[Array, " modes"], truth: Float[Array, " modes"]
-) -> Float[np.ndarray, " ells"]:
+def correlation(mean: Modes, truth: Modes) -> Ells:
     """Compute rho_ell = sum_m a a_true / sqrt(sum_m a^2 sum_m a_true^2), as the paper does.
 
     Parameters
@@ -170,9 +163,7 @@ def correlation(
     return _ratio(sum_over_m(mean * truth), power)
 
 
-def signal_to_noise(
-    mean: Float[Array, " modes"], truth: Float[Array, " modes"]
-) -> Float[np.ndarray, " ells"]:
+def signal_to_noise(mean: Modes, truth: Modes) -> Ells:
     """Compute SNR_ell = sqrt( sum_m a^2 / sum_m (a - a_true)^2 ), as the paper does.
 
     Parameters
@@ -194,7 +185,7 @@ def _ratio(top: np.ndarray, bottom: np.ndarray) -> np.ndarray:
     return np.divide(top, bottom, out=np.full_like(top, np.nan), where=bottom > 0)
 
 
-def ell_cross(snr: Float[np.ndarray, " ells"]) -> int | None:
+def ell_cross(snr: Ells) -> int | None:
     """Find the first ell >= 1 with SNR_ell < 1.
 
     Parameters
@@ -211,7 +202,7 @@ def ell_cross(snr: Float[np.ndarray, " ells"]) -> int | None:
     return int(below[0]) + 1 if below.size else None
 
 
-def prior_fraction_per_ell(posterior: Posterior) -> Float[np.ndarray, " ells"]:
+def prior_fraction_per_ell(posterior: Posterior) -> Ells:
     """Average the share of the prior variance that is left over m.
 
     Parameters
@@ -232,7 +223,7 @@ def prior_fraction_per_ell(posterior: Posterior) -> Float[np.ndarray, " ells"]:
     return mean_over_m(posterior.prior_fraction())
 
 
-def effective_resolution_deg(prior_fraction: Float[np.ndarray, " ells"]) -> float | None:
+def effective_resolution_deg(prior_fraction: Ells) -> float | None:
     """Compute 180 degrees over the first ell >= 1 with more than half of the prior variance left.
 
     Parameters
@@ -268,7 +259,7 @@ def expected_chi2(posterior: Posterior, n_data: int) -> float:
     return float(n_data - len(inverse) + (inverse**2).sum())
 
 
-def highest_altitude(observation: Observation, nside: int) -> Float[np.ndarray, " pixels"]:
+def highest_altitude(observation: Observation, nside: int) -> Pixels:
     """Compute the highest altitude that every pixel of the sky reached.
 
     Parameters
@@ -400,5 +391,5 @@ def widened(posterior: Posterior, factor: float) -> tuple[Posterior, float]:
     return wide, less
 
 
-def _log_diagonal(lower: Float[np.ndarray, "n n"]) -> float:
+def _log_diagonal(lower: Square) -> float:
     return float(np.log(np.diagonal(lower)).sum())

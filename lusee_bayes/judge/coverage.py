@@ -1,9 +1,5 @@
 """How often error bars hold the truth, and how often they would by chance.
 
-Levels of central intervals, in one place for all that counts coverage.
-
-Coverage: how often error bars hold the known truth, and how often they would by chance.
-
 If a posterior is right, the truth is one of its draws. The pulls (truth - mean) / std are then
 those of draws, z ~ N(0, corr(C)): each is standard normal, but neighbouring pixels pull alike, so
 that counts over a band of latitude scatter far more than counts of independent pixels would. How
@@ -18,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lusee_bayes.core.arrays import Draws, Modes, Pixels
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.harmonics import columns_to_maps, lmax_of, mode_numbers
 from lusee_bayes.core.lazy import healpy, special
@@ -28,6 +25,7 @@ LEVELS = (0.50, 0.68, 0.90, 0.95)
 NAMES = tuple(f"{100 * level:.0f}" for level in LEVELS)
 
 
+REST = ("rms", "rms_scatter", "largest", "allowed")
 # draws that tell the scatter: it is then known to 4 %
 N_DRAWS = 300
 # skies that are counted together: their maps fit into a cache
@@ -77,16 +75,13 @@ class Coverage:
             "n": self.n,
             **{f"held_{name}": x for name, x in zip(NAMES, self.held, strict=True)},
             **{f"scatter_{name}": x for name, x in zip(NAMES, self.scatter, strict=True)},
-            "rms": self.rms,
-            "rms_scatter": self.rms_scatter,
-            "largest": self.largest,
-            "allowed": self.allowed,
+            **{name: getattr(self, name) for name in REST},
         }
 
     @classmethod
     def from_row(cls, row: Mapping[str, float | str]) -> Coverage:
         """The inverse of :meth:`row`."""
-        rest = {key: row[key] for key in ("name", "n", "rms", "rms_scatter", "largest", "allowed")}
+        rest = {key: row[key] for key in ("name", "n", *REST)}
         held, scatter = (
             tuple(float(row[f"{kind}_{name}"]) for name in NAMES) for kind in ("held", "scatter")
         )
@@ -113,12 +108,7 @@ class Counts:
     values: Float[np.ndarray, "parts statistics skies"]
 
     @classmethod
-    def of_pixels(
-        cls,
-        std: Float[np.ndarray, " pixels"],
-        error: Float[np.ndarray, " modes"],
-        deviations: Float[np.ndarray, "draws modes"],
-    ) -> Counts:
+    def of_pixels(cls, std: Pixels, error: Modes, deviations: Draws) -> Counts:
         """By Galactic latitude.
 
         Parameters
@@ -143,12 +133,7 @@ class Counts:
         return cls._of(bands, np.concatenate(in_threads(count, batches), axis=2))
 
     @classmethod
-    def of_modes(
-        cls,
-        std: Float[np.ndarray, " modes"],
-        error: Float[np.ndarray, " modes"],
-        deviations: Float[np.ndarray, "draws modes"],
-    ) -> Counts:
+    def of_modes(cls, std: Modes, error: Modes, deviations: Draws) -> Counts:
         """By multipole, of harmonic coefficients; what is known exactly pulls at nothing."""
         groups = multipoles(lmax_of(len(std)))
         width = np.where(std > 0, std, np.inf)[:, None]
@@ -165,17 +150,16 @@ class Counts:
         scatter, allowed = draws.std(2), np.quantile(draws[:, -1], ALLOWED, axis=1)
         n = len(LEVELS)
         return tuple(
-            Coverage(
-                name,
-                size,
-                tuple(truth[k, :n].tolist()),
-                tuple(scatter[k, :n].tolist()),
-                float(truth[k, n]),
-                float(scatter[k, n]),
-                float(truth[k, n + 1]),
-                float(allowed[k]),
+            Coverage(name, size, tuple(held[:n]), tuple(spread[:n]), held[n], spread[n], *largest)
+            for name, size, held, spread, *largest in zip(
+                self.names,
+                self.sizes,
+                truth.tolist(),
+                scatter.tolist(),
+                truth[:, n + 1].tolist(),
+                allowed.tolist(),
+                strict=True,
             )
-            for k, (name, size) in enumerate(zip(self.names, self.sizes, strict=True))
         )
 
 

@@ -109,12 +109,19 @@ class ChannelFits:
         """The verdict of all tests, and the channels that stand out."""
         tests, p = self.tests(), self.p()
         level = worst([test.level for test in tests])
+        sky, misfit = "not what the prior allows", "no sky explains the data of all channels"
+        if self.rest.too_small:
+            sky = "weaker, or closer to the prior's mean, than the prior expects"
+        if self._too_quiet():
+            misfit = (
+                "the data scatter less about what a sky explains than the noise would have them"
+            )
         told = [
             {
                 "consistent": "Consistent: instrument, noise and prior fit in all channels.",
                 "unlike the prior": "Unlike the prior: instrument and noise fit in all channels, "
-                f"but the skies are {self._unlike()}.",
-                "does not fit": f"Does not fit: {self._misfit()}.",
+                f"but the skies are {sky}.",
+                "does not fit": f"Does not fit: {misfit}.",
             }[level]
         ]
         for test in tests:
@@ -141,18 +148,6 @@ class ChannelFits:
         parts = [ChiSquare(*pair) for pair in zip(self.chi2, self.degrees, strict=True)]
         parts.append(ChiSquare(float(self.chi2.sum()), float(self.degrees.sum())))
         return min(parts, key=lambda part: part.p).too_small
-
-    def _misfit(self) -> str:
-        """What is wrong with instrument or noise."""
-        if self._too_quiet():
-            return "the data scatter less about what a sky explains than the noise would have them"
-        return "no sky explains the data of all channels"
-
-    def _unlike(self) -> str:
-        """What the skies are where they are unlike the prior."""
-        if self.rest.too_small:
-            return "weaker, or closer to the prior's mean, than the prior expects"
-        return "not what the prior allows"
 
     def _advice(self, level: Level) -> list[str]:
         if level == "does not fit" and self._too_quiet():

@@ -1,7 +1,5 @@
 """Groups of data against their prediction by all others.
 
-The protocol of what tells how a group of data differs from its prediction by all others.
-
 With K = A S A^T + N the covariance of data under the model and u = K^-1 (d - E[d]), a group s
 differs from its prediction by K_ss^-1 u_s, K_ss being a block of K^-1, and ::
 
@@ -11,10 +9,8 @@ differs from its prediction by K_ss^-1 u_s, K_ss being a block of K^-1, and ::
 Of noise alone its mean is tr K_ss^-1 (K^-1 N K^-1)_ss. Under a wide prior that is the number of
 data, less one for every direction of the sky that only this group measures.
 
-Groups of data against their prediction by all others, with A and N of any kind as matrices.
-
-With N = N_0 + T T^T, F = [A S^(1/2), T] and D = N_0^-1, in blocks of data that N_0 couples (the
-products of a time, or all data), K = N_0 + F F^T has ::
+*Matrices*, for A and N of any kind: with N = N_0 + T T^T, F = [A S^(1/2), T] and D = N_0^-1, in
+blocks of data that N_0 couples (the products of a time, or all data), K = N_0 + F F^T has ::
 
     K^-1 = D - Y Q^-1 Y^T,    Y = D F,    Q = 1 + F^T D F,    K^-1 F = Y Q^-1,
 
@@ -25,10 +21,8 @@ more data than Q has rows is taken out of Q instead, ::
 
 What is left without a group has N_0 without it, and so the D of that: nothing is fitted again.
 
-Data of a stretch of time: the few functions of time in their rows of A, and their noise.
-
-Within a day the rows of A are combinations of a few smooth functions of time, however many samples
-it has, and noise within times couples no two of them.
+*Structure in time*: within a day the rows of A are combinations of a few smooth functions of time,
+however many samples it has, and noise within times couples no two of them.
 
 Groups of data against their prediction by all others, through the structure of A.
 
@@ -68,17 +62,21 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 
-from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.arrays import DataVector, Grid, GridFlags, Square, TimeFlags, Vector, on_host
 from lusee_bayes.core.engine import once
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.core.linalg import cholesky, inverse_from_cholesky, solve_lower
 from lusee_bayes.instrument.coupling import CouplingMatrix, turned_about_pole
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.normal_matrix import summed
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import Covariance, LowRankUpdate
+
+# arrays that recur
+Functions = Float[np.ndarray, "times n"]
+TimeIndex = Int[np.ndarray, " times"]
 
 
 class Missed(NamedTuple):
@@ -114,15 +112,15 @@ class LeftOut(ABC):
         The diagonal of K^-1, in 1/K^2, of the data that :meth:`stretch` has left out; else NaN.
     """
 
-    u: Float[np.ndarray, "products times"]
-    inverse_diagonal: Float[np.ndarray, "products times"]
+    u: Grid
+    inverse_diagonal: Grid
 
     @abstractmethod
-    def stretch(self, times: Bool[np.ndarray, " times"]) -> Missed:
+    def stretch(self, times: TimeFlags) -> Missed:
         """Leave out all data of a stretch of time, such as a day."""
 
     @abstractmethod
-    def together(self, times: Bool[np.ndarray, " times"]) -> Missed:
+    def together(self, times: TimeFlags) -> Missed:
         """Leave out a large part of all data, such as those at one turntable angle."""
 
     @abstractmethod
@@ -130,7 +128,7 @@ class LeftOut(ABC):
         """Leave out all data of one product."""
 
 
-def log_det_of(root: Float[np.ndarray, "n n"]) -> float:
+def log_det_of(root: Square) -> float:
     """ln|M| of a matrix with this Cholesky factor; entries off the diagonal are not read."""
     return 2.0 * float(np.log(np.diagonal(root)).sum())
 
@@ -159,7 +157,7 @@ class DenseLeftOut(LeftOut):
         If the model cannot be factorised.
     """
 
-    def __init__(self, model: LinearGaussian, data: Float[Array, " data"], layout: DataLayout):
+    def __init__(self, model: LinearGaussian, data: DataVector, layout: DataLayout):
         model = on_host(model)
         self.layout = layout
         self._blocks, templates = _blocks(model.noise, layout)
@@ -170,7 +168,7 @@ class DenseLeftOut(LeftOut):
         self._rest = self._rest - (0.0 if mean is None else sky @ mean)
         self._solve()
 
-    def without(self, gone: Bool[np.ndarray, "products times"]) -> DenseLeftOut:
+    def without(self, gone: GridFlags) -> DenseLeftOut:
         """Take out data for good.
 
         Parameters
@@ -283,13 +281,18 @@ class DenseLeftOut(LeftOut):
         return Missed(float(chi2), float(without - within), log_det)
 
 
+def base_and_templates(noise: Covariance) -> tuple[Covariance, Float[np.ndarray, "data templates"]]:
+    """N_0 and T of N = N_0 + T T^T; T has no columns where N is not of this form."""
+    if isinstance(noise, LowRankUpdate):
+        return noise.base, np.asarray(noise.update.root)
+    return noise, np.zeros((noise.size, 0))
+
+
 def _blocks(
     noise: Covariance, layout: DataLayout
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], Float[np.ndarray, "data templates"]]:
     """D in blocks, each with its data, and T; all data in one block where N couples times."""
-    base, templates = noise, np.zeros((noise.size, 0))
-    if isinstance(base, LowRankUpdate):
-        base, templates = base.base, np.asarray(base.update.root)
+    base, templates = base_and_templates(noise)
     weights = base.time_weights(layout)
     if weights is None:
         root = cho_factor(np.asarray(noise.dense()), lower=True)
@@ -340,7 +343,7 @@ class Part:
         turned = (self.root.swapaxes(1, 2) if transpose else self.root) @ by_time
         return turned.swapaxes(0, 1).reshape(x.shape)
 
-    def diagonal(self) -> Float[np.ndarray, " data"]:
+    def diagonal(self) -> DataVector:
         """The diagonal of D = c c^T."""
         return self.root**2 if self.root.ndim == 1 else (self.root**2).sum(2).T.ravel()
 
@@ -351,7 +354,7 @@ class Part:
 
 def smooth_functions(
     phases: Float[np.ndarray, "times functions"], azimuth: Float[np.ndarray, " times"]
-) -> Float[np.ndarray, "times n"]:
+) -> Functions:
     """Find few orthonormal functions of time that make up all of the given ones.
 
     Parameters
@@ -394,10 +397,9 @@ def roots_of_blocks(
     return np.linalg.cholesky(by_time + missing) * present[:, None] * present[:, :, None]
 
 
-def log_det_of_weights(weights: np.ndarray) -> float:
-    """ln|D| of the data that are there, for D as in :func:`weigh`."""
-    root = np.sqrt(weights).ravel() if weights.ndim == 2 else roots_of_blocks(weights)
-    return _log_det_of_roots(root)
+def _root_of_weights(weights: np.ndarray) -> np.ndarray:
+    """c of D = c c^T, for D as in :func:`weigh`."""
+    return np.sqrt(weights).ravel() if weights.ndim == 2 else roots_of_blocks(weights)
 
 
 def _log_det_of_roots(root: Float[np.ndarray, "..."]) -> float:
@@ -426,11 +428,9 @@ class StructuredLeftOut(LeftOut):
 
     """
 
-    def __init__(self, model: LinearGaussian, posterior: Posterior, data: Float[Array, " data"]):
+    def __init__(self, model: LinearGaussian, posterior: Posterior, data: DataVector):
         model, posterior = on_host(model), on_host(posterior)
-        base, templates = model.noise, np.zeros((model.n_data, 0))
-        if isinstance(base, LowRankUpdate):
-            base, templates = base.base, np.asarray(base.update.root)
+        base, templates = base_and_templates(model.noise)
         self._coupling = model.coupling
         shape = self._coupling.layout.n_products, self._coupling.layout.n_times
         self._complete = replace(self._coupling, layout=DataLayout(*shape))
@@ -456,12 +456,9 @@ class StructuredLeftOut(LeftOut):
         # C'^(1/2) of the random directions, whose amplitudes are zero
         self._probed = self._probes.copy()
         self._probed[: len(signs)] = solve_lower(self._lower, 2.0 * signs - 1.0, transpose=False)
-        self._amplitudes = np.concatenate(
-            [
-                -solve_lower(self._lower, across.T, transpose=False),
-                solve_lower(self._q, np.eye(n), transpose=False),
-            ]
-        )
+        of_sky = solve_lower(self._lower, across.T, transpose=False)
+        own = solve_lower(self._q, np.eye(n), transpose=False)
+        self._amplitudes = np.concatenate([-of_sky, own])
 
     def stretch(self, times):
         outside, log_det, inside, halves = 0.0, 0.0, [], []
@@ -488,19 +485,16 @@ class StructuredLeftOut(LeftOut):
     def together(self, times):
         squared = float((self.u * self._y)[:, times].sum())
         every = np.ones(len(self.u), dtype=bool)
-        log_det = log_det_of_weights(self._weights[..., times])
+        log_det = _log_det_of_roots(_root_of_weights(self._weights[..., times]))
         return self._taken_out(self._weights * times, self.u * times, every, squared, log_det)
 
     def product(self, number):
-        own, mixing = self._weights[number], 0.0
+        own, mixing = self._weights[number], np.zeros(self.u.shape)
         if self._weights.ndim == 2:
-            mixing = np.zeros(self.u.shape)
             mixing[number] = own > 0
         else:
             own = self._weights[number, number]
-            mixing = np.divide(
-                self._weights[number], own, out=np.zeros(self.u.shape), where=own > 0
-            )
+            np.divide(self._weights[number], own, out=mixing, where=own > 0)
         here = own > 0
         white = np.divide(self.u[number], np.sqrt(own), out=np.zeros(len(own)), where=here)
         log_det = float(np.log(own[here]).sum())
@@ -515,7 +509,7 @@ class StructuredLeftOut(LeftOut):
         half = half + self._amplitudes @ np.einsum("jt,jta->at", mixing, self._t)
         return self._between((half * np.sqrt(own))[:, here], white[here], 0.0, log_det)
 
-    def _mixed(self, mixing: Float[np.ndarray, "products times"]) -> np.ndarray:
+    def _mixed(self, mixing: Grid) -> np.ndarray:
         """C^(1/2) of the products' rows of every time, added with these factors."""
         if self._kept is not None:
             return np.einsum("jt,jtm->mt", mixing, self._kept, optimize=True)
@@ -545,14 +539,14 @@ class StructuredLeftOut(LeftOut):
         return kept
 
     def _modes(
-        self, run: int, here: Int[np.ndarray, " times"], functions: Float[np.ndarray, "times n"]
+        self, run: int, here: TimeIndex, functions: Functions
     ) -> Float[np.ndarray, "modes columns"]:
         """C^(1/2) of the rows of functions of time, for every product."""
         if len(here) == functions.shape[1] and self._kept is not None:
             return self._kept[:, here].reshape(-1, self._prior.size).T
         return self._whitened(self._rows(run, here, functions))
 
-    def _phases(self, here: Int[np.ndarray, " times"]) -> Float[np.ndarray, "times functions"]:
+    def _phases(self, here: TimeIndex) -> Float[np.ndarray, "times functions"]:
         """cos and sin of m phi(t) times every function of time: all that A knows of time."""
         factors = self._coupling.pointing.functions[here]
         angle = self._coupling.pointing.azimuth[here, None] * np.arange(self._coupling.lmax + 1.0)
@@ -560,7 +554,7 @@ class StructuredLeftOut(LeftOut):
         return (factors[:, :, None] * waves[:, None]).reshape(len(here), -1)
 
     def _rows(
-        self, run: int, here: Int[np.ndarray, " times"], functions: Float[np.ndarray, "times n"]
+        self, run: int, here: TimeIndex, functions: Functions
     ) -> Float[np.ndarray, "rows modes"]:
         """R: for every product U^T A, whose rows are combinations of those of A."""
         coupling, n = self._coupling, self._coupling.lmax + 1
@@ -579,9 +573,7 @@ class StructuredLeftOut(LeftOut):
         rows = packed.transpose(1, 2, 0).reshape(-1, len(m))
         return coupling.pointing.pole_from_galactic.T(rows)
 
-    def _parts(
-        self, here: Int[np.ndarray, " times"], functions: Float[np.ndarray, "times n"]
-    ) -> list[Part]:
+    def _parts(self, here: TimeIndex, functions: Functions) -> list[Part]:
         n_products, n = len(self.u), functions.shape[1]
         weights = self._weights[..., here]
         if weights.ndim == 2 and not len(self._q):
@@ -589,7 +581,7 @@ class StructuredLeftOut(LeftOut):
                 Part((k, here), slice(k * n, (k + 1) * n), np.sqrt(weights[k]), functions)
                 for k in range(n_products)
             ]
-        root = np.sqrt(weights).ravel() if weights.ndim == 2 else roots_of_blocks(weights)
+        root = _root_of_weights(weights)
         every = np.kron(np.eye(n_products), functions)
         amplitudes = self._t[:, here].reshape(len(every), -1)
         where = np.ix_(np.arange(n_products), here)
@@ -628,7 +620,7 @@ class StructuredLeftOut(LeftOut):
     def _taken_out(
         self,
         weights: Float[np.ndarray, "..."],
-        pull: Float[np.ndarray, "products times"],
+        pull: Grid,
         used: Bool[np.ndarray, " products"],
         squared: float,
         log_det: float,
@@ -647,11 +639,8 @@ class StructuredLeftOut(LeftOut):
             left[n:, :n] -= taken
             left[:n, n:] -= taken.T
             left[n:, n:] -= np.einsum("kta,ktb->ab", weighted, self._t)
-        h = [
-            self._pulled(coupling, pull[used][..., None])[0],
-            np.einsum("kt,kta->a", pull, self._t),
-        ]
-        h = np.concatenate(h)
+        of_sky = self._pulled(coupling, pull[used][..., None])[0]
+        h = np.concatenate([of_sky, np.einsum("kt,kta->a", pull, self._t)])
         try:
             root = cho_factor(left, lower=True, overwrite_a=True)
         except LinAlgError:
@@ -662,11 +651,7 @@ class StructuredLeftOut(LeftOut):
         return Missed(float(squared + h @ cho_solve(root, h)), float(grown / PROBES), log_det)
 
     def _between(
-        self,
-        half: Float[np.ndarray, "rank n"],
-        b: Float[np.ndarray, " n"],
-        outside: float,
-        log_det: float,
+        self, half: Float[np.ndarray, "rank n"], b: Vector, outside: float, log_det: float
     ) -> Missed:
         """``outside`` + b^T (1 - W^T W)^-1 b, in whichever of the two spaces is smaller.
 

@@ -2,19 +2,17 @@
 
 Degrees of freedom are those of sky and templates together.
 
-What the data would prefer of something that the model leaves out: score tests of templates.
-
-With K = A S A^T + N the covariance of data under the model and u = K^-1 (d - E[d]), data that hold
-a t besides prefer ::
+Score tests tell what the data would prefer of something that the model leaves out. With K = A S A^T
++ N the covariance of data under the model and u = K^-1 (d - E[d]), data that hold a t besides
+prefer ::
 
     a = t^T u / F,    F = t^T K^-1 t = t^T N^-1 t - P^T C P,    P = A^T N^-1 t,
 
 with the standard deviation F^(-1/2), C being the covariance of the sky; chi^2 of the data would be
 lower by (t^T u)^2 / F. A is not formed.
 
-How strong the sky is compared with its prior: by Galactic latitude and by multipole.
-
-If the model holds, the deviation of the posterior mean from that of the prior is drawn from
+How strong the sky is compared with its prior is told by Galactic latitude and by multipole. If the
+model holds, the deviation of the posterior mean from that of the prior is drawn from
 N(0, S - C): what the prior allows less what the data leave open. Its square over that expectation
 is 1 on average, larger where the prior is too narrow, and smaller where it is too wide.
 """
@@ -27,12 +25,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, compiled, on_host
+from lusee_bayes.core.arrays import Array, DataVector, Modes, ModesMatrix, Pixels, Vector, on_host
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.judge.coverage import latitudes, multipoles
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 
 # directions of the sky that are seen at once, and entries of A up to which it is made a matrix:
@@ -42,7 +39,7 @@ CHUNK, DENSE = 256, 10**8
 
 def data_freedom(
     model: LinearGaussian, posterior: Posterior, columns: Float[Array, "data n"]
-) -> Float[np.ndarray, " data"]:
+) -> DataVector:
     """Compute the diagonal of K_s K^-1: which share of each datum sky and templates follow.
 
     With the templates V among the columns of N's square root, K_s = A S A^T + V V^T is the
@@ -82,18 +79,6 @@ def data_freedom(
     return freedom + (columns * solved).sum(1)
 
 
-@compiled
-def _rows(posterior: Posterior, directions: Float[Array, "n modes"]) -> Float[Array, "n modes"]:
-    """y G (1 - C_w) G^-1, C_w the covariance of u."""
-    white = posterior.prior.colour_columns(directions)
-    inside = white if posterior.basis is None else white @ posterior.basis
-    half = solve_lower(posterior.lower, inside.T, transpose=False)
-    known = inside - solve_lower(posterior.lower, half, transpose=True).T
-    if posterior.basis is not None:
-        known = known @ posterior.basis.T
-    return posterior.prior.whiten_columns(known)
-
-
 # relative, of a difference of two quadratic forms
 ROUNDING = 1e-10
 
@@ -110,16 +95,16 @@ class Preferences:
         By how much chi^2 of the data would be lower.
     """
 
-    amplitude: Float[np.ndarray, " n"]
-    std: Float[np.ndarray, " n"]
-    gain: Float[np.ndarray, " n"]
+    amplitude: Vector
+    std: Vector
+    gain: Vector
 
 
 def preferences(
     model: LinearGaussian,
     posterior: Posterior,
-    covariance: Float[np.ndarray, "modes modes"],
-    data: Float[Array, " data"],
+    covariance: ModesMatrix,
+    data: DataVector,
     templates: Float[np.ndarray, "data n"],
 ) -> Preferences:
     """Test templates one by one.
@@ -161,11 +146,7 @@ def preferences(
     return Preferences(pull * inverse, np.sqrt(inverse), pull**2 * inverse)
 
 
-def strengths(
-    deviation: Float[np.ndarray, " modes"],
-    of_modes: Float[np.ndarray, " modes"],
-    of_pixels: Float[np.ndarray, " pixels"],
-) -> dict[str, float]:
+def strengths(deviation: Modes, of_modes: Modes, of_pixels: Pixels) -> dict[str, float]:
     """Compute the square of a sky's deviation over what is expected, part by part.
 
     The monopole, of which priors know little, is left out.

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import DataVector, Grid, GridFlags
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.products import all_products, auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -20,11 +20,7 @@ DOUBTFUL = 3.0
 LEAST_BITS = 1.0
 
 
-def require_plausible(
-    data: Visibilities,
-    signal: Float[Array, "products times"],
-    std: Float[Array, " data"],
-) -> tuple[str, ...]:
+def require_plausible(data: Visibilities, signal: Grid, std: DataVector) -> tuple[str, ...]:
     """Check measured data against what every correlator and every sky obeys.
 
     Auto-correlations are powers, so that they are positive; ``|V_ij|^2 <= V_ii V_jj``
@@ -61,7 +57,7 @@ def require_plausible(
     )
     _refuse(
         data,
-        _only(autos, values < -SIGNIFICANT * sigma),
+        np.isin(np.arange(len(values)), autos)[:, None] & (values < -SIGNIFICANT * sigma),
         "an auto-correlation that is negative beyond its noise; look at signs and order of the "
         "products, or leave the sample out (NaN)",
     )
@@ -77,15 +73,7 @@ def about_information(bits: float) -> tuple[str, ...]:
     )
 
 
-def _only(
-    rows: np.ndarray, found: Bool[np.ndarray, "products times"]
-) -> Bool[np.ndarray, "products times"]:
-    kept = np.zeros_like(found)
-    kept[rows] = found[rows]
-    return kept
-
-
-def _refuse(data: Visibilities, bad: Bool[np.ndarray, "products times"], why: str) -> None:
+def _refuse(data: Visibilities, bad: GridFlags, why: str) -> None:
     """InputError for the first of the samples that are bad."""
     if not bad.any():
         return
@@ -104,24 +92,20 @@ def _about_range(
     if not present.any():
         return ()
     ratio = float(np.median(autos[present] / modelled[present]))
-    if 1.0 / IMPOSSIBLE < ratio < IMPOSSIBLE and not 1.0 / DOUBTFUL < ratio < DOUBTFUL:
-        return (
-            f"The auto-correlations are {ratio:.2g} times those of the modelled sky: are unit, "
-            "frequency and beams those of the data?",
-        )
     if not 1.0 / IMPOSSIBLE < ratio < IMPOSSIBLE:
         raise InputError(
             f"the auto-correlations are {ratio:.2g} times those of the modelled sky; look at the "
             "unit of the data, their frequency and the beams"
         )
-    return ()
+    if 1.0 / DOUBTFUL < ratio < DOUBTFUL:
+        return ()
+    return (
+        f"The auto-correlations are {ratio:.2g} times those of the modelled sky: are unit, "
+        "frequency and beams those of the data?",
+    )
 
 
-def _about_crosses(
-    data: Visibilities,
-    values: Float[np.ndarray, "products times"],
-    sigma: Float[np.ndarray, "products times"],
-) -> tuple[str, ...]:
+def _about_crosses(data: Visibilities, values: Grid, sigma: Grid) -> tuple[str, ...]:
     """Pairs of antennas whose crosses are larger than their autos allow."""
     n = round(np.sqrt(data.layout.n_products))
     position = {tuple(product): k for k, product in enumerate(all_products(n))}

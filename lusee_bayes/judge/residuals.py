@@ -1,7 +1,5 @@
 """What the model predicts of data from all other data, and what does not fit.
 
-Compare data with what all other data predict, to find products, days or angles that do not fit.
-
 Under a prior that is wide enough for any sky (:mod:`.chi2`), with K = k^2 A S A^T + N the
 covariance of data and u = K^-1 (d - E[d]), a group s of data differs from its prediction by all
 others by K_ss^-1 u_s, K_ss being a block of K^-1, and ::
@@ -11,8 +9,6 @@ others by K_ss^-1 u_s, K_ss being a block of K^-1, and ::
 Directions of the sky that only the group measures take a degree of freedom each: a day that sees
 what no other day does is not blamed for it. A bad group spoils the predictions for all others too;
 the culprit is the group whose removal makes the rest fit.
-
-What the model predicts of every product and of every day from all other data.
 
 The density ln p(d_s | all others) of a group is that of its prediction, whose width counts: a prior
 that predicts too much is punished as one that predicts too little is.
@@ -24,9 +20,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.arrays import DataVector, on_host
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.chi2 import (
@@ -39,16 +35,31 @@ from lusee_bayes.judge.chi2 import (
     two_sided,
     with_sky,
 )
-from lusee_bayes.judge.left_out import DenseLeftOut, LeftOut, Missed, StructuredLeftOut
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.judge.left_out import (
+    NOT_TOLD,
+    DenseLeftOut,
+    LeftOut,
+    Missed,
+    StructuredLeftOut,
+    base_and_templates,
+)
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.noise.covariance import LowRankUpdate
 
 # a larger A is not formed, and its groups of data are not judged: 60,000 data at lmax 47
 DENSE_BYTES = 1.2e9
 # groups that stand out and are named in a sentence
 NAMED = 4
 HOURS_A_DAY = 24.0
+# of a prior that the sky is unlike
+TOO_WIDE = (
+    "The prior is wider than the sky needs: where the sky is weaker than it expects, error bars "
+    "are too wide; a narrower prior would tell more (lusee-bayes compare-priors)."
+)
+TOO_NARROW = (
+    "Where the sky is stronger than the prior expects, error bars are too narrow, and too wide "
+    "where it is weaker: choose another prior (lusee-bayes compare-priors)."
+)
 
 
 @dataclass(frozen=True)
@@ -98,8 +109,8 @@ class Residuals:
         noise that couples times would need an A of more than ``DENSE_BYTES``.
     """
 
-    predicted: Float[np.ndarray, " data"]
-    z: Float[np.ndarray, " data"]
+    predicted: DataVector
+    z: DataVector
     split: Split
     products: tuple[Group, ...]
     days: tuple[Group, ...]
@@ -107,11 +118,7 @@ class Residuals:
 
     def kinds(self) -> tuple[tuple[str, tuple[Group, ...]], ...]:
         """The groups by kind, each with the kind's name."""
-        return (
-            ("product", self.products),
-            ("day", self.days),
-            ("turntable angle", self.angles),
-        )
+        return (("product", self.products), ("day", self.days), ("turntable angle", self.angles))
 
     def compared(self) -> list[tuple[str, Group]]:
         """The groups that others predict, with their kinds."""
@@ -167,25 +174,17 @@ class Residuals:
         if level == "consistent":
             told = f"instrument and noise fit ({instrument}), and so does the prior ({prior})."
             return Fit(level, f"Consistent: {told}")
-        if level == "unlike the prior" and self.split.prior.too_small:
-            told = [
-                f"Unlike the prior: instrument and noise fit ({instrument}), but the sky is "
-                f"weaker, or closer to the prior's mean, than the prior expects ({prior}).",
-                *([strengths] if strengths else []),
-                "The prior is wider than the sky needs: where the sky is weaker than it expects, "
-                "error bars are too wide; a narrower prior would tell more (lusee-bayes "
-                "compare-priors).",
-            ]
-            return Fit(level, " ".join(told))
         if level == "unlike the prior":
-            told = [
-                f"Unlike the prior: instrument and noise fit ({instrument}), but the sky is not "
-                f"what the prior allows ({prior}).",
-                *([strengths] if strengths else []),
-                "Where the sky is stronger than the prior expects, error bars are too narrow, and "
-                "too wide where it is weaker: choose another prior (lusee-bayes compare-priors).",
-            ]
-            return Fit(level, " ".join(told))
+            sky, advice = "not what the prior allows", TOO_NARROW
+            if self.split.prior.too_small:
+                sky, advice = (
+                    "weaker, or closer to the prior's mean, than the prior expects",
+                    TOO_WIDE,
+                )
+            fits = f"Unlike the prior: instrument and noise fit ({instrument}), but the sky is"
+            return Fit(
+                level, " ".join(filter(None, [f"{fits} {sky} ({prior}).", strengths, advice]))
+            )
         small = self.split.instrument.too_small and not self.extremes()
         why = "the noise is smaller than assumed" if small else "no sky explains these data"
         told = f"Does not fit: {why} ({instrument}); do not trust the error bars."
@@ -273,30 +272,24 @@ def residuals(
         return Group(name, n, degrees, missed.chi2, two_sided(missed.chi2, degrees), others.p)
 
     def groups(
-        names: Sequence[str], counts: np.ndarray, leave: Callable[[int], Missed]
+        names: Sequence[str],
+        number: Int[np.ndarray, " data"],
+        leave: Callable[[int], Missed],
+        *,
+        always: bool = False,
     ) -> tuple[Group, ...]:
-        """Of those that have data: number k has counts[k] of them, and is left out by leave(k)."""
+        """Of those that have data; one that has all of them is left out only if ``always``."""
+        counts = np.bincount(number, minlength=len(names))
         some = np.flatnonzero(counts).tolist()
-        missed = in_threads(leave, some)
+        missed = in_threads(lambda k: leave(k) if always or counts[k] < n_data else NOT_TOLD, some)
         return tuple(group(names[k], int(counts[k]), x) for k, x in zip(some, missed, strict=True))
 
-    def unless_all(counts: np.ndarray, leave: Callable[[int], Missed]) -> Callable[[int], Missed]:
-        return lambda k: Missed(np.nan, np.nan, np.nan) if counts[k] == n_data else leave(k)
-
-    of_product, of_day, of_angle = (
-        np.bincount(numbers, minlength=n)
-        for numbers, n in (
-            (layout.product, len(data.labels)),
-            (day[layout.time], day.max() + 1),
-            (angle[layout.time], len(angles)),
-        )
-    )
-    products = groups(data.labels, of_product, unless_all(of_product, left_out.product))
+    products = groups(data.labels, layout.product, left_out.product)
     # every day is left out, even if there is but one: that gives each datum's own variance
-    names = [str(k) for k in range(len(of_day))]
-    days = groups(names, of_day, lambda k: left_out.stretch(day == k))
-    together = unless_all(of_angle, lambda k: left_out.together(angle == k))
-    of_angles = groups([f"{value:g}" for value in angles], of_angle, together)
+    names = [str(k) for k in range(day.max() + 1)]
+    days = groups(names, day[layout.time], lambda k: left_out.stretch(day == k), always=True)
+    names = [f"{value:g}" for value in angles]
+    of_angles = groups(names, angle[layout.time], lambda k: left_out.together(angle == k))
     u = left_out.u[layout.product, layout.time]
     z = u / np.sqrt(left_out.inverse_diagonal[layout.product, layout.time])
     return Residuals(predicted, z, split, products, days, of_angles)
@@ -319,8 +312,7 @@ def leave_out(model: LinearGaussian, posterior: Posterior, data: Visibilities) -
     LeftOut or None
         None if A would be needed and be larger than ``DENSE_BYTES``.
     """
-    noise = model.noise.base if isinstance(model.noise, LowRankUpdate) else model.noise
-    within_times = noise.time_weights(data.layout) is not None
+    within_times = base_and_templates(model.noise)[0].time_weights(data.layout) is not None
     of_modes = posterior.basis is None and model.prior.invertible
     if model.coupling.has_time_structure and within_times and of_modes:
         return StructuredLeftOut(model, posterior, data.data)

@@ -1,9 +1,8 @@
 """Amplitudes beside the sky: templates in N, patterns, and amplitudes that channels share.
 
-Amplitudes of templates that are part of the noise, as point sources' fluxes are.
-
-With N = N_0 + T T^T, an amplitude of each column of T is N(0, 1) before there are data. With
-K = A S A^T + N the covariance of data under the model, and C that of the sky, ::
+*Templates* are part of the noise, as point sources' fluxes are. With N = N_0 + T T^T, an amplitude
+of each column of T is N(0, 1) before there are data. With K = A S A^T + N the covariance of data
+under the model, and C that of the sky, ::
 
     mean = T^T K^-1 (d - offset) = T^T N^-1 (d - offset - A m),    m the posterior mean of the sky,
     covariance = 1 - T^T K^-1 T = 1 - T^T N^-1 T + P C P^T,        P = T^T N^-1 A,
@@ -11,8 +10,7 @@ K = A S A^T + N the covariance of data under the model, and C that of the sky, :
 
 A is not formed.
 
-Patterns of unknown strength beside a sky, such as point sources: integrated out and put back.
-
+*Patterns* of unknown strength beside a sky, such as point sources, are integrated out and put back,
 ::
 
     m = d + sum_j (1 + g_j) t_j,    g_j ~ N(0, 1)
@@ -24,12 +22,11 @@ d + sum_j t_j with ::
 
 and given d, g ~ N(K^-1 T v(d + sum_j t_j), K^-1).
 
-Amplitudes of several channels that are tied to one another, where each was worked out alone.
-
-Channel k has amplitudes z_k, N(0, 1) when it is worked out, and its posterior of them is
-N(E_k, V_k). Its likelihood is then exp(-z^T (V_k^-1 - 1) z / 2 + z^T V_k^-1 E_k) up to a factor.
-Let the prior of all of them be N(0, K x 1) instead: K_kk = 1 ties the channels' values of one
-amplitude, and different amplitudes are independent. With K = R R^T and z = R w, w ~ N(0, 1), ::
+*Tied amplitudes* of several channels: channel k has amplitudes z_k, N(0, 1) when it is worked out,
+and its posterior of them is N(E_k, V_k). Its likelihood is then exp(-z^T (V_k^-1 - 1) z / 2 + z^T
+V_k^-1 E_k) up to a factor. Let the prior of all of them be N(0, K x 1) instead: K_kk = 1 ties the
+channels' values of one amplitude, and different amplitudes are independent. With K = R R^T and z =
+R w, w ~ N(0, 1), ::
 
     Lambda = 1 + sum_k R_k^T (V_k^-1 - 1) R_k,    mean of w = Lambda^-1 sum_k R_k^T V_k^-1 E_k,
 
@@ -47,12 +44,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.arrays import Array, DataVector, Modes, ModesMatrix, Square, Vector, on_host
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 
 
@@ -69,12 +66,12 @@ class Amplitudes:
         Covariance of the sky with the amplitudes, in K.
     """
 
-    mean: Float[np.ndarray, " n"]
-    covariance: Float[np.ndarray, "n n"]
+    mean: Vector
+    covariance: Square
     with_sky: Float[np.ndarray, "modes n"]
 
     @property
-    def std(self) -> Float[np.ndarray, " n"]:
+    def std(self) -> Vector:
         """Standard deviations."""
         return np.sqrt(np.diagonal(self.covariance))
 
@@ -101,14 +98,12 @@ class AmplitudesOfSky:
         The reference sky m0, in K.
     """
 
-    mean: Float[np.ndarray, " n"]
+    mean: Vector
     pull: Float[np.ndarray, "n modes"]
-    covariance: Float[np.ndarray, "n n"]
-    reference: Float[np.ndarray, " modes"]
+    covariance: Square
+    reference: Modes
 
-    def integrated(
-        self, mean: Float[np.ndarray, " modes"], covariance: Float[np.ndarray, "modes modes"]
-    ) -> Amplitudes:
+    def integrated(self, mean: Modes, covariance: ModesMatrix) -> Amplitudes:
         """Integrate a sky N(mean, covariance) out, in K and K^2: given any data besides."""
         with_sky = -covariance @ self.pull.T
         return Amplitudes(
@@ -117,9 +112,7 @@ class AmplitudesOfSky:
             with_sky,
         )
 
-    def given(
-        self, precision: Float[np.ndarray, "n n"], vector: Float[np.ndarray, " n"]
-    ) -> AmplitudesOfSky:
+    def given(self, precision: Square, vector: Vector) -> AmplitudesOfSky:
         """Take in what is known of the amplitudes besides: exp(-z^T Q z / 2 + q^T z).
 
         Parameters
@@ -140,10 +133,7 @@ class AmplitudesOfSky:
 
 
 def amplitudes_of_sky(
-    model: LinearGaussian,
-    reference: Float[Array, " modes"],
-    data: Float[Array, " data"],
-    templates: Float[Array, "data n"],
+    model: LinearGaussian, reference: Modes, data: DataVector, templates: Float[Array, "data n"]
 ) -> AmplitudesOfSky:
     """Compute the posterior of templates' amplitudes given the sky.
 
@@ -175,10 +165,7 @@ def amplitudes_of_sky(
 
 
 def template_amplitudes(
-    model: LinearGaussian,
-    posterior: Posterior,
-    data: Float[Array, " data"],
-    templates: Float[Array, "data n"],
+    model: LinearGaussian, posterior: Posterior, data: DataVector, templates: Float[Array, "data n"]
 ) -> Amplitudes:
     """Compute the posterior of templates' amplitudes.
 
@@ -203,9 +190,7 @@ def template_amplitudes(
     return found.integrated(np.asarray(posterior.mean), np.asarray(posterior.covariance()))
 
 
-def weighted_residual(
-    model: LinearGaussian, posterior: Posterior, data: Float[Array, " data"]
-) -> Float[np.ndarray, " data"]:
+def weighted_residual(model: LinearGaussian, posterior: Posterior, data: DataVector) -> DataVector:
     """Compute N^-1 (d - offset - A m), m the posterior mean of the sky.
 
     T^T of it is the mean of amplitudes, and a term N_0 of N times it that of its part in the data.
@@ -264,7 +249,7 @@ class Patterns(eqx.Module):
         return cls(patterns, information, lower)
 
     @property
-    def expected(self) -> Float[np.ndarray, " modes"]:
+    def expected(self) -> Modes:
         """sum_j t_j, in K."""
         return self.patterns.sum(0)
 
@@ -284,7 +269,7 @@ class Patterns(eqx.Module):
             log_det=np.asarray(whole.log_det + 2.0 * np.log(np.diagonal(self.lower)).sum()),
         )
 
-    def whole_sky(self, diffuse: Float[np.ndarray, " modes"]) -> Float[np.ndarray, " modes"]:
+    def whole_sky(self, diffuse: Modes) -> Modes:
         """Compute the mean of m given d, in K.
 
         Parameters
@@ -295,9 +280,7 @@ class Patterns(eqx.Module):
         return self.whole_skies(diffuse[None], np.zeros((1, len(self.patterns))))[0]
 
     def whole_skies(
-        self,
-        diffuse: Float[np.ndarray, "skies modes"],
-        z: Float[np.ndarray, "skies patterns"],
+        self, diffuse: Float[np.ndarray, "skies modes"], z: Float[np.ndarray, "skies patterns"]
     ) -> Float[np.ndarray, "skies modes"]:
         """Compute draws of m given draws of d, in K.
 
@@ -317,9 +300,7 @@ class Patterns(eqx.Module):
         half = solve_lower(self.lower, self.patterns @ pull.T, transpose=False) + z.T
         return there + solve_lower(self.lower, half, transpose=True).T @ self.patterns
 
-    def whole_covariance(
-        self, covariance: Float[np.ndarray, "modes modes"]
-    ) -> Float[np.ndarray, "modes modes"]:
+    def whole_covariance(self, covariance: ModesMatrix) -> ModesMatrix:
         """Compute the covariance of m from that of d, in K^2.
 
         Parameters
@@ -417,21 +398,15 @@ def tie(
 
 
 def told_by_others(
-    mean: Float[np.ndarray, " n"],
-    covariance: Float[np.ndarray, "n n"],
-    tied_mean: Float[np.ndarray, " n"],
-    tied_covariance: Float[np.ndarray, "n n"],
-) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
+    mean: Vector, covariance: Square, tied_mean: Vector, tied_covariance: Square
+) -> tuple[Square, Vector]:
     """Q and q of one channel, from its own posterior and that given all data."""
     own, tied = np.linalg.inv(covariance), np.linalg.inv(tied_covariance)
     return tied - own, own @ (tied_mean - mean) + (tied - own) @ tied_mean
 
 
 def information_given(
-    information: Information,
-    amplitudes: AmplitudesOfSky,
-    precision: Float[np.ndarray, "n n"],
-    vector: Float[np.ndarray, " n"],
+    information: Information, amplitudes: AmplitudesOfSky, precision: Square, vector: Vector
 ) -> Information:
     """What data say of the sky where amplitudes are known to be N((1 + Q)^-1 q, (1 + Q)^-1).
 

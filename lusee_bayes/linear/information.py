@@ -1,6 +1,4 @@
-"""What data say of the sky, as a quadratic form.
-
-The log-likelihood of data as a quadratic form in the sky.
+"""What data say of the sky: their log-likelihood as a quadratic form.
 
 ::
 
@@ -9,9 +7,8 @@ The log-likelihood of data as a quadratic form in the sky.
 
 for any reference sky m0. It has the size of the sky, however many data there are. With a prior it
 gives the posterior, with those of other frequencies a joint one. m0 is chosen near the posterior
-mean: for m0 = 0 the terms are 1e10 times larger than their sum.
-
-The information of data about some of the unknowns, the others integrated out.
+mean: for m0 = 0 the terms are 1e10 times larger than their sum. Unknowns that are
+of no interest are integrated out.
 """
 
 from __future__ import annotations
@@ -24,32 +21,22 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import (
     Array,
+    DataVector,
+    Modes,
+    ModesMatrix,
     compiled,
     namespace,
     on_processor,
     placed,
     repeated,
 )
-from lusee_bayes.core.checks import (
-    Described,
-    is_traced,
-    number,
-    require_finite,
-    require_float64,
-    require_shape,
-)
+from lusee_bayes.core.checks import Described, is_traced, number, require_array, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import (
-    cholesky,
-    gram_matrix,
-    precise_residual,
-    scaled,
-    solve_lower,
-)
+from lusee_bayes.core.linalg import cholesky, gram_matrix, precise_residual, scaled, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
 from lusee_bayes.linear.normal_matrix import has_structure, is_within_times, normal_matrix
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.solver import CONVERGENCE, MAX_REFINEMENTS
+from lusee_bayes.linear.solver import CONVERGENCE, MAX_REFINEMENTS, unfinished
 from lusee_bayes.noise.covariance import Covariance, Factor
 from lusee_bayes.sky.prior import Prior
 
@@ -73,9 +60,9 @@ class Information(Described, eqx.Module):
         Number of data, as a float.
     """
 
-    matrix: Float[Array, "modes modes"]
-    vector: Float[Array, " modes"]
-    reference: Float[Array, " modes"]
+    matrix: ModesMatrix
+    vector: Modes
+    reference: Modes
     misfit: Float[Array, ""]
     log_det: Float[Array, ""]
     n_data: Float[Array, ""]
@@ -86,8 +73,8 @@ class Information(Described, eqx.Module):
         coupling: Coupling,
         prior: Prior,
         noise: Covariance,
-        offset: Float[Array, " data"] | None,
-        data: Float[Array, " data"],
+        offset: DataVector | None,
+        data: DataVector,
     ) -> tuple[Information, Posterior]:
         """Compute the information of data, and the posterior under a prior.
 
@@ -119,9 +106,7 @@ class Information(Described, eqx.Module):
             If ``data`` is not float64, not finite or of another length, N is not positive definite,
             the prior is over pixels, or the mean does not converge.
         """
-        require_float64("the data", data)
-        require_shape("the data", data, (noise.size,))
-        require_finite("the data", data)
+        require_array("the data", data, (noise.size,))
         if is_within_times(noise):
             coupling, prior, noise, offset, data = on_processor(
                 (coupling, prior, noise, offset, data)
@@ -155,7 +140,7 @@ class Information(Described, eqx.Module):
         """Number of modes of the sky."""
         return self.reference.shape[0]
 
-    def recentred(self, sky: Float[Array, " modes"]) -> Information:
+    def recentred(self, sky: Modes) -> Information:
         """Write the same function with another reference sky.
 
         Parameters
@@ -199,7 +184,7 @@ class Information(Described, eqx.Module):
             log_det=xp.asarray(self.log_det + self.n_data * np.log(factor)),
         )
 
-    def chi2(self, sky: Float[Array, " modes"]) -> Float[Array, ""]:
+    def chi2(self, sky: Modes) -> Float[Array, ""]:
         """Compute ``chi^2 = |L^-1 (d - A m - offset)|^2`` of a sky.
 
         Parameters
@@ -276,7 +261,7 @@ def gradient_and_misfit(
 
 
 @compiled
-def _precision_root(matrix: Float[Array, "modes modes"], prior: Prior) -> Array:
+def _precision_root(matrix: ModesMatrix, prior: Prior) -> Array:
     """L of the precision 1 + G^T M G of u = G^-1 m."""
     precision = prior.sandwich(matrix)
     diagonal = np.diag_indices(len(precision))
@@ -285,12 +270,7 @@ def _precision_root(matrix: Float[Array, "modes modes"], prior: Prior) -> Array:
 
 @compiled
 def _condition(
-    information: Information,
-    prior: Prior,
-    lower: Array,
-    refinements: int,
-    *,
-    precise: bool = False,
+    information: Information, prior: Prior, lower: Array, refinements: int, *, precise: bool = False
 ) -> tuple[Array, Array, Array]:
     """Mean of u, ln p(d), and the last step in standard deviations.
 
@@ -302,13 +282,6 @@ def _condition(
     mean = prior.white_mean
     expected = xp.zeros_like(start) if mean is None else mean
     here = information.recentred(prior.colour(start))
-
-    def unfinished(state):
-        _, moved, before, count = state
-        # what is left may be rounding, which no refinement makes smaller
-        settled = (moved < CONVERGENCE) & (moved > 0.5 * before)
-        more = (moved > 1e-3 * CONVERGENCE) & ~settled & (count < refinements)
-        return (count < 1) | more
 
     def refine(state):
         correction, before, _, count = state
@@ -324,7 +297,7 @@ def _condition(
 
     never = xp.asarray(np.inf)
     first = (xp.zeros_like(start), never, never, xp.asarray(0))
-    correction, moved, _, _ = repeated(xp, unfinished, refine, first)
+    correction, moved, _, _ = repeated(xp, unfinished(refinements), refine, first)
     u = start + correction
     log_evidence = -0.5 * (
         here.recentred(prior.colour(u)).misfit

@@ -1,7 +1,5 @@
 """One posterior for the skies of several frequencies.
 
-One posterior for the skies of several frequencies.
-
 With m_f = sum_c s_fc a_c + r_f (spectral_prior.py), the residual r_f of each channel is integrated
 out by itself. In units of its prior, P = R^1/2 M R^1/2, and ::
 
@@ -9,13 +7,8 @@ out by itself. In units of its prior, P = R^1/2 M R^1/2, and ::
 
 are the channel's information about the common part sum_c s_fc a_c. Sums over channels of
 s_fc s_fc' M' are the information of all channels about the component maps, (components x modes)
-unknowns, from which the posterior follows as for one sky. Given the components, each residual has a
-posterior of its own.
-
-The sky of one channel, from the joint posterior of the component maps.
-
-Given the components, the residual of each channel (:mod:`.joint`) has a posterior of its own, from
-the channel's data alone.
+unknowns, from which the posterior follows as for one sky. Given the components, the residual of
+each channel has a posterior of its own, from the channel's data alone.
 """
 
 from __future__ import annotations
@@ -31,6 +24,8 @@ from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import (
     Array,
+    Modes,
+    ModesMatrix,
     accumulated,
     compiled,
     namespace,
@@ -51,11 +46,12 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import IndependentPrior
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
+# arrays that recur
+ChannelModes = Float[Array, "channels modes"]
+
 
 @compiled
-def common_part(
-    information: Information, residual_root: Float[Array, " modes"] | None
-) -> Information:
+def common_part(information: Information, residual_root: Modes | None) -> Information:
     """Integrate a channel's residual out of its information about the sky.
 
     Parameters
@@ -90,9 +86,7 @@ def common_part(
     )
 
 
-def residual_lower(
-    information: Information, residual_root: Float[Array, " modes"]
-) -> Float[Array, "modes modes"]:
+def residual_lower(information: Information, residual_root: Modes) -> ModesMatrix:
     """L L^T = 1 + P."""
     normal = scaled(information.matrix, residual_root)
     diagonal = np.diag_indices(len(residual_root))
@@ -126,9 +120,7 @@ class ComponentSums(eqx.Module):
     n_data: Float[Array, ""]
 
     @classmethod
-    def empty(
-        cls, prior: SpectralPrior, reference: Float[Array, "channels modes"]
-    ) -> ComponentSums:
+    def empty(cls, prior: SpectralPrior, reference: ChannelModes) -> ComponentSums:
         """Start the sums, with no channel in them.
 
         Parameters
@@ -161,7 +153,7 @@ class ComponentSums(eqx.Module):
 
 
 def reference_maps(
-    prior: SpectralPrior, reference: Float[Array, "channels modes"]
+    prior: SpectralPrior, reference: ChannelModes
 ) -> Float[Array, "components modes"]:
     """Fit component maps to a sky of every channel, by least squares.
 
@@ -219,9 +211,7 @@ def _assembled(sums: ComponentSums) -> Information:
 
 
 def solve_directly(
-    prior: SpectralPrior,
-    channels: Iterable[Information],
-    reference: Float[Array, "channels modes"],
+    prior: SpectralPrior, channels: Iterable[Information], reference: ChannelModes
 ) -> Posterior:
     """Compute the posterior of all component maps by factorising its matrix.
 
@@ -248,13 +238,13 @@ def solve_directly(
     for channel, information in enumerate(channels):
         if channel >= prior.n_channels:
             raise InputError(f"there are more channels than the prior's {prior.n_channels}")
-        sums, count = summed(sums, prior, channel, information), channel + 1
+        sums, count = summed_information(sums, prior, channel, information), channel + 1
     if count != prior.n_channels:
         raise InputError(f"there are {count} channels, the prior is for {prior.n_channels}")
     return component_posterior(sums.information(), prior)
 
 
-def summed(
+def summed_information(
     sums: ComponentSums, prior: SpectralPrior, channel: int, information: Information
 ) -> ComponentSums:
     """Add a channel to the sums.
@@ -346,8 +336,8 @@ class ChannelSky(eqx.Module):
         Of the channel's data, at the mean.
     """
 
-    mean: Float[Array, " modes"]
-    covariance: Float[Array, "modes modes"] | None
+    mean: Modes
+    covariance: ModesMatrix | None
     draws: Float[Array, "n modes"]
     chi2: Float[Array, ""]
 

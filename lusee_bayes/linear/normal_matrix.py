@@ -1,19 +1,11 @@
 """A^T N^-1 A without A: from the beams and Fourier sums over time.
 
-Sums over times of weights, pairs of functions and exp(i q phi): all of time in A^T N^-1 A.
-
-::
+Sums over times of weights, pairs of functions and exp(i q phi) hold all of time, ::
 
     F_c,jk(q) = sum_t w_c(t) u_j(t) u_k(t) exp(i q phi(t)),    q = -2 lmax .. 2 lmax
 
 They are the only part of a normal matrix whose cost grows with the number of samples, and a small
 part of its cost.
-
-A^T W A of the samples at one turntable angle, from beams and Fourier sums over time.
-
-The equations are those of :mod:`.normal_matrix`; here is the arithmetic that takes the time.
-
-A^T N^-1 A without A: from the beams and Fourier sums over time.
 
 With c_lm(t) = sum_j u_j(t) beta_j,lm exp(i m phi(t)), beta_lm = W_lm + i W_l,-m (coupling.py), a
 visibility is Re sum_m conj(c_lm) (a_lm + i a_l,-m), and for noise that does not couple times ::
@@ -21,7 +13,7 @@ visibility is Re sum_m conj(c_lm) (a_lm + i a_l,-m), and for noise that does not
     sum_t w(t) c_lm conj(c'_l'm') = sum_jk beta_j,lm conj(beta'_k,l'm') F_jk(m - m') = P,
     sum_t w(t) c_lm c'_l'm'       = sum_jk beta_j,lm beta'_k,l'm' F_jk(m + m')       = Q,
 
-with F the sums of :mod:`.normal_matrix`. The four parts of the matrix follow from P + Q and P - Q.
+at each turntable angle. The four parts of the matrix follow from P + Q and P - Q.
 Noise that couples different times is whitened in order of time, a few rows of A at once.
 """
 
@@ -37,7 +29,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from lusee_bayes.core.arrays import Array, as_complex, compiled, namespace, placed, scan
+from lusee_bayes.core.arrays import (
+    Array,
+    ModesMatrix,
+    as_complex,
+    compiled,
+    namespace,
+    placed,
+    scan,
+)
 from lusee_bayes.core.checks import is_traced, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import Rotation, mode_numbers
@@ -51,6 +51,9 @@ from lusee_bayes.noise.covariance import (
     TimeBandedFactor,
     TimeBlockCovariance,
 )
+
+# arrays that recur
+Beams = Float[Array, "orders products 2 functions degrees"]
 
 # times that are summed at once: it bounds the memory
 CHUNK = 512
@@ -121,7 +124,7 @@ def of_one_angle(
     azimuth: Float[Array, " times"],
     functions: Float[Array, "functions times"],
     n_products: int,
-) -> Float[Array, "modes modes"]:
+) -> ModesMatrix:
     """The lower triangle of their part in the mean-pole frame; modes as :func:`places` has them."""
     n = by_order.shape[0]
     beams = by_order.reshape(n, n_products, -1, 2, n).swapaxes(2, 3)
@@ -129,9 +132,7 @@ def of_one_angle(
     return _from_sums(beams, f.reshape(*weights.shape[:-1], *f.shape[1:]))
 
 
-def _from_sums(
-    beams: Float[Array, "orders products 2 functions degrees"], f: Complex[Array, "..."]
-) -> Float[Array, "modes modes"]:
+def _from_sums(beams: Beams, f: Complex[Array, "..."]) -> ModesMatrix:
     """The matrix of beams (W_lm, W_l,-m) and Fourier sums, one strip of orders after the other.
 
     Only columns of orders up to the strip's own last one, and rows of degrees from its first one,
@@ -176,11 +177,7 @@ def _by_order(lmax: int) -> Int[np.ndarray, " modes"]:
 
 
 def _rows_of_order(
-    m: Array,
-    beams: Float[Array, "orders products 2 functions degrees"],
-    f: Complex[Array, "..."],
-    first: int,
-    end: int,
+    m: Array, beams: Beams, f: Complex[Array, "..."], first: int, end: int
 ) -> Float[Array, "rows columns"]:
     """Rows a_lm, then a_l,-m, of one order; columns a_l'm', then a_l',-m', of orders below end.
 
@@ -202,9 +199,7 @@ def _rows_of_order(
 
 
 def _weighted(
-    even: Complex[Array, "..."],
-    odd: Complex[Array, "..."],
-    beams: Float[Array, "orders products 2 functions degrees"],
+    even: Complex[Array, "..."], odd: Complex[Array, "..."], beams: Beams
 ) -> list[Float[Array, "orders parts degrees"]]:
     """(P + Q) / 2 and (P - Q) / 2 without the row's own beam, real and imaginary parts.
 
@@ -234,7 +229,7 @@ def _weighted(
     return [x.reshape(n_orders, -1, n) for x in products]
 
 
-def normal_matrix(coupling: Coupling, noise: Covariance) -> Float[Array, "modes modes"]:
+def normal_matrix(coupling: Coupling, noise: Covariance) -> ModesMatrix:
     """Compute A^T N^-1 A without forming A.
 
     Exact for the coupling's own functions of time. For diagonal noise and blocks in time the cost
@@ -320,20 +315,16 @@ def _with_templates(coupling: CouplingMatrix, noise: LowRankUpdate) -> Array:
     return normal_matrix(coupling, noise.base) - gram_matrix(solve_lower(lower, v, transpose=False))
 
 
-def _of_bands(coupling: CouplingMatrix, noise: TimeBandedCovariance) -> Array:
-    return _streamed(coupling, noise.factor())
-
-
 # how A^T N^-1 A is summed for each structure of N in time; those without an entry need A itself
 NORMAL_MATRICES: dict[type[Covariance], Callable[..., Array]] = {
     DiagonalCovariance: _within_times,
     TimeBlockCovariance: _within_times,
-    TimeBandedCovariance: _of_bands,
+    TimeBandedCovariance: lambda coupling, noise: _streamed(coupling, noise.factor()),
     LowRankUpdate: _with_templates,
 }
 
 
-def summed(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> Float[Array, "modes modes"]:
+def summed(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> ModesMatrix:
     """Compute A^T W A for weights W within times.
 
     Parameters
@@ -381,10 +372,8 @@ def _turntable_groups(
 
 @compiled
 def _to_galactic(
-    pole_from_galactic: Rotation,
-    lower: Float[Array, "modes modes"],
-    place: Int[Array, " modes"],
-) -> Float[Array, "modes modes"]:
+    pole_from_galactic: Rotation, lower: ModesMatrix, place: Int[Array, " modes"]
+) -> ModesMatrix:
     """R^T M R, symmetric to the last bit.
 
     Of M the lower triangle is given, with the packed mode k in row ``place[k]``. NumPy's is
@@ -399,8 +388,8 @@ def _to_galactic(
 
 
 def _turned(
-    rotation: Rotation, matrix: Float[np.ndarray, "modes modes"], place: Int[np.ndarray, " modes"]
-) -> Float[np.ndarray, "modes modes"]:
+    rotation: Rotation, matrix: ModesMatrix, place: Int[np.ndarray, " modes"]
+) -> ModesMatrix:
     """R^T M R degree by degree, on and below the diagonal: what is worked on fits into a cache."""
     turned = np.empty_like(matrix)
     spans = [slice(ell**2, (ell + 1) ** 2) for ell in range(len(rotation.blocks))]
@@ -412,7 +401,7 @@ def _turned(
 
 
 @eqx.filter_jit
-def _streamed(coupling: CouplingMatrix, factor: TimeBandedFactor) -> Float[Array, "modes modes"]:
+def _streamed(coupling: CouplingMatrix, factor: TimeBandedFactor) -> ModesMatrix:
     """For time-banded noise: A is made, whitened and summed one block row of N after the other."""
     pointing, layout = coupling.pointing, coupling.layout
     n_blocks, rows, window = factor.left.shape

@@ -1,6 +1,4 @@
-"""One posterior for positive skies of several frequencies.
-
-One posterior for positive skies of several frequencies, by Gauss and Newton.
+"""One posterior for positive skies of several frequencies, by Gauss and Newton.
 
 With the exponents phi_f = sum_c s_fc a_c + r_f of :mod:`.positive_skies`, ::
 
@@ -12,13 +10,9 @@ of maps without unit. The step to its mean is halved until E falls, and rounds a
 step would gain nothing. Meanwhile A and tilt of the fields may be learned.
 The last posterior is the Gaussian about the mode, its evidence Laplace's.
 
-The positive sky of one channel, from the joint posterior of the fields.
-
-Laws of the fields of positive skies, learned from the large scales of all channels.
-
-Learning takes twenty rounds of :mod:`.positive_joint`. A and tilt are those of a power law, of
-which modes up to a low ell tell nearly all: those above are integrated out, with the power of the
-template.
+The laws of the fields are learned in twenty rounds from the large scales of all channels. A and
+tilt are those of a power law, of which modes up to a low ell tell nearly all: those above are
+integrated out, with the power of the template.
 """
 
 from __future__ import annotations
@@ -32,24 +26,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.arrays import Modes, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, per_mode, power_spectrum, sum_over_m
 from lusee_bayes.core.linalg import inverse_from_cholesky, symmetric_product
+from lusee_bayes.linear import joint
 from lusee_bayes.linear.amplitudes import Patterns
 from lusee_bayes.linear.information import Information, integrated_out
-from lusee_bayes.linear.joint import (
-    ChannelSky,
-    ComponentSums,
-    channel_sky,
-    component_posterior,
-    paired,
-    residual_lower,
-    summed,
-)
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
 from lusee_bayes.sky.spectral_prior import SpectralPrior
+
+# arrays that recur
+Pairs = Float[np.ndarray, "pairs modes modes"]
+Fields = Float[np.ndarray, "fields modes"]
+ChannelModes = Float[np.ndarray, "channels modes"]
 
 # found when a round moves all unknowns together by less than this, in standard deviations, and no
 # ln A or tilt by more than that
@@ -57,22 +48,22 @@ SETTLED, SETTLED_LAW = 0.1, 0.05
 MAX_ROUNDS, HALVINGS = 60, 20
 
 
+# arrays by name, and their shapes
+Arrays, Shapes = dict[str, np.ndarray], dict[str, tuple[int, ...]]
+# functions of a channel's number and information
+OfChannel = Callable[[int, Information], Arrays]
+Linearised = Callable[[int, Information], Information]
+
+
 @runtime_checkable
 class Channels(Protocol):
     """The channels of a joint posterior, wherever their data are."""
 
-    def each(
-        self,
-        function: Callable[[int, Information], dict[str, np.ndarray]],
-        shapes: dict[str, tuple[int, ...]],
-    ) -> dict[str, np.ndarray]:
+    def each(self, function: OfChannel, shapes: Shapes) -> Arrays:
         """Call a function with number and information of every channel; its arrays, stacked."""
 
     def summed(
-        self,
-        prior: SpectralPrior,
-        reference: Float[np.ndarray, "channels modes"],
-        function: Callable[[int, Information], Information],
+        self, prior: SpectralPrior, reference: ChannelModes, function: Linearised
     ) -> Information:
         """What a function of every channel's information says of the component maps."""
 
@@ -89,25 +80,18 @@ class ChannelsInMemory:
 
     informations: tuple[Information, ...]
 
-    def each(
-        self,
-        function: Callable[[int, Information], dict[str, np.ndarray]],
-        shapes: dict[str, tuple[int, ...]],
-    ) -> dict[str, np.ndarray]:
+    def each(self, function: OfChannel, shapes: Shapes) -> Arrays:
         """Call a function with number and information of every channel; its arrays, stacked."""
         found = [function(k, information) for k, information in enumerate(self.informations)]
         return {name: np.stack([part[name] for part in found]) for name in shapes}
 
     def summed(
-        self,
-        prior: SpectralPrior,
-        reference: Float[np.ndarray, "channels modes"],
-        function: Callable[[int, Information], Information],
+        self, prior: SpectralPrior, reference: ChannelModes, function: Linearised
     ) -> Information:
         """What a function of every channel's information says of the component maps."""
-        sums = ComponentSums.empty(prior, reference)
+        sums = joint.ComponentSums.empty(prior, reference)
         for k, information in enumerate(self.informations):
-            sums = summed(sums, prior, k, function(k, information))
+            sums = joint.summed_information(sums, prior, k, function(k, information))
         return sums.information()
 
 
@@ -133,7 +117,7 @@ class PositiveMode:
 
     skies: PositiveSkies
     laws: FieldLaws
-    exponents: Float[np.ndarray, "channels modes"]
+    exponents: ChannelModes
     posterior: Posterior
     energy: float
     moved: float
@@ -145,7 +129,7 @@ class PositiveMode:
         return self.laws.prior(self.skies)
 
     @property
-    def fields(self) -> Float[np.ndarray, "fields modes"]:
+    def fields(self) -> Fields:
         """Posterior mean of the fields."""
         return np.asarray(self.posterior.mean).reshape(len(self.skies.names), -1)
 
@@ -156,10 +140,7 @@ def diffuse_part(skies: PositiveSkies, channel: int, information: Information) -
 
 
 def linearised(
-    skies: PositiveSkies,
-    channel: int,
-    information: Information,
-    exponent: Float[np.ndarray, " modes"],
+    skies: PositiveSkies, channel: int, information: Information, exponent: Modes
 ) -> Information:
     """What a channel's data say of its exponent, the sky being linear about a given one.
 
@@ -192,8 +173,8 @@ def linearised(
 class _Point:
     """Fields and exponents of all channels, and chi^2 of their skies."""
 
-    fields: Float[np.ndarray, "fields modes"]
-    exponents: Float[np.ndarray, "channels modes"]
+    fields: Fields
+    exponents: ChannelModes
     chi2: float
 
     def energy(self, prior: SpectralPrior) -> float:
@@ -211,7 +192,7 @@ def find_joint_mode(
     channels: Channels,
     *,
     learn: bool = False,
-    start: Float[np.ndarray, "fields modes"] | None = None,
+    start: Fields | None = None,
     report: Callable[[int, str], None] | None = None,
 ) -> PositiveMode:
     """Find the most probable skies.
@@ -238,35 +219,13 @@ def find_joint_mode(
     fields = np.zeros((len(skies.names), skies.n_fields)) if start is None else start
     exponents = skies.mixing @ fields
     here = _Point(fields, exponents, _chi2(skies, channels, exponents))
-    shapes: dict[str, tuple[int, ...]] = {"exponent": (skies.n_fields,), "chi2": ()}
+    shapes: Shapes = {"exponent": (skies.n_fields,), "chi2": ()}
     if learn:
         shapes |= dict.fromkeys(("power", "known"), (skies.grid.lmax + 1,))
     last = np.zeros_like(laws.parameters)
     for rounds in range(MAX_ROUNDS):
         prior = laws.prior(skies)
-
-        def relative(
-            channel: int, information: Information, at: np.ndarray = here.exponents
-        ) -> Information:
-            return linearised(skies, channel, information, at[channel])
-
-        information = channels.summed(prior, here.exponents, relative)
-        posterior = on_host(component_posterior(information, prior))
-        maps = np.asarray(posterior.mean).reshape(prior.n_components, -1)
-        spread = np.asarray(paired(posterior.covariance(), prior)) if learn else None
-
-        def judged(
-            channel: int,
-            information: Information,
-            relative: Callable = relative,
-            prior: SpectralPrior = prior,
-            maps: np.ndarray = maps,
-            spread: np.ndarray | None = spread,
-        ) -> dict[str, np.ndarray]:
-            return _judged(prior, channel, relative(channel, information), maps, spread)
-
-        found = channels.each(judged, shapes)
-        there = _Point(maps, found["exponent"], float(found["chi2"].sum()))
+        posterior, there, found = _linear_round(skies, channels, prior, here.exponents, shapes)
         energy = here.energy(prior)
         moved = np.sqrt(max(energy - there.energy(prior), 0.0))
         if report is not None:
@@ -289,31 +248,51 @@ def find_joint_mode(
     )
 
 
-def _chi2(
-    skies: PositiveSkies, channels: Channels, exponents: Float[np.ndarray, "channels modes"]
-) -> float:
-    def chi2(channel: int, information: Information) -> dict[str, np.ndarray]:
+def _chi2(skies: PositiveSkies, channels: Channels, exponents: ChannelModes) -> float:
+    def chi2(channel: int, information: Information) -> Arrays:
         diffuse = diffuse_part(skies, channel, information).without()
         return {"chi2": np.asarray(diffuse.chi2(skies.modes(channel, exponents[channel])))}
 
     return float(channels.each(chi2, {"chi2": ()})["chi2"].sum())
 
 
-def _judged(
+def _linear_round(
+    skies: PositiveSkies,
+    channels: Channels,
     prior: SpectralPrior,
-    channel: int,
-    information: Information,
-    maps: Float[np.ndarray, "fields modes"],
-    spread: Float[np.ndarray, "pairs modes modes"] | None,
-) -> dict[str, np.ndarray]:
+    exponents: ChannelModes,
+    shapes: Shapes,
+) -> tuple[Posterior, _Point, Arrays]:
+    """The posterior of skies that are linear about exponents, its mean, and every channel there."""
+
+    def relative(channel: int, information: Information) -> Information:
+        return linearised(skies, channel, information, exponents[channel])
+
+    information = channels.summed(prior, exponents, relative)
+    posterior = on_host(joint.component_posterior(information, prior))
+    maps = np.asarray(posterior.mean).reshape(prior.n_components, -1)
+    spread = np.asarray(joint.paired(posterior.covariance(), prior)) if "power" in shapes else None
+
+    def judged(channel: int, information: Information) -> Arrays:
+        return _judged(prior, channel, relative(channel, information), maps, spread)
+
+    found = channels.each(judged, shapes)
+    return posterior, _Point(maps, found["exponent"], float(found["chi2"].sum())), found
+
+
+def _judged(
+    prior: SpectralPrior, channel: int, information: Information, maps: Fields, spread: Pairs | None
+) -> Arrays:
     """Exponent and chi^2 of a channel at the mean of a linear round, and its residual's power."""
     none = np.zeros((0, *maps.shape))
-    sky = on_host(channel_sky(prior, channel, information, maps, None, none, jax.random.key(0)))
+    sky = on_host(
+        joint.channel_sky(prior, channel, information, maps, None, none, jax.random.key(0))
+    )
     found = {"exponent": np.asarray(sky.mean), "chi2": np.asarray(sky.chi2)}
     if spread is None:
         return found
     root, mixing = prior.residual_root(channel), np.asarray(prior.mixing[channel])
-    inverse = inverse_from_cholesky(residual_lower(information, root))
+    inverse = inverse_from_cholesky(joint.residual_lower(information, root))
     first, second = np.tril_indices(len(mixing))
     common = np.tensordot(mixing[first] * mixing[second], spread, 1)
     # of the residual given the common part, and of what it follows of that
@@ -324,7 +303,7 @@ def _judged(
 
 
 def _powers(
-    posterior: Posterior, prior: SpectralPrior, found: dict[str, np.ndarray]
+    posterior: Posterior, prior: SpectralPrior, found: Arrays
 ) -> tuple[Float[np.ndarray, "laws ells"], Float[np.ndarray, "laws ells"]]:
     """sum_m u^2 and sum_m (1 - var u) of all fields and residuals."""
     shape = prior.n_components, -1
@@ -360,10 +339,10 @@ def positive_sky(
     mode: PositiveMode,
     channel: int,
     information: Information,
-    spread: Float[np.ndarray, "pairs modes modes"],
+    spread: Pairs,
     draws: Float[np.ndarray, "n fields modes"],
     key: PRNGKeyArray,
-) -> ChannelSky:
+) -> joint.ChannelSky:
     """Compute the sky of one channel.
 
     Its mean is the sky of the mean exponent, and draws are those of exponents' draws: all are
@@ -385,12 +364,14 @@ def positive_sky(
 
     Returns
     -------
-    ChannelSky
+    joint.ChannelSky
         In K.
     """
     skies, exponent = mode.skies, mode.exponents[channel]
     relative = linearised(skies, channel, information, exponent)
-    found = on_host(channel_sky(mode.prior, channel, relative, mode.fields, spread, draws, key))
+    found = on_host(
+        joint.channel_sky(mode.prior, channel, relative, mode.fields, spread, draws, key)
+    )
     beside = diffuse_part(skies, channel, information)
     slope = skies.jacobian(channel, exponent)
     covariance = beside.whole_covariance(symmetric_product(slope @ found.covariance, slope.T))
@@ -403,7 +384,7 @@ def positive_sky(
         here = slice(first, first + CHUNK)
         drawn[here] = skies.modes(channel, np.asarray(found.draws[here]))
     whole = on_host(information)
-    return ChannelSky(mean, covariance, beside.whole_skies(drawn, z), whole.chi2(mean))
+    return joint.ChannelSky(mean, covariance, beside.whole_skies(drawn, z), whole.chi2(mean))
 
 
 # highest ell of the maps that laws are learned from
@@ -445,7 +426,7 @@ def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsI
     """What all channels say of the first modes."""
     names = ("matrix", "vector", "reference", "misfit", "log_det", "n_data")
 
-    def large(channel: int, information: Information) -> dict[str, np.ndarray]:
+    def large(channel: int, information: Information) -> Arrays:
         found = on_host(information)
         if found.n_modes > n:
             found = integrated_out(found, n, _small_scales(skies, channel)[n:])
@@ -461,7 +442,7 @@ def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsI
     )
 
 
-def _small_scales(skies: PositiveSkies, channel: int) -> Float[np.ndarray, " modes"]:
+def _small_scales(skies: PositiveSkies, channel: int) -> Modes:
     """The template's power in every mode, with its sources'."""
     template = skies.modes(channel, np.zeros(skies.n_fields))
     return per_mode(power_spectrum(template) + power_spectrum(skies.sources[channel]).sum(0))

@@ -1,10 +1,7 @@
-"""The posterior over sky maps, and the variances of its pixels.
+"""The posterior over sky maps: mean, covariance, standard deviations, draws.
 
-The posterior over sky maps: mean, covariance, standard deviations, draws.
-
-Variances of all pixels of a map, from the covariance of its harmonic coefficients.
-
-diag(Y C Y^T) ring by ring; see :mod:`lusee_bayes.core.harmonics`.
+The variances of all pixels of a map are diag(Y C Y^T), ring by ring; see
+:mod:`lusee_bayes.core.harmonics`.
 """
 
 from __future__ import annotations
@@ -17,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array, compiled, namespace
+from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, Pixels, compiled, namespace
 from lusee_bayes.core.checks import Described, is_traced, number
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import (
@@ -300,9 +297,7 @@ def _std_of(posterior: Posterior, directions: Float[Array, "n unknowns"]) -> Flo
 
 
 @compiled
-def _covariance(
-    posterior: Posterior,
-) -> tuple[Float[Array, "unknowns unknowns"], Float[Array, ""]]:
+def _covariance(posterior: Posterior) -> tuple[Float[Array, "unknowns unknowns"], Float[Array, ""]]:
     """C, and the :func:`_rounding` of its diagonal."""
     xp, rank = namespace(posterior), posterior.prior.rank
     if posterior.basis is None:
@@ -335,7 +330,7 @@ def _whiten(posterior: Posterior, skies: Float[Array, "n unknowns"]) -> Float[Ar
     return u + (white - inside) @ posterior.basis.T
 
 
-def pixel_std(covariance: Float[Array, "modes modes"], nside: int) -> Float[np.ndarray, " pixels"]:
+def pixel_std(covariance: ModesMatrix, nside: int) -> Pixels:
     """Compute the standard deviation of a map at the centre of every pixel.
 
     Parameters
@@ -356,9 +351,7 @@ def pixel_std(covariance: Float[Array, "modes modes"], nside: int) -> Float[np.n
     return np.sqrt(_on_pixels(((azimuth @ between) * azimuth).sum(2), place))
 
 
-def independent_pixel_std(
-    variance: Float[Array, " modes"], nside: int
-) -> Float[np.ndarray, " pixels"]:
+def independent_pixel_std(variance: Modes, nside: int) -> Pixels:
     """Compute :func:`pixel_std` of coefficients that are independent of each other.
 
     Parameters
@@ -382,9 +375,7 @@ def independent_pixel_std(
     return np.sqrt(_on_pixels((azimuth**2 @ of_orders[:, :, None])[:, :, 0], place))
 
 
-def prior_pixel_std(
-    prior: Prior, nside: int, *, monopole: bool = True
-) -> Float[np.ndarray, " pixels"]:
+def prior_pixel_std(prior: Prior, nside: int, *, monopole: bool = True) -> Pixels:
     """Compute :func:`pixel_std` of a prior.
 
     Parameters
@@ -424,9 +415,7 @@ def _rings(nside: int, lmax: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return heights, place, azimuth_functions(phi, lmax)[place]
 
 
-def _on_pixels(
-    values: Float[np.ndarray, "rings longest"], place: np.ndarray
-) -> Float[np.ndarray, " pixels"]:
+def _on_pixels(values: Float[np.ndarray, "rings longest"], place: np.ndarray) -> Pixels:
     found = np.empty(place.max() + 1)
     found[place] = values
     return found

@@ -19,14 +19,16 @@ other to eps s. So they are in the root form, which takes the same L from the QR
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import is_traced, require_finite, require_float64, require_shape
+from lusee_bayes.core.arrays import Array, DataVector
+from lusee_bayes.core.checks import is_traced, require_array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import gram_matrix, solve_lower
 from lusee_bayes.instrument.coupling import Coupling
@@ -40,6 +42,21 @@ FORMS = ("map", "data", "root")
 # posterior standard deviations
 CONVERGENCE = 1e-6
 MAX_REFINEMENTS = 10
+
+
+def unfinished(most: int = MAX_REFINEMENTS) -> Callable:
+    """Whether a mean is to be refined once more, at most so often.
+
+    The state is the mean, the length of the last step and of that before, and the number of steps.
+    """
+
+    def more(state):
+        _, moved, before, count = state
+        # what is left may be rounding, which no refinement makes smaller
+        settled = (moved < CONVERGENCE) & (moved > 0.5 * before)
+        return (count < 1) | ((moved > 1e-3 * CONVERGENCE) & ~settled & (count < most))
+
+    return more
 
 
 class Solver(eqx.Module):
@@ -66,9 +83,9 @@ class Solver(eqx.Module):
     whitened: Float[Array, "data white"]
     lower: Float[Array, "rank rank"]
     basis: Float[Array, "white rank"] | None
-    offset: Float[Array, " data"] | None
+    offset: DataVector | None
 
-    def condition(self, data: Float[Array, " data"]) -> Posterior:
+    def condition(self, data: DataVector) -> Posterior:
         """Compute the posterior over the sky given data.
 
         Parameters
@@ -88,16 +105,9 @@ class Solver(eqx.Module):
             mean does not converge.
         """
         u, log_evidence, moved = self._solve(data)
-        return Posterior(
-            prior=self.prior,
-            white_mean=u,
-            lower=self.lower,
-            basis=self.basis,
-            log_evidence=log_evidence,
-            refinement=moved,
-        )
+        return Posterior(self.prior, u, self.lower, self.basis, log_evidence, moved)
 
-    def log_prob(self, data: Float[Array, " data"]) -> Float[Array, ""]:
+    def log_prob(self, data: DataVector) -> Float[Array, ""]:
         """Compute the evidence ln p(d).
 
         Parameters
@@ -117,7 +127,7 @@ class Solver(eqx.Module):
         """
         return self._solve(data)[1]
 
-    def surprise(self, data: Float[Array, " data"]) -> Float[Array, " data"]:
+    def surprise(self, data: DataVector) -> DataVector:
         """Compute L^-1 (d - E[d]), where E[d] is what the prior's mean sky predicts.
 
         Parameters
@@ -145,10 +155,8 @@ class Solver(eqx.Module):
         inside = self.whitened if self.basis is None else self.whitened @ self.basis
         return solve_lower(self.lower, inside.T, transpose=False)
 
-    def _solve(self, data: Float[Array, " data"]) -> tuple[Array, Array, Array]:
-        require_float64("the data", data)
-        require_shape("the data", data, (self.whitened.shape[0],))
-        require_finite("the data", data)
+    def _solve(self, data: DataVector) -> tuple[Array, Array, Array]:
+        require_array("the data", data, (self.whitened.shape[0],))
         u, log_evidence, moved = _solve(self, jnp.asarray(data))
         if not is_traced(moved) and not float(moved) <= CONVERGENCE:
             raise InputError(
@@ -160,11 +168,7 @@ class Solver(eqx.Module):
 
 
 def factorise(
-    coupling: Coupling,
-    prior: Prior,
-    noise: Covariance,
-    offset: Float[Array, " data"] | None,
-    form: str,
+    coupling: Coupling, prior: Prior, noise: Covariance, offset: DataVector | None, form: str
 ) -> Solver:
     """Factorise d = A m + offset + n.
 
@@ -203,11 +207,7 @@ def factorise(
 
 @eqx.filter_jit
 def _factorise(
-    coupling: Coupling,
-    prior: Prior,
-    noise: Covariance,
-    offset: Float[Array, " data"] | None,
-    form: str,
+    coupling: Coupling, prior: Prior, noise: Covariance, offset: DataVector | None, form: str
 ) -> Solver:
     factor = noise.factor()
     whitened = factor.whiten(prior.colour_columns(coupling.dense()))
@@ -258,7 +258,7 @@ def _newton(
 
 
 @eqx.filter_jit
-def _solve(solver: Solver, data: Float[Array, " data"]) -> tuple[Array, Array, Array]:
+def _solve(solver: Solver, data: DataVector) -> tuple[Array, Array, Array]:
     """Mean of u, log evidence, and size of the last refinement in standard deviations.
 
     The normal equations square the condition number; repeating the solve on the residual
@@ -269,19 +269,12 @@ def _solve(solver: Solver, data: Float[Array, " data"]) -> tuple[Array, Array, A
     live = (solver.whitened, solver.lower, solver.basis, white)
     frozen = jax.lax.stop_gradient(live)
 
-    def unfinished(state):
-        _, moved, before, count = state
-        # what is left may be rounding, which no refinement makes smaller
-        settled = (moved < CONVERGENCE) & (moved > 0.5 * before)
-        more = (moved > 1e-3 * CONVERGENCE) & ~settled & (count < MAX_REFINEMENTS)
-        return (count < 1) | more
-
     def refine(state):
         u, moved = _newton(*frozen, state[0])
         return u, moved, state[1], state[3] + 1
 
     first, _ = _newton(*frozen, jnp.zeros(solver.whitened.shape[1]))
-    u, moved, _, _ = jax.lax.while_loop(unfinished, refine, (first, jnp.inf, jnp.inf, 0))
+    u, moved, _, _ = jax.lax.while_loop(unfinished(), refine, (first, jnp.inf, jnp.inf, 0))
     fixed = (solver.whitened, *frozen[1:3], white)
     u, _ = _newton(*fixed, jax.lax.stop_gradient(u))
     misfit = white - solver.whitened @ u

@@ -1,7 +1,5 @@
 """N: what every kind of covariance of the noise answers, and the kinds.
 
-The protocol of all covariances.
-
 A :class:`Covariance` describes N by its product with a vector, its dense form and its diagonal.
 :meth:`Covariance.factor` does the expensive part once and returns a :class:`Factor`, a square root
 N = L L^T that whitens vectors (L^-1 x), colours them (L z) and solves with N.
@@ -9,30 +7,22 @@ N = L L^T that whitens vectors (L^-1 x), colours them (L z) and solves with N.
 A new structure is one file: implement the abstract methods here, and ``absorb`` for the sums that
 keep the structure. ``a + b`` tries whether either side can absorb the other.
 
-Noise without any structure: N is a full matrix.
+N may be a full matrix, or diagonal.
 
-Independent noise: N = diag(variance).
-
-Noise along a few directions: templates with prior variances, beam errors.
-
-U U^T alone is singular; added to any other covariance N_0 it gives N_0 + U U^T, which is solved
-through the small matrix C = 1 + V^T V, V = L_0^-1 U (Woodbury). With C = R R^T, ::
+**Noise along a few directions**, such as templates with prior variances or beam errors: U U^T alone
+is singular; added to any other covariance N_0 it gives N_0 + U U^T, which is solved through the
+small matrix C = 1 + V^T V, V = L_0^-1 U (Woodbury). With C = R R^T, ::
 
     B = 1 - V R^-T (R + 1)^-1 V^T     satisfies     B B^T = (1 + V V^T)^-1,
 
 so that L = L_0 B^-T is a square root of the sum, applied by products with V. Nothing is subtracted
 from N_0^-1, which would leave a small difference of large numbers.
 
-Noise that couples the products of one time, but no two times: a block for each time.
-
-Noise that is correlated in time: blocks couple times up to some number of samples apart.
-
-The matrix is banded where the products of one time stand together. Its Cholesky factor fills only
-the band, so that factorising costs O(times x bandwidth^2). Several times make up one block row,
-large enough for matrix products to run at full speed and small enough to follow the edge of the
-band.
-
-Noise covariances: one protocol, one file for each structure, composed with ``+``.
+**Noise that couples the products of one time** has a block for each time. **Noise that is
+correlated in time** has blocks for times up to some number of samples apart. The matrix is banded
+where the products of one time stand together. Its Cholesky factor fills only the band, so that
+factorising costs O(times x bandwidth^2). Several times make up one block row, large enough for
+matrix products to run at full speed and small enough to follow the edge of the band.
 """
 
 from __future__ import annotations
@@ -50,6 +40,7 @@ from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import (
     Described,
     is_traced,
+    require_array,
     require_finite,
     require_float64,
     require_positive,
@@ -249,9 +240,7 @@ class DenseCovariance(Covariance):
     name: str = eqx.field(static=True, default="the dense covariance")
 
     def __check_init__(self):
-        require_float64(self.name, self.matrix)
-        require_shape(self.name, self.matrix, (self.matrix.shape[0],) * 2)
-        require_finite(self.name, self.matrix)
+        require_array(self.name, self.matrix, (self.matrix.shape[0],) * 2)
         require_symmetric(self.name, self.matrix)
 
     @property
@@ -376,9 +365,7 @@ class LowRankCovariance(Covariance):
     name: str = eqx.field(static=True, default="the low-rank term")
 
     def __check_init__(self):
-        require_float64(self.name, self.root)
-        require_shape(self.name, self.root, (None, None))
-        require_finite(self.name, self.root)
+        require_array(self.name, self.root, (None, None))
 
     @property
     def size(self) -> int:
@@ -543,7 +530,20 @@ class TimeBlockFactor(Factor):
         return 2.0 * xp.log(xp.diagonal(self.lower, axis1=1, axis2=2)).sum()
 
 
-class TimeBlockCovariance(Covariance):
+class _OverLayout(Covariance):
+    """A covariance that knows which product and time each of its data has."""
+
+    layout: DataLayout
+
+    @property
+    def size(self) -> int:
+        return self.layout.size
+
+    def dense(self):
+        return self.mv(namespace(self).eye(self.size))
+
+
+class TimeBlockCovariance(_OverLayout):
     """N with one block for each time.
 
     Missing samples get the rows and columns of the unit matrix, which change neither the solution
@@ -562,7 +562,6 @@ class TimeBlockCovariance(Covariance):
     """
 
     blocks: Float[Array, "times products products"]
-    layout: DataLayout
 
     def __init__(self, blocks: Float[Array, "times products products"], layout: DataLayout):
         require_float64("the noise blocks", blocks)
@@ -577,18 +576,11 @@ class TimeBlockCovariance(Covariance):
         self.blocks = blocks
         self.layout = layout
 
-    @property
-    def size(self) -> int:
-        return self.layout.size
-
     def mv(self, x):
         return self.layout.from_times(self.blocks @ self.layout.by_time(x), x.shape)
 
     def diagonal(self):
         return self.layout.gather(namespace(self).diagonal(self.blocks, axis1=1, axis2=2).T)
-
-    def dense(self):
-        return self.mv(np.eye(self.size))
 
     def factor(self):
         lower = checked_cholesky("the noise covariance of one time", self.blocks)
@@ -724,7 +716,7 @@ class TimeBandedFactor(Factor):
         return 2.0 * jnp.log(jnp.diagonal(self.diagonal, axis1=1, axis2=2)).sum()
 
 
-class TimeBandedCovariance(Covariance):
+class TimeBandedCovariance(_OverLayout):
     """N with a block for every two times up to ``width`` samples apart, zero beyond.
 
     Missing samples get the rows and columns of the unit matrix.
@@ -745,7 +737,6 @@ class TimeBandedCovariance(Covariance):
     """
 
     band: Float[Array, "times widths products products"]
-    layout: DataLayout
     name: str = eqx.field(static=True, default="the time-banded covariance")
 
     def __init__(
@@ -763,10 +754,6 @@ class TimeBandedCovariance(Covariance):
         self.band = band
         self.layout = layout
         self.name = name
-
-    @property
-    def size(self) -> int:
-        return self.layout.size
 
     @property
     def width(self) -> int:
@@ -787,9 +774,6 @@ class TimeBandedCovariance(Covariance):
 
     def diagonal(self):
         return self.layout.gather(jnp.diagonal(self.band[:, 0], axis1=1, axis2=2).T)
-
-    def dense(self):
-        return self.mv(jnp.eye(self.size))
 
     def factor(self):
         left, diagonal = _cholesky(*_block_rows(self.band))

@@ -1,10 +1,8 @@
 """Errors of gains and beams as terms of N.
 
-Noise along templates of the user: T P T^T.
+Besides, noise along templates of the user, T P T^T.
 
-Gain drifts: Gaussian processes g_i(t), one per antenna, that multiply the visibilities.
-
-::
+**Gain drifts** are Gaussian processes g_i(t), one per antenna, that multiply the visibilities, ::
 
     V_ij -> (1 + g_i)(1 + g_j) V_ij,    <g_i(t) g_j(t')> = delta_ij C_g(t, t'),
     C_g = sigma_g^2 exp(-(t - t')^2 / (2 sigma_t^2))
@@ -17,12 +15,11 @@ Marginalised over g, the error is a noise term with (paper, appendix A) ::
 and with the mean sigma_g^2 d_ii in the autos. The quadratic part is not negligible: at sigma_g =
 0.01 it is 1e-4 of the signal, ten times the radiometer noise.
 
-Errors of the beams in A: N_beam = dA (S + mu mu^T) dA^T along known directions dA.
-
-If the true coupling matrix is A + dA, the data hold dA m besides A m; over skies of the prior, that
-is noise of covariance dA S dA^T (paper, section on beam precision). Directions: the
-difference to another beam (a frequency shift, another file), or the derivative with respect to a
-parameter of the embedded beam times its standard deviation.
+**Errors of the beams** in A: N_beam = dA (S + mu mu^T) dA^T along known directions dA. If the true
+coupling matrix is A + dA, the data hold dA m besides A m; over skies of the prior, that is noise of
+covariance dA S dA^T (paper, section on beam precision). Directions: the difference to another beam
+(a frequency shift, another file), or the derivative with respect to a parameter of the embedded
+beam times its standard deviation.
 """
 
 from __future__ import annotations
@@ -33,9 +30,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.checks import (
     is_traced,
+    require_array,
     require_finite,
     require_float64,
     require_positive,
@@ -45,9 +43,9 @@ from lusee_bayes.core.checks import (
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, placed
+from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, with_values
 from lusee_bayes.instrument.coupling import Coupling
-from lusee_bayes.instrument.products import DataLayout, Product, all_products
+from lusee_bayes.instrument.products import DataLayout, ports
 from lusee_bayes.noise.covariance import LowRankCovariance, TimeBandedCovariance
 from lusee_bayes.sky.prior import Prior
 
@@ -77,9 +75,7 @@ def template_noise(
     InputError
         For templates of the wrong length, and for a P that is not positive definite.
     """
-    require_float64("the templates", templates)
-    require_shape("the templates", templates, (layout.size, None))
-    require_finite("the templates", templates)
+    require_array("the templates", templates, (layout.size, None))
     require_float64("the templates' prior", prior)
     n = templates.shape[1]
     if prior.ndim == 1:
@@ -95,10 +91,6 @@ def template_noise(
 
 # C_g is dropped where it is below double precision relative to sigma_g^2: exp(-x^2 / 2) = eps
 REACH = float(np.sqrt(-2.0 * np.log(np.finfo(np.float64).eps)))
-
-
-def _scalar(x) -> Float[Array, ""]:
-    return jnp.asarray(x, dtype=jnp.float64)
 
 
 class GainDrift(eqx.Module):
@@ -119,8 +111,8 @@ class GainDrift(eqx.Module):
         If one of them is not positive.
     """
 
-    sigma: Float[Array, ""] = eqx.field(converter=_scalar)
-    correlation_h: Float[Array, ""] = eqx.field(default=10.0, converter=_scalar)
+    sigma: Float[Array, ""] = eqx.field(converter=scalar)
+    correlation_h: Float[Array, ""] = eqx.field(default=10.0, converter=scalar)
 
     def __check_init__(self):
         require_positive("the gain drift's sigma", self.sigma)
@@ -167,9 +159,7 @@ class GainDrift(eqx.Module):
         InputError
             If shapes do not fit, visibilities are not finite or times do not grow.
         """
-        require_float64("the visibilities", visibilities)
-        require_shape("the visibilities", visibilities, (layout.n_products, layout.n_times))
-        require_finite("the visibilities", visibilities)
+        require_array("the visibilities", visibilities, (layout.n_products, layout.n_times))
         require_shape("hours", hours, (layout.n_times,))
         if not is_traced(hours) and not (np.diff(hours) > 0).all():
             raise InputError("the sample times (hours) must grow from one to the next")
@@ -185,8 +175,8 @@ class GainDrift(eqx.Module):
 
     def mean_response(self, n_products: int) -> Float[Array, " products"]:
         """Return the mean factor of each product: 1 + sigma_g^2 for autos, 1 for crosses."""
-        products = all_products(round(np.sqrt(n_products)))
-        auto = jnp.asarray([1.0 if p.i == p.j else 0.0 for p in products])
+        i, j, _ = ports(round(np.sqrt(n_products)))
+        auto = jnp.asarray(i == j, dtype=jnp.float64)
         return 1.0 + self.sigma**2 * auto
 
     def sample(
@@ -263,25 +253,15 @@ def with_gains(
     visibilities: Float[Array, "products times"], gains: Float[Array, "antennas times"]
 ) -> Float[Array, "products times"]:
     """Return (1 + g_i)(1 + g_j) V_ij, exactly, for every product."""
-    products = all_products(gains.shape[0])
-    i, j = np.array([p.i for p in products]), np.array([p.j for p in products])
+    i, j, _ = ports(gains.shape[0])
     return (1.0 + gains[i]) * (1.0 + gains[j]) * visibilities
 
 
 def shared_antennas(n_products: int) -> tuple[np.ndarray, np.ndarray]:
     """Return (dik + dil + djk + djl) and (dik djl + dil djk) for every pair of products."""
-    products = all_products(round(np.sqrt(n_products)))
-
-    def linear(p: Product, q: Product) -> int:
-        return (p.i == q.i) + (p.i == q.j) + (p.j == q.i) + (p.j == q.j)
-
-    def quadratic(p: Product, q: Product) -> int:
-        return (p.i == q.i) * (p.j == q.j) + (p.i == q.j) * (p.j == q.i)
-
-    return tuple(
-        np.array([[float(f(p, q)) for q in products] for p in products])
-        for f in (linear, quadratic)
-    )
+    i, j, _ = ports(round(np.sqrt(n_products)))
+    ii, ij, ji, jj = (np.equal.outer(a, b).astype(np.float64) for a in (i, j) for b in (i, j))
+    return ii + ij + ji + jj, ii * jj + ij * ji
 
 
 @eqx.filter_jit
@@ -352,7 +332,7 @@ def derivative(name: str, frequency_mhz: float, lmax: int, monopoles: Monopoles)
     """
 
     def modes(value: Float[Array, ""]) -> Float[Array, "products modes"]:
-        return monopole_beams(frequency_mhz, lmax, placed(monopoles, {name: value})).modes
+        return monopole_beams(frequency_mhz, lmax, with_values(monopoles, {name: value})).modes
 
     value = parameter(name).where(monopoles)
     _, slope = jax.jvp(modes, (value,), (jnp.ones_like(value),))

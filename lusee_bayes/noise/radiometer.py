@@ -1,15 +1,12 @@
 """Radiometer noise: its variances, and covariances between products.
 
-Sample covariances of complex Gaussian voltages, for as many samples as a spectrum averages.
-
-The mean of v v* over N independent samples of covariance T = L L* is T + L H L* / sqrt(N), where H
-is Hermitian and for large N Gaussian: real numbers of variance one on its diagonal, complex ones of
+**Sample covariances** of complex Gaussian voltages, for as many samples as a spectrum averages: the
+mean of v v* over N independent samples of covariance T = L L* is T + L H L* / sqrt(N), where H is
+Hermitian and for large N Gaussian: real numbers of variance one on its diagonal, complex ones of
 mean square one beside it. Its covariances are those of :func:`.exact_blocks`, divided by N.
 
-Radiometer noise, in two forms.
-
-With T_ij(t) the visibilities of the antennas in K, bandwidth df and integration time dt (times the
-duty cycle)::
+**N has two forms.** With T_ij(t) the visibilities of the antennas in K, bandwidth df and
+integration time dt (times the duty cycle)::
 
     paper   sigma_k^2 = (T_ii T_jj + V_k^2) / (2 df dt), independent;
     exact   the voltages are complex Gaussian with covariance T(t), so
@@ -32,7 +29,7 @@ from lusee_bayes.core.checks import (
     require_shape,
 )
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.instrument.products import DataLayout, all_products, auto_indices, to_matrix
+from lusee_bayes.instrument.products import DataLayout, auto_indices, ports, to_matrix
 from lusee_bayes.instrument.schedule import without_gaps
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, TimeBlockCovariance
 
@@ -167,16 +164,12 @@ def radiometer_noise(
     return TimeBlockCovariance(exact_blocks(visibilities) * scale[:, None, None], layout)
 
 
-def paper_variance(
-    visibilities: Float[Array, "products times"],
-) -> Float[Array, "products times"]:
+def paper_variance(visibilities: Float[Array, "products times"]) -> Float[Array, "products times"]:
     """Return (T_ii T_jj + V_k^2) / 2 in K^2, to be divided by df dt."""
     n = round(np.sqrt(visibilities.shape[0]))
     autos = visibilities[auto_indices(n)]
-    products = all_products(n)
-    t_ii = autos[np.array([p.i for p in products])]
-    t_jj = autos[np.array([p.j for p in products])]
-    return (t_ii * t_jj + visibilities**2) / 2.0
+    i, j, _ = ports(n)
+    return (autos[i] * autos[j] + visibilities**2) / 2.0
 
 
 @compiled
@@ -189,11 +182,8 @@ def exact_blocks(
 
         Cov[k, l] = Re( c_k conj(c_l) E[dV dV'*] + c_k c_l E[dV dV'] ) / 2.
     """
-    n = round(np.sqrt(visibilities.shape[0]))
-    products = all_products(n)
-    i = np.array([p.i for p in products])
-    j = np.array([p.j for p in products])
-    part = np.array([1.0 + 0j if p.part == "R" else -1j for p in products])
+    i, j, imaginary = ports(round(np.sqrt(visibilities.shape[0])))
+    part = np.where(imaginary, -1j, 1.0 + 0j)
     t = namespace(visibilities).moveaxis(to_matrix(visibilities), 2, 0)
     hermitian = t[:, i[:, None], i[None]] * t[:, j[:, None], j[None]].conj()
     pseudo = t[:, i[:, None], j[None]] * t[:, j[:, None], i[None]].conj()

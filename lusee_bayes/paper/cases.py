@@ -28,19 +28,15 @@ from lusee_bayes.results.channel import channel_of_posterior
 # by name: a scenario of the package and what differs from it; those after the frequencies are not
 # among the paper's figures, but its text speaks of them or they tell why a claim does not hold
 CASES = {
-    "fiducial": ("fiducial", []),
-    "noise_x10": ("noise_x10", []),
-    "noise_x100": ("noise_x100", []),
-    "duty_cycle_50": ("duty_cycle_50", []),
-    "gain_1e-2": ("gain_1e-2", []),
-    "gain_1e-3": ("gain_1e-3", []),
-    "gain_ignored": ("gain_ignored", []),
-    "beam_4MHz": ("beam_4MHz", []),
-    "beam_0.4MHz": ("beam_0.4MHz", []),
-    "beam_ignored": ("beam_ignored", []),
-    "two_cycles": ("two_cycles", []),
-    "three_cycles": ("three_cycles", []),
-    "quarter_cycle": ("quarter_cycle", []),
+    **{
+        name: (name, [])
+        for name in (
+            *("fiducial", "noise_x10", "noise_x100", "duty_cycle_50"),
+            *("gain_1e-2", "gain_1e-3", "gain_ignored"),
+            *("beam_4MHz", "beam_0.4MHz", "beam_ignored"),
+            *("two_cycles", "three_cycles", "quarter_cycle"),
+        )
+    },
     **{
         frequency_case(f): ("fiducial", [f"frequency_mhz={f}"])
         for f in FREQUENCIES
@@ -59,6 +55,8 @@ CASES = {
     "quarter_4th": ("quarter_cycle", ["observation.start=2027-02-05"]),
 }
 
+# of a channel, as a case file has them
+MODES, NUMBERS = ("mean", "truth", "std"), ("log_evidence", "chi2", "chi2_expected", "n_data")
 # nodes in zenith angle and azimuth of the beams that a case file keeps for the figure
 BEAM_NODES = (48, 96)
 
@@ -71,7 +69,7 @@ def paper_scenarios(
     scenarios = {
         name: load_scenario(base, [*changes, *overrides]) for name, (base, changes) in CASES.items()
     }
-    return {name: with_sky(s, files) for name, s in scenarios.items()} if files else scenarios
+    return {name: with_sky_file(s, files) for name, s in scenarios.items()} if files else scenarios
 
 
 def sky_frequency_mhz(path: str | Path) -> float:
@@ -89,7 +87,7 @@ def sky_frequency_mhz(path: str | Path) -> float:
     return float(found[1])
 
 
-def with_sky(scenario: Scenario, files: Mapping[float, Path]) -> Scenario:
+def with_sky_file(scenario: Scenario, files: Mapping[float, Path]) -> Scenario:
     """The scenario with the file (by MHz) nearest in log frequency, scaled to its frequency."""
     nearest = min(files, key=lambda f: abs(np.log(f / scenario.frequency_mhz)))
     sky = FileSkySection(file=str(files[nearest]), file_frequency_mhz=nearest)
@@ -117,8 +115,7 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
         phi; temperatures in K. Attributes: the scenario, the versions and what is one number.
     """
     experiment = build(scenario)
-    setup, data = experiment.setup, experiment.data
-    inference = infer(experiment)
+    setup, data, inference = experiment.setup, experiment.data, infer(experiment)
     channel = channel_of_posterior(experiment, inference, on_host(inference.posterior).covariance())
     spectra, maps = channel.spectra(), channel.maps()
     variances = data.layout.scatter(radiometer(setup).diagonal())
@@ -129,11 +126,8 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
     return xr.Dataset(
         {
             **{name: ("ell", spectra[name]) for name in ("rho", "snr", "cl_mean", "cl_truth")},
-            "mean_modes": ("mode", channel.mean),
-            "truth_modes": ("mode", channel.truth),
-            "std_modes": ("mode", channel.std),
-            "mean": ("pixel", maps["mean"]),
-            "truth": ("pixel", maps["truth"]),
+            **{f"{name}_modes": ("mode", getattr(channel, name)) for name in MODES},
+            **{name: ("pixel", maps[name]) for name in ("mean", "truth")},
             "highest_altitude": ("pixel", channel.highest_altitude),
             "data": (("product", "time"), data.grid()),
             "noise_std": (("product", "time"), np.sqrt(np.asarray(variances))),
@@ -155,10 +149,7 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
             "version": __version__,
             "versions": json.dumps(versions()),
             "frequency_mhz": scenario.frequency_mhz,
-            "log_evidence": channel.log_evidence,
-            "chi2": channel.chi2,
-            "chi2_expected": channel.chi2_expected,
-            "n_data": channel.n_data,
+            **{name: getattr(channel, name) for name in NUMBERS},
             "n_modes": len(channel.mean),
             **({} if rms is None else {"beam_rms_difference": rms}),
         },

@@ -18,10 +18,12 @@ from lusee_bayes.report.figures.drawing import (
     BLUE,
     DIVERGING,
     GREY,
+    framed,
     mollweide,
     orthographic,
     shown,
     taper_fwhm_deg,
+    temperatures,
 )
 
 # the paper's colours by group, of lightness different enough for colour-blind readers; the lines
@@ -67,10 +69,9 @@ MAP_CASES = (
 )  # fmt: skip
 
 
-def beams(cases: Cases) -> Figure:
+def beam_panels(cases: Cases) -> Figure:
     """Figure 2: an auto and two crosses at five frequencies, each over its peak."""
-    figure = Figure(figsize=(13, 8), layout="constrained")
-    panels = figure.subplots(3, len(SHOWN_FREQUENCIES))
+    figure, panels = framed((13, 8), 3, len(SHOWN_FREQUENCIES))
     for column, frequency in enumerate(SHOWN_FREQUENCIES):
         beam = cases[frequency_case(frequency)]["beam"]
         grid = HemisphereGrid.gauss_legendre(beam.sizes["theta"], beam.sizes["phi"])
@@ -83,12 +84,11 @@ def beams(cases: Cases) -> Figure:
     return figure
 
 
-def data_vector(cases: Cases) -> Figure:
+def data_by_product(cases: Cases) -> Figure:
     """Figure 3: the products at 25 MHz side by side, time running within each."""
     data = cases["fiducial"]["data"]
     n_products, n_times = data.shape
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = framed((11, 4))
     for k, series in enumerate(data.values):
         axes.plot(k * n_times + np.arange(n_times), series, color=BLUE, lw=1.0)
         axes.axvline(k * n_times, color=GREY, lw=0.4)
@@ -113,22 +113,20 @@ def frequency_maps(cases: Cases) -> Figure:
         mean, truth = (drawn(case, name) for name in ("mean", "truth"))
         percent = 100.0 * (mean - truth) / truth.mean()
         limit = float(np.percentile(np.abs(percent), 99.0))
-        norm = temperature_norm(truth)
+        norm = temperatures(truth)
+        seen, signed = case["highest_altitude"].values, Normalize(-limit, limit)
         rows = [
             ("truth", truth, norm, "inferno", None),
-            ("posterior mean", mean, norm, "inferno", case["highest_altitude"].values),
-            (
-                "difference", percent, Normalize(-limit, limit), DIVERGING,
-                case["highest_altitude"].values,
-            ),
-        ]  # fmt: skip
+            ("posterior mean", mean, norm, "inferno", seen),
+            ("difference", percent, signed, DIVERGING, seen),
+        ]
         for row, (name, pixels, scale, cmap, altitude) in enumerate(rows):
             axes = figure.add_subplot(3, columns, row * columns + column + 1)
             image = mollweide(axes, pixels, norm=scale, cmap=cmap, highest_altitude=altitude)
             axes.set_title(f"{frequency} MHz, {name}", fontsize=10)
             axes.set_xticklabels([])
             axes.set_yticklabels([])
-            colour_bar(figure, axes, image, "K" if row < 2 else "% of the mean sky")
+            flat_bar(figure, axes, image, "K" if row < 2 else "% of the mean sky")
     figure.suptitle(
         "Galactic coordinates, longitude grows to the left; dashed: never observed; drawn through "
         f"a beam of {taper_fwhm_deg(lmax_of(case.sizes['mode'])):.1f}° (FWHM)"
@@ -141,12 +139,7 @@ def drawn(case: xr.Dataset, name: str) -> Float[np.ndarray, " pixels"]:
     return shown(case[f"{name}_modes"].values, healpy.npix2nside(case.sizes["pixel"]))
 
 
-def temperature_norm(pixels: Float[np.ndarray, " pixels"]) -> LogNorm:
-    """Logarithmic colours over all but the extreme pixels."""
-    return LogNorm(*np.percentile(pixels[pixels > 0], [0.5, 99.8]))
-
-
-def colour_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> None:
+def flat_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> None:
     """A flat bar below; three round numbers on a logarithmic one."""
     bar = figure.colorbar(
         image,
@@ -166,20 +159,9 @@ def colour_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> Non
         bar.set_ticks([], minor=True)
 
 
-def rho_by_frequency(cases: Cases) -> Figure:
-    """Figure 5: rho_ell at 5 to 50 MHz."""
-    return by_frequency(cases, "rho")
-
-
-def snr_by_frequency(cases: Cases) -> Figure:
-    """Figure 6: SNR_ell at 5 to 50 MHz."""
-    return by_frequency(cases, "snr")
-
-
 def by_frequency(cases: Cases, metric: str) -> Figure:
-    """One curve for each frequency, from dark (low) to light."""
-    figure = Figure(figsize=(8, 4.8), layout="constrained")
-    axes = figure.subplots()
+    """Figures 5, 6: rho_ell or SNR_ell, one curve for each frequency, from dark (low) to light."""
+    figure, axes = framed((8, 4.8))
     shades = colormaps["viridis"](np.linspace(0.0, 0.92, len(FREQUENCIES)))
     for k, (frequency, shade) in enumerate(zip(FREQUENCIES, shades, strict=True)):
         curve = cases[frequency_case(frequency)][metric]
@@ -204,21 +186,13 @@ def dress(axes: Axes, metric: str, lmax: int) -> None:
         axes.axhline(level, color=GREY, lw=0.7, ls=":", zorder=0)
 
 
-def rho_by_scenario(cases: Cases) -> Figure:
-    """Figure 7: rho_ell of the scenarios at 25 MHz."""
-    return by_scenario(cases, "rho")
-
-
-def snr_by_scenario(cases: Cases) -> Figure:
-    """Figure 8: SNR_ell of the scenarios at 25 MHz."""
-    return by_scenario(cases, "snr")
-
-
 def by_scenario(cases: Cases, metric: str) -> Figure:
-    """A panel for each group of scenarios, the fiducial one in black in all of them."""
-    figure = Figure(figsize=(12, 8), layout="constrained")
-    panels = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
-    for axes, (title, (colour, members)) in zip(panels, GROUPS.items(), strict=True):
+    """Figures 7, 8: rho_ell or SNR_ell at 25 MHz, a panel for each group of scenarios.
+
+    The fiducial one is black in all of them.
+    """
+    figure, panels = framed((12, 8), 2, 2, sharex=True, sharey=True)
+    for axes, (title, (colour, members)) in zip(panels.flat, GROUPS.items(), strict=True):
         curve = cases["fiducial"][metric]
         axes.plot(curve["ell"][1:], curve[1:], color="black", lw=1.6, label="fiducial")
         for line, (name, label) in zip(LINES, members.items(), strict=True):
@@ -229,10 +203,10 @@ def by_scenario(cases: Cases, metric: str) -> Figure:
         axes.set_title(title)
         axes.legend(frameon=False, fontsize=9, ncols=2, loc="upper center")
     # room above the curves for the legends
-    low, high = panels[0].get_ylim()
-    panels[0].set_ylim(low, 8 * high if metric == "snr" else 1.4)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, 8 * high if metric == "snr" else 1.4)
     if metric == "rho":
-        panels[0].set_yticks([-0.25, 0.0, 0.25, 0.5, 0.75, 1.0])
+        axes.set_yticks([-0.25, 0.0, 0.25, 0.5, 0.75, 1.0])
     figure.suptitle("Scenarios at 25 MHz")
     return figure
 
@@ -242,7 +216,7 @@ def scenario_maps(cases: Cases) -> Figure:
     labels = {name: f"{group}: {label}" for group, (_, members) in GROUPS.items()
               for name, label in members.items()}  # fmt: skip
     truth = drawn(cases["fiducial"], "truth")
-    norm = temperature_norm(truth)
+    norm = temperatures(truth)
     figure = Figure(figsize=(13, 11), layout="constrained")
     panels = [("truth", truth, None)] + [
         (labels.get(name, name), drawn(cases[name], "mean"), cases[name]["highest_altitude"].values)
@@ -254,7 +228,7 @@ def scenario_maps(cases: Cases) -> Figure:
         axes.set_title(title, fontsize=11)
         axes.set_xticklabels([])
         axes.set_yticklabels([])
-    colour_bar(figure, figure.axes, image, "K")
+    flat_bar(figure, figure.axes, image, "K")
     lmax = lmax_of(cases["fiducial"].sizes["mode"])
     figure.suptitle(
         "Maps at 25 MHz, Galactic coordinates; dashed: never observed; drawn through a beam of "
@@ -264,12 +238,12 @@ def scenario_maps(cases: Cases) -> Figure:
 
 
 FIGURES = {
-    "2_beams": beams,
-    "3_data_vector": data_vector,
+    "2_beams": beam_panels,
+    "3_data_vector": data_by_product,
     "4_frequency_maps": frequency_maps,
-    "5_rho_frequencies": rho_by_frequency,
-    "6_snr_frequencies": snr_by_frequency,
-    "7_rho_scenarios": rho_by_scenario,
-    "8_snr_scenarios": snr_by_scenario,
+    "5_rho_frequencies": lambda cases: by_frequency(cases, "rho"),
+    "6_snr_frequencies": lambda cases: by_frequency(cases, "snr"),
+    "7_rho_scenarios": lambda cases: by_scenario(cases, "rho"),
+    "8_snr_scenarios": lambda cases: by_scenario(cases, "snr"),
     "9_scenario_maps": scenario_maps,
 }

@@ -19,23 +19,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import (
-    gammainc,
-    gammaincc,
-    gammainccinv,
-    gammaincinv,
-    gammaln,
-    ndtr,
-    ndtri,
-    stdtr,
-    stdtrit,
-)
+from scipy import special
 
+from lusee_bayes.core.arrays import Ells, ModesMatrix
 from lusee_bayes.core.harmonics import per_mode, sum_over_m
 from lusee_bayes.sky.prior import PIVOT, HarmonicPrior, Prior
+
+# arrays that recur
+Parameters = Float[np.ndarray, " parameters"]
 
 # degrees of freedom of the parameters' Student distribution: near their centre they are held as by
 # a normal one of the same width, and a few may be far from it
@@ -92,37 +87,33 @@ class Hyperprior:
         """Number of parameters, with the cells'."""
         return len(self.centre) + self.n_cells
 
-    def start(self) -> Float[np.ndarray, " parameters"]:
+    def start(self) -> Parameters:
         """Return the most probable parameters."""
         return np.concatenate([self.centre, np.zeros(self.n_cells)])
 
-    def log_density(self, parameters: Float[np.ndarray, " parameters"]) -> float:
+    def log_density(self, parameters: Parameters) -> float:
         """Compute ln p(theta, t)."""
         return float(self._log_densities(parameters).sum())
 
-    def _log_densities(
-        self, parameters: Float[np.ndarray, " parameters"]
-    ) -> Float[np.ndarray, " parameters"]:
+    def _log_densities(self, parameters: Parameters) -> Parameters:
         z, t = self._parts(parameters)
         half = FREEDOM / 2.0
         theta = -(half + 0.5) * np.log1p(z**2 / FREEDOM) - np.log(self.width)
-        constant = gammaln(half + 0.5) - gammaln(half) - 0.5 * np.log(FREEDOM * np.pi)
+        constant = (
+            special.gammaln(half + 0.5) - special.gammaln(half) - 0.5 * np.log(FREEDOM * np.pi)
+        )
         shape = self.tail / self.steepness
         cells = -self.tail * t - shape * np.exp(-self.steepness * t)
-        of_cell = np.log(self.steepness) + shape * np.log(shape) - gammaln(shape)
+        of_cell = np.log(self.steepness) + shape * np.log(shape) - special.gammaln(shape)
         return np.concatenate([theta + constant, cells + of_cell])
 
-    def gradient(
-        self, parameters: Float[np.ndarray, " parameters"]
-    ) -> Float[np.ndarray, " parameters"]:
+    def gradient(self, parameters: Parameters) -> Parameters:
         """Compute its derivative."""
         z, t = self._parts(parameters)
         theta = -(FREEDOM + 1.0) * z / (FREEDOM + z**2) / self.width
         return np.concatenate([theta, self.tail * np.expm1(-self.steepness * t)])
 
-    def curvature(
-        self, parameters: Float[np.ndarray, " parameters"]
-    ) -> Float[np.ndarray, " parameters"]:
+    def curvature(self, parameters: Parameters) -> Parameters:
         """Compute positive second derivatives of -ln p, of a normal density that touches p.
 
         That of theta is p's own at the centre and goes with the slope where p is not concave.
@@ -132,39 +123,37 @@ class Hyperprior:
         cells = self.tail * self.steepness * np.exp(-self.steepness * t)
         return np.concatenate([theta, cells])
 
-    def scores(
-        self, parameters: Float[np.ndarray, " parameters"]
-    ) -> Float[np.ndarray, " parameters"]:
+    def scores(self, parameters: Parameters) -> Parameters:
         """Compute z with Phi(z) = P(parameter is smaller), one by one: standard normal."""
         x, t = self._parts(parameters)
         shape = self.tail / self.steepness
         # the smaller of both tails keeps its digits
-        theta = np.sign(x) * -ndtri(stdtr(FREEDOM, -np.abs(x)))
+        theta = np.sign(x) * -special.ndtri(special.stdtr(FREEDOM, -np.abs(x)))
         power = shape * np.exp(-self.steepness * t)
-        below, above = gammaincc(shape, power), gammainc(shape, power)
-        cells = np.where(below < above, ndtri(below), -ndtri(above))
+        below, above = special.gammaincc(shape, power), special.gammainc(shape, power)
+        cells = np.where(below < above, special.ndtri(below), -special.ndtri(above))
         return np.concatenate([theta, cells])
 
-    def of_scores(
-        self, scores: Float[np.ndarray, " parameters"]
-    ) -> Float[np.ndarray, " parameters"]:
+    def of_scores(self, scores: Parameters) -> Parameters:
         """Compute the inverse of :meth:`scores`."""
         x, t = np.split(scores, [len(self.centre)])
         shape = self.tail / self.steepness
-        theta = np.sign(x) * -stdtrit(FREEDOM, ndtr(-np.abs(x)))
-        power = np.where(t < 0, gammainccinv(shape, ndtr(t)), gammaincinv(shape, ndtr(-t)))
+        theta = np.sign(x) * -special.stdtrit(FREEDOM, special.ndtr(-np.abs(x)))
+        power = np.where(
+            t < 0,
+            special.gammainccinv(shape, special.ndtr(t)),
+            special.gammaincinv(shape, special.ndtr(-t)),
+        )
         cells = -np.log(power / shape) / self.steepness
         return np.concatenate([self.centre + self.width * theta, cells])
 
-    def slopes_of_scores(
-        self, scores: Float[np.ndarray, " parameters"]
-    ) -> Float[np.ndarray, " parameters"]:
+    def slopes_of_scores(self, scores: Parameters) -> Parameters:
         """Compute d parameter / d score of each: phi(z) over the parameter's density."""
         log_normal = -0.5 * (scores**2 + np.log(2.0 * np.pi))
         return np.exp(log_normal - self._log_densities(self.of_scores(scores)))
 
     def _parts(
-        self, parameters: Float[np.ndarray, " parameters"]
+        self, parameters: Parameters
     ) -> tuple[Float[np.ndarray, " theta"], Float[np.ndarray, " cells"]]:
         theta, cells = np.split(parameters, [len(self.centre)])
         return (theta - self.centre) / self.width, cells
@@ -175,11 +164,11 @@ class Member(ABC):
 
     @property
     @abstractmethod
-    def covariance(self) -> Float[np.ndarray, "modes modes"]:
+    def covariance(self) -> ModesMatrix:
         """S, in K^2."""
 
     @abstractmethod
-    def traces(self, matrix: Float[np.ndarray, "modes modes"]) -> Float[np.ndarray, " parameters"]:
+    def traces(self, matrix: ModesMatrix) -> Parameters:
         """Compute 1/2 tr[(dS / d theta_i) F] of a symmetric F, in 1/K^2."""
 
     @abstractmethod
@@ -190,18 +179,16 @@ class Member(ABC):
 class PriorFamily(ABC):
     """Priors N(mean, S(theta)) over harmonic coefficients, in NumPy."""
 
+    # of those parameters that are reported: the first ones
+    names: ClassVar[tuple[str, ...]] = ("ln C at ell = 9", "tilt", "curvature")
+
     @property
     @abstractmethod
     def hyperprior(self) -> Hyperprior:
         """What is expected of the parameters."""
 
-    @property
     @abstractmethod
-    def names(self) -> tuple[str, ...]:
-        """Names of those parameters that are reported: the first ones."""
-
-    @abstractmethod
-    def at(self, parameters: Float[np.ndarray, " parameters"]) -> Member:
+    def at(self, parameters: Parameters) -> Member:
         """Return the member of these parameters."""
 
     def expected(self) -> Prior:
@@ -209,9 +196,7 @@ class PriorFamily(ABC):
         return self.prior(self.at(self.hyperprior.start()).covariance)
 
     @abstractmethod
-    def averaged(
-        self, parameters: Float[np.ndarray, " parameters"], spread: Spread
-    ) -> Float[np.ndarray, "modes modes"]:
+    def averaged(self, parameters: Parameters, spread: Spread) -> ModesMatrix:
         """Compute S with the parameters' uncertainty: its variances' means, in K^2.
 
         Parameters
@@ -224,13 +209,11 @@ class PriorFamily(ABC):
         """
 
     @abstractmethod
-    def prior(self, covariance: Float[np.ndarray, "modes modes"]) -> Prior:
+    def prior(self, covariance: ModesMatrix) -> Prior:
         """Return the prior with this S and the family's mean."""
 
     @abstractmethod
-    def start_from(
-        self, coarse: PriorFamily, parameters: Float[np.ndarray, " parameters"]
-    ) -> Float[np.ndarray, " parameters"]:
+    def start_from(self, coarse: PriorFamily, parameters: Parameters) -> Parameters:
         """Return parameters of this family that stand for those of one with a lower lmax.
 
         Parameters
@@ -254,11 +237,8 @@ class SpectrumBasis:
     """
 
     matrix: Float[np.ndarray, "ells parameters"]
-    centre: Float[np.ndarray, " parameters"]
-    width: Float[np.ndarray, " parameters"]
-
-    # of the parameters that are reported
-    names = ("ln C at ell = 9", "tilt", "curvature")
+    centre: Parameters
+    width: Parameters
 
     @classmethod
     def around(cls, power: float, lmax: int) -> SpectrumBasis:
@@ -310,11 +290,7 @@ class IsotropicFamily(PriorFamily):
             np.append(self.spectrum.width, LOG_MONOPOLE_WIDTH),
         )
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return SpectrumBasis.names
-
-    def at(self, parameters: Float[np.ndarray, " parameters"]) -> IsotropicMember:
+    def at(self, parameters: Parameters) -> IsotropicMember:
         return IsotropicMember(self, parameters)
 
     def averaged(self, parameters, spread):
@@ -341,10 +317,10 @@ class IsotropicMember(Member):
     """One prior of :class:`IsotropicFamily`."""
 
     family: IsotropicFamily
-    parameters: Float[np.ndarray, " parameters"]
+    parameters: Parameters
 
     @cached_property
-    def spectrum(self) -> Float[np.ndarray, " ells"]:
+    def spectrum(self) -> Ells:
         """C_ell, in K^2."""
         return np.exp(self.family.basis @ self.parameters)
 

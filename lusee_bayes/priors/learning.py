@@ -1,7 +1,5 @@
 """How the parameters of a family of priors are learned from data, and draws with them.
 
-A family's parameters in coordinates in which what is expected of them is standard normal.
-
 Parameters that the data do not tell keep what is expected of them, which has heavy tails: Laplace's
 approximation misses 0.32 in ln p(d) for every such theta, and 0.11 for every cell. In normal scores
 z, theta_i = F_i^-1(Phi(z_i)) with F_i the hyperprior's distribution function, it is exact for them.
@@ -13,17 +11,13 @@ is raised by Newton's method, J = d theta / d z, with the precision P = J F J + 
 there; the quadratic form holds near theta* only, and further ones may leave for a maximum of its
 own.
 
-Learning the parameters of a family of priors from data, by their most probable values.
-
 With the sky integrated out, ln p(d, theta) is maximised by Fisher scoring: its gradient is exact,
 its curvature the Fisher information, estimated from simulated data, and that of the hyperprior.
 Around the maximum theta is taken for normal; the prior that is returned has the variances' means
 over it. The evidence is the integral of p(d, theta) by Laplace's approximation, in coordinates that
-know the hyperprior's tails (:mod:`.learning`).
+know the hyperprior's tails.
 
-Draws of a sky whose prior was learned, with the parameters as uncertain as they are.
-
-::
+Draws of a sky have the parameters as uncertain as they are, ::
 
     p(m | d) = int p(m | d, theta) p(theta | d) d theta
 
@@ -43,14 +37,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.arrays import Draws, Square, on_host
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cholesky, invert_lower
 from lusee_bayes.judge.chi2 import ChiSquare, Split, expected_chi2, stands_out
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.priors.families import Hyperprior, Member, PriorFamily
+from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily
 from lusee_bayes.sky.prior import Prior
 
 # steps of Newton's method, each halved until ln p is not lower
@@ -70,14 +64,14 @@ class NormalScores:
     """
 
     hyperprior: Hyperprior
-    mean: Float[np.ndarray, " parameters"]
+    mean: Parameters
     root: Float[np.ndarray, "parameters parameters"]
 
     @classmethod
     def around(
         cls,
         hyperprior: Hyperprior,
-        parameters: Float[np.ndarray, " parameters"],
+        parameters: Parameters,
         covariance: Float[np.ndarray, "parameters parameters"],
     ) -> NormalScores:
         """Transform the normal distribution about the most probable parameters.
@@ -98,11 +92,11 @@ class NormalScores:
         known = np.linalg.inv(covariance) - np.diag(hyperprior.curvature(parameters))
         slope = -hyperprior.gradient(parameters)
 
-        def value(z: Float[np.ndarray, " parameters"]) -> float:
+        def value(z: Parameters) -> float:
             off = hyperprior.of_scores(z) - parameters
             return float(slope @ off - 0.5 * off @ known @ off - 0.5 * z @ z)
 
-        def precision(z: Float[np.ndarray, " parameters"]) -> np.ndarray:
+        def precision(z: Parameters) -> np.ndarray:
             j = hyperprior.slopes_of_scores(z)
             return j[:, None] * known * j + np.eye(len(z))
 
@@ -172,7 +166,7 @@ class Learned:
 
     prior: Prior
     names: tuple[str, ...]
-    parameters: Float[np.ndarray, " parameters"]
+    parameters: Parameters
     covariance: Float[np.ndarray, "parameters parameters"]
     log_evidence: float
     steps: int
@@ -198,17 +192,14 @@ class Learned:
 class _Point:
     """What is known of ln p(d, theta) at some theta."""
 
-    parameters: Float[np.ndarray, " parameters"]
+    parameters: Parameters
     member: Member
     posterior: Posterior
     value: float
 
 
 def learn(
-    family: PriorFamily,
-    information: Information,
-    start: Float[np.ndarray, " parameters"] | None = None,
-    seed: int = 1,
+    family: PriorFamily, information: Information, start: Parameters | None = None, seed: int = 1
 ) -> Learned:
     """Find the most probable parameters of a family, and the prior that they give.
 
@@ -245,10 +236,7 @@ def learn(
 
 
 def learn_whatever_fits(
-    family: PriorFamily,
-    information: Information,
-    start: Float[np.ndarray, " parameters"] | None = None,
-    seed: int = 1,
+    family: PriorFamily, information: Information, start: Parameters | None = None, seed: int = 1
 ) -> Learned:
     """Learn a prior as :func:`learn`, from data that no sky explains, too.
 
@@ -316,9 +304,7 @@ def _fixed(family: PriorFamily, information: Information, factor: float) -> Lear
     return Learned(prior, (), np.zeros(0), np.zeros((0, 0)), evidence, 0, settled=False)
 
 
-def _at(
-    family: PriorFamily, information: Information, parameters: Float[np.ndarray, " parameters"]
-) -> _Point:
+def _at(family: PriorFamily, information: Information, parameters: Parameters) -> _Point:
     member = family.at(parameters)
     posterior = information.posterior(family.prior(member.covariance))
     value = float(posterior.log_evidence) + family.hyperprior.log_density(parameters)
@@ -326,10 +312,7 @@ def _at(
 
 
 def _uphill(
-    family: PriorFamily,
-    information: Information,
-    here: _Point,
-    step: Float[np.ndarray, " parameters"],
+    family: PriorFamily, information: Information, here: _Point, step: Parameters
 ) -> _Point:
     """The end of a step, or of a half, a quarter, ... of it, if ln p is not lower there."""
     part = 1.0
@@ -348,7 +331,7 @@ def _uphill(
 
 def _slope(
     family: PriorFamily, here: _Point, rng: np.random.Generator, n: int
-) -> tuple[Float[np.ndarray, " parameters"], Float[np.ndarray, "parameters parameters"]]:
+) -> tuple[Parameters, Float[np.ndarray, "parameters parameters"]]:
     """Gradient of ln p(d, theta), and its expected curvature."""
     prior, posterior, hyperprior = here.posterior.prior, here.posterior, family.hyperprior
     unknown = np.asarray(inverse_from_cholesky(posterior.lower))
@@ -368,7 +351,7 @@ def _slope(
     return found + hyperprior.gradient(here.parameters), curvature
 
 
-def _root(known: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n k"]:
+def _root(known: Square) -> Float[np.ndarray, "n k"]:
     """A root of a covariance with eigenvalues from 0 to 1.
 
     Of data that are very precise, those near 0 are wrong by more than ``ROUNDING``; then what lies
@@ -409,7 +392,7 @@ ATTEMPTS = 5
 
 def draws_with_parameters(
     family: PriorFamily, learned: Learned, posterior: Posterior, key: PRNGKeyArray, n: int
-) -> Float[np.ndarray, "draws modes"]:
+) -> Draws:
     """Draw skies; neighbouring ones have different parameters.
 
     Parameters

@@ -22,14 +22,18 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy import sparse
 
+from lusee_bayes.core.arrays import Ells, Modes, ModesMatrix, Vector
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.harmonics import n_modes, per_mode, sum_over_m, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.priors.families import Hyperprior, Member, PriorFamily, SpectrumBasis
+from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, SpectrumBasis
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource
 from lusee_bayes.sky.prior import PIVOT, DensePrior
 from lusee_bayes.sky.template import EmbeddedTemplate
+
+# arrays that recur
+Covariates = Float[np.ndarray, " covariates"]
 
 # frequency in MHz at which the Galaxy is nearly transparent
 TRANSPARENT_MHZ = 50.0
@@ -73,18 +77,13 @@ class Band:
         Interpolation between cells.
     """
 
-    window: Float[np.ndarray, " ells"]
+    window: Ells
     grid: SphereGrid
     covariates: Float[np.ndarray, "points covariates"]
     cells: sparse.csr_array
 
     @classmethod
-    def of(
-        cls,
-        window: Float[np.ndarray, " ells"],
-        template: SmoothedTemplate,
-        transparent: SmoothedTemplate,
-    ) -> Band:
+    def of(cls, window: Ells, template: SmoothedTemplate, transparent: SmoothedTemplate) -> Band:
         """Make the band of a window."""
         top = int(np.flatnonzero(window)[-1])
         grid = SphereGrid.of(top, max((3 * top + 1) // 2, LEAST_BAND))
@@ -124,7 +123,7 @@ def windows(lmax: int) -> Float[np.ndarray, "bands ells"]:
     return found
 
 
-def _middle(window: Float[np.ndarray, " ells"]) -> float:
+def _middle(window: Ells) -> float:
     """Root mean square ell of a window's modes."""
     ell = np.arange(len(window))
     weight = window**2 * (2.0 * ell + 1.0)
@@ -167,9 +166,7 @@ class SmoothedTemplate:
         return np.log(healpy.get_interp_val(smooth, theta, phi)) - self.mean_log
 
 
-def expected_covariates() -> tuple[
-    Float[np.ndarray, " covariates"], Float[np.ndarray, " covariates"]
-]:
+def expected_covariates() -> tuple[Covariates, Covariates]:
     """Return centre and width of what is expected of the covariates' coefficients."""
     ell = np.sqrt(np.arange(1, n_modes(FIELD_LMAX))).astype(int)
     named = [POWER_WIDTH, POWER_WIDTH, PLANE_WIDTH, TILTS_WIDTH, TILTS_WIDTH]
@@ -198,12 +195,12 @@ class LocalScales(PriorFamily):
         What is expected of the coefficients of the bands' bases.
     """
 
-    mean: Float[np.ndarray, " modes"]
+    mean: Modes
     wide: Float[np.ndarray, "modes 2"]
     sources: Float[np.ndarray, "modes sources"]
     spectrum: SpectrumBasis
     bands: tuple[Band, ...]
-    covariates: tuple[Float[np.ndarray, " covariates"], Float[np.ndarray, " covariates"]]
+    covariates: tuple[Covariates, Covariates]
 
     @classmethod
     def of(
@@ -254,11 +251,7 @@ class LocalScales(PriorFamily):
             N_CELLS,
         )
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return SpectrumBasis.names
-
-    def at(self, parameters: Float[np.ndarray, " parameters"]) -> LocalScalesMember:
+    def at(self, parameters: Parameters) -> LocalScalesMember:
         return LocalScalesMember(self, *self._split(parameters))
 
     def averaged(self, parameters, spread):
@@ -287,18 +280,14 @@ class LocalScales(PriorFamily):
         return np.split(parameters, np.cumsum([n_spectrum, 1, n_covariates]))
 
 
-def _covariance(
-    family: LocalScales, flux: float, texture: Float[np.ndarray, "modes modes"]
-) -> Float[np.ndarray, "modes modes"]:
+def _covariance(family: LocalScales, flux: float, texture: ModesMatrix) -> ModesMatrix:
     sources = flux * (family.sources @ family.sources.T)
     return family.wide @ family.wide.T + sources + texture
 
 
 def _texture(
-    family: LocalScales,
-    spectrum: Float[np.ndarray, " ells"],
-    strengths: list[Float[np.ndarray, " _"]],
-) -> Float[np.ndarray, "modes modes"]:
+    family: LocalScales, spectrum: Ells, strengths: list[Float[np.ndarray, " _"]]
+) -> ModesMatrix:
     total = np.zeros((len(family.mean),) * 2)
     for band, strength in zip(family.bands, strengths, strict=True):
         scale = _scale(band, spectrum)
@@ -307,7 +296,7 @@ def _texture(
     return total
 
 
-def _scale(band: Band, spectrum: Float[np.ndarray, " ells"]) -> Float[np.ndarray, " modes"]:
+def _scale(band: Band, spectrum: Ells) -> Modes:
     """w_j C_ell^1/2 of every mode up to the band's last."""
     ells = slice(band.grid.lmax + 1)
     return per_mode(band.window[ells] * np.sqrt(spectrum[ells]))
@@ -327,11 +316,11 @@ class LocalScalesMember(Member):
     family: LocalScales
     power: Float[np.ndarray, " spectrum"]
     fluxes: Float[np.ndarray, "1"]
-    coefficients: Float[np.ndarray, " covariates"]
+    coefficients: Covariates
     factors: Float[np.ndarray, " cells"]
 
     @cached_property
-    def spectrum(self) -> Float[np.ndarray, " ells"]:
+    def spectrum(self) -> Ells:
         """C_ell, in K^2."""
         return np.exp(self.family.spectrum.matrix @ self.power)
 
@@ -344,7 +333,7 @@ class LocalScalesMember(Member):
         ]
 
     @cached_property
-    def texture(self) -> Float[np.ndarray, "modes modes"]:
+    def texture(self) -> ModesMatrix:
         """Covariance of the last term of the module's equation, in K^2."""
         return _texture(self.family, self.spectrum, self.strengths)
 
@@ -374,10 +363,7 @@ class LocalScalesMember(Member):
         return self._gathered(ells, sources, fields)
 
     def _gathered(
-        self,
-        ells: Float[np.ndarray, "ells n"],
-        sources: Float[np.ndarray, " n"],
-        fields: list[np.ndarray],
+        self, ells: Float[np.ndarray, "ells n"], sources: Vector, fields: list[np.ndarray]
     ) -> Float[np.ndarray, "parameters n"]:
         """Derivatives by the parameters, from those by ln C_ell, ln f^2 and the strengths."""
         family = self.family
@@ -388,14 +374,8 @@ class LocalScalesMember(Member):
             by_point = field.reshape(len(field), -1)
             covariates += (by_point @ (band.covariates * area[:, None])).T
             cells += band.cells.multiply(area[:, None]).T @ by_point.T
-        return np.concatenate(
-            [
-                family.spectrum.matrix.T @ ells,
-                np.exp(self.fluxes[0]) * sources[None],
-                covariates,
-                cells,
-            ]
-        )
+        fluxes = np.exp(self.fluxes[0]) * sources[None]
+        return np.concatenate([family.spectrum.matrix.T @ ells, fluxes, covariates, cells])
 
 
 def embedded_local_scales(

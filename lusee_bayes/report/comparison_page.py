@@ -1,9 +1,4 @@
-"""Pages that set runs or priors side by side.
-
-The page that sets finished runs side by side.
-
-The report of a comparison of priors, out of what it has left in its folder.
-"""
+"""Pages that set finished runs, or priors for one data set, side by side."""
 
 from __future__ import annotations
 
@@ -15,10 +10,8 @@ from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_json
 from lusee_bayes.judge.chi2 import RULE
 from lusee_bayes.report import html
-from lusee_bayes.report.html import details
 from lusee_bayes.results.finished_runs import (
     FinishedRun,
-    Provenance,
     comparison_rows,
     evidence_caveat,
 )
@@ -41,8 +34,8 @@ HEADER = {
 }
 
 
-def comparison_page(runs: Sequence[FinishedRun], figures: Path) -> str:
-    """The page as text; ``figures``: folder with maps.png and curves.png."""
+def comparison_page(runs: Sequence[FinishedRun], folder: Path) -> str:
+    """The page as text; ``folder`` has the figures maps and curves."""
     rows = [
         [_shown((row | {"ell_cross": run.cross_in_words()})[key]) for key in HEADER]
         for run, row in zip(runs, comparison_rows(runs), strict=True)
@@ -57,15 +50,17 @@ def comparison_page(runs: Sequence[FinishedRun], figures: Path) -> str:
             html.paragraph(f"{RULE}.", "threshold"),
             html.table(list(HEADER.values()), rows),
             html.subsection("Where they come from"),
-            html.table(("run", "data", "dates, UTC", "command", "made"), origins(runs)),
+            html.table(("run", "data", "dates, UTC", "command", "made"), map(_origin, runs)),
             html.figure(
-                figures / "curves.png",
+                folder,
+                "curves",
                 "Correlation with the truth, signal-to-noise and share of the prior over "
                 "multipole ell, a line for each run",
                 "Fidelity and the share of the prior.",
             ),
             html.figure(
-                figures / "maps.png",
+                folder,
+                "maps",
                 "Galactic maps of posterior mean and standard deviation, a row for each run",
                 "Posterior means, and standard deviations, on one scale each.",
             ),
@@ -73,17 +68,15 @@ def comparison_page(runs: Sequence[FinishedRun], figures: Path) -> str:
     )
 
 
-def origins(runs: Sequence[FinishedRun]) -> list[tuple[str, ...]]:
-    """Name, data, dates, command, date and version of every run, a row each."""
-    return [_origin(run.name, run.provenance) for run in runs]
-
-
-def _origin(name: str, found: Provenance | None) -> tuple[str, ...]:
+def _origin(run: FinishedRun) -> tuple[str, ...]:
+    """Name, data, dates, command, date and version of a run."""
+    found = run.provenance
     if found is None:
-        return name, "not recorded", "-", "-", "by an earlier version"
+        return run.name, "not recorded", "-", "-", "by an earlier version"
     dates = f"{found.first} to {found.last}"
     command = found.command or "a call of the library"
-    return name, found.data_line(), dates, command, f"{found.made} by lusee_bayes {found.version}"
+    made = f"{found.made} by lusee_bayes {found.version}"
+    return run.name, found.data_line(), dates, command, made
 
 
 def _shown(value: object) -> str:
@@ -100,28 +93,10 @@ FIGURE = (
     "that 68 % intervals hold, with "
     "its scatter if the posterior is right, and spectra of the errors.",
 )
-SECTIONS = [
-    ("priors", "The priors"),
-    ("files", "Files and citation"),
-    ("run", "The run"),
-]
 
 
 def priors_page(folder: Path, name: str) -> str:
-    """The page as text.
-
-    Parameters
-    ----------
-    folder : Path
-        With the files of a run.
-    name : str
-        Of the run, for the title.
-
-    Raises
-    ------
-    InputError
-        If something is missing in the folder.
-    """
+    """The page as text, of the folder and the name of a run. InputError as :func:`.map_page`."""
     require_files(folder, ("priors.json", "scenario.yaml", "figures/priors.png"), "compare-priors")
     path = folder / "priors.json"
     found = read_json(path, PRIORS)
@@ -131,22 +106,19 @@ def priors_page(folder: Path, name: str) -> str:
         raise InputError(f"{path}: notes is no list of texts; make the results anew")
     frequency = f"{found['frequency_mhz']:g} MHz"
     words = [(str(one["name"]), str(one["prior"])) for one in priors]
-    return html.page(
+    told = [
+        *map(html.paragraph, notes),
+        html.table(*prior_table(priors)),
+        html.figure(folder, "priors", *FIGURE),
+        html.definitions(words),
+    ]
+    return html.run_page(
+        folder,
         f"{name}: one data set at {frequency} under several priors",
-        [
-            html.contents(SECTIONS),
-            html.paragraph(found["verdict"], "verdict"),
-            html.about(folder, frequency),
-            html.section(
-                *SECTIONS[0],
-                *map(html.paragraph, notes),
-                html.table(*prior_table(priors)),
-                html.figure(folder / "figures" / "priors.png", *FIGURE),
-                html.definitions(words),
-            ),
-            html.section(*SECTIONS[1], html.downloads(folder), html.citation(folder)),
-            html.section(*SECTIONS[2], *details(folder, found)),
-        ],
+        frequency,
+        found,
+        [html.paragraph(found["verdict"], "verdict")],
+        {("priors", "The priors"): told},
     )
 
 

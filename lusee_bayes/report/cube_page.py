@@ -11,8 +11,7 @@ from lusee_bayes.judge.chi2 import stands_out
 from lusee_bayes.judge.cube_fit import N_TESTS
 from lusee_bayes.report import html
 from lusee_bayes.report.explorer import cube_explorer
-from lusee_bayes.report.html import details
-from lusee_bayes.report.sections import SECTION, cube_unknowns, flight_section, is_flight
+from lusee_bayes.report.sections import cube_unknowns, flight_section
 from lusee_bayes.results.saved import (
     CHANNEL_SUMMARY,
     COVERAGE,
@@ -43,78 +42,57 @@ FIGURES = {
         "prior; grey: two standard deviations.",
     ),
 }
-SECTIONS = [
-    ("maps", "The maps"),
-    ("spectra", "Spectra"),
-    ("scales", "Scales"),
-    ("data", "Data and prediction"),
-    ("files", "Files and citation"),
-    ("run", "The run"),
-]
 
 
 def cube_page(folder: Path, name: str) -> str:
-    """The page as text.
-
-    Parameters
-    ----------
-    folder : Path
-        With the files of a run.
-    name : str
-        Of the run, for the title.
-
-    Raises
-    ------
-    InputError
-        If something is missing in the folder.
-    """
+    """The page as text, of the folder and the name of a run. InputError as :func:`.map_page`."""
     require_files(folder, (*NEEDED, *(f"figures/{figure}.png" for figure in FIGURES)), "map")
-    summary = read_json(folder / "summary.json", CUBE_SUMMARY)
-    channels = entries(folder / "summary.json", summary, "channels", CHANNEL_SUMMARY)
+    where = folder / "summary.json"
+    summary = read_json(where, CUBE_SUMMARY)
+    channels = entries(where, summary, "channels", CHANNEL_SUMMARY)
     frequencies = [channel["frequency_mhz"] for channel in channels]
     band = f"{frequencies[0]:g} to {frequencies[-1]:g} MHz"
     count = len(channels)
-    title = f"{name}: the sky at {counted(count, 'frequency', 'frequencies')}, {band}"
-    channel_words = f"{counted(count, 'channel')}, {band}"
-    anchors = dict(zip(("maps", "spectra", "fidelity", "chi2"), SECTIONS, strict=False))
-    parts = {
-        name: [html.figure(folder / "figures" / f"{name}.png", *texts)]
-        for name, texts in FIGURES.items()
-    }
-    joint = None
-    if summary.get("joint") is not None:
-        (joint,) = entries(
-            folder / "summary.json", {"joint": [summary["joint"]]}, "joint", JOINT_SUMMARY
-        )
-    parts["maps"].insert(0, cube_explorer(folder, frequencies))
-    parts["maps"].append(html.paragraph(_how(joint, summary)))
-    parts["spectra"] += _pulls(folder, summary)
-    parts["chi2"] = [_tests(folder, summary), *parts["chi2"], _table(channels)]
-    parts["chi2"] += cube_unknowns(folder, summary)
+    figures = {name: html.figure(folder, name, *texts) for name, texts in FIGURES.items()}
+    maps = [
+        cube_explorer(folder, frequencies),
+        figures["maps"],
+        html.paragraph(_how(where, summary)),
+    ]
     if "coverage" in channels[0]:
-        parts["maps"].append(_coverage(folder, channels))
-    sections = [*SECTIONS[:-2], SECTION, *SECTIONS[-2:]] if is_flight(folder) else SECTIONS
-    return html.page(
-        title,
+        maps.append(_coverage(where, channels))
+    unmapped = html.sentences(where, summary, "unmapped")
+    return html.run_page(
+        folder,
+        f"{name}: the sky at {counted(count, 'frequency', 'frequencies')}, {band}",
+        f"{counted(count, 'channel')}, {band}",
+        summary,
         [
-            html.contents(sections),
             html.verdict(summary["level"], summary["verdict"]),
-            html.doubts(folder / "summary.json", summary),
-            html.unmapped(folder / "summary.json", summary),
-            html.about(folder, channel_words),
-            *(html.section(*anchors[name], *inside) for name, inside in parts.items()),
-            *([flight_section(folder)] if is_flight(folder) else []),
-            html.section(*SECTIONS[-2], html.downloads(folder), html.citation(folder)),
-            html.section(*SECTIONS[-1], *details(folder, summary)),
+            html.doubtful(where, summary),
+            "\n".join(html.paragraph(text, html.BAD) for text in unmapped),
         ],
+        {
+            ("maps", "The maps"): maps,
+            ("spectra", "Spectra"): [figures["spectra"], *_pulls(where, summary)],
+            ("scales", "Scales"): [figures["fidelity"]],
+            ("data", "Data and prediction"): [
+                _tests(where, summary),
+                figures["chi2"],
+                _table(channels),
+                *cube_unknowns(folder, summary),
+            ],
+            **flight_section(folder),
+        },
     )
 
 
-def _how(joint: dict | None, summary: dict) -> str:
+def _how(where: Path, summary: dict) -> str:
     known = f" ln evidence {summary['log_evidence']:.1f}."
-    if joint is None:
+    if summary.get("joint") is None:
         tied = ", given what the others tell of its receivers" * summary.get("tied", False)
         return f"Every channel has a posterior of its own{tied}.{known}"
+    (joint,) = entries(where, {"joint": [summary["joint"]]}, "joint", JOINT_SUMMARY)
     solver = joint["solver"]
     if joint["iterations"]:
         solver += f" ({joint['iterations']} iterations)"
@@ -127,8 +105,8 @@ def _how(joint: dict | None, summary: dict) -> str:
     )
 
 
-def _tests(folder: Path, summary: dict) -> str:
-    tests = entries(folder / "summary.json", summary, "tests", JOINT_TEST)
+def _tests(where: Path, summary: dict) -> str:
+    tests = entries(where, summary, "tests", JOINT_TEST)
     rows = [
         (t["test"], t["found"], f"{t['p']:.2g}", "" if t["among"] == 1 else t["among"], t["level"])
         for t in tests
@@ -142,11 +120,11 @@ def _tests(folder: Path, summary: dict) -> str:
     return note + html.table(("joint test", "found", "p", "smallest of", "verdict"), rows, bad)
 
 
-def _pulls(folder: Path, summary: dict) -> list[str]:
+def _pulls(where: Path, summary: dict) -> list[str]:
     """How far the spectra are from the truth, and why in the plane."""
     if not summary.get("pulls"):
         return []
-    found = entries(folder / "summary.json", summary, "pulls", PULLS)
+    found = entries(where, summary, "pulls", PULLS)
     rows = [
         (p["direction"], f"{p['rms']:.2f}", f"{p['worst']:+.1f} at {p['worst_mhz']:g} MHz")
         for p in found
@@ -166,9 +144,8 @@ def _pulls(folder: Path, summary: dict) -> list[str]:
     ]
 
 
-def _coverage(folder: Path, channels: list[dict]) -> str:
+def _coverage(where: Path, channels: list[dict]) -> str:
     """Share of pixels whose 68 % interval holds the truth, a row for each channel."""
-    where = folder / "summary.json"
     bands = [entries(where, channel, "coverage", COVERAGE) for channel in channels]
     header = ("MHz", *(band["name"] for band in bands[0]))
     rows = [

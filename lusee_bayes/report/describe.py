@@ -41,7 +41,7 @@ KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
     (lambda path: has_words(path, formats.UVBEAM_WORDS), "describe_data:describe_sampled_beams"),
     (_has_image("combinations", "products"), "describe_data:describe_waterfall"),
     (_is_session, "describe_data:describe_session"),
-    (lambda path: True, "describe_data:describe_sky"),
+    (lambda path: True, "describe_sky:describe_sky"),
 )
 
 
@@ -54,9 +54,11 @@ def describe(path: str | Path) -> str:
         If the file is missing, or of none of these kinds; for a folder that no run has written.
     """
     if Path(path).is_dir():
-        return str(resolve_name("lusee_bayes.report.describe_results:describe_folder")(Path(path)))
-    path = require_file(path, "file")
-    kind = OWN_FORMATS.get(formats.format_of(path) or "")
-    if kind is None:
-        kind = next(kind for recognises, kind in KINDS if recognises(path))
-    return str(resolve_name(f"lusee_bayes.report.{kind}")(path))
+        path, kind = Path(path), "describe_results:describe_folder"
+    else:
+        path = require_file(path, "file")
+        kind = OWN_FORMATS.get(formats.format_of(path) or "")
+        if kind is None:
+            kind = next(kind for recognises, kind in KINDS if recognises(path))
+    first, *further = resolve_name(f"lusee_bayes.report.{kind}")(path)
+    return "\n".join([f"{path}: {first}", *(f"  {line}" for line in further)])

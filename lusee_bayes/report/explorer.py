@@ -1,8 +1,7 @@
-"""Maps to look into: one channel, or a cube.
+"""Maps to look into, with their data packed into the page.
 
-The map to point at: its data, packed into the page, and its place on it.
-
-Maps of every channel behind a slider, with the spectrum of a direction that is pointed at.
+That of one channel has the point-spread function of the direction that is pointed at; those of a
+cube stand behind a slider, with the spectrum of the direction.
 """
 
 from __future__ import annotations
@@ -30,48 +29,22 @@ KERNEL_NSIDE = 16
 # multipoles of point-spread functions, at most: a page with more would be too large
 LARGEST_ELL = 47
 
-# what every view of the sky has: zoom, grid, names, colour bar
-CONTROLS = """<label for="explorer-grid">grid <select id="explorer-grid">
-<option value="galactic">Galactic</option><option value="equatorial">equatorial</option>
-<option value="none">none</option></select></label>
-<label for="explorer-names">sources <input id="explorer-names" type="checkbox" checked></label>
-<span><button type="button" id="explorer-in" aria-label="zoom in">+</button>
-<button type="button" id="explorer-out" aria-label="zoom out">-</button></span>
-<span class="bar"><canvas id="explorer-bar" width="400" height="42" role="img"
-aria-label="colour scale"></canvas> <span id="explorer-unit"></span></span>"""
-LAYOUT = f"""<div class="controls">
-<label for="explorer-layer">show <select id="explorer-layer"></select></label>
-<label for="explorer-l">l [°] <input id="explorer-l" type="number" step="0.1"></label>
-<label for="explorer-b">b [°] <input id="explorer-b" type="number" step="0.1"></label>
-{CONTROLS}
-</div>
-<canvas id="explorer-map" width="1200" height="600" tabindex="0" role="img"></canvas>
-<p id="explorer-hover" class="hover">&nbsp;</p>
-<p>Galactic Mollweide view, centre l = 0, longitude grows to the left; dashes: the rim of what was
-never above the horizon, hatched where standard deviations are shown. Click, or move with the arrow
-keys; double-click, the buttons or the wheel with Ctrl zoom, dragging moves.</p>
-<div class="explorer">
-<div><h3>Posterior there</h3><dl id="explorer-values" aria-live="polite"></dl></div>
-<div><h3>Point-spread function there</h3>
-<canvas id="explorer-psf" width="600" height="300" role="img"
-aria-label="point-spread function of the chosen direction"></canvas>
-<p>How the mean in this very direction weighs the sky, over its peak: orange adds, purple takes
-away.</p></div>
-</div>"""
 SCRIPTS = ("sky_view.js", "point_spread.js", "explorer.js")
 
 
 def explorer(folder: Path, diagnostics: xr.Dataset) -> str:
     """The explorer of a map run's folder as HTML with its data and its script."""
-    return with_scripts(LAYOUT, explorer_data(folder, diagnostics), SCRIPTS)
+    return _with_scripts("explorer.html", explorer_data(folder, diagnostics), SCRIPTS)
 
 
-def with_scripts(layout: str, found: dict[str, object], scripts: tuple[str, ...]) -> str:
+def _with_scripts(layout: str, found: dict[str, object], scripts: tuple[str, ...]) -> str:
     """A layout, its data, and what draws them."""
     data = json.dumps(found).replace("</", "<\\/")
+    # zoom, grid, names and colour bar of every view
+    controls = html.package_text("explorer_controls.html").rstrip("\n")
     return "\n".join(
         [
-            layout,
+            html.package_text(layout).rstrip("\n").replace("{controls}", controls),
             f'<script type="application/json" id="explorer-data">{data}</script>',
             *(f"<script>\n{html.package_text(name)}\n</script>" for name in scripts),
         ]
@@ -88,7 +61,7 @@ def explorer_data(folder: Path, diagnostics: xr.Dataset) -> dict[str, object]:
     mean, std, truth = read("mean"), read("std"), read("truth")
     sky = mean if truth is None else truth
     low, high = np.percentile(sky[sky > 0], [0.5, 99.8])
-    temperature = {"unit": "K", "low": low, "high": high, "log": True, "colours": "sequential"}
+    temperature = _scale("K", low, high, log=True)
     altitude = diagnostics["highest_altitude"].values
     layers = [
         ("mean", "posterior mean", mean, temperature),
@@ -98,14 +71,19 @@ def explorer_data(folder: Path, diagnostics: xr.Dataset) -> dict[str, object]:
         limit = np.percentile(np.abs(mean - truth), 99.0)
         layers += [
             ("truth", "truth", truth, temperature),
-            ("residual", "mean - truth", None, signed_scale(limit, "K")),
-            ("pull", "pull, (mean - truth) / standard deviation", None, signed_scale(4.0, "sigma")),
+            ("residual", "mean - truth", None, _scale("K", -limit, limit, "diverging")),
+            (
+                "pull",
+                "pull, (mean - truth) / standard deviation",
+                None,
+                _scale("sigma", -4.0, 4.0, "diverging"),
+            ),
         ]
     fraction = diagnostics["prior_fraction"].values
-    layers.append(("prior_fraction", "share from the prior", fraction, _range(fraction, "")))
+    layers.append(("prior_fraction", "share from the prior", fraction, _range(fraction)))
     for k, draw in enumerate(diagnostics["draws"].values, 1):
         layers.append((f"draw{k}", f"draw {k} of the posterior", draw, temperature))
-    layers.append(("highest_altitude", "highest altitude", altitude, _range(altitude, "")))
+    layers.append(("highest_altitude", "highest altitude", altitude, _range(altitude)))
     coarse = healpy.npix2nside(diagnostics.sizes["region"])
     return {
         "nside": healpy.npix2nside(mean.size),
@@ -159,18 +137,17 @@ def std_scale(
     std: Float[np.ndarray, " pixels"], altitude: Float[np.ndarray, " pixels"]
 ) -> dict[str, object]:
     """A logarithmic scale over what was seen."""
-    low, high = seen_range(std, altitude)
-    return {"unit": "K", "low": low, "high": high, "log": True, "colours": "sequential"}
+    return _scale("K", *seen_range(std, altitude), log=True)
 
 
-def signed_scale(limit: float, unit: str) -> dict[str, object]:
-    """A linear scale about zero."""
-    return {"unit": unit, "low": -limit, "high": limit, "log": False, "colours": "diverging"}
+def _range(values: Float[np.ndarray, " pixels"]) -> dict[str, object]:
+    return _scale("", *np.percentile(values, [0.5, 99.5]))
 
 
-def _range(values: Float[np.ndarray, " pixels"], unit: str) -> dict[str, object]:
-    low, high = np.percentile(values, [0.5, 99.5])
-    return {"unit": unit, "low": low, "high": high, "log": False, "colours": "sequential"}
+def _scale(
+    unit: str, low: float, high: float, colours: str = "sequential", *, log: bool = False
+) -> dict[str, object]:
+    return {"unit": unit, "low": low, "high": high, "log": log, "colours": colours}
 
 
 def packed(values: np.ndarray) -> str:
@@ -186,29 +163,12 @@ CUBE = Layout("maps of every channel", {"maps": Variable(("channel", "pixel"))})
 # what the maps of a page may take, in bytes, before base64; two bytes a number
 BUDGET = 3_500_000
 LEVELS = 65535
-CUBE_LAYOUT = f"""<div class="controls">
-<label for="explorer-layer">show <select id="explorer-layer"></select></label>
-<label for="explorer-channel">channel: <span id="explorer-frequency"></span>
-<input id="explorer-channel" type="range" min="0" step="1" value="0"></label>
-{CONTROLS}
-</div>
-<canvas id="explorer-map" width="1200" height="600" tabindex="0" role="img"></canvas>
-<p id="explorer-hover" class="hover">&nbsp;</p>
-<p>Galactic Mollweide view, centre l = 0, longitude grows to the left. Move the slider for another
-channel; click for the spectrum of a direction. Double-click, the buttons or the wheel with Ctrl
-zoom, dragging moves. <span id="explorer-note"></span></p>
-<div class="explorer">
-<div><h3>Posterior there</h3><dl id="explorer-values" aria-live="polite"></dl></div>
-<div><h3>Spectrum there</h3><canvas id="explorer-spectrum" width="600" height="360" role="img"
-aria-label="brightness temperature against frequency in the chosen direction"></canvas>
-<p>Dots with bars: posterior mean and one standard deviation; dashes: truth, where it is known.</p>
-</div></div>"""
 CUBE_SCRIPTS = ("sky_view.js", "cube_explorer.js")
 
 
 def cube_explorer(folder: Path, frequencies_mhz: list[float]) -> str:
     """The explorer of the folder of a run of several frequencies."""
-    return with_scripts(CUBE_LAYOUT, cube_data(folder, frequencies_mhz), CUBE_SCRIPTS)
+    return _with_scripts("cube_explorer.html", cube_data(folder, frequencies_mhz), CUBE_SCRIPTS)
 
 
 def cube_data(folder: Path, frequencies_mhz: list[float]) -> dict[str, object]:

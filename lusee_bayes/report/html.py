@@ -1,10 +1,8 @@
-"""HTML of reports: elements, the head of a page, details of a run.
+"""HTML of reports: elements of a page, and what the pages of all runs have.
 
-Pieces of a page: sections, figures, tables; everything inside one file.
-
-What every page begins and ends with: the verdict, where the data come from, files, citation.
-
-How a run was made: scenario, versions, times, memory.
+A page is one file with everything inside. That of a run begins with its verdict and where the data
+come from, and ends with links to its files, how to cite it, and how it was made: scenario,
+versions, times, memory.
 """
 
 from __future__ import annotations
@@ -18,29 +16,12 @@ from typing import Any
 from urllib.parse import quote
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.layouts import Layout
 from lusee_bayes.core.reading import read_text
 from lusee_bayes.core.version import __version__, printable
 from lusee_bayes.judge.chi2 import LEVELS, RULE
 from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.map_files import text_hash
-
-TEMPLATE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<link rel="icon" href="data:,">
-<title>{title}</title>
-<style>
-{style}
-</style>
-</head>
-<body>
-<h1>{title}</h1>
-{body}
-</body>
-</html>
-"""
 
 
 def page(title: str, parts: Iterable[str]) -> str:
@@ -49,7 +30,8 @@ def page(title: str, parts: Iterable[str]) -> str:
     Bytes of file names that are no UTF-8 are shown by their escapes.
     """
     style = package_text("report.css")
-    text = TEMPLATE.format(title=escape(title), style=style, body="\n".join(parts))
+    body = "\n".join(parts)
+    text = package_text("page.html").format(title=escape(title), style=style, body=body)
     return printable(text)
 
 
@@ -64,7 +46,7 @@ def contents(sections: Sequence[tuple[str, str]]) -> str:
     return f"<nav>{' '.join(links)}</nav>"
 
 
-def section(anchor: str, title: str, *parts: str) -> str:
+def section(anchor: str, title: str, parts: Iterable[str]) -> str:
     """A part of the page with its heading."""
     inside = "\n".join([f"<h2>{escape(title)}</h2>", *parts])
     return f'<section id="{anchor}">\n{inside}\n</section>'
@@ -101,14 +83,19 @@ def _cell(value: object) -> str:
     return value if isinstance(value, Markup) else escape(str(value))
 
 
-def figure(path: Path, alternative: str, caption: str) -> str:
-    """A picture, inside the page, with a text for those who do not see it."""
-    data = base64.b64encode(path.read_bytes()).decode()
+def figure(folder: Path, name: str, alternative: str, caption: str) -> str:
+    """A picture of a run, inside the page, with a text for those who do not see it."""
+    data = base64.b64encode(figure_path(folder, name).read_bytes()).decode()
     return (
         f'<figure><div class="scroll"><img src="data:image/png;base64,{data}" '
         f'alt="{escape(alternative)}"></div><p class="cue">Swipe the figure sideways.</p>'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
+
+
+def figure_path(folder: Path, name: str) -> Path:
+    """Where a run has a picture."""
+    return folder / "figures" / f"{name}.png"
 
 
 def table(
@@ -129,6 +116,14 @@ def table(
         + "\n".join(lines)
         + "\n</tbody></table></div>"
     )
+
+
+def cells(
+    table: Mapping[str, Sequence[object]], layout: Layout, forms: Sequence[str]
+) -> list[tuple[str, ...]]:
+    """The rows of a table that was read, each column in its form."""
+    rows = zip(*(table[name] for name in layout.variables), strict=True)
+    return [tuple(map(format, row, forms)) for row in rows]
 
 
 def preformatted(text: str) -> str:
@@ -194,30 +189,16 @@ def sentences(path: Path, found: Mapping[str, Any], name: str) -> list[str]:
     return told
 
 
-def doubts(path: Path, found: Mapping[str, Any]) -> str:
-    """What is doubtful about the data, as a run's figures tell it; nothing if they do not.
+def doubtful(path: Path, found: Mapping[str, Any]) -> str:
+    """What is doubtful about the data, as a run's figures tell it.
 
-    Raises
-    ------
-    InputError
-        If it is no list of sentences.
+    InputError as :func:`sentences`.
     """
     told = sentences(path, found, "doubts")
     return "\n".join(paragraph(f"Doubtful: {text}", TENSE) for text in told)
 
 
-def unmapped(path: Path, found: Mapping[str, Any]) -> str:
-    """Which channels could not be mapped, and why; nothing if a run's figures name none.
-
-    Raises
-    ------
-    InputError
-        If it is no list of sentences.
-    """
-    return "\n".join(paragraph(t, BAD) for t in sentences(path, found, "unmapped"))
-
-
-def about(folder: Path, channels: str) -> str:
+def provenance(folder: Path, channels: str) -> str:
     """Where the results come from; ``channels``: the frequencies in words."""
     found = Provenance.read(folder)
     if found is None:
@@ -272,7 +253,40 @@ def citation(folder: Path) -> str:
     )
 
 
-def details(folder: Path, figures: dict) -> list[str]:
+def run_page(
+    folder: Path,
+    title: str,
+    channels: str,
+    figures: Mapping[str, Any],
+    head: Sequence[str],
+    sections: Mapping[tuple[str, str], Iterable[str]],
+) -> str:
+    """The page of a run.
+
+    Parameters
+    ----------
+    folder : Path
+        With the files of the run.
+    title : str
+    channels : str
+        The frequencies in words.
+    figures : mapping
+        The run's figures, with its seconds and versions.
+    head : sequence of str
+        The verdict, and what belongs to it.
+    sections : mapping
+        The parts of each by anchor and title, before those that every run has.
+    """
+    sections = {
+        **sections,
+        ("files", "Files and citation"): [downloads(folder), citation(folder)],
+        ("run", "The run"): details(folder, figures),
+    }
+    parts = [section(*name, inside) for name, inside in sections.items()]
+    return page(title, [contents(list(sections)), *head, provenance(folder, channels), *parts])
+
+
+def details(folder: Path, figures: Mapping[str, Any]) -> list[str]:
     """Tables of seconds and versions, and the resolved scenario."""
     scenario = read_text(folder / "scenario.yaml", "a scenario")
     for name in ("seconds", "versions"):

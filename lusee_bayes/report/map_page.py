@@ -13,21 +13,12 @@ from lusee_bayes.judge.chi2 import probability
 from lusee_bayes.judge.coverage import LEVELS, NAMES
 from lusee_bayes.report import html
 from lusee_bayes.report.explorer import explorer
-from lusee_bayes.report.html import details
-from lusee_bayes.report.sections import SECTION, flight_section, is_flight, map_unknowns
+from lusee_bayes.report.sections import flight_section, map_unknowns
 from lusee_bayes.results.finished_runs import FinishedRun
 from lusee_bayes.results.saved import COVERAGE, DIAGNOSIS, POINTING, SOURCES
 
 NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "diagnostics.nc", "mean.fits", "std.fits")
 FIGURES = ("maps", "draws", "fidelity", "spectra", "data_vector", "residuals", "beams")
-SECTIONS = [
-    ("map", "The map"),
-    ("scales", "Scales"),
-    ("data", "Data and prediction"),
-    ("numbers", "Numbers"),
-    ("files", "Files and citation"),
-    ("run", "The run"),
-]
 # days in the table, the worst first
 WORST_DAYS = 5
 
@@ -50,30 +41,25 @@ def map_page(folder: Path, name: str) -> str:
     require_files(folder, (*NEEDED, *(f"figures/{figure}.png" for figure in FIGURES)), "map")
     run = FinishedRun.read(folder)
     summary, found = run.summary, run.diagnostics
-    title = f"{name}: the sky at {summary['frequency_mhz']:g} MHz"
-    flight = is_flight(folder)
-    sections = [*SECTIONS[:2], SECTION, *SECTIONS[2:]] if flight else SECTIONS
-    return html.page(
-        title,
+    frequency = f"{summary['frequency_mhz']:g} MHz"
+    return html.run_page(
+        folder,
+        f"{name}: the sky at {frequency}",
+        frequency,
+        summary,
         [
-            html.contents(sections),
             html.verdict(found.attrs["level"], found.attrs["verdict"]),
             *_mistakes(folder, summary),
-            html.doubts(folder / "summary.json", summary),
-            html.about(folder, f"{summary['frequency_mhz']:g} MHz"),
-            html.section(*SECTIONS[0], *_map(folder, summary, found)),
-            html.section(*SECTIONS[1], *_scales(folder, run)),
-            *([flight_section(folder)] if flight else []),
-            html.section(*SECTIONS[2], *_data(folder, summary, found)),
-            html.section(*SECTIONS[3], *_numbers(folder, summary)),
-            html.section(*SECTIONS[4], html.downloads(folder), html.citation(folder)),
-            html.section(*SECTIONS[5], *details(folder, summary)),
+            html.doubtful(folder / "summary.json", summary),
         ],
+        {
+            ("map", "The map"): _map(folder, summary, found),
+            ("scales", "Scales"): _scales(folder, run),
+            **flight_section(folder),
+            ("data", "Data and prediction"): _data(folder, summary, found),
+            ("numbers", "Numbers"): _numbers(folder, summary),
+        },
     )
-
-
-def _figure(folder: Path, name: str, alternative: str, caption: str) -> str:
-    return html.figure(folder / "figures" / f"{name}.png", alternative, caption)
 
 
 def _map(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
@@ -88,7 +74,7 @@ def _map(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
             "The share from the prior is that of a pixel's variance, the monopole left out."
         ),
         explorer(folder, found),
-        _figure(
+        html.figure(
             folder,
             "maps",
             "Galactic maps: posterior mean and its standard deviation, and, where the true sky is "
@@ -97,7 +83,7 @@ def _map(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
             "All but the standard deviation are drawn through the Gaussian beam named above the "
             "maps, so that bright edges have no rings; files and numbers are without it.",
         ),
-        _figure(
+        html.figure(
             folder,
             "draws",
             "Galactic maps of four draws of the posterior",
@@ -151,14 +137,14 @@ def _scales(folder: Path, run: FinishedRun) -> list[str]:
         )
     return [
         html.paragraph(" ".join(text)),
-        _figure(
+        html.figure(
             folder,
             "fidelity",
             "Curves over multipole ell: correlation with the truth and signal-to-noise where the "
             "truth is known, and the share of the variance that the prior supplies",
             "Correlation with the truth, signal-to-noise ratio, and the share of the prior.",
         ),
-        _figure(
+        html.figure(
             folder,
             "spectra",
             "Power spectra of prior, posterior mean, posterior variance and truth",
@@ -200,7 +186,7 @@ def _data(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
             "spoils the predictions of others too; the culprit is the group whose removal makes "
             "the rest fit (last column)."
         ),
-        _figure(
+        html.figure(
             folder,
             "residuals",
             "Standardised residuals of every datum by product and time, and p-values by product",
@@ -228,7 +214,7 @@ def _data(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
     parts += _pointing(folder)
     parts += map_unknowns(folder, summary)
     parts.append(
-        _figure(
+        html.figure(
             folder,
             "data_vector",
             "The measured visibilities, product by product",
@@ -273,16 +259,11 @@ def _pointing(folder: Path) -> list[str]:
     parts = []
     if (folder / "pointing.csv").is_file():
         table = read_table(folder / "pointing.csv", POINTING)
-        rows = zip(*(table[name] for name in POINTING.variables), strict=True)
-        cells = [
-            (name, f"{value:.4g}", f"{std:.2g}", f"{prior:.2g}", f"{left:.1g}")
-            for name, value, std, prior, left in rows
-        ]
         header = ("offset", "found", "+-", "+- before the data", "beyond first order [noise]")
-        parts = [html.table(header, cells)]
-    if (folder / "figures" / "pointing.png").is_file():
+        parts = [html.table(header, html.cells(table, POINTING, ("", ".4g", ".2g", ".2g", ".1g")))]
+    if html.figure_path(folder, "pointing").is_file():
         parts.append(
-            _figure(
+            html.figure(
                 folder,
                 "pointing",
                 "Preferred offsets of clock, turntable and lean, day by day",
@@ -325,14 +306,13 @@ def _numbers(folder: Path, summary: dict) -> list[str]:
     sources = folder / "sources.csv"
     if sources.is_file():
         table = read_table(sources, SOURCES)
-        rows_of_sources = zip(*(table[name] for name in SOURCES.variables), strict=True)
-        cells = [(name, block, f"{f:.4g}", f"{std:.2g}") for name, block, f, std in rows_of_sources]
+        cells = html.cells(table, SOURCES, ("", "", ".4g", ".2g"))
         parts += [
             html.paragraph("Point sources beside the map"),
             html.table(("source", "block", "flux [Jy]", "+- [Jy]"), cells),
         ]
     parts.append(
-        _figure(
+        html.figure(
             folder,
             "beams",
             "Beams of an auto and two crosses seen from above, North up",

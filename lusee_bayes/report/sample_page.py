@@ -9,7 +9,6 @@ import numpy as np
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_json, read_table
 from lusee_bayes.report import html
-from lusee_bayes.report.html import details
 from lusee_bayes.results.draws import CRITERIA, FAR, FEW, warnings_of
 from lusee_bayes.results.saved import CHECK, SAMPLING, SUMMARY_TABLE, VALIDATION
 
@@ -54,20 +53,7 @@ FIGURES = {
 
 
 def sample_page(folder: Path, name: str) -> str:
-    """The page as text.
-
-    Parameters
-    ----------
-    folder : Path
-        With the files of a run.
-    name : str
-        Of the run, for the title.
-
-    Raises
-    ------
-    InputError
-        If something is missing in the folder.
-    """
+    """The page as text, of the folder and the name of a run. InputError as :func:`.map_page`."""
     require_files(folder, ("summary.csv", "sampling.json", "scenario.yaml"), "sample")
     sampling = read_json(folder / "sampling.json", SAMPLING)
     table = read_table(folder / "summary.csv", SUMMARY_TABLE)
@@ -83,34 +69,27 @@ def sample_page(folder: Path, name: str) -> str:
     kind = html.TENSE if reasons else html.GOOD
     if worst > FAR or sampling["divergences"] > FEW * sampling["chains"] * sampling["draws"]:
         kind = html.BAD
-    sections = [("summary", "Summary"), ("pictures", "Pictures")]
-    sections += [("files", "Files and citation"), ("run", "The run")]
-    parts = [html.section("summary", "Summary", html.table(header, map(_short, rows)))]
+    sections = {("summary", "Summary"): [html.table(header, map(_short, rows))]}
     validation = folder / "validation.json"
     if validation.is_file():
-        sections.insert(1, ("checks", "Checks"))
         checks = entries(validation, read_json(validation, VALIDATION), "checks", CHECK)
-        parts.append(html.section("checks", "Checks", _checks(checks)))
-    present = [
-        html.figure(folder / "figures" / f"{figure}.png", *texts)
+        sections["checks", "Checks"] = [_checks(checks)]
+    sections["pictures", "Pictures"] = [
+        html.figure(folder, figure, *texts)
         for figure, texts in FIGURES.items()
-        if (folder / "figures" / f"{figure}.png").is_file()
+        if html.figure_path(folder, figure).is_file()
     ]
-    return html.page(
+    return html.run_page(
+        folder,
         f"{name}: draws of {sampling['program']}",
+        f"draws of the program {sampling['program']}",
+        sampling,
         [
-            html.contents(sections),
             html.paragraph(" ".join([*reasons[:1], verdict, *reasons[1:]]), kind),
             html.paragraph(CRITERIA, "threshold"),
-            html.doubts(folder / "sampling.json", sampling),
-            html.about(folder, f"draws of the program {sampling['program']}"),
-            *parts,
-            html.section("pictures", "Pictures", *present),
-            html.section(
-                "files", "Files and citation", html.downloads(folder), html.citation(folder)
-            ),
-            html.section("run", "The run", *details(folder, sampling)),
+            html.doubtful(folder / "sampling.json", sampling),
         ],
+        sections,
     )
 
 

@@ -1,9 +1,4 @@
-"""Sections that several pages show: unknowns, sessions.
-
-Receivers, ground and gain table on the page of a run, where its folder has them.
-
-The part of a report that says how spectra became visibilities.
-"""
+"""Sections of the pages of maps and cubes: unknowns, and how spectra became visibilities."""
 
 from __future__ import annotations
 
@@ -48,7 +43,8 @@ def cube_unknowns(folder: Path, summary: Mapping[str, Any]) -> list[str]:
     cells = zip(table["frequency_mhz"], _cells(table), strict=True)
     rows = [(f"{frequency:g}", *row) for frequency, row in cells]
     figure = html.figure(
-        folder / "figures" / "unknowns.png",
+        folder,
+        "unknowns",
         "Powers of receivers, temperature of the ground and errors of gains against frequency",
         "What was found of each in every channel, with one standard deviation; grey: before the "
         "data. What is as wide as before was not told by them.",
@@ -70,7 +66,6 @@ def _cells(table: Mapping[str, np.ndarray]) -> list[tuple[str, ...]]:
     ]
 
 
-SECTION = ("flight", "From counts to visibilities")
 FLIGHT_FIGURES = {
     "flight_time_line": (
         "Gain level of every port and flagged spectra, over time",
@@ -90,26 +85,24 @@ FLIGHT_FIGURES = {
 SESSION = ("file", "layout", "spectra", "integration [s]", "Navgf", "gains", "software", "clock")
 
 
-def is_flight(folder: Path) -> bool:
-    """Whether a run was made of flight data."""
-    return (folder / REDUCED).is_file()
-
-
-def flight_section(folder: Path) -> str:
-    """The section: sessions, gains, flags, noise.
+def flight_section(folder: Path) -> dict[tuple[str, str], list[str]]:
+    """Sessions, gains, flags and noise, by anchor and title; nothing for other data.
 
     Parameters
     ----------
     folder : Path
-        Of a run of flight data.
+        Of a run.
     """
+    if not (folder / REDUCED).is_file():
+        return {}
     reduced = read_reduced(folder / REDUCED)
     figures = [
-        html.figure(path, alternative, caption)
-        for name, (alternative, caption) in FLIGHT_FIGURES.items()
-        if (path := folder / "figures" / f"{name}.png").is_file()
+        html.figure(folder, name, *texts)
+        for name, texts in FLIGHT_FIGURES.items()
+        if html.figure_path(folder, name).is_file()
     ]
-    return html.section(*SECTION, *_sessions(reduced), *_flags(reduced), *figures)
+    parts = [*_sessions(reduced), *_flags(reduced), *figures]
+    return {("flight", "From counts to visibilities"): parts}
 
 
 def _sessions(reduced: Reduced) -> list[str]:

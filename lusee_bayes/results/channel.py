@@ -1,27 +1,21 @@
-"""The posterior over the sky at one frequency, and what is known of it.
-
-What is known of a channel besides its posterior.
-
-The posterior over the sky at one frequency: what every kind of run has in common.
+"""The posterior over the sky at one frequency: what every kind of run has in common.
 
 A map is one channel, a cube several; samples and the paper's cases stand beside one. It is made of
-an information with its covariance here, or of a posterior with its model (:mod:`.claims`).
-
-The channel of a posterior with its model at hand: that of a map of one frequency.
-
-How far a map is from a known truth, by latitude and at some multipoles.
+an information with its covariance, or of a posterior with its model, and tells how far it is from a
+known truth, by latitude and at some multipoles.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from jaxtyping import Float, Shaped
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, Ells, Modes, ModesMatrix, Pixels
 from lusee_bayes.core.checks import Described, extent
 from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, power_spectrum
 from lusee_bayes.experiment.experiment import Experiment
@@ -62,9 +56,9 @@ class Observed:
     """
 
     frequency_mhz: float
-    prior_std: Float[np.ndarray, " modes"]
-    truth: Float[np.ndarray, " modes"] | None
-    highest_altitude: Float[np.ndarray, " pixels"]
+    prior_std: Modes
+    truth: Modes | None
+    highest_altitude: Pixels
     n_missing: int
     rounds: int
     instrument: ChiSquare
@@ -96,18 +90,11 @@ class Observed:
 
 # numbers of a channel that a file keeps as attributes
 NUMBERS = (
-    "log_evidence",
-    "information_bits",
-    "chi2",
-    "chi2_expected",
-    "chi2_model",
-    "instrument_chi2",
-    "instrument_chi2_expected",
-    "refinement",
-    "n_data",
-    "n_missing",
-    "rounds",
+    "frequency_mhz",
+    *("log_evidence", "information_bits", "chi2", "chi2_expected", "chi2_model"),
+    *("instrument_chi2", "instrument_chi2_expected", "refinement"),
 )
+COUNTS = ("n_data", "n_missing", "rounds")
 
 
 @dataclass(frozen=True, repr=False)
@@ -156,15 +143,15 @@ class ChannelResult(Described):
     """
 
     frequency_mhz: float
-    mean: Float[np.ndarray, " modes"]
-    std: Float[np.ndarray, " modes"]
-    prior_std: Float[np.ndarray, " modes"]
-    prior_fraction: Float[np.ndarray, " ells"]
-    pixel_std: Float[np.ndarray, " pixels"]
-    highest_altitude: Float[np.ndarray, " pixels"]
+    mean: Modes
+    std: Modes
+    prior_std: Modes
+    prior_fraction: Ells
+    pixel_std: Pixels
+    highest_altitude: Pixels
     draws: Float[np.ndarray, "n modes"]
-    truth: Float[np.ndarray, " modes"] | None
-    independent: Float[np.ndarray, " modes"] | None
+    truth: Modes | None
+    independent: Modes | None
     log_evidence: float
     information_bits: float
     chi2: float
@@ -197,7 +184,7 @@ class ChannelResult(Described):
         """Share of the sky that was never above the horizon."""
         return float((self.highest_altitude < 0).mean())
 
-    def snr(self, mean: Float[np.ndarray, " modes"] | None = None) -> np.ndarray | None:
+    def snr(self, mean: Modes | None = None) -> np.ndarray | None:
         """SNR_ell of the map, or of another mean; None where the truth is not known."""
         if self.truth is None:
             return None
@@ -211,25 +198,25 @@ class ChannelResult(Described):
 
     def spectra(self) -> dict[str, Shaped[np.ndarray, " ells"]]:
         """Columns of spectra.csv; rho, snr and cl_truth only where the truth is known."""
-        columns: dict[str, np.ndarray] = {"ell": np.arange(len(self.prior_fraction))}
-        if self.truth is not None:
-            columns["rho"] = correlation(self.mean, self.truth)
-            columns["snr"] = self.snr()
-        columns["cl_prior"] = power_spectrum(self.prior_std)
-        columns["cl_mean"] = power_spectrum(self.mean)
-        if self.truth is not None:
-            columns["cl_truth"] = power_spectrum(self.truth)
-        columns["cl_posterior_variance"] = power_spectrum(self.std)
-        columns["prior_fraction"] = self.prior_fraction
-        if self.truth is not None and self.independent is not None:
-            columns["snr_independent"] = self.snr(self.independent)
-        return columns
+        truth, alone = self.truth, self.independent
+        columns = {
+            "ell": np.arange(len(self.prior_fraction)),
+            "rho": None if truth is None else correlation(self.mean, truth),
+            "snr": self.snr(),
+            "cl_prior": power_spectrum(self.prior_std),
+            "cl_mean": power_spectrum(self.mean),
+            "cl_truth": None if truth is None else power_spectrum(truth),
+            "cl_posterior_variance": power_spectrum(self.std),
+            "prior_fraction": self.prior_fraction,
+            "snr_independent": None if alone is None else self.snr(alone),
+        }
+        return {name: values for name, values in columns.items() if values is not None}
 
     def coverage_rows(self) -> list[dict[str, float | str]] | None:
         """:attr:`coverage` for summary.json; None where the truth is not known."""
         return [band.row() for band in self.coverage] or None
 
-    def maps(self) -> dict[str, Float[np.ndarray, " pixels"]]:
+    def maps(self) -> dict[str, Pixels]:
         """HEALPix RING maps by name, in K: mean, std and, where known, truth and residual."""
         maps = {"mean": modes_to_map(self.mean, self.nside), "std": self.pixel_std}
         if self.truth is not None:
@@ -239,33 +226,28 @@ class ChannelResult(Described):
 
     def variables(self) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
         """What posterior.nc holds of a channel, on dims ``mode`` and ``draw``; in K."""
-        variables = {
-            "mean": (("mode",), self.mean),
-            "std": (("mode",), self.std),
-            "prior_std": (("mode",), self.prior_std),
+        known = {
+            "mean": self.mean,
+            "std": self.std,
+            "prior_std": self.prior_std,
+            "truth": self.truth,
+            "independent_mean": self.independent,
         }
-        if self.truth is not None:
-            variables["truth"] = (("mode",), self.truth)
-        if self.independent is not None:
-            variables["independent_mean"] = (("mode",), self.independent)
-        if len(self.draws):
-            variables["draws"] = (("draw", "mode"), self.draws)
-        return variables
+        found = {name: (("mode",), values) for name, values in known.items() if values is not None}
+        return found | ({"draws": (("draw", "mode"), self.draws)} if len(self.draws) else {})
 
     def to_dataset(self) -> xr.Dataset:
         """All of it, for :meth:`from_dataset`."""
-        variables = dict(self.variables())
-        variables["draws"] = (("draw", "mode"), self.draws)
-        variables["prior_fraction"] = (("ell",), self.prior_fraction)
-        variables["pixel_std"] = (("pixel",), self.pixel_std)
-        variables["highest_altitude"] = (("pixel",), self.highest_altitude)
-        numbers = {name: getattr(self, name) for name in ("frequency_mhz", *NUMBERS)}
-        unknowns = None if self.unknowns is None else self.unknowns.summary()
-        texts = {
-            "doubts": self.doubts,
-            "coverage": self.coverage_rows() or [],
-            "unknowns": unknowns,
+        variables = self.variables() | {
+            "draws": (("draw", "mode"), self.draws),
+            "prior_fraction": (("ell",), self.prior_fraction),
+            "pixel_std": (("pixel",), self.pixel_std),
+            "highest_altitude": (("pixel",), self.highest_altitude),
         }
+        numbers = {name: getattr(self, name) for name in (*NUMBERS, *COUNTS)}
+        unknowns = None if self.unknowns is None else self.unknowns.summary()
+        rows = self.coverage_rows() or []
+        texts = {"doubts": self.doubts, "coverage": rows, "unknowns": unknowns}
         told = {name: json.dumps(value) for name, value in texts.items()}
         return xr.Dataset(variables, attrs={**numbers, **told})
 
@@ -273,32 +255,29 @@ class ChannelResult(Described):
     def from_dataset(cls, dataset: xr.Dataset) -> ChannelResult:
         """The inverse of :meth:`to_dataset`."""
         arrays = {str(name): np.asarray(v) for name, v in dataset.data_vars.items()}
-        independent = arrays.pop("independent_mean", None)
-        numbers = {name: float(dataset.attrs[name]) for name in NUMBERS}
-        counts = {name: int(numbers.pop(name)) for name in ("n_data", "n_missing", "rounds")}
-        unknowns = json.loads(dataset.attrs["unknowns"])
+        texts = ("doubts", "coverage", "unknowns")
+        told, coverage, unknowns = (json.loads(dataset.attrs[name]) for name in texts)
         return cls(
-            frequency_mhz=float(dataset.attrs["frequency_mhz"]),
             truth=arrays.pop("truth", None),
-            independent=independent,
-            doubts=tuple(json.loads(dataset.attrs["doubts"])),
-            coverage=tuple(map(Coverage.from_row, json.loads(dataset.attrs["coverage"]))),
+            independent=arrays.pop("independent_mean", None),
+            doubts=tuple(told),
+            coverage=tuple(map(Coverage.from_row, coverage)),
             unknowns=None if unknowns is None else UnknownsReport.from_summary(unknowns),
             **arrays,
-            **numbers,
-            **counts,
+            **{name: float(dataset.attrs[name]) for name in NUMBERS},
+            **{name: int(dataset.attrs[name]) for name in COUNTS},
         )
 
 
 def channel_of_information(
     observed: Observed,
     information: Information,
-    mean: Float[Array, " modes"],
-    covariance: Float[Array, "modes modes"],
+    mean: Modes,
+    covariance: ModesMatrix,
     draws: Float[Array, "n modes"],
     *,
     compared: Float[np.ndarray, "more modes"] | None = None,
-    independent: Float[Array, " modes"] | None = None,
+    independent: Modes | None = None,
     log_evidence: float = np.nan,
     information_bits: float = np.nan,
     chi2_model: float = np.nan,
@@ -322,21 +301,16 @@ def channel_of_information(
     independent, log_evidence, information_bits, chi2_model, refinement
         See :class:`ChannelResult`.
     """
-    std, unknowns = np.sqrt(np.diagonal(np.asarray(covariance))), observed.unknowns
-    width, found = pixel_std(covariance, round(np.sqrt(observed.highest_altitude.size / 12))), ()
-    if compared is not None and observed.truth is not None:
-        found = Counts.of_pixels(width, observed.truth - np.asarray(mean), compared).coverage()
-    return ChannelResult(
-        frequency_mhz=observed.frequency_mhz,
-        mean=np.asarray(mean),
-        std=std,
-        prior_std=observed.prior_std,
-        prior_fraction=mean_over_m(std**2 / observed.prior_std**2),
-        pixel_std=width,
-        highest_altitude=observed.highest_altitude,
+    variance, unknowns = np.diagonal(np.asarray(covariance)), observed.unknowns
+    joint = independent is not None
+    return _channel(
+        observed,
+        np.asarray(mean),
+        covariance,
+        compared,
+        prior_fraction=mean_over_m(np.sqrt(variance) ** 2 / observed.prior_std**2),
         draws=np.asarray(draws),
-        truth=observed.truth,
-        independent=_array(independent),
+        independent=np.asarray(independent) if joint else None,
         log_evidence=log_evidence,
         information_bits=information_bits,
         chi2=float(information.chi2(mean)),
@@ -344,26 +318,39 @@ def channel_of_information(
         chi2_model=chi2_model,
         refinement=refinement,
         n_data=int(information.n_data),
-        n_missing=observed.n_missing,
-        rounds=observed.rounds,
-        doubts=(*observed.doubts, *about_information(information_bits)),
-        coverage=found,
-        instrument_chi2=observed.instrument.chi2,
-        instrument_chi2_expected=observed.instrument.degrees,
-        unknowns=None
-        if unknowns is None
-        else unknowns.report(mean, covariance, joint=independent is not None),
+        unknowns=None if unknowns is None else unknowns.report(mean, covariance, joint=joint),
     )
 
 
-def _array(values: Float[Array, " modes"] | None) -> Float[np.ndarray, " modes"] | None:
-    return None if values is None else np.asarray(values)
+def _channel(
+    observed: Observed,
+    mean: Modes,
+    covariance: ModesMatrix,
+    compared: Float[np.ndarray, "more modes"] | None,
+    **figures: Any,
+) -> ChannelResult:
+    """A channel with what follows from its observation, a mean and a covariance."""
+    width, found = pixel_std(covariance, round(np.sqrt(observed.highest_altitude.size / 12))), ()
+    if compared is not None and observed.truth is not None:
+        found = Counts.of_pixels(width, observed.truth - mean, compared).coverage()
+    names = ("frequency_mhz", "prior_std", "highest_altitude", "truth", "n_missing", "rounds")
+    return ChannelResult(
+        mean=mean,
+        std=np.sqrt(np.diagonal(np.asarray(covariance))),
+        pixel_std=width,
+        doubts=(*observed.doubts, *about_information(figures["information_bits"])),
+        coverage=found,
+        instrument_chi2=observed.instrument.chi2,
+        instrument_chi2_expected=observed.instrument.degrees,
+        **{name: getattr(observed, name) for name in names},
+        **figures,
+    )
 
 
 def channel_of_posterior(
     experiment: Experiment,
     inference: Inference,
-    covariance: Float[np.ndarray, "modes modes"],
+    covariance: ModesMatrix,
     *,
     n_draws: int = 0,
     judged: Inference | None = None,
@@ -382,41 +369,30 @@ def channel_of_posterior(
     judged : Inference, optional
         The model that predicts the data and its posterior, where earlier data were there.
     """
-    scenario, data, posterior = experiment.scenario, experiment.data, inference.posterior
-    judged, found = inference if judged is None else judged, ()
-    prior_variance = np.asarray(inference.model.prior.variance())
-    std, width = np.sqrt(np.diagonal(covariance)), pixel_std(covariance, scenario.map_nside)
-    fraction = np.divide(std**2, prior_variance, out=np.zeros(len(std)), where=prior_variance > 0)
-    mean = np.asarray(posterior.mean)
-    truth = None if data.truth is None else np.asarray(data.truth)
-    if truth is not None:
-        found = Counts.of_pixels(width, truth - mean, deviations(experiment, posterior)).coverage()
-    return ChannelResult(
-        frequency_mhz=scenario.frequency_mhz,
-        mean=mean,
-        std=std,
-        prior_std=np.sqrt(prior_variance),
+    model, posterior, data = inference.model, inference.posterior, experiment.data
+    judged = inference if judged is None else judged
+    prior_variance = np.asarray(model.prior.variance())
+    variance = np.sqrt(np.diagonal(covariance)) ** 2
+    fraction = np.divide(
+        variance, prior_variance, out=np.zeros(len(variance)), where=prior_variance > 0
+    )
+    observed = Observed.of(experiment, inference, ChiSquare(np.nan, np.nan))
+    misfit = float(judged.model.chi2(judged.posterior.mean, data.data))
+    return _channel(
+        replace(observed, prior_std=np.sqrt(prior_variance)),
+        np.asarray(posterior.mean),
+        covariance,
+        None if data.truth is None else deviations(experiment, posterior),
         prior_fraction=mean_over_m(fraction),
-        pixel_std=width,
-        highest_altitude=highest_altitude(data.observation, scenario.map_nside),
         draws=posterior_draws(experiment, posterior, n_draws),
-        truth=truth,
         independent=None,
         log_evidence=float(posterior.log_evidence),
         information_bits=float(posterior.information_bits()),
-        chi2=float(inference.model.chi2(posterior.mean, data.data)),
-        chi2_expected=expected_chi2(judged.posterior, inference.model.n_data),
-        chi2_model=float(judged.model.chi2(judged.posterior.mean, data.data))
-        + float(judged.posterior.prior_chi2()),
+        chi2=float(model.chi2(posterior.mean, data.data)),
+        chi2_expected=expected_chi2(judged.posterior, model.n_data),
+        chi2_model=misfit + float(judged.posterior.prior_chi2()),
         refinement=float(posterior.refinement),
-        n_data=inference.model.n_data,
-        n_missing=data.n_missing,
-        rounds=inference.rounds,
-        doubts=(
-            *doubts(experiment, inference),
-            *about_information(float(posterior.information_bits())),
-        ),
-        coverage=found,
+        n_data=model.n_data,
     )
 
 

@@ -1,9 +1,4 @@
-"""The posterior over the skies of several frequencies.
-
-Receivers, ground and gain table of a run of several frequencies, channel by channel.
-
-The posterior over the skies of several frequencies: a channel each, or one for all.
-"""
+"""The posterior over the skies of several frequencies: a channel each, or one for all."""
 
 from __future__ import annotations
 
@@ -22,7 +17,8 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import Described, counted, extent
 from lusee_bayes.core.harmonics import mode_numbers, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.progress import peak_memory_gb
+from lusee_bayes.core.progress import about_run
+from lusee_bayes.core.reading import rows_of
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.flight.reduced import Reduced
@@ -34,6 +30,12 @@ from lusee_bayes.results.map_result import joint_prior_sentence
 from lusee_bayes.results.unknowns import UnknownsReport
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.sky.spectral_prior import SpectralPrior
+
+# what summary.json says of a channel, where it is known
+FIGURES = (
+    *("instrument_chi2", "instrument_chi2_expected", "chi2_model", "chi2", "chi2_expected"),
+    *("n_data", "n_missing", "never_observed", "log_evidence", "information_bits"),
+)
 
 
 @dataclass(frozen=True)
@@ -75,8 +77,7 @@ class CubeUnknowns:
                 untold[name] = untold.get(name, 0) + 1
         counts = [f"{name} (at {k} of {n} frequencies)" for name, k in untold.items()]
         what = f"do not tell {', '.join(counts)}" if counts else "tell all of them"
-        first = f"Receivers, ground and gain table: the data {what}."
-        found = [first]
+        found = [f"Receivers, ground and gain table: the data {what}."]
         if self.octaves is not None:
             found.append(
                 f"Powers of receivers are smooth over {self.octaves:g} octaves: every channel is "
@@ -247,33 +248,16 @@ class CubeResult(Described):
                 return []
             pull = (values["mean"] - values["truth"]) / values["std"]
             worst = int(np.argmax(np.abs(pull)))
-            found.append(
-                {
-                    "direction": name,
-                    "rms": float(np.sqrt((pull**2).mean())),
-                    "worst": float(pull[worst]),
-                    "worst_mhz": float(self.frequencies_mhz[worst]),
-                }
-            )
+            rms, frequency = float(np.sqrt((pull**2).mean())), float(self.frequencies_mhz[worst])
+            row = {"direction": name, "rms": rms, "worst": float(pull[worst])}
+            found.append({**row, "worst_mhz": frequency})
         return found
 
     def summary(self) -> dict[str, object]:
         """Figures of summary.json."""
         channels = []
         for channel, p in zip(self.channels, self.fits().p().tolist(), strict=True):
-            numbers = {
-                "instrument_p": p,
-                "instrument_chi2": channel.instrument_chi2,
-                "instrument_chi2_expected": channel.instrument_chi2_expected,
-                "chi2_model": channel.chi2_model,
-                "chi2": channel.chi2,
-                "chi2_expected": channel.chi2_expected,
-                "n_data": channel.n_data,
-                "n_missing": channel.n_missing,
-                "never_observed": channel.never_observed,
-                "log_evidence": channel.log_evidence,
-                "information_bits": channel.information_bits,
-            }
+            numbers = {"instrument_p": p} | {name: getattr(channel, name) for name in FIGURES}
             known = {name: value for name, value in numbers.items() if not np.isnan(value)}
             if channel.coverage:
                 known["coverage"] = channel.coverage_rows()
@@ -300,9 +284,7 @@ class CubeResult(Described):
             "pulls": self.pulls(),
             "unknowns": [] if self.unknowns is None else self.unknowns.lines(),
             "channels": channels,
-            "seconds": {name: round(s, 3) for name, s in self.seconds.items()},
-            "peak_memory_gb": round(peak_memory_gb(), 3),
-            "versions": versions(),
+            **about_run(self.seconds),
         }
 
     def _joint_summary(self) -> dict[str, object] | None:
@@ -324,10 +306,9 @@ class CubeResult(Described):
         """Rows of spectra.csv: one for every channel and ell."""
         rows = []
         for channel in self.channels:
-            columns = channel.spectra()
-            for ell in range(len(columns["ell"])):
-                values = {name: float(column[ell]) for name, column in columns.items()}
-                rows.append({"frequency_mhz": channel.frequency_mhz, **values, "ell": ell})
+            columns = {name: v.astype(np.float64) for name, v in channel.spectra().items()}
+            for ell, row in enumerate(rows_of(columns)):
+                rows.append({"frequency_mhz": channel.frequency_mhz, **row, "ell": ell})
         return rows
 
     def to_dataset(self) -> xr.Dataset:
@@ -335,12 +316,9 @@ class CubeResult(Described):
         scenario, components = self.scenario, self.components
         ell, m = mode_numbers(scenario.lmax)
         parts = [channel.variables() for channel in self.channels]
+        stacked = {name: np.stack([part[name][1] for part in parts]) for name in parts[0]}
         variables = {
-            name: (
-                ("frequency", *dims),
-                np.stack([part[name][1] for part in parts]),
-                {"units": "K"},
-            )
+            name: (("frequency", *dims), stacked[name], {"units": "K"})
             for name, (dims, _) in parts[0].items()
         }
         if components is not None:

@@ -1,9 +1,5 @@
 """What a report shows beyond the map: computed once, kept in diagnostics.nc.
 
-diagnostics.nc: written and read.
-
-What a report shows beyond the map itself, computed once and kept in diagnostics.nc.
-
 Residuals of data against the prediction of the rest, draws as maps, the prior's share of every
 pixel, posterior of regions, and point-spread functions.
 """
@@ -19,7 +15,7 @@ import xarray as xr
 from jaxtyping import Float, Int8
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.arrays import DataVector, Grid, ModesMatrix, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import read_dataset
 from lusee_bayes.core.harmonics import (
@@ -32,6 +28,7 @@ from lusee_bayes.core.harmonics import (
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.judge.measures import strengths, strengths_in_words
 from lusee_bayes.judge.residuals import Residuals
 from lusee_bayes.linear.posterior import prior_pixel_std
@@ -62,17 +59,18 @@ def read_diagnostics(path: str | Path) -> xr.Dataset:
     return found
 
 
+# what is told of a group of data
+GROUP = {"kind": np.str_, "name": np.str_, "n": np.int64} | dict.fromkeys(
+    ("degrees", "chi2", "p", "others_p"), np.float64
+)
+
+
 def group_variables(kinds: Mapping[str, Sequence[Any]]) -> dict[str, tuple[str, np.ndarray]]:
     """One row for every group (``linear.residuals.Group``) that was left out, by its kind."""
-    groups = [(kind, group) for kind, found in kinds.items() for group in found]
+    groups = [{"kind": kind, **vars(group)} for kind, found in kinds.items() for group in found]
     return {
-        "group_kind": ("group", np.array([kind for kind, _ in groups], dtype=np.str_)),
-        "group_name": ("group", np.array([group.name for _, group in groups], dtype=np.str_)),
-        "group_n": ("group", np.array([group.n for _, group in groups], dtype=np.int64)),
-        "group_degrees": ("group", np.array([group.degrees for _, group in groups])),
-        "group_chi2": ("group", np.array([group.chi2 for _, group in groups])),
-        "group_p": ("group", np.array([group.p for _, group in groups])),
-        "group_others_p": ("group", np.array([group.others_p for _, group in groups])),
+        f"group_{name}": ("group", np.array([group[name] for group in groups], dtype=dtype))
+        for name, dtype in GROUP.items()
     }
 
 
@@ -87,7 +85,7 @@ def diagnostics(
     inference: Inference,
     found: Residuals,
     channel: ChannelResult,
-    covariance: Float[np.ndarray, "modes modes"],
+    covariance: ModesMatrix,
 ) -> xr.Dataset:
     """Work out what a report shows beyond the map itself.
 
@@ -133,7 +131,7 @@ def diagnostics(
     region_prior = (prior.colour_columns(without) ** 2).sum(1)
     region_share = (region_variance - rows[:, 0] * with_monopole) / region_prior
 
-    def on_grid(values: Float[np.ndarray, " data"]) -> Float[np.ndarray, "products times"]:
+    def on_grid(values: DataVector) -> Grid:
         return np.where(data.layout.present, data.layout.scatter(values), np.nan)
 
     kelvin = {"units": "K"}
@@ -159,12 +157,8 @@ def diagnostics(
             "format": formats.DIAGNOSTICS,
             "level": fit.level,
             "verdict": fit.text,
-            "instrument_chi2": found.split.instrument.chi2,
-            "instrument_chi2_expected": found.split.instrument.degrees,
-            "instrument_p": found.split.instrument.p,
-            "prior_chi2": found.split.prior.chi2,
-            "prior_chi2_expected": found.split.prior.degrees,
-            "prior_p": found.split.prior.p,
+            **_chi2("instrument", found.split.instrument),
+            **_chi2("prior", found.split.prior),
             "extremes": [f"{kind} {group.name}" for kind, group in found.extremes()] or "none",
             "suspects": [f"{kind} {group.name}" for kind, group in found.suspects()] or "none",
             "frequency_mhz": scenario.frequency_mhz,
@@ -172,8 +166,13 @@ def diagnostics(
     )
 
 
+def _chi2(name: str, part: ChiSquare) -> dict[str, float]:
+    found = {"chi2": part.chi2, "chi2_expected": part.degrees, "p": part.p}
+    return {f"{name}_{key}": value for key, value in found.items()}
+
+
 def packed_resolution(
-    covariance: Float[np.ndarray, "modes modes"], prior: Prior
+    covariance: ModesMatrix, prior: Prior
 ) -> tuple[Int8[np.ndarray, "modes modes"], Float[np.ndarray, "ells ells"]]:
     """Pack what the data know of the modes, for point-spread functions of any direction.
 

@@ -1,9 +1,4 @@
-"""Draws of a posterior, and whether draws can be trusted.
-
-Draws of a posterior, which of them a scenario's seed stands for, and what is doubtful.
-
-Whether draws can be trusted: what is wanted of chains, and what they fall short of.
-"""
+"""Draws of a posterior: which of them a seed stands for, and whether they can be trusted."""
 
 from __future__ import annotations
 
@@ -12,9 +7,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.arrays import Draws, on_host
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
@@ -33,7 +28,7 @@ def draw_key(scenario: Scenario) -> PRNGKeyArray:
 
 def posterior_draws(
     experiment: Experiment, posterior: Posterior, n: int, purpose: int = DRAWS
-) -> Float[np.ndarray, "draws modes"]:
+) -> Draws:
     """Draw the sky.
 
     Where the prior was learned, its parameters are drawn, too (:mod:`.learning`); not for
@@ -60,9 +55,7 @@ def posterior_draws(
     return np.asarray(on_host(posterior).sample(key, n))
 
 
-def deviations(
-    experiment: Experiment, posterior: Posterior, n: int = N_DRAWS
-) -> Float[np.ndarray, "draws modes"]:
+def deviations(experiment: Experiment, posterior: Posterior, n: int = N_DRAWS) -> Draws:
     """Draws of a posterior less its mean, in K, that coverage is compared with."""
     draws = posterior_draws(experiment, posterior, n, COMPARED)
     return draws - np.asarray(posterior.mean)

@@ -1,8 +1,6 @@
-"""Runs that are finished, read back from their folders, and where they come from.
+"""Runs that are finished, read back from their folders to be set side by side.
 
-Where results come from: which data, of which site and dates, by which command and when.
-
-Map runs that are finished, read back from their folders to be set side by side.
+Their provenance says which data they are of, of which site and dates, by which command and when.
 """
 
 from __future__ import annotations
@@ -15,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Ells, Pixels
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover, require_files, user_path
 from lusee_bayes.core.reading import read_json, read_table
@@ -137,9 +135,9 @@ class FinishedRun:
 
     name: str
     summary: dict
-    spectra: dict[str, Float[np.ndarray, " ells"]]
-    mean: Float[np.ndarray, " pixels"]
-    std: Float[np.ndarray, " pixels"]
+    spectra: dict[str, Ells]
+    mean: Pixels
+    std: Pixels
     diagnostics: xr.Dataset
     provenance: Provenance | None
 

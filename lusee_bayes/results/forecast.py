@@ -17,9 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-from jaxtyping import Float
-
+from lusee_bayes.core.arrays import Ells
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.judge.chi2 import ell_cross
@@ -66,7 +64,7 @@ class Forecast:
     n_data: int
     information_bits: float
     modes: int
-    snr_squared: Float[np.ndarray, " ells"]
+    snr_squared: Ells
     resolution_deg: float | None
     offsets: dict[str, float] = field(default_factory=dict)
 

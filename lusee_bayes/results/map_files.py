@@ -1,9 +1,4 @@
-"""The files of a map: posterior.nc, and HEALPix FITS.
-
-Maps as HEALPix FITS files whose headers say where they come from.
-
-posterior.nc of a map: mean, standard deviations, and what was asked for besides.
-"""
+"""The files of a map: posterior.nc, and HEALPix FITS whose headers say where they come from."""
 
 from __future__ import annotations
 
@@ -17,6 +12,7 @@ from astropy.io import fits
 from jaxtyping import Float
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.arrays import Pixels
 from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.version import __version__, versions
@@ -69,9 +65,7 @@ def text_hash(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def write_map(
-    path: Path, name: str, pixels: Float[np.ndarray, " pixels"], scenario: Scenario
-) -> None:
+def write_map(path: Path, name: str, pixels: Pixels, scenario: Scenario) -> None:
     """Write one map of a scenario: HEALPix RING, Galactic, K, float64, for healpy.read_map."""
     extra = [
         (key, *value) if isinstance(value, tuple) else (key, value)

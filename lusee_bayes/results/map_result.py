@@ -1,10 +1,6 @@
 """A posterior map at one frequency, with what is needed to judge it.
 
-Fluxes of the point sources beside a map.
-
-Where a map's prior comes from, in words and numbers.
-
-A posterior map at one frequency, with what is needed to judge it.
+Beside the map are the fluxes of point sources, and where its prior comes from.
 """
 
 from __future__ import annotations
@@ -12,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from textwrap import wrap
+from typing import Any
 
 import jax
 import numpy as np
@@ -21,8 +18,7 @@ import xarray as xr
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.progress import Stages, peak_memory_gb
-from lusee_bayes.core.version import versions
+from lusee_bayes.core.progress import Stages, about_run
 from lusee_bayes.experiment.diagnosis import Diagnosis, diagnose
 from lusee_bayes.experiment.experiment import Experiment, explained, infer
 from lusee_bayes.experiment.instrument_terms import beam_rms_difference
@@ -33,7 +29,7 @@ from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.judge.chi2 import LEVELS, RULE, effective_resolution_deg
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.linear.amplitudes import template_amplitudes
-from lusee_bayes.linear.model import composed, deviation_model
+from lusee_bayes.linear.linear_gaussian import composed, deviation_model
 from lusee_bayes.results.channel import ChannelResult, channel_of_posterior
 from lusee_bayes.results.diagnostics import diagnostics
 from lusee_bayes.results.saved import JUDGED
@@ -74,24 +70,24 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     std = prior_std * amplitudes.std
     jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
     truth = true_values(setup) if data.truth is not None else {}
-    rows, at = [], 0
-    for source in sources.sources:
-        true = np.broadcast_to(truth.get(source.site, np.nan), source.n_blocks)
-        for block, up in enumerate(source.seen()):
-            row = {
-                "source": source.name,
-                "block": block,
-                "above_horizon": bool(up),
-                "flux_jy": mean[at] * jansky,
-                "std_jy": std[at] * jansky,
-                "flux_k_sr": mean[at],
-                "std_k_sr": std[at],
-                "prior_jy": float(source.mean) * jansky,
-                "prior_std_jy": float(source.std) * jansky,
-            }
-            rows.append(row if data.truth is None else row | {"true_jy": true[block] * jansky})
-            at += 1
-    return pd.DataFrame(rows)
+    listed = [(s, block) for s in sources.sources for block in range(s.n_blocks)]
+    table = pd.DataFrame(
+        {
+            "source": [source.name for source, _ in listed],
+            "block": [block for _, block in listed],
+            "above_horizon": [bool(up) for s in sources.sources for up in s.seen()],
+            "flux_jy": mean * jansky,
+            "std_jy": std * jansky,
+            "flux_k_sr": mean,
+            "std_k_sr": std,
+            "prior_jy": [float(source.mean) * jansky for source, _ in listed],
+            "prior_std_jy": [float(source.std) * jansky for source, _ in listed],
+        }
+    )
+    if data.truth is None:
+        return table
+    true = [np.broadcast_to(truth.get(s.site, np.nan), s.n_blocks) for s in sources.sources]
+    return table.assign(true_jy=np.concatenate(true) * jansky)
 
 
 def flux_lines(fluxes: pd.DataFrame) -> list[str]:
@@ -221,39 +217,28 @@ class MapResult(Described):
     def summary(self) -> dict[str, object]:
         """Figures of summary.json; null where a truth would be needed and is not known."""
         channel = self.channel
+        offsets = None if self.pointing is None else self.pointing.offsets
         return {
-            "frequency_mhz": channel.frequency_mhz,
-            "ell_cross": channel.ell_cross,
+            **_figures(channel, "frequency_mhz", "ell_cross"),
             "effective_resolution_deg": effective_resolution_deg(channel.prior_fraction),
-            "log_evidence": channel.log_evidence,
-            "information_bits": channel.information_bits,
-            "chi2": channel.chi2,
-            "chi2_expected": channel.chi2_expected,
+            **_figures(channel, "log_evidence", "information_bits", "chi2", "chi2_expected"),
             "level": self.diagnostics.attrs["level"],
             "verdict": self.verdict(),
             **{name: self.diagnostics.attrs[name] for name in JUDGED},
             "diagnosis": None if self.diagnosis is None else self.diagnosis.rows(),
             "coverage": channel.coverage_rows(),
-            "n_data": channel.n_data,
-            "n_missing": channel.n_missing,
+            **_figures(channel, "n_data", "n_missing"),
             "n_modes": len(channel.mean),
             "rounds": channel.rounds,
             **prior_summary(self.experiment),
-            "pointing": self._pointing_rows(),
+            "pointing": None if offsets is None else offsets.to_dict("records"),
             "unknowns": None if self.unknowns is None else self.unknowns.summary(),
             "beam_rms_difference": beam_rms_difference(self.experiment.setup),
             "mean_refinement_sigma": channel.refinement,
             "never_observed_fraction": channel.never_observed,
             "doubts": list(channel.doubts),
-            "seconds": {name: round(s, 3) for name, s in self.seconds.items()},
-            "peak_memory_gb": round(peak_memory_gb(), 3),
-            "versions": versions(),
+            **about_run(self.seconds),
         }
-
-    def _pointing_rows(self) -> list[dict[str, object]] | None:
-        if self.pointing is None or self.pointing.offsets is None:
-            return None
-        return self.pointing.offsets.to_dict("records")
 
     def verdict(self) -> str:
         """Whether the data fit, in sentences."""
@@ -261,19 +246,16 @@ class MapResult(Described):
 
     def headline(self) -> str:
         """The few figures that matter, in one line."""
-        summary = self.summary()
-        parts = []
-        if self.channel.truth is not None:
-            cross = summary["ell_cross"]
-            parts.append(
-                "SNR > 1 at every ell" if cross is None else f"SNR < 1 first at ell {cross}"
-            )
-        resolution = summary["effective_resolution_deg"]
+        channel, parts = self.channel, []
+        if channel.truth is not None:
+            cross = channel.ell_cross
+            parts = ["SNR > 1 at every ell" if cross is None else f"SNR < 1 first at ell {cross}"]
+        resolution = effective_resolution_deg(channel.prior_fraction)
         if resolution is not None:
             parts.append(f"resolution {resolution:.1f} deg")
-        parts.append(f"chi2 {summary['chi2']:.0f} (expected {summary['chi2_expected']:.0f})")
-        parts.append(f"ln evidence {summary['log_evidence']:.1f}")
-        parts.append(f"{summary['information_bits']:.0f} bits")
+        parts.append(f"chi2 {channel.chi2:.0f} (expected {channel.chi2_expected:.0f})")
+        parts.append(f"ln evidence {channel.log_evidence:.1f}")
+        parts.append(f"{channel.information_bits:.0f} bits")
         return ", ".join(parts)
 
     def lines(self) -> list[str]:
@@ -293,6 +275,10 @@ class MapResult(Described):
         fitting = self.experiment.fitting
         line = self.reduced.flag_line(self.band, 0.0 if fitting is None else fitting.share)
         return [line.capitalize(), *self.reduced.doubts(self.band), *self.reduced.notes()]
+
+
+def _figures(channel: ChannelResult, *names: str) -> dict[str, Any]:
+    return {name: getattr(channel, name) for name in names}
 
 
 def map_result(

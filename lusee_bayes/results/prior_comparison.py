@@ -6,13 +6,14 @@ with the prior that was learned from all. Where the sky is known, so is how ofte
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.core.progress import peak_memory_gb
-from lusee_bayes.core.version import versions
+from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment, infer
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.judge.chi2 import Split
@@ -167,9 +168,7 @@ class PriorComparison:
             "frequency_mhz": self.scenario.frequency_mhz,
             "n_data": self.best.channel.n_data,
             "priors": [one.as_json() for one in self.priors],
-            "seconds": {name: round(s, 3) for name, s in self.seconds.items()},
-            "peak_memory_gb": round(peak_memory_gb(), 3),
-            "versions": versions(),
+            **about_run(self.seconds),
         }
 
     def as_markdown(self) -> str:
@@ -215,59 +214,39 @@ def prior_table(
         Entries of priors.json.
     """
     header = ("", *(str(one["name"]) for one in priors))
-    evidence = [one["log_evidence"] for one in priors]
+
+    def each(form: str, *path: str | int) -> list[str]:
+        """A cell for each prior, of the entry at this place."""
+        return [format(reduce(getitem, path, one), form) for one in priors]
+
+    def less_best(*path: str | int) -> list[str]:
+        values = [reduce(getitem, path, one) for one in priors]
+        return [f"{value - max(values):.1f}" for value in values]
+
     rows = [
-        ("ln evidence", *_numbers(evidence)),
-        ("less the best", *_less_best(evidence)),
-        ("parameters learned", *(str(one["parameters"]) for one in priors)),
+        ("ln evidence", *each(".1f", "log_evidence")),
+        ("less the best", *less_best("log_evidence")),
+        ("parameters learned", *each("", "parameters")),
     ]
     for k, held in enumerate(priors[0]["held_out"]):
-        found = [one["held_out"][k] for one in priors]
         kind = f"{held['kind']}s left out"
         rows += [
-            (f"{kind}: ln p less the best", *_less_best([one["log_density"] for one in found])),
-            (f"{kind}: chi2 of {held['n']}", *(f"{one['chi2']:.0f}" for one in found)),
+            (f"{kind}: ln p less the best", *less_best("held_out", k, "log_density")),
+            (f"{kind}: chi2 of {held['n']}", *each(".0f", "held_out", k, "chi2")),
         ]
-    rows += [
-        (f"chi2 {words}", *(_of(one[f"chi2_{key}"], one[f"degrees_{key}"]) for one in priors))
-        for key, words in (("instrument", "no sky explains"), ("prior", "of the sky"))
-    ]
-    if all(one["coverage"] for one in priors):
-        rows += _known(priors)
-    return header, rows
-
-
-def _known(priors: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """What can be told where the sky is known."""
-
-    def each(cell: Callable[[Mapping[str, Any]], str]) -> list[str]:
-        return [cell(one) for one in priors]
-
-    rows = []
+    for key, words in (("instrument", "no sky explains"), ("prior", "of the sky")):
+        pairs = zip(each(".0f", f"chi2_{key}"), each(".0f", f"degrees_{key}"), strict=True)
+        rows.append((f"chi2 {words}", *(f"{chi2} of {degrees}" for chi2, degrees in pairs)))
+    if not all(one["coverage"] for one in priors):
+        return header, rows
+    held = (("68% hold", "held_68", ".1%"), ("95% hold", "held_95", ".1%"))
     for k, part in enumerate(priors[0]["coverage"]):
-        name = str(part["name"])
         rows += [
-            (f"68% hold, {name}", *each(lambda one, k=k: f"{one['coverage'][k]['held_68']:.1%}")),
-            (f"95% hold, {name}", *each(lambda one, k=k: f"{one['coverage'][k]['held_95']:.1%}")),
-            (f"rms pull, {name}", *each(lambda one, k=k: f"{one['coverage'][k]['rms']:.2f}")),
+            (f"{w}, {part['name']}", *each(f, "coverage", k, key))
+            for w, key, f in (*held, ("rms pull", "rms", ".2f"))
         ]
-    rows += [
-        ("largest pull", *each(lambda one: f"{one['coverage'][-1]['largest']:.1f}")),
-        ("rms error [K]", *each(lambda one: f"{one['errors'][-1]['rms_error_k']:,.0f}")),
-    ]
+    rows.append(("largest pull", *each(".1f", "coverage", -1, "largest")))
+    rows.append(("rms error [K]", *each(",.0f", "errors", -1, "rms_error_k")))
     for k, found in enumerate(priors[0]["snr"]):
-        name = f"SNR at ell {found['ell']}"
-        rows.append((name, *each(lambda one, k=k: f"{one['snr'][k]['snr']:.1f}")))
-    return rows
-
-
-def _numbers(values: Sequence[float]) -> list[str]:
-    return [f"{value:.1f}" for value in values]
-
-
-def _less_best(values: Sequence[float]) -> list[str]:
-    return [f"{value - max(values):.1f}" for value in values]
-
-
-def _of(chi2: float, degrees: float) -> str:
-    return f"{chi2:.0f} of {degrees:.0f}"
+        rows.append((f"SNR at ell {found['ell']}", *each(".1f", "snr", k, "snr")))
+    return header, rows

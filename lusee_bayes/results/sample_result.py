@@ -9,19 +9,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lusee_bayes.core.progress import peak_memory_gb
-from lusee_bayes.core.version import versions
+from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.results.draws import warnings_of
-from lusee_bayes.sampling.mode import (
-    INTERVAL,
-    pixel_interval_of_draws,
-    pixel_mean_of_draws,
-    pixel_std_of_draws,
-    sky_quantities,
-    summary,
-)
+from lusee_bayes.sampling import mode
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.systematics.systematic import SKY
 
@@ -66,11 +58,11 @@ class SampleResult:
         }
         ells = sorted({min(ell, lmax) for ell in (0, 1, 2, 5, 10, 20, 30, 40)})
         modes = [(ell, m) for ell in range(min(lmax, 2) + 1) for m in range(-ell, ell + 1)]
-        return others | sky_quantities(self.skies, pixels=LANDMARKS, ells=ells, modes=modes)
+        return others | mode.sky_quantities(self.skies, pixels=LANDMARKS, ells=ells, modes=modes)
 
     @cached_property
     def _summary(self) -> pd.DataFrame:
-        return summary(self.quantities())
+        return mode.summary(self.quantities())
 
     def summary_table(self) -> pd.DataFrame:
         """ArviZ's summary of :meth:`quantities`."""
@@ -80,10 +72,10 @@ class SampleResult:
     def maps(self) -> dict[str, np.ndarray]:
         """Mean, standard deviation and the ends of the 90 % interval of every pixel, in K."""
         nside = self.experiment.scenario.map_nside
-        lower, upper = pixel_interval_of_draws(self.skies, nside, INTERVAL)
+        lower, upper = mode.pixel_interval_of_draws(self.skies, nside, mode.INTERVAL)
         return {
-            "mean": pixel_mean_of_draws(self.skies, nside),
-            "std": pixel_std_of_draws(self.skies, nside),
+            "mean": mode.pixel_mean_of_draws(self.skies, nside),
+            "std": mode.pixel_std_of_draws(self.skies, nside),
             "lower": lower,
             "upper": upper,
         }
@@ -121,7 +113,5 @@ class SampleResult:
             "step_size": [float(x) for x in stats["step_size"].values[:, -1]],
             "mean_steps": float(stats["n_steps"].mean()),
             "gradients_per_second": self.gradients_per_second,
-            "seconds": {name: round(s, 3) for name, s in self.seconds.items()},
-            "peak_memory_gb": round(peak_memory_gb(), 3),
-            "versions": versions(),
+            **about_run(self.seconds),
         }

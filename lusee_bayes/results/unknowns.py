@@ -1,18 +1,14 @@
 """What the data tell of the instrument: receivers, ground, gain table, clock and pointing.
 
-What data cannot tell of unknowns that look alike.
-
 A uniform sky, warmer ground and noisier receivers look much alike. Of their joint posterior, each
 in units of its prior's standard deviation, the *null direction* is the one with the largest
 variance, which is 1 where the data say nothing.
-
-Receivers, ground and gain table of a map: what the data tell of each, and what they cannot.
 
 Of a joint posterior each channel has its own unknowns z ~ N(0, 1), and given the channel's sky m no
 other channel's data tell of them: p(z | all data) is p(z | m, d) with the joint posterior of m
 integrated out.
 
-Clock and pointing of a map: what the data tell of their offsets, and which each day prefers.
+Of clock and pointing, the offsets of the model are told, and which each day prefers.
 """
 
 from __future__ import annotations
@@ -27,7 +23,7 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, on_host
+from lusee_bayes.core.arrays import Modes, ModesMatrix, on_host
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.instrument_terms import offsets_about, second_order
 from lusee_bayes.experiment.model import radiometer, true_values
@@ -36,6 +32,7 @@ from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
 from lusee_bayes.judge.residuals import HOURS_A_DAY
 from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, amplitudes_of_sky
+from lusee_bayes.results.saved import UNKNOWNS
 from lusee_bayes.systematics.gain_table import GainTable
 from lusee_bayes.systematics.systematic import LinearUnknowns
 
@@ -162,16 +159,12 @@ class UnknownsReport:
 
     def summary(self) -> dict[str, Any]:
         """Entry of summary.json."""
-        found: dict[str, Any] = {
-            "rows": self.table.to_dict("records"),
-            "common_gain_std_share": self.common,
-            "notes": self.notes(),
-        }
+        rows, notes = self.table.to_dict("records"), self.notes()
+        found: dict[str, Any] = {"rows": rows, "common_gain_std_share": self.common, "notes": notes}
         if self.null is None:
             return found
-        parts = dict(zip(self.null.names, self.null.weights.tolist(), strict=True))
         return found | {
-            "null_direction": parts,
+            "null_direction": dict(zip(self.null.names, self.null.weights.tolist(), strict=True)),
             "null_share": self.null.share,
             "null_sentence": self.null_sentence(),
         }
@@ -214,9 +207,7 @@ class Unknowns:
     sky_std: float
 
     @classmethod
-    def of(
-        cls, experiment: Experiment, found: Inference, reference: Float[Array, " modes"]
-    ) -> Unknowns | None:
+    def of(cls, experiment: Experiment, found: Inference, reference: Modes) -> Unknowns | None:
         """Of data and their model; None if that has no such unknowns.
 
         Parameters
@@ -237,11 +228,7 @@ class Unknowns:
         return cls(_rows(experiment, listed), amplitudes, names, parts, sky_std)
 
     def report(
-        self,
-        mean: Float[np.ndarray, " modes"],
-        covariance: Float[np.ndarray, "modes modes"],
-        *,
-        joint: bool = False,
+        self, mean: Modes, covariance: ModesMatrix, *, joint: bool = False
     ) -> UnknownsReport:
         """What is told of them with the sky integrated out.
 
@@ -253,23 +240,16 @@ class Unknowns:
             It is also that of other data: no null direction is looked for.
         """
         told = self.amplitudes.integrated(np.asarray(mean), np.asarray(covariance))
-        rows = []
-        for row, z, std in zip(self.rows, told.mean.tolist(), told.std.tolist(), strict=True):
-            found = {
-                "unknown": row["unknown"],
-                "unit": row["unit"],
-                "value": row["expected"] + row["prior_std"] * z,
-                "std": row["prior_std"] * std,
-                "prior": row["prior"],
-                "prior_std": row["prior_std"],
-            }
-            rows.append(found | {"true": row["true"]} if "true" in row else found)
+        rows = pd.DataFrame(self.rows)
+        values = rows["expected"] + rows["prior_std"] * told.mean
+        rows = rows.assign(value=values, std=rows["prior_std"] * told.std)
         null = None if joint else self._null_direction(told, float(covariance[0, 0]))
         common = None
         if GAIN in self.names:
             gain = self.parts[self.names.index(GAIN)]
             common = float(np.sqrt(gain @ told.covariance @ gain))
-        return UnknownsReport(pd.DataFrame(rows), null, common)
+        columns = [*UNKNOWNS.variables, *(["true"] if "true" in rows else [])]
+        return UnknownsReport(rows[columns], null, common)
 
     def _null_direction(self, told: Amplitudes, variance: float) -> NullDirection:
         mixed = self.parts @ told.with_sky[0] / self.sky_std
@@ -295,9 +275,7 @@ class Unknowns:
         )
 
     @classmethod
-    def from_dataset(
-        cls, dataset: xr.Dataset, reference: Float[np.ndarray, " modes"]
-    ) -> Unknowns | None:
+    def from_dataset(cls, dataset: xr.Dataset, reference: Modes) -> Unknowns | None:
         """The inverse of :meth:`to_dataset`; None if it has none."""
         if "unknowns" not in dataset.attrs:
             return None
@@ -365,15 +343,11 @@ def _like_the_sky(
     names, weights, at = [], [], 0
     every = np.eye(sum(len(systematic.names) for systematic in listed))
     for systematic in listed:
-        n = len(systematic.names)
-        own = every[at : at + n]
-        if isinstance(systematic, GainTable):
-            names.append(GAIN)
-            weights.append(systematic.common[None] @ own)
-        else:
-            names.extend(systematic.labels)
-            weights.append(own)
-        at += n
+        own = every[at : at + len(systematic.names)]
+        table = isinstance(systematic, GainTable)
+        names += [GAIN] if table else systematic.labels
+        weights.append(systematic.common[None] @ own if table else own)
+        at += len(own)
     return tuple(names), np.concatenate(weights)
 
 
@@ -421,7 +395,7 @@ class PointingReport:
 
 
 def pointing_report(
-    experiment: Experiment, found: Inference, covariance: Float[np.ndarray, "modes modes"]
+    experiment: Experiment, found: Inference, covariance: ModesMatrix
 ) -> PointingReport:
     """Work out the offsets of the model, and those that the data prefer besides.
 
@@ -439,9 +413,7 @@ def pointing_report(
     return PointingReport(table, _preferred(experiment, found, covariance, sky, values))
 
 
-def _table(
-    experiment: Experiment, found: Inference, sky: Float[np.ndarray, " modes"]
-) -> pd.DataFrame:
+def _table(experiment: Experiment, found: Inference, sky: Modes) -> pd.DataFrame:
     mean, covariance = offset_posterior(found)
     std = dict(zip(mean, np.sqrt(np.diagonal(covariance)).tolist(), strict=True))
     prior = found.offsets.in_units(np.ones(len(mean)))
@@ -450,32 +422,22 @@ def _table(
     noise = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
     left = second_order(experiment.setup, about, sky)
     truth = true_values(experiment.setup) if experiment.data.truth is not None else {}
-    rows = []
-    for name in mean:
-        row = {
-            "offset": name,
-            "value": mean[name],
-            "std": std[name],
-            "prior_std": prior[name],
-            "beyond_first_order": float(np.sqrt(np.mean((left[name] / noise) ** 2))),
-        }
-        rows.append(row | {"true": truth[name]} if truth else row)
-    return pd.DataFrame(rows)
+    beyond = {name: float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in mean}
+    columns = {"value": mean, "std": std, "prior_std": prior, "beyond_first_order": beyond}
+    columns |= {"true": {name: truth[name] for name in mean}} if truth else {}
+    return pd.DataFrame(columns, index=list(mean)).rename_axis("offset").reset_index()
 
 
 def _preferred(
     experiment: Experiment,
     found: Inference,
-    covariance: Float[np.ndarray, "modes modes"],
-    sky: Float[np.ndarray, " modes"],
+    covariance: ModesMatrix,
+    sky: Modes,
     values: dict[str, float],
 ) -> pd.DataFrame:
     setup, data = experiment.setup, experiment.data
-    steps = {
-        name: step
-        for kind, step in TESTED.items()
-        for name in offset_names((kind,), setup.observation.n_runs)
-    }
+    n_runs = setup.observation.n_runs
+    steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), n_runs)}
     centre = dict.fromkeys(steps, 0.0) | values
     offsets = offsets_about(setup, steps, sky, centre)
     per_unit = offsets.templates / np.asarray(offsets.stds)

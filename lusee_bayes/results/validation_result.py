@@ -10,6 +10,12 @@ from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.results.sample_result import SampleResult
 from lusee_bayes.sampling.validation import Check, Comparison, Ranks
 
+# what a comparison has mode by mode
+OF_MODES = (
+    *("mean_z", "variance_ratio", "variance_error", "eigenvalues", "null_eigenvalues"),
+    *("ess_bulk", "ess_tail"),
+)
+
 
 @dataclass(frozen=True)
 class ValidationResult:
@@ -98,13 +104,7 @@ class ValidationResult:
                 }
                 for check in self.checks
             ],
-            "mean_z": found.mean_z.tolist(),
-            "variance_ratio": found.variance_ratio.tolist(),
-            "variance_error": found.variance_error.tolist(),
-            "eigenvalues": found.eigenvalues.tolist(),
-            "null_eigenvalues": found.null_eigenvalues.tolist(),
-            "ess_bulk": found.ess_bulk.tolist(),
-            "ess_tail": found.ess_tail.tolist(),
+            **{name: getattr(found, name).tolist() for name in OF_MODES},
             "coverage": {
                 name: {f"{p:g}": share for p, share in levels.items()}
                 for name, levels in ranks.coverage().items()

@@ -1,14 +1,8 @@
 """Unfinished work of a run of several frequencies: a file for each channel that is done.
 
-Unfinished work of a run of several frequencies: a file for each channel that is done.
-
 ``DIR/channels/25.information.nc`` holds what a channel's data say, ``25.result.nc`` its posterior.
 So memory stays bounded, and an interrupted run goes on where it was. Files of other scenarios or
-data are made anew.
-
-What the data of a channel say, in a file: for the channels of a joint posterior.
-
-The channels of a joint posterior, in the files of a run, and sums over them.
+data are made anew. A joint posterior adds up what the files of all channels say.
 """
 
 from __future__ import annotations
@@ -35,7 +29,7 @@ from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.judge.chi2 import ChiSquare, Split
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.joint import ComponentSums, summed
+from lusee_bayes.linear.joint import ComponentSums, summed_information
 from lusee_bayes.results.channel import Observed
 from lusee_bayes.results.unknowns import Unknowns
 from lusee_bayes.sky.spectral_prior import SpectralPrior
@@ -208,7 +202,7 @@ class ChannelsInFiles:
         found = self.engine.each(tasks, self.stages, "joint sums")
         return {name: np.stack([np.asarray(one[name]) for one in found]) for name in shapes}
 
-    def summed(
+    def summed_information(
         self,
         prior: SpectralPrior,
         reference: Float[np.ndarray, "channels modes"],
@@ -221,7 +215,7 @@ class ChannelsInFiles:
             sums = ComponentSums.empty(prior, reference)
             for number in numbers:
                 information = function(number, _information(files, channels[number]))
-                sums = summed(sums, prior, number, information)
+                sums = summed_information(sums, prior, number, information)
             return on_host(sums)
 
         # the same blocks, and the same tree of them, whatever carries out the tasks

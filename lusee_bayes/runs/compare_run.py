@@ -1,22 +1,15 @@
-"""Runs, or priors, side by side.
-
-A comparison: finished map runs side by side.
-
-One data set mapped under several priors, and which of them it prefers.
-"""
+"""Comparisons: of finished map runs, and of one data set mapped under several priors."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.reading import write_csv
-from lusee_bayes.experiment.data_files import Data, read_data
-from lusee_bayes.experiment.experiment import Experiment, observed, with_truth
+from lusee_bayes.experiment.data_files import Data
+from lusee_bayes.experiment.experiment import Experiment, observed
 from lusee_bayes.experiment.rounds import about_sky, learned_prior, named_priors
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup
@@ -26,18 +19,19 @@ from lusee_bayes.report.figures.maps import curves_of_runs, maps_of_runs
 from lusee_bayes.report.figures.plans import priors
 from lusee_bayes.results.finished_runs import FinishedRun, Provenance, comparison_rows, read_runs
 from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
-from lusee_bayes.runs.cost import require_resources
+from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import (
-    FIGURES,
+    SCENARIO,
     Output,
-    Run,
     RunKind,
-    inputs_of,
-    origin_of,
+    RunOutcome,
+    json_file,
     require_marginal,
     require_single_frequency,
+    rows_file,
     run_folder,
-    write_run,
+    scenario_run,
+    text_file,
 )
 
 
@@ -47,7 +41,7 @@ def run_compare(
     *,
     replace: bool = False,
     stages: Stages | None = None,
-) -> Run[list[FinishedRun]]:
+) -> RunOutcome[list[FinishedRun]]:
     """Set finished map runs side by side, and write page, table and figures in one transaction.
 
     Parameters
@@ -56,10 +50,8 @@ def run_compare(
         Of finished map runs, two or more.
     folder : path
         Of the results.
-    replace : bool
-        Replace results of another run in the folder.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
 
     Raises
     ------
@@ -67,15 +59,12 @@ def run_compare(
         For fewer than two folders, or one that is not of a finished map run.
     """
     stages = stages or Stages()
-    origin = origin_of()
-    with run_folder(folder, COMPARISON, origin, replace=replace, inputs=folders) as place:
-        return write_run(place, read_runs(folders), COMPARISON, origin, stages)
+    with run_folder(folder, COMPARISON, {}, replace=replace, inputs=folders) as run:
+        return run.write(read_runs(folders), stages)
 
 
 def _write_page(runs: list[FinishedRun], folder: Path) -> None:
-    (folder / "comparison.html").write_text(
-        comparison_page(runs, folder / FIGURES), encoding="utf-8"
-    )
+    (folder / "comparison.html").write_text(comparison_page(runs, folder), encoding="utf-8")
 
 
 # what the folder of a comparison holds; a new file is one line here
@@ -83,7 +72,7 @@ COMPARISON = RunKind(
     "compare",
     outputs=(
         Output(_write_page),
-        Output(lambda runs, folder: write_csv(folder / "comparison.csv", comparison_rows(runs))),
+        rows_file("comparison.csv", comparison_rows),
     ),
     figures={"maps": maps_of_runs, "curves": curves_of_runs},
     dpi=100,
@@ -101,7 +90,7 @@ def run_compare_priors(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> Run[PriorComparison]:
+) -> RunOutcome[PriorComparison]:
     """Map one data set under several priors, and say which of them it prefers.
 
     A, N and the data are the same for all; what :func:`run_map` would find is found for each. The
@@ -123,10 +112,8 @@ def run_compare_priors(
         Of the scenario, for the title.
     engine : Engine, optional
         What maps the data under each prior; by default this process, one after the other.
-    replace : bool
-        Replace results of another run in the folder.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
 
     Raises
     ------
@@ -137,19 +124,12 @@ def run_compare_priors(
     scenario = load_scenario(scenario)
     engine, stages = engine or ThisProcess(side_by_side=1), stages or Stages()
     require_single_frequency("compare-priors", bool(scenario.frequencies_mhz))
-    require_marginal("compare-priors", "set treatment=marginalised", scenario.samples)
+    require_marginal("compare-priors", "set treatment=marginalised", scenario)
     sections = named_priors(priors, scenario, known_sky=data is None or truth)
     sections = {name: section.anchored() for name, section in sections.items()}
-    names = ",".join(sections)
-    origin = origin_of(scenario, data, truth=truth or None, priors=names)
-    with run_folder(
-        folder, COMPARE_PRIORS, origin, replace=replace, inputs=inputs_of(scenario, data)
-    ) as place:
-        measured = None if data is None else read_data(data, scenario)
-        require_resources(scenario, measured, stages)
-        experiment = observed(scenario, measured, stages)
-        if truth:
-            experiment = with_truth(experiment)
+    origin = {"truth": truth or None, "priors": ",".join(sections)}
+    with scenario_run(folder, COMPARE_PRIORS, scenario, data, replace=replace, **origin) as run:
+        experiment = measured_experiment(scenario, data, stages, truth=truth, make=observed)
         with stages("data"):
             information = about_sky(experiment.setup, experiment.data)
 
@@ -157,11 +137,11 @@ def run_compare_priors(
             setup = experiment.setup.with_prior(sections[prior])
             return _under(prior, setup, experiment, information)
 
-        engine.work_in(place)
+        engine.work_in(run.path)
         found = engine.each(Tasks(under, list(sections), list(sections)), stages, "priors")
         result = PriorComparison(name, scenario, tuple(found), stages.seconds)
         provenance = Provenance.of_experiment(experiment, data)
-        return write_run(place, result, COMPARE_PRIORS, origin, stages, provenance)
+        return run.write(result, stages, provenance)
 
 
 def _under(name: str, setup: Setup, experiment: Experiment, information: Information) -> UnderPrior:
@@ -175,20 +155,14 @@ def _under(name: str, setup: Setup, experiment: Experiment, information: Informa
     return UnderPrior.of(name, mapped, learned.log_evidence)
 
 
-def _write_texts(result: PriorComparison, folder: Path) -> None:
-    (folder / "priors.json").write_text(
-        json.dumps(result.as_json(), indent=2) + "\n", encoding="utf-8"
-    )
-    (folder / "priors.md").write_text(result.as_markdown(), encoding="utf-8")
-    (folder / "scenario.yaml").write_text(result.scenario.to_yaml(), encoding="utf-8")
-
-
 # what the folder of a comparison of priors holds; a new file is one line here
 COMPARE_PRIORS = RunKind(
     "compare-priors",
     outputs=(
-        Output(_write_texts),
-        Output(lambda result, folder: write_csv(folder / "priors.csv", result.rows())),
+        json_file("priors.json", lambda result: result.as_json()),
+        text_file("priors.md", lambda result: result.as_markdown()),
+        SCENARIO,
+        rows_file("priors.csv", lambda result: result.rows()),
     ),
     figures={"priors": priors},
 )

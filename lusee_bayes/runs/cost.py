@@ -8,7 +8,7 @@ Factorisations of them take nearly all of the time.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import ceil
@@ -18,11 +18,12 @@ import numpy as np
 from lusee_bayes.core.engine import Demand
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
+from lusee_bayes.experiment.data_files import Data, read_data
+from lusee_bayes.experiment.experiment import Experiment, build, with_truth
 from lusee_bayes.experiment.leave_out import ARRAYS, MOST_MEMORY
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.runs.cube import lmax_of_fields
-from lusee_bayes.sampling.validation import BATCH, N_DRAWS
+from lusee_bayes.runs.channels import lmax_of_fields
 
 # measured at lmax 12 to 80 and up to 3e5 data (docs/commands.md): what is there before anything is
 # computed, and what each datum takes from reading to the report
@@ -231,24 +232,57 @@ def require_resources(
         stages.say(cost.sizes() if n_draws else cost.line())
 
 
+def measured_experiment(
+    scenario: Scenario,
+    data: Data | None,
+    stages: Stages,
+    *,
+    n_draws: int = 0,
+    truth: bool = False,
+    make: Callable[..., Experiment] = build,
+) -> Experiment:
+    """Read data, say what their posterior will take, and make the experiment.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    data : Visibilities, path, or sequence of them, or None
+        Measured; without them the scenario's own are simulated.
+    stages : Stages
+        Told what it will take.
+    n_draws : int
+        As in :func:`posterior_cost`.
+    truth : bool
+        The data are of the scenario's own sky.
+    make : callable
+        ``make(scenario, data, stages)``.
+
+    Raises
+    ------
+    InputError
+        As :func:`.read_data` and :func:`require_fits`.
+    """
+    measured = None if data is None else read_data(data, scenario)
+    require_resources(scenario, measured, stages, n_draws)
+    experiment = make(scenario, measured, stages)
+    return with_truth(experiment) if truth else experiment
+
+
 def _smaller(scenario: Scenario) -> Iterator[tuple[str, float | str, Scenario]]:
     """The scenario with less of one thing at a time."""
+
+    def changed(section: str, **values: object) -> Scenario:
+        part = getattr(scenario, section).model_copy(update=values)
+        return scenario.model_copy(update={section: part})
+
     if scenario.nside is not None:
         yield "nside", 64, scenario.model_copy(update={"nside": 64})
     for draws in (1000, 100, 0):
-        output = scenario.output.model_copy(update={"draws": draws})
-        yield "output.draws", draws, scenario.model_copy(update={"output": output})
+        yield "output.draws", draws, changed("output", draws=draws)
     if scenario.joint:
         yield "joint", "false", scenario.model_copy(update={"joint": False})
     for lmax in range(scenario.lmax - 1, 0, -1):
         yield "lmax", lmax, scenario.model_copy(update={"lmax": lmax})
-    section = scenario.observation
     for times in range(1, 40):
-        step_s = float(ceil(section.step_s)) * 2.0**times
-        fewer = section.model_copy(update={"step_s": step_s})
-        yield "observation.step_s", step_s, scenario.model_copy(update={"observation": fewer})
-
-
-def demand_of_calibration(scenario: Scenario) -> Demand:
-    """What simulation-based calibration takes, in batches that use all processors."""
-    return replace(demand_of([posterior_cost(scenario, BATCH * N_DRAWS)]), side_by_side=1)
+        step_s = float(ceil(scenario.observation.step_s)) * 2.0**times
+        yield "observation.step_s", step_s, changed("observation", step_s=step_s)

@@ -1,18 +1,13 @@
-"""Data: simulated, reduced, averaged.
+"""Data in files: visibilities that are simulated, sessions that are reduced or simulated, averages.
 
-A simulation: visibilities of a scenario in a file.
-
-Sessions of the spectrometer, reduced to bands and bins of time, in a file.
-
-Sessions of the spectrometer, simulated, in files of luseepy's layout.
-
-Means of data over longer times, in a file, and what they cost.
+Sessions are the spectrometer's, in luseepy's layout; averages are means of data over longer times,
+with what these cost.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,7 +31,7 @@ from lusee_bayes.instrument.averaging import averaged, product_live_s
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import NO_ROOM, write_four_port, write_waterfall
 from lusee_bayes.runs.cost import require_fits, require_resources, simulation_cost
-from lusee_bayes.runs.folder import RunKind, inputs_of, origin_of, run_folder
+from lusee_bayes.runs.folder import RunKind, inputs_of, scenario_run
 from lusee_bayes.runs.forecasting import expected_posterior
 
 
@@ -153,10 +148,8 @@ def run_reduce(
         Sessions, in any order.
     path : path
         The netCDF file to write.
-    replace : bool
-        Replace a file that is there.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`run_simulate`.
 
     Raises
     ------
@@ -242,37 +235,29 @@ def run_simulate_flight(
     stages = stages or Stages()
     if frequencies_mhz:
         scenario = scenario.model_copy(update={"frequencies_mhz": tuple(frequencies_mhz)})
-    origin = origin_of(scenario)
-    inputs = inputs_of(scenario)
-    with run_folder(folder, FLIGHT, origin, replace=replace, inputs=inputs) as place:
-        return _simulated(scenario, place, origin, stages)
+    with scenario_run(folder, FLIGHT, scenario, replace=replace) as run:
+        made, place = simulate_flight(scenario, stages), run.path
+        with transaction(place, FLIGHT.name, origin=run.origin) as stage:
+            names = _write_flight(made, stage, place.resolve(), stages)
+        paths = tuple(place / name for name in names)
+        return FlightFiles(paths, place / SCENARIO, made.observation.n_times)
 
 
-def _simulated(
-    scenario: Scenario, folder: Path, origin: Mapping[str, str], stages: Stages
-) -> FlightFiles:
-    made = simulate_flight(scenario, stages)
+def _write_flight(made: FlightSimulation, stage: Path, folder: Path, stages: Stages) -> list[str]:
+    """Write what ``folder`` is to hold into ``stage``; the names of the sessions."""
     suffix = SUFFIX[made.section.kind]
     names = [f"session_{number:03d}.{suffix}" for number in range(len(made.sessions))]
-    with transaction(folder, FLIGHT.name, origin=origin) as stage:
-        if flight_of(scenario).gain_table is None:
-            write_gain_table(stage / GAINS, made.table)
-        if made.section.clock == "unknown":
-            (stage / CLOCK).write_text(_clock_text(made.clock), encoding="utf-8")
-        np.savez(stage / TRUTH, **_truth(made))
-        (stage / SCENARIO).write_text(
-            _to_be_mapped(made, folder.resolve()).to_yaml(), encoding="utf-8"
-        )
-        with stages.progress("spectra", made.observation.n_times) as done:
-            for name, session in zip(names, made.sessions, strict=True):
-                write_session(
-                    stage / name,
-                    made.rows(session),
-                    _told(made.blocks(session), session.start, done),
-                    kind=made.section.kind,
-                )
-    paths = tuple(folder / name for name in names)
-    return FlightFiles(paths, folder / SCENARIO, made.observation.n_times)
+    if flight_of(made.scenario).gain_table is None:
+        write_gain_table(stage / GAINS, made.table)
+    if made.section.clock == "unknown":
+        (stage / CLOCK).write_text(_clock_text(made.clock), encoding="utf-8")
+    np.savez(stage / TRUTH, **_truth(made))
+    (stage / SCENARIO).write_text(_to_be_mapped(made, folder).to_yaml(), encoding="utf-8")
+    with stages.progress("spectra", made.observation.n_times) as done:
+        for name, session in zip(names, made.sessions, strict=True):
+            blocks = _told(made.blocks(session), session.start, done)
+            write_session(stage / name, made.rows(session), blocks, kind=made.section.kind)
+    return names
 
 
 def _require_no_sessions(folder: Path, replace: bool) -> None:
@@ -416,10 +401,8 @@ def run_average(
         The netCDF file to write.
     information : bool
         Work out the information about the map, in the data and in their averages.
-    replace : bool
-        Replace a file that is there.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`run_simulate`.
 
     Raises
     ------
@@ -455,13 +438,12 @@ def run_average(
         require_fitting(fine, scenario)
         require_resources(scenario, fine, stages)
     coarse.write(path)
-    bits = None
-    if information:
-        with stages("information of the data"):
-            before = _bits(scenario, fine)
-        with stages("and of the averages"):
-            bits = (before, _bits(scenario, coarse))
-    return Averages(fine, coarse, bits)
+    if not information:
+        return Averages(fine, coarse, None)
+    with stages("information of the data"):
+        before = _bits(scenario, fine)
+    with stages("and of the averages"):
+        return Averages(fine, coarse, (before, _bits(scenario, coarse)))
 
 
 def _bits(scenario: Scenario, data: Visibilities) -> float:

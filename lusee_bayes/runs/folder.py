@@ -1,8 +1,7 @@
-"""The folder of a run: written whole or not at all, and what it was made of.
+"""The folder of a run: written in one transaction, and what its results were made of.
 
-What results are made of: results of something else are not replaced unless that is asked for.
-
-The folder of a run: written in one transaction, and what it holds if that does not happen.
+Results of something else are not replaced unless that is asked for, and a run that is interrupted
+says what its folder holds.
 """
 
 from __future__ import annotations
@@ -10,12 +9,13 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from matplotlib.figure import Figure
+from pandas import DataFrame
 
 from lusee_bayes.core.arrays import use_compilation_cache
 from lusee_bayes.core.errors import InputError, WorkersLost
@@ -30,6 +30,7 @@ from lusee_bayes.core.files import (
     user_path,
 )
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.reading import write_csv
 from lusee_bayes.experiment.data_files import Data, digest_of, files_of, names_of_data
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.report.figures.drawing import save
@@ -56,7 +57,7 @@ def origin_of(
     Returns
     -------
     dict
-        For :func:`.run_folder` and :func:`.write_run`.
+        For :func:`.run_folder`.
 
     Raises
     ------
@@ -141,7 +142,7 @@ class RunInterrupted(KeyboardInterrupt):
 
 
 @dataclass(frozen=True)
-class Run(Generic[Result]):
+class RunOutcome(Generic[Result]):
     """A finished run.
 
     Attributes
@@ -174,6 +175,37 @@ class Output:
     wanted: Callable[[Any], bool] = lambda result: True
 
 
+def text_file(name: str, text: Callable[[Any], str]) -> Output:
+    """A file of text, UTF-8."""
+    return Output(lambda result, folder: _write_text(folder / name, text(result)))
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+def json_file(name: str, figures: Callable[[Any], Mapping[str, Any]]) -> Output:
+    """A file of JSON."""
+    return text_file(name, lambda result: json.dumps(figures(result), indent=2) + "\n")
+
+
+def rows_file(name: str, rows: Callable[[Any], Sequence[Mapping[str, object]]]) -> Output:
+    """A table, row by row."""
+    return Output(lambda result, folder: write_csv(folder / name, rows(result)))
+
+
+def table_file(name: str, table: Callable[[Any], DataFrame | None]) -> Output:
+    """A table of pandas; None where the run has none."""
+
+    def write(result: Any, folder: Path) -> None:
+        table(result).to_csv(folder / name, index=False)
+
+    return Output(write, lambda result: table(result) is not None)
+
+
+SCENARIO = text_file("scenario.yaml", lambda result: result.scenario.to_yaml())
+
+
 @dataclass(frozen=True)
 class RunKind:
     """What the folder of one kind of run holds.
@@ -191,6 +223,8 @@ class RunKind:
         Of the figures.
     after : sequence of str
         Kinds of runs whose results in the folder, of the same origin, it takes over.
+    resume : str
+        How a run that was stopped is gone on with.
     """
 
     name: str
@@ -199,6 +233,64 @@ class RunKind:
     unfinished: str = ""
     dpi: int = 110
     after: Sequence[str] = ()
+    resume: str = ""
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The folder of a run while it is open.
+
+    Attributes
+    ----------
+    path : Path
+    kind : RunKind
+    origin : mapping
+        What the results are made of (:func:`.origin_of`).
+    """
+
+    path: Path
+    kind: RunKind
+    origin: Origin
+
+    def write(
+        self, result: Result, stages: Stages, provenance: Provenance | None = None
+    ) -> RunOutcome[Result]:
+        """Draw all figures and write all files of a run, in one transaction.
+
+        Parameters
+        ----------
+        result : object
+            What the outputs and figures of the kind take.
+        stages : Stages
+            Told what is being done.
+        provenance : Provenance, optional
+            Where the data come from, for the head of the page.
+
+        Returns
+        -------
+        Run
+            With the files in the folder.
+        """
+        kind, folder = self.kind, self.path
+        discard = [kind.unfinished] if kind.unfinished else []
+        with transaction(folder, kind.name, discard, self.origin) as stage:
+            if kind.figures:
+                (stage / FIGURES).mkdir()
+                with stages("figures"):
+                    for name, draw in kind.figures.items():
+                        if (figure := draw(result)) is not None:
+                            save(figure, stage / FIGURES / f"{name}.png", kind.dpi)
+            with stages("files"):
+                for output in kind.outputs:
+                    if output.wanted(result):
+                        output.write(result, stage)
+                if provenance is not None:
+                    provenance.write(stage)
+                if kind.name in PAGES:
+                    page = PAGES[kind.name](stage, folder.resolve().name)
+                    _write_text(stage / REPORT, page)
+            files = sorted(path.relative_to(stage) for path in stage.rglob("*") if path.is_file())
+        return RunOutcome(result, folder, [folder / name for name in files])
 
 
 @contextmanager
@@ -206,11 +298,10 @@ def run_folder(
     folder: str | Path,
     kind: RunKind,
     origin: Origin,
-    resume: str = "",
     *,
     replace: bool = False,
     inputs: Iterable[str | Path] = (),
-) -> Iterator[Path]:
+) -> Iterator[RunFolder]:
     """Open a folder for a run, and say what it holds if the run is interrupted.
 
     Parameters
@@ -219,8 +310,6 @@ def run_folder(
     kind : RunKind
     origin : mapping
         What the results are made of (:func:`.origin_of`).
-    resume : str
-        How the run is gone on with.
     replace : bool
         Replace results of another run.
     inputs : iterable of path
@@ -228,8 +317,8 @@ def run_folder(
 
     Yields
     ------
-    Path
-        The folder; an interrupted transaction of an earlier run is completed.
+    RunFolder
+        An interrupted transaction of an earlier run is completed.
 
     Raises
     ------
@@ -254,15 +343,14 @@ def run_folder(
             before = _written_at(folder)
             use_compilation_cache()
             try:
-                yield folder
+                yield RunFolder(folder, kind, origin)
             except RunInterrupted:
                 # of a run in a folder inside this one
                 raise
             except KeyboardInterrupt as interrupt:
-                raise RunInterrupted(_state(folder, before, kind.unfinished, resume)) from interrupt
+                raise RunInterrupted(_state(folder, before, kind)) from interrupt
             except WorkersLost as error:
-                state = _state(folder, before, kind.unfinished, resume)
-                raise WorkersLost(f"{error}; {state}") from error
+                raise WorkersLost(f"{error}; {_state(folder, before, kind)}") from error
     finally:
         # nothing written: nothing left
         for place in ([folder / kind.unfinished] if kind.unfinished else []) + made:
@@ -282,69 +370,48 @@ def _written_at(folder: Path) -> int | None:
     return manifest.stat().st_mtime_ns if manifest.is_file() else None
 
 
-def _state(folder: Path, before: int | None, unfinished: str, resume: str) -> str:
+def _state(folder: Path, before: int | None, kind: RunKind) -> str:
     recover(folder)
     now = _written_at(folder)
     if now is not None and now != before:
         return f"the new results in '{folder}' are complete"
     earlier = "no results are written" if now is None else "the earlier results are as they were"
-    if unfinished and any((folder / unfinished).glob("*")):
-        return f"{earlier} in '{folder}'; {resume}"
+    if kind.unfinished and any((folder / kind.unfinished).glob("*")):
+        return f"{earlier} in '{folder}'; {kind.resume}"
     return f"{earlier} in '{folder}'"
 
 
-def write_run(
-    folder: Path,
-    result: Result,
+def scenario_run(
+    folder: str | Path,
     kind: RunKind,
-    origin: Origin,
-    stages: Stages,
-    provenance: Provenance | None = None,
-) -> Run[Result]:
-    """Draw all figures and write all files of a run, in one transaction.
+    scenario: Scenario,
+    data: Data | None = None,
+    *inputs: str | Path | None,
+    replace: bool = False,
+    **others: object,
+) -> AbstractContextManager[RunFolder]:
+    """Open a folder for a run of a scenario and data (:func:`run_folder`).
 
     Parameters
     ----------
-    folder : Path
-    result : object
-        What the outputs and figures of ``kind`` take.
+    folder : path
     kind : RunKind
-    origin : mapping
-        What the results are made of (:func:`.origin_of`).
-    stages : Stages
-        Told what is being done.
-    provenance : Provenance, optional
-        Where the data come from, for the head of the page.
-
-    Returns
-    -------
-    Run
-        With the files in the folder.
+    scenario : Scenario
+    data : Visibilities, path, or sequence of them, optional
+    *inputs
+        Other files that the run reads, if given (:func:`inputs_of`).
+    replace : bool
+        Replace results of another run.
+    **others
+        What else determines the numbers (:func:`origin_of`).
     """
-    discard = [kind.unfinished] if kind.unfinished else []
-    with transaction(folder, kind.name, discard, origin) as stage:
-        if kind.figures:
-            (stage / FIGURES).mkdir()
-            with stages("figures"):
-                for name, draw in kind.figures.items():
-                    if (figure := draw(result)) is not None:
-                        save(figure, stage / FIGURES / f"{name}.png", kind.dpi)
-        with stages("files"):
-            for output in kind.outputs:
-                if output.wanted(result):
-                    output.write(result, stage)
-            if provenance is not None:
-                provenance.write(stage)
-            if kind.name in PAGES:
-                page = PAGES[kind.name](stage, folder.resolve().name)
-                (stage / REPORT).write_text(page, encoding="utf-8")
-        files = sorted(path.relative_to(stage) for path in stage.rglob("*") if path.is_file())
-    return Run(result, folder, [folder / name for name in files])
+    origin, files = origin_of(scenario, data, **others), inputs_of(scenario, data, *inputs)
+    return run_folder(folder, kind, origin, replace=replace, inputs=files)
 
 
-def require_marginal(what: str, advice: str, samples: bool) -> None:
+def require_marginal(what: str, advice: str, scenario: Scenario) -> None:
     """InputError where what makes maps is to sample something."""
-    if samples:
+    if scenario.samples:
         raise InputError(
             f"the scenario says that something is to be sampled, and {what} can only marginalise; "
             f"{advice}"

@@ -1,13 +1,9 @@
-"""Forecasts of observations, one by one, each kept as soon as it is made.
+"""Forecasts of observations: the information in them, from the posterior covariance alone.
 
-The information in an observation, from the posterior covariance alone: no data are needed.
-
-The variations of a scenario that a plan looks at by itself.
-
-Turned in the same time and repeated at the same angles, so that a turn is compared with standing
-still for as long.
-
-Forecasts of many variations, each kept in a file as soon as it is made.
+No data are needed. A plan looks at variations of a scenario, by itself at those of turntable,
+duration, nights, duty cycle and lost antennas: turned in the same time and repeated at the same
+angles, so that a turn is compared with standing still for as long. Each forecast is kept in a file
+as soon as it is made.
 """
 
 from __future__ import annotations
@@ -40,7 +36,7 @@ from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.judge.chi2 import effective_resolution_deg, prior_fraction_per_ell
 from lusee_bayes.linear.amplitudes import template_amplitudes
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation
 from lusee_bayes.runs.cost import duration
@@ -178,23 +174,18 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
 def families_of_runs(scenario: Scenario) -> dict[str, dict[str, Scenario]]:
     """The scenario with its runs turned, longer or shorter, or by night."""
     runs = scenario.observation.runs
-    return {
-        "turned, same time": {
-            angles(turned): with_runs(scenario, turned)
-            for turned in (parted(runs, n) for n in PARTS)
-        },
-        "turned, more time": {
-            f"{length(turned)}: {angles(turned)}": with_runs(scenario, turned)
-            for turned in (repeated(runs, n, TURN_DEG) for n in PARTS[1:])
-        },
-        "duration": {
-            length(longer): with_runs(scenario, longer)
-            for longer in (lasting(runs, cycles) for cycles in CYCLES)
-        },
+    turned = [runs_repeated(runs, n, TURN_DEG) for n in PARTS[1:]]
+    families = {
+        "turned, same time": {angles(r): r for r in (parted(runs, n) for n in PARTS)},
+        "turned, more time": {f"{length(r)}: {angles(r)}": r for r in turned},
+        "duration": {length(r): r for r in (lasting(runs, cycles) for cycles in CYCLES)},
         "nights only": {
-            length(longer): with_runs(scenario, at_night(longer))
-            for longer in (repeated(runs, n, 0.0) for n in PARTS[:2])
+            length(r): at_night(r) for r in (runs_repeated(runs, n, 0.0) for n in PARTS[:2])
         },
+    }
+    return {
+        family: {name: with_runs(scenario, varied) for name, varied in members.items()}
+        for family, members in families.items()
     }
 
 
@@ -215,7 +206,7 @@ def parted(runs: Sequence[RunSection], parts: int) -> Runs:
     )
 
 
-def repeated(runs: Sequence[RunSection], times: int, turn_deg: float) -> Runs:
+def runs_repeated(runs: Sequence[RunSection], times: int, turn_deg: float) -> Runs:
     """All runs so many times, each time turned by ``turn_deg`` more."""
     return tuple(
         changed(run, turntable_deg=run.turntable_deg + number * turn_deg)

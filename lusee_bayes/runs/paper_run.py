@@ -11,14 +11,12 @@ from pathlib import Path
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.reading import write_csv
 from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios, read_case
 from lusee_bayes.paper.claims import Cases, claim_table, claims_as_markdown
 from lusee_bayes.paper.figures import FIGURES
-from lusee_bayes.runs.folder import Output, Run, RunKind, origin_of, run_folder, write_run
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, rows_file, run_folder, text_file
 
 CASES, UNFINISHED = "cases", "unfinished-cases"
-RESUME = "the same command continues from the finished cases"
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ def run_paper(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> Run[Cases]:
+) -> RunOutcome[Cases]:
     """Compute what is missing of the paper's cases, then draw the figures and judge the claims.
 
     Cases that were computed before with the same scenario and version are kept. The folder changes
@@ -52,10 +50,8 @@ def run_paper(
         ULSA HDF5 files with the frequency in their names; each case scales the nearest one.
     engine : Engine, optional
         What computes the cases; by default this process.
-    replace : bool
-        Replace results of another run in the folder.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
 
     Raises
     ------
@@ -64,11 +60,10 @@ def run_paper(
     """
     engine, stages = engine or ThisProcess(), stages or Stages()
     scenarios = paper_scenarios(overrides, skies)
-    origin = origin_of()
-    with run_folder(folder, PAPER, origin, RESUME, replace=replace) as place:
-        engine.work_in(place)
+    with run_folder(folder, PAPER, {}, replace=replace) as run:
+        engine.work_in(run.path)
         # workers may have other folders of their own
-        home = place.resolve()
+        home = run.path.resolve()
 
         def path_of(name: str) -> Path:
             """Where a case is, if it has been computed, or else will be."""
@@ -86,8 +81,7 @@ def run_paper(
         engine.each(Tasks(compute, names, names), stages, "cases")
         paths = {name: path_of(name) for name in names}
         cases = {name: read_case(path) for name, path in paths.items()}
-        run = write_run(place, _Computed(cases, paths), PAPER, origin, stages)
-        return Run(cases, place, run.files)
+        return RunOutcome(cases, run.path, run.write(_Computed(cases, paths), stages).files)
 
 
 def _write_cases(computed: _Computed, folder: Path) -> None:
@@ -100,24 +94,18 @@ def _write_cases(computed: _Computed, folder: Path) -> None:
             shutil.copy2(path, target)
 
 
-def _write_claims(computed: _Computed, folder: Path) -> None:
-    claims = claim_table(computed.cases)
-    write_csv(folder / "claims.csv", claims)
-    (folder / "claims.md").write_text(claims_as_markdown(claims), encoding="utf-8")
-
-
 # what the folder of the paper's run holds; a new file is one line here
 PAPER = RunKind(
     "paper",
     outputs=(
         Output(_write_cases),
-        Output(
-            lambda computed, folder: write_csv(folder / "cases.csv", case_table(computed.cases))
-        ),
-        Output(_write_claims),
+        rows_file("cases.csv", lambda computed: case_table(computed.cases)),
+        rows_file("claims.csv", lambda computed: claim_table(computed.cases)),
+        text_file("claims.md", lambda computed: claims_as_markdown(claim_table(computed.cases))),
     ),
     figures={
         name: lambda computed, draw=draw: draw(computed.cases) for name, draw in FIGURES.items()
     },
     unfinished=UNFINISHED,
+    resume="the same command continues from the finished cases",
 )

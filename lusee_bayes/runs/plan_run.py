@@ -8,23 +8,14 @@ from pathlib import Path
 
 from lusee_bayes.core.engine import Engine, ThisProcess
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.reading import naming, write_csv
+from lusee_bayes.core.reading import naming
 from lusee_bayes.report.figures.plans import forecasts
 from lusee_bayes.results.forecast import Forecast, Variation, forecast_rows
 from lusee_bayes.runs.cost import posterior_cost, require_fits
-from lusee_bayes.runs.folder import (
-    Output,
-    Run,
-    RunKind,
-    inputs_of,
-    origin_of,
-    run_folder,
-    write_run,
-)
+from lusee_bayes.runs.folder import RunKind, RunOutcome, inputs_of, origin_of, rows_file, run_folder
 from lusee_bayes.runs.forecasting import ForecastFiles, forecasts_of
 
 UNFINISHED = "unfinished-forecasts"
-RESUME = "the same command continues from the finished forecasts"
 
 
 def run_plan(
@@ -34,7 +25,7 @@ def run_plan(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> Run[list[Forecast]]:
+) -> RunOutcome[list[Forecast]]:
     """Forecast the information in every variation, and write table and figure in one transaction.
 
     A plan that was stopped goes on with the same call.
@@ -47,10 +38,8 @@ def run_plan(
         Of the results.
     engine : Engine, optional
         What makes the forecasts; by default this process.
-    replace : bool
-        Replace results of another run in the folder.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
 
     Raises
     ------
@@ -66,19 +55,17 @@ def run_plan(
     digests = {name: sha256(s.to_yaml().encode()).hexdigest()[:12] for name, s in told.items()}
     origin = origin_of(**digests)
     inputs = [path for v in variations for path in inputs_of(v.scenario)]
-    with run_folder(folder, PLAN, origin, RESUME, replace=replace, inputs=inputs) as place:
-        engine.work_in(place)
-        files = ForecastFiles((place / UNFINISHED).resolve())
-        forecasts = forecasts_of(variations, files, engine, stages)
-        return write_run(place, forecasts, PLAN, origin, stages)
+    with run_folder(folder, PLAN, origin, replace=replace, inputs=inputs) as run:
+        engine.work_in(run.path)
+        files = ForecastFiles((run.path / UNFINISHED).resolve())
+        return run.write(forecasts_of(variations, files, engine, stages), stages)
 
 
 # what the folder of a plan holds; a new file is one line here
 PLAN = RunKind(
     "plan",
-    outputs=(
-        Output(lambda forecasts, folder: write_csv(folder / "plan.csv", forecast_rows(forecasts))),
-    ),
+    outputs=(rows_file("plan.csv", forecast_rows),),
     figures={"plan": forecasts},
     unfinished=UNFINISHED,
+    resume="the same command continues from the finished forecasts",
 )

@@ -1,43 +1,213 @@
-"""A sampling run: draws from the posterior of a NumPyro program."""
+"""Sampling of a program given an experiment's data: draws survive a kill.
+
+A sampling run: draws from the posterior of a NumPyro program.
+"""
 
 from __future__ import annotations
 
 import json
+import time
+from contextlib import AbstractContextManager
 from pathlib import Path
 
+import jax
 import numpy as np
+import xarray as xr
+from numpyro.infer.hmc import HMCState
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.data_files import Data, read_data
-from lusee_bayes.experiment.experiment import build
+from lusee_bayes.core.reading import naming, reading
+from lusee_bayes.core.version import versions
+from lusee_bayes.experiment.data_files import Data
+from lusee_bayes.experiment.experiment import Experiment, infer, program_pieces
+from lusee_bayes.experiment.model import true_values
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.report.figures.sampling import (
-    against_analytic,
-    energy,
-    pairs,
-    ranks,
-    traces,
-    uncertainty,
-)
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.report.figures import sampling as figures
 from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.map_files import write_cube, write_map
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult
-from lusee_bayes.runs.cost import require_resources
+from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import (
     Output,
-    Run,
+    RunFolder,
     RunKind,
-    inputs_of,
-    origin_of,
-    run_folder,
-    write_run,
+    RunOutcome,
+    json_file,
+    scenario_run,
+    text_file,
 )
-from lusee_bayes.runs.sampling import sample_result
-from lusee_bayes.sampling.datatree import write_datatree
-from lusee_bayes.sampling.hmc import Sampler
-from lusee_bayes.sampling.programs import Program, load_program
+from lusee_bayes.sampling.datatree import read_datatree, to_datatree, write_datatree
+from lusee_bayes.sampling.distributions import TimesStudentT
+from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sample
+from lusee_bayes.sampling.log_normal_program import coordinates_of
+from lusee_bayes.sampling.mode import laplace_approximation
+from lusee_bayes.sampling.program_checks import require_sampleable
+from lusee_bayes.sampling.programs import Program, load_program, predicts
+from lusee_bayes.systematics.gain_drifts import SCALES
+from lusee_bayes.systematics.systematic import SKY, Chart, Systematic
+
+# where the mode of a collapsed program is looked for
+STARTS = 4
+
+
+def sample_result(
+    experiment: Experiment,
+    program: Program,
+    sampler: Sampler,
+    folder: Path,
+    *,
+    resume: bool = False,
+    stages: Stages | None = None,
+) -> SampleResult:
+    """Sample ``program`` given an experiment's data; draws are kept in ``folder``/chains.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    program : Program
+    sampler : Sampler
+    folder : Path
+        Of the run; unfinished chains are kept in it.
+    resume : bool
+        Go on with an unfinished run of the same settings, or take over a finished one.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        If ``folder`` holds an unfinished run and ``resume`` is not given, if the unfinished run has
+        other settings, or if the program does not end with draws of the sky.
+    """
+    stages = stages or Stages()
+    scenario, data = experiment.scenario, experiment.data
+    with stages("posterior"):
+        inference = infer(experiment)
+        jax.block_until_ready(inference.posterior.white_mean)
+    identity = {
+        "scenario": scenario.to_yaml(),
+        "data": data.digest(),
+        "program": program.name,
+        "program text": program.digest,
+        **{f"sampler's {name}": value for name, value in sampler.identity().items()},
+        "versions": versions(with_commit=False),
+    }
+    if resume and (finished := _finished(folder, identity, sampler)) is not None:
+        return SampleResult(experiment, inference, finished, stages.seconds, None)
+    arguments = program.arguments(inference.model, program_pieces(experiment))
+    n_modes = inference.posterior.mean.shape[0]
+    latent = require_sampleable(program, arguments, data.data, n_modes)
+    with stages("coordinates"):
+        whitening = coordinates(program, arguments, data, inference, latent)
+    checkpoints = Checkpoints(folder / CHAINS, identity, resume=resume)
+    times = []
+    with stages.progress("sampling", sampler.warmup + sampler.draws) as update:
+
+        def report(iteration: int, state: HMCState) -> None:
+            times.append((time.perf_counter(), iteration))
+            update(iteration, _state_in_words(iteration, state, sampler))
+
+        with naming(f"the program '{program.path or program.name}'"):
+            chains = sample(
+                program.model,
+                {**arguments, "data": data.data},
+                sampler,
+                whitening,
+                checkpoints,
+                report,
+            )
+    with stages("data tree"):
+        tree = to_datatree(
+            chains,
+            program,
+            inference.model,
+            inference.posterior,
+            data,
+            seed=sampler.seed,
+            arguments=arguments,
+            truth=true_values(experiment.setup),
+            attributes={
+                "coordinates": "learned in warmup" if whitening is None else "white",
+                "identity": json.dumps(identity),
+                "frequency_mhz": scenario.frequency_mhz,
+                "frame": "galactic",
+                "scenario": scenario.to_yaml(),
+            },
+        )
+    speed = _speed(times, chains, sampler.warmup)
+    return SampleResult(experiment, inference, tree, stages.seconds, speed)
+
+
+def coordinates(
+    program: Program,
+    arguments: dict,
+    data: Visibilities,
+    inference: Inference,
+    latent: list[str],
+) -> Whitening | None:
+    """White coordinates for a program: those of the analytic posterior where it samples the sky
+    alone, and data are Gaussian about it; the straight ones of a log-normal sky; else those about
+    its mode. None if no mode is found: warmup then learns scales."""
+    if latent == [SKY] and not predicts(program.model, arguments, TimesStudentT):
+        return Whitening.of(inference.posterior)
+    positive = arguments.get("log_normal")
+    if positive is not None and set(latent) == set(positive.sites):
+        return coordinates_of(positive, inference.model.inform(data.data)[0])
+    start = {SKY: inference.posterior.mean} if SKY in latent else {}
+    arguments = {**arguments, "data": data.data}
+    starts = 1 if SKY in latent else STARTS
+    chart = _chart(arguments, latent)
+    found = laplace_approximation(program.model, arguments, start, SCALES, starts, chart)
+    return found.whitening if bool(found.converged) else None
+
+
+def _chart(arguments: dict, latent: list[str]) -> Chart | None:
+    """The curved coordinates that a systematic among a program's arguments knows."""
+    gaussian = arguments.get("gaussian")
+    for piece in arguments.values():
+        for systematic in piece if isinstance(piece, tuple) else (piece,):
+            if gaussian is not None and isinstance(systematic, Systematic):
+                chart = systematic.chart(gaussian)
+                if chart is not None and set(chart.names) <= set(latent):
+                    return chart
+    return None
+
+
+def _finished(folder: Path, identity: dict, sampler: Sampler) -> xr.DataTree | None:
+    """The samples that an earlier run of the same settings has left, if there are enough."""
+    if (folder / CHAINS).exists() or not (folder / SAMPLES).exists():
+        return None
+    tree = read_datatree(folder / SAMPLES)
+    with reading(folder / SAMPLES, "samples"):
+        same = json.loads(tree.attrs["identity"]) == json.loads(json.dumps(identity))
+    if not same or tree["posterior"].sizes["draw"] != sampler.draws:
+        raise InputError(
+            f"'{folder}' holds a finished run with other settings; leave out --resume to replace "
+            "it, or give another folder"
+        )
+    return tree
+
+
+def _state_in_words(iteration: int, state: HMCState, sampler: Sampler) -> str:
+    phase = "warmup" if iteration <= sampler.warmup else "draws"
+    steps, size = float(state.num_steps.mean()), float(state.adapt_state.step_size.mean())
+    return (
+        f"{phase}, {steps:.0f} steps of {size:.3f}, acceptance {state.mean_accept_prob.mean():.2f}"
+    )
+
+
+def _speed(times: list[tuple[float, int]], chains: Chains, warmup: int) -> float | None:
+    """Gradients per second between the first and the last file of draws of this session."""
+    drawn = [(at, done - warmup) for at, done in times if done > warmup]
+    if len(drawn) < 2:
+        return None
+    (start, first), (end, last) = drawn[0], drawn[-1]
+    return float(chains.statistics["n_steps"][:, first:last].sum() / (end - start))
+
 
 RESUME = "go on with --resume"
 
@@ -57,7 +227,7 @@ def run_sample(
     resume: bool = False,
     replace: bool = False,
     stages: Stages | None = None,
-) -> Run[tuple[SampleResult, ...]]:
+) -> RunOutcome[tuple[SampleResult, ...]]:
     """Sample the posterior of a program, and write the folder in one transaction.
 
     Several frequencies are sampled one after the other, each in a folder of its own, and their maps
@@ -76,10 +246,8 @@ def run_sample(
         Visibilities to use; without them the scenario's own are simulated.
     resume : bool
         Go on with the unfinished run in the folder, or take over a finished one.
-    replace : bool
-        Replace results of another run in the folder.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
 
     Raises
     ------
@@ -95,49 +263,45 @@ def run_sample(
         )
     program = program or default_program(scenario)
     sampler = sampler or Sampler(seed=scenario.seed)
-    folder = user_path(folder)
+
+    def one(
+        scenario: Scenario, folder: Path, stages: Stages
+    ) -> RunOutcome[tuple[SampleResult, ...]]:
+        with sample_folder(folder, SAMPLE, scenario, data, program, replace) as run:
+            n_draws = sampler.chains * sampler.draws
+            experiment = measured_experiment(scenario, data, stages, n_draws=n_draws)
+            options = {"resume": resume, "stages": stages}
+            result = sample_result(experiment, program, sampler, run.path, **options)
+            written = run.write(result, stages, Provenance.of_experiment(experiment, data))
+            return RunOutcome((result,), run.path, written.files)
+
+    folder, stages = user_path(folder), stages or Stages()
     if not scenario.frequencies_mhz:
-        return _run_single(scenario, folder, program, sampler, data, resume, replace, stages)
-    stages = stages or Stages()
-    origin = sample_origin(scenario, data, program)
-    inputs = inputs_of(scenario, data, program.path)
-    with run_folder(folder, CUBES, origin, RESUME, replace=replace, inputs=inputs) as place:
+        return one(scenario, folder, stages)
+    with sample_folder(folder, CUBES, scenario, data, program, replace) as run:
         runs = []
         for channel in scenario.channels():
-            where = place / f"{channel.frequency_mhz:.15g}MHz"
-            own = Stages(stages.console, verbose=stages.verbose)
-            runs.append(_run_single(channel, where, program, sampler, data, resume, replace, own))
-        results = tuple(result for run in runs for result in run.result)
-        cubes = write_run(place, (scenario, results), CUBES, origin, stages)
-        return Run(results, place, [*(f for run in runs for f in run.files), *cubes.files])
+            where = run.path / f"{channel.frequency_mhz:.15g}MHz"
+            runs.append(one(channel, where, Stages(stages.console, verbose=stages.verbose)))
+        results = tuple(result for each in runs for result in each.result)
+        cubes = run.write((scenario, results), stages)
+        return RunOutcome(
+            results, run.path, [*(f for each in runs for f in each.files), *cubes.files]
+        )
 
 
-def sample_origin(scenario: Scenario, data: Data | None, program: Program) -> dict[str, str]:
-    """What determines the draws of a program (:func:`.origin_of`)."""
-    return origin_of(scenario, data, program=f"{program.name} ({program.digest[:12]})")
-
-
-def _run_single(
+def sample_folder(
+    folder: str | Path,
+    kind: RunKind,
     scenario: Scenario,
-    folder: Path,
-    program: Program,
-    sampler: Sampler,
     data: Data | None,
-    resume: bool,
+    program: Program,
     replace: bool,
-    stages: Stages | None,
-) -> Run[tuple[SampleResult, ...]]:
-    stages = stages or Stages()
-    origin = sample_origin(scenario, data, program)
-    inputs = inputs_of(scenario, data, program.path)
-    with run_folder(folder, SAMPLE, origin, RESUME, replace=replace, inputs=inputs) as place:
-        measured = None if data is None else read_data(data, scenario)
-        require_resources(scenario, measured, stages, sampler.chains * sampler.draws)
-        experiment = build(scenario, measured, stages)
-        result = sample_result(experiment, program, sampler, place, resume=resume, stages=stages)
-        provenance = Provenance.of_experiment(experiment, data)
-        run = write_run(place, result, SAMPLE, origin, stages, provenance)
-        return Run((result,), place, run.files)
+) -> AbstractContextManager[RunFolder]:
+    """Open the folder of a run whose draws are those of a program (:func:`.scenario_run`)."""
+    named = f"{program.name} ({program.digest[:12]})"
+    given = {"replace": replace, "program": named}
+    return scenario_run(folder, kind, scenario, data, program.path, **given)
 
 
 def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Path) -> None:
@@ -146,7 +310,6 @@ def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Pat
     for name in ("mean", "std"):
         pixels = np.stack([result.maps[name] for result in results])
         write_cube(folder / f"{name}.fits", name, pixels, frequencies, scenario)
-    (folder / "scenario.yaml").write_text(scenario.to_yaml(), encoding="utf-8")
 
 
 def _write_maps(result: SampleResult, folder: Path) -> None:
@@ -154,18 +317,12 @@ def _write_maps(result: SampleResult, folder: Path) -> None:
         write_map(folder / f"{name}.fits", name, pixels, result.experiment.scenario)
 
 
-def _write_summaries(result: SampleResult, folder: Path) -> None:
-    result.summary_table().to_csv(folder / "summary.csv", index_label="quantity")
-    (folder / "scenario.yaml").write_text(result.experiment.scenario.to_yaml(), encoding="utf-8")
-    (folder / "sampling.json").write_text(
-        json.dumps(result.figures(), indent=2) + "\n", encoding="utf-8"
-    )
-
-
 SAMPLE_OUTPUTS = (
     Output(lambda result, folder: write_datatree(result.tree, folder / SAMPLES)),
     Output(_write_maps),
-    Output(_write_summaries),
+    text_file("summary.csv", lambda run: run.summary_table().to_csv(index_label="quantity")),
+    text_file("scenario.yaml", lambda run: run.experiment.scenario.to_yaml()),
+    json_file("sampling.json", lambda run: run.figures()),
 )
 
 # what the folder of a sampled program holds; a new file is one line here
@@ -173,15 +330,23 @@ SAMPLE = RunKind(
     "sample",
     outputs=SAMPLE_OUTPUTS,
     figures={
-        "uncertainty": uncertainty,
-        "traces": traces,
-        "ranks": lambda result: ranks(result.quantities()),
-        "energy": lambda result: energy(result.tree["sample_stats"].dataset),
-        "pairs": lambda result: pairs(result.quantities()),
-        "against_analytic": lambda result: against_analytic(result.tree),
+        "uncertainty": figures.uncertainty,
+        "traces": figures.traces,
+        "ranks": lambda result: figures.ranks(result.quantities()),
+        "energy": lambda result: figures.energy(result.tree["sample_stats"].dataset),
+        "pairs": lambda result: figures.pairs(result.quantities()),
+        "against_analytic": lambda result: figures.against_analytic(result.tree),
     },
     unfinished=CHAINS,
+    resume=RESUME,
 )
 
 # what the folder of several channels holds, besides a folder of each
-CUBES = RunKind("sampled cubes", outputs=(Output(_write_cubes),), figures={})
+CUBES = RunKind(
+    "sampled cubes",
+    outputs=(
+        Output(_write_cubes),
+        text_file("scenario.yaml", lambda sampled: sampled[0].to_yaml()),
+    ),
+    figures={},
+)

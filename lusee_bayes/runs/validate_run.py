@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace as replace_fields
 from pathlib import Path
 
-from lusee_bayes.core.engine import Engine
+from lusee_bayes.core.engine import Demand, Engine
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.data_files import Data, read_data
-from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.report.figures.sampling import comparison, rank_statistics
 from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.sample_result import CHAINS
 from lusee_bayes.results.validation_result import ValidationResult
-from lusee_bayes.runs.cost import require_resources
-from lusee_bayes.runs.folder import Output, Run, RunKind, inputs_of, run_folder, write_run
-from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_origin
-from lusee_bayes.runs.sampling import sample_result
+from lusee_bayes.runs.cost import demand_of, measured_experiment, posterior_cost
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, json_file, text_file
+from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_folder, sample_result
 from lusee_bayes.sampling.hmc import Sampler, require_draws, require_simulations
 from lusee_bayes.sampling.programs import load_program
-from lusee_bayes.sampling.validation import calibrate_sky, validate_draws
+from lusee_bayes.sampling.validation import BATCH, N_DRAWS, calibrate_sky, validate_draws
+
+
+def demand_of_calibration(scenario: Scenario) -> Demand:
+    """What simulation-based calibration takes, in batches that use all processors."""
+    return replace_fields(demand_of([posterior_cost(scenario, BATCH * N_DRAWS)]), side_by_side=1)
 
 
 def run_validate(
@@ -35,7 +38,7 @@ def run_validate(
     engine: Engine | None = None,
     replace: bool = False,
     stages: Stages | None = None,
-) -> Run[ValidationResult]:
+) -> RunOutcome[ValidationResult]:
     """Check the analytic posterior of a scenario by HMC and by simulated data sets.
 
     The folder is written in one transaction.
@@ -57,10 +60,8 @@ def run_validate(
         Go on with the unfinished run in the folder, or judge the finished one again.
     engine : Engine, optional
         What works on the simulated data sets; by default this process.
-    replace : bool
-        Replace results of another run in the folder.
-    stages : Stages, optional
-        Told what is being done.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
 
     Raises
     ------
@@ -73,13 +74,11 @@ def run_validate(
     program = load_program("sky")
     require_simulations(simulations)
     require_draws(sampler.draws)
-    origin = sample_origin(scenario, data, program)
-    inputs = inputs_of(scenario, data, program.path)
-    with run_folder(folder, VALIDATION, origin, RESUME, replace=replace, inputs=inputs) as place:
-        measured = None if data is None else read_data(data, scenario)
-        require_resources(scenario, measured, stages, sampler.chains * sampler.draws)
-        experiment = build(scenario, measured, stages)
-        sampled = sample_result(experiment, program, sampler, place, resume=resume, stages=stages)
+    with sample_folder(folder, VALIDATION, scenario, data, program, replace) as run:
+        n_draws = sampler.chains * sampler.draws
+        experiment = measured_experiment(scenario, data, stages, n_draws=n_draws)
+        options = {"resume": resume, "stages": stages}
+        sampled = sample_result(experiment, program, sampler, run.path, **options)
         posterior, model = sampled.inference.posterior, sampled.inference.model
         with stages("comparison"):
             stats = sampled.tree["sample_stats"]
@@ -87,7 +86,7 @@ def run_validate(
                 sampled.skies, posterior, stats["diverging"].values, stats["energy"].values
             )
         if engine is not None:
-            engine.work_in(place)
+            engine.work_in(run.path)
         ranks = calibrate_sky(
             model,
             model,
@@ -98,28 +97,26 @@ def run_validate(
         )
         result = ValidationResult(name, sampled, found, ranks)
         provenance = Provenance.of_experiment(experiment, data)
-        return write_run(place, result, VALIDATION, origin, stages, provenance)
+        return run.write(result, stages, provenance)
 
 
 def _of_sampled(output: Output) -> Output:
     return Output(lambda result, folder: output.write(result.sampled, folder))
 
 
-def _write_verdict(result: ValidationResult, folder: Path) -> None:
-    (folder / "validation.json").write_text(
-        json.dumps(result.as_json(), indent=2) + "\n", encoding="utf-8"
-    )
-    (folder / "validation.md").write_text(result.as_markdown(), encoding="utf-8")
-
-
 # what the folder of a validation holds; a new file is one line here
 VALIDATION = RunKind(
     "validate",
-    outputs=(*map(_of_sampled, SAMPLE_OUTPUTS), Output(_write_verdict)),
+    outputs=(
+        *map(_of_sampled, SAMPLE_OUTPUTS),
+        json_file("validation.json", lambda result: result.as_json()),
+        text_file("validation.md", lambda result: result.as_markdown()),
+    ),
     figures={
         "comparison": lambda result: comparison(result.comparison),
         "calibration": lambda result: rank_statistics(result.ranks),
     },
     unfinished=CHAINS,
     after=("sample",),
+    resume=RESUME,
 )

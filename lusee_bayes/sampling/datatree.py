@@ -17,16 +17,10 @@ from lusee_bayes.core.harmonics import lmax_of, mode_numbers
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import reading, require_file
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling.hmc import Chains
-from lusee_bayes.sampling.programs import (
-    Program,
-    collapsed_skies,
-    is_collapsed,
-    numpyro_promotion,
-    replicated_data,
-)
+from lusee_bayes.sampling.programs import Program, collapsed_draws, is_collapsed, numpyro_promotion
 from lusee_bayes.systematics.systematic import SKY
 
 DATA = "data"
@@ -100,12 +94,12 @@ def to_datatree(
     step = max(1, n_chains * n_draws // n_predictive)
     with numpyro_promotion():
         if collapsed:
-            sites[SKY] = collapsed_skies(program, arguments, data.data, sites, keys[0])
+            sites[SKY] = collapsed_draws(program, arguments, data.data, sites, keys[0])
         prior = Predictive(program.model, num_samples=n_predictive)(keys[1], **arguments)
         thinned = {name: values[:, ::step] for name, values in sites.items()}
         if collapsed:
             skies = thinned.pop(SKY)
-            replicated = replicated_data(program, arguments, data.data, thinned, skies, keys[2])
+            replicated = collapsed_draws(program, arguments, data.data, thinned, keys[2], skies)
         else:
             again = Predictive(program.model, thinned, batch_ndims=2, return_sites=["data"])
             replicated = np.asarray(again(keys[2], **arguments)["data"])

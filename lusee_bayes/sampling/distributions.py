@@ -24,7 +24,7 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, Factor
 from lusee_bayes.sky.prior import Prior
 
@@ -48,10 +48,10 @@ class SkyPrior(dist.Distribution):
     support = dist.constraints.real_vector
     pytree_data_fields = ("prior",)
 
-    def __init__(self, prior: Prior, *, validate_args: bool | None = None):
+    def __init__(self, prior: Prior):
         prior.require_density()
         self.prior = prior
-        super().__init__(event_shape=(prior.size,), validate_args=validate_args)
+        super().__init__(event_shape=(prior.size,))
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Skies of the prior, ``(*sample_shape, unknowns)``, in K."""
@@ -69,6 +69,14 @@ class SkyPrior(dist.Distribution):
 class Prediction(dist.Distribution):
     """Data about a prediction: what a search for the mode needs to know besides ln p(d)."""
 
+    support = dist.constraints.real_vector
+    pytree_data_fields = ("factor", "loc")
+
+    def __init__(self, loc: Float[Array, " data"], noise: Covariance | Factor):
+        self.loc = loc
+        self.factor = noise.factor() if isinstance(noise, Covariance) else noise
+        super().__init__(event_shape=loc.shape)
+
     @abstractmethod
     def misfit(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute the part of -ln p(d) that depends on d, of every row of an array."""
@@ -79,6 +87,11 @@ class Prediction(dist.Distribution):
 
         J^T J is the misfit's curvature, as Gauss and Newton take it.
         """
+
+    def _white(self, value: Float[Array, "..."]) -> Float[Array, "data rows"]:
+        """L^-1 (d - loc) of every row d of an array, N = L L^T."""
+        residual = value - self.loc.reshape(*(1,) * (value.ndim - 1), -1)
+        return self.factor.whiten(residual.reshape(-1, self.loc.shape[0]).T)
 
 
 class CorrelatedNormal(Prediction):
@@ -92,20 +105,6 @@ class CorrelatedNormal(Prediction):
         N. Where it is fixed, give ``noise.factor()``: it is then factorised once and not at every
         evaluation of a model.
     """
-
-    support = dist.constraints.real_vector
-    pytree_data_fields = ("factor", "loc")
-
-    def __init__(
-        self,
-        loc: Float[Array, " data"],
-        noise: Covariance | Factor,
-        *,
-        validate_args: bool | None = None,
-    ):
-        self.loc = loc
-        self.factor = noise.factor() if isinstance(noise, Covariance) else noise
-        super().__init__(event_shape=loc.shape, validate_args=validate_args)
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Data vectors, ``(*sample_shape, data)``, in K."""
@@ -121,8 +120,7 @@ class CorrelatedNormal(Prediction):
 
     def misfit(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute chi^2 / 2, of every row of an array."""
-        white = _whitened(self.factor, value, self.loc)
-        return 0.5 * (white**2).sum(0).reshape(value.shape[:-1])
+        return 0.5 * (self._white(value) ** 2).sum(0).reshape(value.shape[:-1])
 
     def residual(self, value: Float[Array, " data"]) -> Float[Array, " data"]:
         """Compute L^-1 (d - loc), N = L L^T."""
@@ -145,14 +143,6 @@ class CorrelatedNormal(Prediction):
         root = self.factor.whiten(jnp.eye(self.loc.shape[0]))
         precise = self.factor.solve(value - self.loc)
         return _leave_one_out(precise, (root**2).sum(0))
-
-
-def _whitened(
-    factor: Factor, value: Float[Array, "..."], loc: Float[Array, " data"]
-) -> Float[Array, "data rows"]:
-    """L^-1 (d - loc) of every row d of an array, N = L L^T."""
-    residual = value - loc.reshape(*(1,) * (value.ndim - 1), -1)
-    return factor.whiten(residual.reshape(-1, loc.shape[0]).T)
 
 
 def _leave_one_out(
@@ -195,8 +185,7 @@ class TimesStudentT(Prediction):
     Lange, Little & Taylor 1989, J. Am. Stat. Assoc. 84, 881.
     """
 
-    support = dist.constraints.real_vector
-    pytree_data_fields = ("factor", "layout", "loc", "nu")
+    pytree_data_fields = ("layout", "nu")
 
     def __init__(
         self,
@@ -204,23 +193,19 @@ class TimesStudentT(Prediction):
         noise: Covariance | Factor,
         layout: DataLayout,
         nu: float | Float[Array, ""],
-        *,
-        validate_args: bool | None = None,
     ):
         require_positive("nu of the Student-t", nu)
         if layout.size != loc.shape[0]:
             raise InputError(f"the layout has {layout.size} data, the mean {loc.shape[0]}")
-        self.factor = noise.factor() if isinstance(noise, Covariance) else noise
+        super().__init__(loc, noise)
         if self.factor.couples_times:
             raise InputError(
                 f"a Student-t for every time needs noise that couples no two times, not "
                 f"{type(noise).__name__}; have what couples them (gains, receivers, sources) "
                 "sampled instead of marginalised, or leave it out"
             )
-        self.loc = loc
         self.layout = layout
         self.nu = nu
-        super().__init__(event_shape=loc.shape, validate_args=validate_args)
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Data vectors, ``(*sample_shape, data)``, in K."""
@@ -268,7 +253,7 @@ class TimesStudentT(Prediction):
 
     def _chi2(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Chi^2 of the data of every time, (..., times)."""
-        white = self.layout.scatter(_whitened(self.factor, value, self.loc))
+        white = self.layout.scatter(self._white(value))
         return (white**2).sum(0).T.reshape(*value.shape[:-1], self.layout.n_times)
 
 
@@ -284,9 +269,9 @@ class Marginal(dist.Distribution):
     support = dist.constraints.real_vector
     pytree_data_fields = ("model",)
 
-    def __init__(self, model: LinearGaussian, *, validate_args: bool | None = None):
+    def __init__(self, model: LinearGaussian):
         self.model = model
-        super().__init__(event_shape=(model.n_data,), validate_args=validate_args)
+        super().__init__(event_shape=(model.n_data,))
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Data vectors of skies of the prior, ``(*sample_shape, data)``, in K."""

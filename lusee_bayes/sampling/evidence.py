@@ -28,7 +28,7 @@ from numpyro.infer.util import potential_energy
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling.mode import LaplaceApproximation, laplace_approximation
-from lusee_bayes.sampling.programs import Program, numpyro_promotion
+from lusee_bayes.sampling.programs import Program, numpyro_promotion, side_by_side
 
 # degrees of freedom of the proposal, whose tails are heavier than a Gaussian's
 TAILS = 7.0
@@ -141,11 +141,9 @@ def pointwise(
         If the program's data are not at a site Marginal or CorrelatedNormal.
     """
     shape = next(iter(sites.values())).shape[:2]
-    flat = {
-        name: jnp.asarray(v).reshape(shape[0] * shape[1], *v.shape[2:]) for name, v in sites.items()
-    }
     with numpyro_promotion():
-        rows = _pointwise(program, {**arguments, DATA: jnp.asarray(data)}, flat)
+        given = {**arguments, DATA: jnp.asarray(data)}
+        rows = _pointwise(program, given, side_by_side(dict(sites)))
     return np.asarray(rows).reshape(*shape, -1)
 
 
@@ -167,11 +165,7 @@ def _pointwise(
 
 
 def with_log_likelihood(
-    tree: xr.DataTree,
-    program: Program,
-    arguments: Mapping[str, Any],
-    *,
-    most: int = 400,
+    tree: xr.DataTree, program: Program, arguments: Mapping[str, Any], *, most: int = 400
 ) -> xr.DataTree:
     """Make a tree of some of the draws, with a group log_likelihood (chain, draw, datum).
 

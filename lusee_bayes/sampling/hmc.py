@@ -1,30 +1,19 @@
-"""Hamiltonian Monte Carlo: chains that survive a kill.
+"""Hamiltonian Monte Carlo of any NumPyro program: chains side by side that survive a kill.
 
-Draws of chains side by side, and statistics of every draw.
+Programs are sampled in coordinates in which their posterior is nearly round, if such are known:
+those of the sky's analytic posterior, or of :mod:`lusee_bayes.sampling.mode`. They change the speed
+of sampling, not its density, which is the program's own: ``whitened(program, whitening)`` samples m
+through z, m = mean + R z.
 
-Coordinates in which posteriors are round: they change the speed of sampling, not its density.
-
-whitened(program, whitening)    samples m through z, m = mean + R z
-
-Draws on disk as they come: a run that is killed at any moment goes on where it stopped.
-
+Draws are kept on disk as they come: a run that is killed at any moment goes on where it stopped.
 One file a chunk: the draws of that chunk and the state of the chains behind it, written whole or
 not at all. The last file is the place to go on from; nothing else needs to be consistent with it.
-
-Hamiltonian Monte Carlo of any NumPyro program: chains side by side, draws kept as they come.
-
-Programs are sampled in coordinates in which their posterior is nearly round, if such are known
-(:mod:`lusee_bayes.sampling.hmc`: those of the sky's analytic posterior, or of
-:mod:`lusee_bayes.sampling.mode`); the density is the program's own.
-
-The least numbers of draws and simulations that checks need; asked before any work begins.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -35,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float
 from numpyro.infer import HMC, NUTS
 from numpyro.infer.hmc import HMCState
 
@@ -380,19 +369,14 @@ class Checkpoints:
                     "delete the chunks behind them to go on from there"
                 )
             done = chunk.iteration
-        kept = [chunk.draws for chunk in chunks if chunk.draws]
-        return {
-            name: np.concatenate([c[name] for c in kept]).swapaxes(0, 1)
-            for name in (kept[0] if kept else {})
-        }
+        return _by_chain([chunk.draws for chunk in chunks])
 
-    def remove(self) -> None:
-        """Delete the folder. If that is interrupted, no half of it is left under its name."""
-        doomed = self.folder.with_name(f".{self.folder.name}-removed")
-        shutil.rmtree(doomed, ignore_errors=True)
-        if self.folder.exists():
-            os.replace(self.folder, doomed)
-            shutil.rmtree(doomed)
+
+def _by_chain(parts: list[dict[str, Array]]) -> dict[str, np.ndarray]:
+    """Draws (chains, draws, ...) by name, of parts (draws, chains, ...) one after the other."""
+    kept = [part for part in parts if part]
+    names = kept[0] if kept else ()
+    return {n: np.concatenate([np.asarray(k[n]) for k in kept]).swapaxes(0, 1) for n in names}
 
 
 def _iteration(path: Path) -> int:
@@ -554,68 +538,12 @@ def sample(
             else:
                 checkpoints.append(done, jax.tree.leaves(state), draws)
             report(done, state)
-    if checkpoints is not None:
-        merged = checkpoints.draws()
-    else:
-        kept = [k for k in kept if k]
-        merged = {
-            name: np.concatenate([np.asarray(k[name]) for k in kept]).swapaxes(0, 1)
-            for name in kept[0]
-        }
+    merged = _by_chain(kept) if checkpoints is None else checkpoints.draws()
     merged = {name: values[:, : sampler.draws] for name, values in merged.items()}
     return Chains(
         {name: values for name, values in merged.items() if name not in STATISTICS},
         {name: merged[name] for name in STATISTICS},
     )
-
-
-@numpyro_promotion()
-def draw_within(
-    program: Callable,
-    arguments: Mapping[str, Any],
-    key: PRNGKeyArray,
-    sampler: Sampler,
-    whitening: Whitening | None = None,
-    thin: int = 1,
-) -> dict[str, Array]:
-    """Draw one chain inside a JAX program.
-
-    It can be mapped over many data sets (``jax.vmap``), as in simulation-based calibration;
-    nothing is kept on disk.
-
-    Parameters
-    ----------
-    program : callable
-        A NumPyro model.
-    arguments : mapping
-        Its arguments, with the data.
-    key : PRNG key
-        Of the chain.
-    sampler : Sampler
-        How to sample; its ``chains`` and ``seed`` are not used.
-    whitening : Whitening, optional
-        Coordinates of some of the program's sites.
-    thin : int
-        Keep every ``thin``-th draw.
-
-    Returns
-    -------
-    dict of (draws, ...) array
-        Draws by site.
-    """
-    run = _Run(program, dict(arguments), sampler, whitening)
-    kernel, inputs = run.kernel, (run.dynamic,)
-    state = kernel.init(key, sampler.warmup, None, inputs, {})
-
-    def iterate(n, state):
-        return jax.lax.fori_loop(0, n, lambda _, s: kernel.sample(s, inputs, {}), state)
-
-    def step(state, _):
-        state = iterate(thin, state)
-        return state, state.z
-
-    _, z = jax.lax.scan(step, iterate(sampler.warmup, state), None, length=sampler.draws)
-    return _without_auxiliary(jax.vmap(kernel.postprocess_fn(inputs, {}))(z))
 
 
 NOT_FINITE = (

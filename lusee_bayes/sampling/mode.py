@@ -1,18 +1,14 @@
 """The mode of a program, the curvature there, and how uncertain quantities are.
 
-Minus the log posterior of a program, its gradient and its curvature.
+Mode and curvature say where sampling is to begin, and in which coordinates. The curvature is the
+Hessian where few sites are sampled (the sky integrated out). Where a program predicts the data at a
+site CorrelatedNormal, as d ~ N(f(x), N), it is that of Gauss and Newton, J^T N^-1 J plus that of
+the prior, J the derivative of f: for the sky and thousands of other unknowns at once. At a site
+TimesStudentT every time has its weight in N^-1. Both only serve as coordinates; the density sampled
+is the program's own.
 
-The mode of a program's posterior and its curvature there: where to begin, in which coordinates.
-
-The curvature is the Hessian where few sites are sampled (the sky integrated out). Where a
-program predicts the data at a site CorrelatedNormal, as d ~ N(f(x), N), it is that of Gauss and
-Newton, J^T N^-1 J plus that of the prior, J the derivative of f: for the sky and thousands of
-other unknowns at once. At a site TimesStudentT every time has its weight in N^-1. Both only serve
-as coordinates; the density sampled is the program's own.
-
-Maps of draws of the sky: standard deviations, intervals, which region is brighter.
-
-Skies are draws (chains, draws, modes) of Galactic harmonic coefficients in K, by HMC or
+Of draws of the sky there are maps of standard deviations and intervals, and which region is
+brighter. Skies are draws (chains, draws, modes) of Galactic harmonic coefficients in K, by HMC or
 :meth:`Posterior.sample`; maps are HEALPix RING, Galactic, in K.
 """
 
@@ -86,11 +82,8 @@ class Potential(eqx.Module):
         for name in self.hold if still else ():
             if name in parts:
                 parts[name] = jax.lax.stop_gradient(parts[name])
-        return (
-            (parts, jnp.zeros(()))
-            if self.shapes.chart is None
-            else self.shapes.chart.to_values(parts)
-        )
+        chart = self.shapes.chart
+        return (parts, jnp.zeros(())) if chart is None else chart.to_values(parts)
 
     def value(self, x: Float[Array, " n"], still: bool = False) -> Float[Array, ""]:
         """Return it at x; ``still``: without derivatives by what is held."""
@@ -300,15 +293,14 @@ def laplace_approximation(
         for name, site in trace.items()
         if site["type"] == "sample" and not site["is_observed"]
     }
-    unconstrained = {
-        name: dist.biject_to(site["fn"].support).inv(jnp.asarray(site["value"], dtype=jnp.float64))
-        for name, site in latent.items()
-    }
+    unconstrained = {name: _unconstrained(site) for name, site in latent.items()}
     sites = tuple((name, value.shape) for name, value in unconstrained.items())
     n = sum(value.size for value in unconstrained.values())
     shapes = Whitening(jnp.zeros(n), jnp.zeros((n, 0)), jnp.zeros(()), sites, chart)
     first = shapes.from_values(unconstrained)
-    problem = Potential(program, arguments, shapes, _predicts(trace), tuple(hold))
+    observed = [s for s in trace.values() if s["type"] == "sample" and s["is_observed"]]
+    predicts = any(isinstance(site["fn"], Prediction) for site in observed)
+    problem = Potential(program, arguments, shapes, predicts, tuple(hold))
     if not problem.predicts and n > MOST_COLLAPSED:
         raise InputError(
             f"the program has {n} unknowns and no site CorrelatedNormal, whose curvature is found "
@@ -327,6 +319,11 @@ def laplace_approximation(
     return jax.tree.map(lambda leaf: leaf[jnp.argmax(weight)], found)
 
 
+def _unconstrained(site: dict) -> Float[Array, "..."]:
+    value = jnp.asarray(site["value"], dtype=jnp.float64)
+    return dist.biject_to(site["fn"].support).inv(value)
+
+
 def _drawn(
     program: Callable, arguments: dict, shapes: Whitening, n: int
 ) -> Float[Array, "draws unknowns"]:
@@ -334,13 +331,7 @@ def _drawn(
 
     def one(key):
         trace = handlers.trace(handlers.seed(program, key)).get_trace(**arguments)
-        values = {
-            name: dist.biject_to(trace[name]["fn"].support).inv(
-                jnp.asarray(trace[name]["value"], dtype=jnp.float64)
-            )
-            for name in shapes.names
-        }
-        return shapes.from_values(values)
+        return shapes.from_values({name: _unconstrained(trace[name]) for name in shapes.names})
 
     return jax.lax.map(one, jax.random.split(jax.random.PRNGKey(1), n))
 
@@ -364,11 +355,6 @@ def _prior_scale(latent: dict) -> Float[Array, " n"]:
         x = jax.vmap(dist.biject_to(site["fn"].support).inv)(jnp.asarray(draws, jnp.float64))
         scales.append(x.std(0).reshape(-1))
     return jnp.concatenate(scales)
-
-
-def _predicts(trace: dict) -> bool:
-    observed = [s for s in trace.values() if s["type"] == "sample" and s["is_observed"]]
-    return any(isinstance(site["fn"], Prediction) for site in observed)
 
 
 @eqx.filter_jit

@@ -17,10 +17,10 @@ from numpyro.infer.util import log_density
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.sampling.datatree import DATA
 from lusee_bayes.sampling.hmc import WHITE_SUFFIX
-from lusee_bayes.sampling.programs import Program, numpyro_promotion
+from lusee_bayes.sampling.programs import Program, numpyro_promotion, traced
 from lusee_bayes.systematics.systematic import SKY
 
 # names that samples.nc uses for something else
@@ -116,19 +116,11 @@ def _traced(
     program: Program, arguments: dict[str, Any], data: Array | None, who: str
 ) -> tuple[dict[str, dict[str, Any]], bool]:
     """The sample and deterministic sites of a program, by name; whether it returns a model."""
-    found: list[tuple[dict[str, dict[str, Any]], bool]] = []
-
-    def run(dynamic):
-        with handlers.trace() as sites:
-            returned = handlers.seed(program.model, 0)(**eqx.combine(dynamic, static))
-        kept = {n: s for n, s in sites.items() if s["type"] in ("sample", "deterministic")}
-        found.append((kept, isinstance(returned, LinearGaussian)))
-
-    dynamic, static = eqx.partition({**arguments, DATA: data}, eqx.is_array)
     how = "when it is called" if data is not None else "when it is called with data=None"
-    with _blaming(who, how), numpyro_promotion():
-        jax.eval_shape(run, dynamic)
-    return found[0]
+    with _blaming(who, how):
+        sites, returned = traced(program.model, {**arguments, DATA: data})
+    kept = {n: s for n, s in sites.items() if s["type"] in ("sample", "deterministic")}
+    return kept, isinstance(returned, LinearGaussian)
 
 
 def _is_sampled(site: dict[str, Any]) -> bool:

@@ -1,10 +1,7 @@
-"""NumPyro programs: what a program is given, and what it says.
+"""NumPyro programs: files with a ``model``, what they can ask for, and what their sites are.
 
-NumPyro under strict rules of JAX.
-
-Probabilistic programs: files with a NumPyro ``model``, and what they can ask for.
-
-The sites of a NumPyro program: which are sampled, which observed, which predict.
+NumPyro runs under JAX's standard rules of types and ranks, the package under strict ones
+(:func:`numpyro_promotion`).
 """
 
 from __future__ import annotations
@@ -31,7 +28,7 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.reading import read_text, require_file
 from lusee_bayes.core.version import printable
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.sampling.distributions import Prediction
 
 
@@ -77,7 +74,7 @@ class Program:
     """A NumPyro model whose arguments are ``data`` and pieces of a model or an experiment.
 
     Called with ``data=None`` it is the prior predictive. If it returns a LinearGaussian, it has
-    integrated the sky out; :func:`collapsed_skies` then draws it.
+    integrated the sky out; :func:`collapsed_draws` then draws it.
 
     Attributes
     ----------
@@ -207,91 +204,82 @@ def _find(source: str | Path) -> Path:
     )
 
 
-@numpyro_promotion()
-def is_collapsed(program: Program, arguments: dict[str, Any], data: Array) -> bool:
-    """Tell whether the program integrates the sky out: its model returns a LinearGaussian."""
+def traced(program: Callable, arguments: Mapping[str, Any]) -> tuple[dict[str, dict], Any]:
+    """Return the sites of a program by name, and what it returns, without running it."""
     found = []
 
     def run(dynamic):
-        result = handlers.seed(program.model, 0)(**eqx.combine(dynamic, static), data=data)
-        found.append(isinstance(result, LinearGaussian))
+        with handlers.trace() as sites:
+            returned = handlers.seed(program, 0)(**eqx.combine(dynamic, static))
+        found.append((dict(sites), returned))
 
-    dynamic, static = eqx.partition(arguments, eqx.is_array)
-    jax.eval_shape(run, dynamic)
+    dynamic, static = eqx.partition(dict(arguments), eqx.is_array)
+    with numpyro_promotion():
+        jax.eval_shape(run, dynamic)
     return found[0]
 
 
-def collapsed_skies(
-    program: Program,
-    arguments: dict[str, Any],
-    data: Float[Array, " data"],
-    sites: dict[str, np.ndarray],
-    key: PRNGKeyArray,
-) -> Float[np.ndarray, "chains draws modes"]:
-    """Draw the sky exactly, given each draw of the other sites.
+def is_collapsed(program: Program, arguments: dict[str, Any], data: Array) -> bool:
+    """Tell whether the program integrates the sky out: its model returns a LinearGaussian."""
+    return isinstance(traced(program.model, {**arguments, "data": data})[1], LinearGaussian)
 
-    Parameters
-    ----------
-    program : Program
-        One that integrates the sky out.
-    arguments : dict
-        What it asks for, without the data.
-    data : (data,) array
-        d, in K.
-    sites : dict of (chains, draws, ...) array
-        Draws by site.
-    key : PRNG key
-        Of the skies.
 
-    Returns
-    -------
-    (chains, draws, modes) array
-        In K.
+def predicts(program: Callable, arguments: dict, kind: type[Prediction] = Prediction) -> bool:
+    """Tell whether a program has a site CorrelatedNormal or TimesStudentT, or of one ``kind``.
+
+    It then samples everything that they depend on, and its density needs matrix products only.
     """
-    return _map_draws(program, arguments, data, sites, None, key)
+    return any(isinstance(site["fn"], kind) for site in _sampled(program, arguments))
 
 
-def replicated_data(
-    program: Program,
-    arguments: dict[str, Any],
-    data: Float[Array, " data"],
-    sites: dict[str, np.ndarray],
-    skies: Float[np.ndarray, "chains draws modes"],
-    key: PRNGKeyArray,
-) -> Float[np.ndarray, "chains draws data"]:
-    """Simulate data of a collapsed program again: of the drawn skies, with new noise.
+def latent_sites(program: Callable, arguments: dict) -> list[str]:
+    """Return the names of the sites that a program samples and does not observe."""
+    return [site["name"] for site in _sampled(program, arguments) if not site["is_observed"]]
 
-    Parameters
-    ----------
-    program : Program
-        One that integrates the sky out.
-    arguments : dict
-        What it asks for, without the data.
-    data : (data,) array
-        d, in K.
-    sites : dict of (chains, draws, ...) array
-        Draws by site.
-    skies : (chains, draws, modes) array
-        From :func:`collapsed_skies`, in K.
-    key : PRNG key
-        Of the noise.
 
-    Returns
-    -------
-    (chains, draws, data) array
-        In K.
-    """
-    return _map_draws(program, arguments, data, sites, skies, key)
+def _sampled(program: Callable, arguments: dict) -> list[dict]:
+    return [s for s in traced(program, arguments)[0].values() if s["type"] == "sample"]
+
+
+def side_by_side(draws: Any) -> Any:
+    """Put the draws of all chains of a tree of (chains, draws, ...) arrays one after the other."""
+    return jax.tree.map(lambda v: jnp.asarray(v).reshape(-1, *v.shape[2:]), draws)
 
 
 @numpyro_promotion()
-def _map_draws(program, arguments, data, sites, skies, key) -> np.ndarray:
+def collapsed_draws(
+    program: Program,
+    arguments: dict[str, Any],
+    data: Float[Array, " data"],
+    sites: dict[str, np.ndarray],
+    key: PRNGKeyArray,
+    skies: Float[np.ndarray, "chains draws modes"] | None = None,
+) -> Float[np.ndarray, "chains draws n"]:
+    """Draw the sky exactly, given each draw of the other sites; or simulate data of drawn skies.
+
+    Parameters
+    ----------
+    program : Program
+        One that integrates the sky out.
+    arguments : dict
+        What it asks for, without the data.
+    data : (data,) array
+        d, in K.
+    sites : dict of (chains, draws, ...) array
+        Draws by site.
+    key : PRNG key
+        Of the skies, or of the noise.
+    skies : (chains, draws, modes) array, optional
+        Those that were drawn, in K.
+
+    Returns
+    -------
+    (chains, draws, modes) or (chains, draws, data) array
+        Skies; or, of skies that are given, data with new noise. In K.
+    """
     shape = next(iter(sites.values())).shape[:2]
-    per_draw = jax.tree.map(
-        lambda v: jnp.asarray(v).reshape(shape[0] * shape[1], *v.shape[2:]), (sites, skies)
-    )
     keys = jax.random.split(key, shape[0] * shape[1])
-    rows = _draw(program, arguments, jnp.asarray(data), *per_draw, keys)
+    rows = _draw(program, arguments, jnp.asarray(data), *side_by_side((sites, skies)), keys)
     return np.asarray(rows).reshape(*shape, -1)
 
 
@@ -315,38 +303,3 @@ def _draw(
         return gaussian.predict(sky) + gaussian.noise.sample(key)
 
     return jax.lax.map(one, (sites, skies, keys))
-
-
-def predicts(program: Callable, arguments: dict, kind: type[Prediction] = Prediction) -> bool:
-    """Tell whether a program has a site CorrelatedNormal or TimesStudentT, or of one ``kind``.
-
-    It then samples everything that they depend on, and its density needs matrix products only.
-    """
-    return any(isinstance(site["fn"], kind) for site in _sites(program, arguments))
-
-
-def latent_sites(program: Callable, arguments: dict) -> list[str]:
-    """Return the names of the sites that a program samples and does not observe."""
-    return site_names(program, arguments)[0]
-
-
-def site_names(program: Callable, arguments: dict) -> tuple[list[str], list[str]]:
-    """Return the names of a program's latent and of its observed sites."""
-    latent, observed = [], []
-    for site in _sites(program, arguments):
-        (observed if site["is_observed"] else latent).append(site["name"])
-    return latent, observed
-
-
-def _sites(program: Callable, arguments: dict) -> list[dict]:
-    """The sample sites of a program, without running it."""
-    found = []
-
-    def run(dynamic):
-        trace = handlers.trace(handlers.seed(program, 0)).get_trace(**eqx.combine(dynamic, static))
-        found.extend(site for site in trace.values() if site["type"] == "sample")
-
-    dynamic, static = eqx.partition(arguments, eqx.is_array)
-    with numpyro_promotion():
-        jax.eval_shape(run, dynamic)
-    return found

@@ -1,16 +1,14 @@
 """HMC and simulated data against the posterior in closed form.
 
-Simulation-based calibration: does a posterior mean what it says, over many data sets?
-
+**Simulation-based calibration** asks whether a posterior means what it says, over many data sets.
 Draw a truth from the prior, data from the truth, draws from the posterior given the data; the rank
 of the truth among the draws is uniform if and only if the posterior is right (Talts et al. 2018).
 What is ranked is a *quantity* of the unknowns, which may depend on the data too: the likelihood
 catches posteriors that leave data unused, which single modes cannot (Modrak et al. 2023).
 
-HMC as an independent check of the analytic posterior: mean, variances and covariance.
-
-Every threshold is what exact draws of the analytic posterior would exceed once in ``1 /
-FALSE_ALARM`` runs, given how many draws there are and how they hang together in time:
+**HMC checks the analytic posterior**: mean, variances and covariance. Every threshold is what exact
+draws of the analytic posterior would exceed once in ``1 / FALSE_ALARM`` runs, given how many draws
+there are and how they hang together in time:
 
 * means: the largest of the modes' deviations in units of their Monte Carlo errors;
 * variances: the same for chi^2 of each mode's sample variance, with its own effective sample size;
@@ -43,7 +41,7 @@ from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.judge.coverage import LEVELS
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.linear.solver import Solver
 from lusee_bayes.sampling.hmc import N_BINS, require_draws, require_simulations
@@ -250,19 +248,20 @@ def calibrate_sky(
     """
     solver = posterior.factorise()
     quantities = SkyQuantities.spread(solver, n_modes, n_projections, seed)
-    return quantities.rename(
-        calibrate(
-            truth.sample,
-            eqx.Partial(_sky_draws, solver),
-            quantities,
-            n_simulations=n_simulations,
-            seed=seed,
-            batch=int(np.clip(MEMORY // (N_DRAWS * posterior.n_data), 1, BATCH)),
-            regions=("distance",),
-            engine=engine,
-            stages=stages,
-        )
+    ranks = calibrate(
+        truth.sample,
+        eqx.Partial(_sky_draws, solver),
+        quantities,
+        n_simulations=n_simulations,
+        seed=seed,
+        batch=int(np.clip(MEMORY // (N_DRAWS * posterior.n_data), 1, BATCH)),
+        regions=("distance",),
+        engine=engine,
+        stages=stages,
     )
+    # modes by their number among all modes
+    numbers = {f"mode {i}": f"mode {mode}" for i, mode in enumerate(quantities.modes)}
+    return replace(ranks, names=tuple(numbers.get(name, name) for name in ranks.names))
 
 
 def _sky_draws(solver: Solver, key: PRNGKeyArray, data: Array) -> Float[Array, "draws modes"]:
@@ -306,11 +305,6 @@ class SkyQuantities(eqx.Module):
             "distance": (solver.condition(data).whiten(sky[None])[0] ** 2).sum(),
             "log likelihood": -0.5 * ((white - solver.whitened @ u) ** 2).sum(),
         }
-
-    def rename(self, ranks: Ranks) -> Ranks:
-        """Name the modes of ranks by their number among all modes."""
-        numbers = {f"mode {i}": f"mode {mode}" for i, mode in enumerate(self.modes)}
-        return replace(ranks, names=tuple(numbers.get(name, name) for name in ranks.names))
 
 
 MAX_RHAT = 1.01
@@ -429,7 +423,11 @@ def validate_draws(
     white = np.asarray(posterior.whiten(draws.reshape(-1, n_modes))).reshape(draws.shape)
     eigenvalues = _eigenvalues(white)
     null = _null_eigenvalues(white, np.random.default_rng(seed))
-    rhat, bulk, tail = _rhat(draws), _ess(draws, "bulk"), _ess(draws, "tail")
+    rhat = np.asarray(array_stats.rhat(draws, chain_axis=0, draw_axis=1, method="rank"))
+    # energy changes between draws over its variance (Betancourt 2016)
+    changes = (np.diff(energy, axis=1) ** 2).sum(1)
+    bfmi = changes / ((energy.T - energy.mean(1)).T ** 2).sum(1)
+    bulk, tail = _ess(draws, "bulk"), _ess(draws, "tail")
     limit = float(stats.norm.isf(FALSE_ALARM / (2 * n_modes)))
     spread = NULL_MARGIN * null.std(0, ddof=1)
     low, high = null.mean(0)[0] - spread[0], null.mean(0)[-1] + spread[-1]
@@ -455,19 +453,12 @@ def validate_draws(
         Check("bulk ESS", float(bulk.min()), ess_floor, infinite, "smallest of all modes"),
         Check("tail ESS", float(tail.min()), ess_floor, infinite, "smallest of all modes"),
         Check("divergences", float(diverging.sum()), 0.0, 0.0, "diverging trajectories"),
-        Check("BFMI", float(_bfmi(energy).min()), MIN_BFMI, infinite,
+        Check("BFMI", float(bfmi.min()), MIN_BFMI, infinite,
               "smallest of all chains: how well energies are explored"),
     )  # fmt: skip
+    error, null_mean = np.sqrt(2.0 / ess_square), null.mean(0)
     return Comparison(
-        mean_z,
-        variance_ratio,
-        np.sqrt(2.0 / ess_square),
-        eigenvalues,
-        null.mean(0),
-        rhat,
-        bulk,
-        tail,
-        checks,
+        mean_z, variance_ratio, error, eigenvalues, null_mean, rhat, bulk, tail, checks
     )
 
 
@@ -480,15 +471,6 @@ def _ess(
 ) -> Float[np.ndarray, " modes"]:
     tails = (0.05, 0.95) if method == "tail" else None
     return np.asarray(array_stats.ess(draws, chain_axis=0, draw_axis=1, method=method, prob=tails))
-
-
-def _rhat(draws: Float[np.ndarray, "chains draws modes"]) -> Float[np.ndarray, " modes"]:
-    return np.asarray(array_stats.rhat(draws, chain_axis=0, draw_axis=1, method="rank"))
-
-
-def _bfmi(energy: Float[np.ndarray, "chains draws"]) -> Float[np.ndarray, " chains"]:
-    """Energy changes between draws over its variance (Betancourt 2016)."""
-    return (np.diff(energy, axis=1) ** 2).sum(1) / ((energy.T - energy.mean(1)).T ** 2).sum(1)
 
 
 def _chi2_z(

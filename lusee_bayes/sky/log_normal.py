@@ -21,7 +21,7 @@ from jaxtyping import Float
 from scipy.special import log_ndtr
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import Described, extent, is_traced, require_finite, require_positive
+from lusee_bayes.core.checks import is_traced, require_finite, require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mode_numbers, n_modes, per_mode
 from lusee_bayes.core.sphere_grid import SphereGrid
@@ -59,7 +59,7 @@ def deviation_spectrum(
     return xp.concatenate([level, amplitude**2 * ((ell + 1.0) / 10.0) ** tilt])
 
 
-class LogNormalSky(Described, eqx.Module):
+class LogNormalSky(eqx.Module):
     """The sky as a function of white unknowns; see the module's equations.
 
     Attributes
@@ -116,18 +116,7 @@ class LogNormalSky(Described, eqx.Module):
         require_positive("the template", level, "a log-normal sky is a positive template times exp")
         modes = [source.modes(frequency_mhz, lmax) for source in sources]
         return cls(
-            np.asarray(spectrum),
-            grid,
-            level,
-            np.reshape(modes, (len(sources), n_modes(lmax))),
-        )
-
-    def description(self) -> tuple[str, ...]:
-        return (
-            f"a template times exp of a Gaussian field, lmax = {self.lmax}",
-            f"template {extent(self.level, 'K')}; C_ell of the logarithm "
-            f"{extent(self.spectrum[1:], '')}",
-            f"{len(self.source_modes)} point sources; {self.size} white unknowns",
+            np.asarray(spectrum), grid, level, np.reshape(modes, (len(sources), n_modes(lmax)))
         )
 
     @property

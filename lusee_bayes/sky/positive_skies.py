@@ -1,6 +1,4 @@
-"""Skies that are positive everywhere, at several frequencies.
-
-Positive skies of several frequencies: templates times the exponential of few fields.
+"""Positive skies of several frequencies: templates times the exponential of few fields.
 
 ::
 
@@ -15,9 +13,7 @@ exponent of a channel is linear in them, its sky is positive. About any exponent
 
     dm_f = W d(phi),    W_ij = int y_i w T_f exp(w phi) y_j dOmega.
 
-C_ell of the fields in the logarithm of skies: a power law in ell for each.
-
-::
+C_ell of the fields are power laws in ell, ::
 
     C_ell = A^2 ((ell + 1) / 10)^tilt
 
@@ -34,13 +30,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import Described, extent, listed, require_positive, require_shape
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.checks import require_positive, require_shape
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.sky.galaxy import FREE_FREE_SLOPE
 from lusee_bayes.sky.prior import PIVOT
-from lusee_bayes.sky.spectral_prior import SpectralPrior
+from lusee_bayes.sky.spectral_prior import SpectralPrior, require_names
 from lusee_bayes.sky.template import Template
 
 # how fields enter the logarithm: x is frequency / reference, y frequency / turnover
@@ -50,36 +46,14 @@ FIELDS = {
     "curvature": lambda x, y: np.log(x) ** 2,
     "absorption": lambda x, y: -(y**FREE_FREE_SLOPE),
 }
+# what they are, for messages
+FIELDS_OF = "fields of the logarithm"
 # band limit of the grid: this many times that of the exponents, and at least so much: what the grid
 # does not resolve of a template folds back into the map, at 96 by 5 % of it in the plane
 GRID, LEAST_GRID = 3, 192
 
 
-def check_fields(names: tuple[str, ...], n_channels: int) -> None:
-    """Refuse fields that so many channels cannot tell apart.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Keys of ``FIELDS``.
-    n_channels : int
-
-    Raises
-    ------
-    InputError
-        For unknown names, and for fewer channels than fields.
-    """
-    for name in names:
-        if name not in FIELDS:
-            raise InputError(f"unknown field '{name}'; {nearest(name, FIELDS)}")
-    if not names or n_channels < len(names):
-        raise InputError(
-            f"{len(names)} fields of the logarithm need at least as many channels, got "
-            f"{n_channels}; name fewer in spectral.fields, or give more frequencies"
-        )
-
-
-class PositiveSkies(Described, eqx.Module):
+class PositiveSkies(eqx.Module):
     """Skies of all channels as functions of their exponents; see the module's equations.
 
     Attributes
@@ -155,7 +129,7 @@ class PositiveSkies(Described, eqx.Module):
             frequencies, and templates or weights that are not positive everywhere.
         """
         frequencies = np.asarray(frequencies_mhz, dtype=np.float64)
-        check_fields(names, len(frequencies))
+        require_names("field", FIELDS_OF, names, FIELDS, len(frequencies))
         if len(templates) != len(frequencies):
             raise InputError(
                 f"there are {len(templates)} templates for {len(frequencies)} frequencies; give "
@@ -188,24 +162,8 @@ class PositiveSkies(Described, eqx.Module):
         lmax, lmax_fields : int
             Highest ell of the maps, and of the exponents.
         """
-        return PositiveSkies(
-            self.frequencies_mhz,
-            self.mixing,
-            SphereGrid.of(lmax_fields, len(self.grid.theta) - 1),
-            self.levels,
-            self.weight,
-            self.sources[:, :, : n_modes(lmax)],
-            lmax,
-            self.names,
-        )
-
-    def description(self) -> tuple[str, ...]:
-        return (
-            f"{len(self.levels)} channels, {extent(self.frequencies_mhz, 'MHz')}, "
-            f"lmax = {self.lmax}",
-            f"templates times the exponential of {len(self.names)} fields ({listed(self.names)}) "
-            "and of a residual in each",
-        )
+        grid = SphereGrid.of(lmax_fields, len(self.grid.theta) - 1)
+        return replace(self, grid=grid, sources=self.sources[:, :, : n_modes(lmax)], lmax=lmax)
 
     @property
     def n_fields(self) -> int:
@@ -310,17 +268,11 @@ class FieldLaws:
         fields = len(self.means)
         spectra[:fields, 0] = 4.0 * np.pi * self.means**2
         return SpectralPrior(
-            skies.frequencies_mhz,
-            skies.mixing,
-            spectra[:fields],
-            spectra[fields:],
-            skies.names,
+            skies.frequencies_mhz, skies.mixing, spectra[:fields], spectra[fields:], skies.names
         )
 
     def matched(
-        self,
-        found: Float[np.ndarray, "laws ells"],
-        known: Float[np.ndarray, "laws ells"],
+        self, found: Float[np.ndarray, "laws ells"], known: Float[np.ndarray, "laws ells"]
     ) -> FieldLaws:
         """Compute the parameters under which the fields have as much power as they should.
 

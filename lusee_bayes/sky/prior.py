@@ -1,26 +1,19 @@
-"""S as a square root: what every prior answers, and its kinds.
+"""S as a square root: what every prior on the sky answers, and its kinds.
 
-The protocol of priors on the sky, m ~ N(mu, S) through a square root S = G G^T.
+m ~ N(mu, S) goes through a square root S = G G^T. Everything downstream works with the whitened sky
+u = G^-1 m ~ N(G^-1 mu, 1). S itself is never inverted, so a mode without variance is one that is
+known to be zero, not an error.
 
-Everything downstream works with the whitened sky u = G^-1 m ~ N(G^-1 mu, 1). S itself is never
-inverted, so a mode without variance is one that is known to be zero, not an error.
-
-A Gaussian sky whose coefficients are correlated: S = G G^T as a matrix.
-
-Priors of independent unknowns: S = diag(root^2).
-
-An isotropic Gaussian sky in real harmonic coefficients: S = diag(C_ell).
-
-An isotropic Gaussian sky in HEALPix pixels: S = Y diag(C_ell) Y^T.
-
-What a prior can be read from: C_ell in a text file, and a mean sky in a FITS map.
+Kinds: correlated coefficients, S = G G^T as a matrix; independent unknowns, S = diag(root^2); an
+isotropic Gaussian sky in real harmonic coefficients, S = diag(C_ell), or in HEALPix pixels,
+S = Y diag(C_ell) Y^T. C_ell can be read from a text file, a mean sky from a FITS map.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from pathlib import Path
-from typing import NoReturn
+from typing import ClassVar, NoReturn
 
 import equinox as eqx
 import jax
@@ -29,15 +22,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import (
-    Described,
-    extent,
-    is_traced,
-    require_finite,
-    require_float64,
-    require_shape,
-    require_whole,
-)
+from lusee_bayes.core.checks import Described, extent, is_traced, require_array, require_whole
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import LARGEST_LMAX, n_modes, per_mode, pixel_matrix
 from lusee_bayes.core.layouts import Layout, Variable
@@ -57,7 +42,18 @@ PIVOT = 10.0
 
 
 class Prior(Described, eqx.Module):
-    """N(mu, S) over the sky's unknowns, as m = G u of independent normals u of unit variance."""
+    """N(mu, S) over the sky's unknowns, as m = G u of independent normals u of unit variance.
+
+    Attributes
+    ----------
+    invertible : bool
+        Whether m tells u, but for unknowns without variance: :meth:`whiten` needs it.
+    independent : bool
+        Whether S is diagonal; it may save work.
+    """
+
+    invertible: ClassVar[bool] = True
+    independent: ClassVar[bool] = False
 
     def description(self) -> tuple[str, ...]:
         return (f"{self.size} unknowns of {self.rank} independent normals",)
@@ -68,19 +64,9 @@ class Prior(Described, eqx.Module):
         """Number of unknowns in m."""
 
     @property
-    @abstractmethod
     def rank(self) -> int:
         """Number of independent normals behind them."""
-
-    @property
-    @abstractmethod
-    def invertible(self) -> bool:
-        """Whether m tells u, but for unknowns without variance: :meth:`whiten` needs it."""
-
-    @property
-    @abstractmethod
-    def independent(self) -> bool:
-        """Whether S is diagonal; it may save work."""
+        return self.size
 
     @abstractmethod
     def colour(self, u: Float[Array, "*batch white"]) -> Float[Array, "*batch unknowns"]:
@@ -195,13 +181,9 @@ class DensePrior(Prior):
     mean: Float[Array, " unknowns"] | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
-        require_float64("the root of the prior", self.root)
-        require_shape("the root of the prior", self.root, (self.size, self.size))
-        require_finite("the root of the prior", self.root)
+        require_array("the root of the prior", self.root, (self.size, self.size))
         if self.mean is not None:
-            require_float64("the prior mean", self.mean)
-            require_shape("the prior mean", self.mean, (self.size,))
-            require_finite("the prior mean", self.mean)
+            require_array("the prior mean", self.mean, (self.size,))
         if is_traced(self.root):
             return
         root = np.asarray(self.root)
@@ -236,9 +218,7 @@ class DensePrior(Prior):
         InputError
             If S is not float64, not finite, not symmetric or not positive definite.
         """
-        require_float64("the prior covariance", covariance)
-        require_finite("the prior covariance", covariance)
-        require_shape("the prior covariance", covariance, (len(covariance), len(covariance)))
+        require_array("the prior covariance", covariance, (len(covariance), len(covariance)))
         lower = cholesky(covariance)
         if not is_traced(lower):
             _require_covariance(np.asarray(covariance), np.asarray(lower))
@@ -255,18 +235,6 @@ class DensePrior(Prior):
     @property
     def size(self) -> int:
         return self.root.shape[0]
-
-    @property
-    def rank(self) -> int:
-        return self.size
-
-    @property
-    def invertible(self) -> bool:
-        return True
-
-    @property
-    def independent(self) -> bool:
-        return False
 
     @property
     def white_mean(self) -> Float[Array, " white"] | None:
@@ -333,6 +301,8 @@ def _require_covariance(
 class DiagonalPrior(Prior):
     """A prior whose G is diagonal."""
 
+    independent: ClassVar[bool] = True
+
     @property
     @abstractmethod
     def widths(self) -> Float[Array, " unknowns"]:
@@ -341,18 +311,6 @@ class DiagonalPrior(Prior):
     @property
     def size(self) -> int:
         return self.widths.shape[0]
-
-    @property
-    def rank(self) -> int:
-        return self.size
-
-    @property
-    def invertible(self) -> bool:
-        return True
-
-    @property
-    def independent(self) -> bool:
-        return True
 
     def colour(self, u):
         return u * self.widths.reshape(*(1,) * (u.ndim - 1), -1)
@@ -408,8 +366,7 @@ class IndependentPrior(DiagonalPrior):
     root: Float[Array, " unknowns"]
 
     def __check_init__(self):
-        require_float64("the prior's standard deviations", self.root)
-        require_finite("the prior's standard deviations", self.root)
+        require_array("the prior's standard deviations", self.root)
 
     @property
     def widths(self) -> Float[Array, " unknowns"]:
@@ -421,8 +378,7 @@ class IndependentPrior(DiagonalPrior):
 
 def require_spectrum(spectrum: Float[Array, " ells"]) -> None:
     """Raise an InputError unless C_ell is float64, finite and not negative."""
-    require_float64("the prior spectrum", spectrum)
-    require_finite("the prior spectrum", spectrum)
+    require_array("the prior spectrum", spectrum)
     if is_traced(spectrum):
         return
     negative = np.asarray(spectrum) < 0
@@ -458,9 +414,7 @@ class HarmonicPrior(DiagonalPrior):
         require_spectrum(self.spectrum)
         if self.mean is None:
             return
-        require_float64("the prior mean", self.mean)
-        require_shape("the prior mean", self.mean, (self.size,))
-        require_finite("the prior mean", self.mean)
+        require_array("the prior mean", self.mean, (self.size,))
         if is_traced(self.spectrum, self.mean):
             return
         fixed = np.flatnonzero((np.asarray(self.mean) != 0.0) & ~(np.asarray(self.variance()) > 0))
@@ -532,6 +486,8 @@ class PixelPrior(Prior):
         If the pixels are fewer than the modes, or the spectrum cannot be one.
     """
 
+    invertible: ClassVar[bool] = False
+
     spectrum: Float[Array, " ells"]
     synthesis: Float[Array, "pixels modes"]
 
@@ -553,14 +509,6 @@ class PixelPrior(Prior):
     @property
     def rank(self) -> int:
         return self.synthesis.shape[1]
-
-    @property
-    def invertible(self) -> bool:
-        return False
-
-    @property
-    def independent(self) -> bool:
-        return False
 
     def colour(self, u):
         return HarmonicPrior(self.spectrum).colour(u) @ self.synthesis.T

@@ -1,17 +1,13 @@
 """Skies in files: maps, coefficients, cubes.
 
-What a reader of sky files must offer.
+**Maps** are ULSA's HDF5 or HEALPix FITS.
 
-Sky maps from files: ULSA's HDF5 and HEALPix FITS.
+**Coefficients** are in healpy's packing. FITS, as healpy.write_alm makes it: columns
+index = ell^2 + ell + m + 1, real, imag, for m >= 0. NumPy's .npz: ``alm`` (frequency, coefficient)
+and ``freq`` in MHz. Galactic, K.
 
-Skies as spherical-harmonic coefficients in healpy's packing: its FITS tables, and .npz files.
-
-FITS, as healpy.write_alm makes it: columns index = ell^2 + ell + m + 1, real, imag, for m >= 0.
-NumPy's .npz: ``alm`` (frequency, coefficient) and ``freq`` in MHz. Galactic, K.
-
-Sky maps of many frequencies: the layout of luseepy's ULSA file, which lowsky writes too.
-
-FITS: one primary image (frequency, pixel) of HEALPix maps, RING, Galactic, K; the header has
+**Cubes** are maps of many frequencies, in the layout of luseepy's ULSA file, which lowsky writes
+too. FITS: one primary image (frequency, pixel) of HEALPix maps, RING, Galactic, K; the header has
 FREQ_START, FREQ_END and FREQ_STEP in MHz. The file does not say its frame and order.
 """
 

@@ -10,6 +10,8 @@ its turnover, or the principal ones of a kernel in ln frequency; the residual is
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,14 +23,13 @@ from lusee_bayes.core.checks import (
     Described,
     extent,
     listed,
-    require_finite,
+    require_array,
     require_float64,
     require_positive,
     require_shape,
 )
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import per_mode, power_spectrum
-from lusee_bayes.sky.prior import HarmonicPrior
 
 # spectra over the power law: x is frequency / reference, y frequency / turnover; ionised gas takes
 # 1 - exp(-tau) away, and tau goes as nu^-2.1 (Altenhoff et al. 1960)
@@ -39,6 +40,34 @@ SPECTRA = {
 }
 # principal spectra of a kernel with a smaller share of the variance are left out
 KERNEL_TOLERANCE = 1e-10
+
+
+def require_names(
+    kind: str, several: str, names: tuple[str, ...], known: Mapping[str, Callable], n_channels: int
+) -> None:
+    """Refuse names that are not known, and more of them than channels.
+
+    Parameters
+    ----------
+    kind, several : str
+        What they name, one and many; for the message.
+    names : tuple of str
+    known : mapping
+        By name.
+    n_channels : int
+
+    Raises
+    ------
+    InputError
+    """
+    for name in names:
+        if name not in known:
+            raise InputError(f"unknown {kind} '{name}'; {nearest(name, known)}")
+    if not names or n_channels < len(names):
+        raise InputError(
+            f"{len(names)} {several} need at least as many channels, got {n_channels}; name fewer "
+            f"in spectral.{kind}s, or give more frequencies"
+        )
 
 
 def check_components(names: tuple[str, ...], n_channels: int, residual: float | None) -> None:
@@ -57,14 +86,7 @@ def check_components(names: tuple[str, ...], n_channels: int, residual: float | 
     InputError
         For unknown names, and for fewer channels than the components need.
     """
-    for name in names:
-        if name not in SPECTRA:
-            raise InputError(f"unknown component '{name}'; {nearest(name, SPECTRA)}")
-    if not names or n_channels < len(names):
-        raise InputError(
-            f"{len(names)} spectral components need at least as many channels, got {n_channels}; "
-            "name fewer in spectral.components, or give more frequencies"
-        )
+    require_names("component", "spectral components", names, SPECTRA, n_channels)
     if residual is None and n_channels == len(names):
         raise InputError(
             f"{len(names)} spectral components fit the skies of {n_channels} channels "
@@ -108,9 +130,7 @@ class SpectralPrior(Described, eqx.Module):
             ("the mixing", self.mixing, (None, None)),
             ("the components' spectra", self.spectra, (components, None)),
         ):
-            require_float64(name, values)
-            require_shape(name, values, shape)
-            require_finite(name, values)
+            require_array(name, values, shape)
         require_positive("the components' C_ell", self.spectra)
         if self.residual is not None:
             require_float64("the residual spectra", self.residual)
@@ -262,13 +282,6 @@ class SpectralPrior(Described, eqx.Module):
         if self.residual is None:
             return None
         return namespace(self).sqrt(per_mode(self.residual[channel]))
-
-    def of_channel(self, channel: int) -> HarmonicPrior:
-        """Return the prior of one channel by itself."""
-        spectrum = self.mixing[channel] ** 2 @ self.spectra
-        if self.residual is not None:
-            spectrum = spectrum + self.residual[channel]
-        return HarmonicPrior(spectrum)
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, "channels modes"]:
         """Draw skies of all channels from the prior, in K."""

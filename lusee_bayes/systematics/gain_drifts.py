@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.instrument_errors import GainDrift, white_grid, with_gains
 from lusee_bayes.systematics.systematic import (
     SKY,
@@ -57,6 +58,8 @@ class GainDrifts(Systematic):
         Prior standard deviations of the natural logarithms of the two; None where known.
     """
 
+    needs_sky: ClassVar[bool] = True
+
     drift: GainDrift
     visibilities: Float[Array, "products times"]
     hours: Float[Array, " times"]
@@ -98,27 +101,12 @@ class GainDrifts(Systematic):
             factor = float(np.exp(CORRELATION_REACH * log_correlation_std))
         longest = GainDrift(drift.sigma, middle * max(factor, FACTOR))
         grid = white_grid(
-            hours,
-            middle / factor,
-            middle * factor,
-            per_correlation=PER_CORRELATION,
-            margin=MARGIN,
+            hours, middle / factor, middle * factor, per_correlation=PER_CORRELATION, margin=MARGIN
         )
-        return cls(
-            drift,
-            visibilities,
-            jnp.asarray(hours),
-            jnp.asarray(grid),
-            layout,
-            drift.width(hours),
-            longest.width(hours),
-            log_sigma_std,
-            log_correlation_std,
-        )
-
-    @property
-    def needs_sky(self) -> bool:
-        return True
+        widths = drift.width(hours), longest.width(hours)
+        stds = log_sigma_std, log_correlation_std
+        hours, grid = jnp.asarray(hours), jnp.asarray(grid)
+        return cls(drift, visibilities, hours, grid, layout, *widths, *stds)
 
     @property
     def n_antennas(self) -> int:
@@ -171,18 +159,11 @@ class GainDrifts(Systematic):
             return None
         noise = self.layout.scatter(model.noise.diagonal())
         floor = noise.sum() / (self.visibilities**2).sum()
-        reach = None
+        reach, sigma_is_site = None, self.log_sigma_std is not None
         if self.log_correlation_std is not None:
             reach = CORRELATION_REACH * self.log_correlation_std
-        return GainCoordinates(
-            self.drift,
-            self.hours,
-            self.grid,
-            self.n_antennas,
-            floor,
-            self.log_sigma_std is not None,
-            reach,
-        )
+        times = self.hours, self.grid
+        return GainCoordinates(self.drift, *times, self.n_antennas, floor, sigma_is_site, reach)
 
     def marginalised(self, model: LinearGaussian, drift: GainDrift | None = None) -> LinearGaussian:
         """Add the drifts' covariance to N, and multiply by the autos' mean response.

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -34,8 +35,8 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.lazy import dist, numpyro
-from lusee_bayes.instrument.products import DataLayout, all_products
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.instrument.products import DataLayout, ports
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankCovariance
 from lusee_bayes.systematics.systematic import Expanded, Systematic, multiplied, with_added
 
@@ -93,8 +94,7 @@ class TableErrors(eqx.Module):
     def _gains(self, z: Float[Array, " errors"]) -> tuple[np.ndarray, np.ndarray, Array]:
         """The two ports of every product, and the power gains (ports, times)."""
         own = self._own.astype(np.float64)
-        products = all_products(len(own))
-        first, second = (np.array([p[k] for p in products]) for k in (0, 1))
+        first, second, _ = ports(len(own))
         return first, second, 1.0 + own @ (z[:, None] * self.slope)
 
 
@@ -113,6 +113,8 @@ class GainTable(Expanded):
     moves : bool
         Whether z_0 and v_0 are those that the data tell, found in rounds.
     """
+
+    changes_coupling: ClassVar[bool] = False
 
     errors: TableErrors
     centre: Float[Array, " errors"]
@@ -157,10 +159,6 @@ class GainTable(Expanded):
 
     def behind(self, response: Float[Array, " data"]) -> Systematic:
         return self
-
-    @property
-    def changes_coupling(self) -> bool:
-        return False
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Multiply by F(z_0), add T T^T to N and T (expected - z_0) to the mean."""

@@ -1,18 +1,13 @@
 """Unknowns of the instrument: its beams, its pointing, the level of its noise.
 
-The antennas and the ground under them: parameters of the embedded beam that are not known.
-
-Clock and pointing that are not known: templates of first order, or A as it is with offsets.
-
-About the values z_0 of the offsets (in prior standard deviations) and a sky m_0, the data are ::
+**Clock and pointing** are templates of first order, or A as it is with offsets. About the values
+z_0 of the offsets (in prior standard deviations) and a sky m_0, the data are ::
 
     d = A(z) m + n = A(z_0) m + T (z - z_0) + n,    T = dA/dz m_0,    z ~ N(0, 1),
 
 to first order in z - z_0 and in their product with m - m_0: N gets T T^T and the mean -T z_0. Where
 z_0 and m_0 are those that the data tell, this is the Gaussian about the joint mode of sky and
 offsets (Gauss and Newton), with the term that couples z - z_0 and m - m_0 left out.
-
-How much noise there is: a factor of the radiometer's variance.
 """
 
 from __future__ import annotations
@@ -24,14 +19,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.monopoles import parameter
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
 from lusee_bayes.instrument.instrument import Instrument
 from lusee_bayes.instrument.pointing import turned_by_offsets
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankCovariance
 from lusee_bayes.noise.instrument_errors import beam_error_noise, derivative
 from lusee_bayes.systematics.systematic import (
@@ -39,7 +34,6 @@ from lusee_bayes.systematics.systematic import (
     Scale,
     Systematic,
     normal_within,
-    scalar,
     uncertain_scale,
     with_added,
 )

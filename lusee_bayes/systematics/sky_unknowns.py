@@ -1,30 +1,29 @@
 """Unknowns of the sky: point sources, and the prior's spectrum.
 
-Point sources of known place and unknown flux: columns of A with a prior of their own.
-
-The sky's prior power spectrum, up to a few unknown factors.
+Sources of known place and unknown flux are columns of A with a prior of their own. The prior's
+power spectrum may be known up to a few factors.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.checks import require_finite, require_positive, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import dist, numpyro
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankCovariance
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.systematic import (
     Scale,
     Systematic,
-    scalar,
     scalar_or_none,
     uncertain_scale,
     with_added,
@@ -90,12 +89,10 @@ class PointSources(Systematic):
         Gains that they are seen through in N; None for ones.
     """
 
+    changes_coupling: ClassVar[bool] = False
+
     sources: tuple[Source, ...]
     response: Float[Array, " data"] | None = None
-
-    @property
-    def changes_coupling(self) -> bool:
-        return False
 
     def columns(self) -> Float[Array, "data amplitudes"]:
         """Return the responses of all sources and blocks side by side, in K per K sr."""

@@ -1,15 +1,12 @@
 """What is not known of instrument and sky: marginalised into N, or sampled.
 
-Coordinates of several sites in which a posterior's ridges are straight.
+Every systematic is a term of the noise covariance, and sites of a NumPyro program; a :class:`Chart`
+has coordinates of several sites in which a posterior's ridges are straight.
 
-What every systematic offers: a term of the noise covariance, and sites of a NumPyro program.
-
-Unknowns whose part in the data is linear, or taken to first order: columns of N's square root.
-
+Unknowns whose part in the data is linear, or taken to first order, are columns of N's square root:
 N gets T T^T, a column of T for each unknown: what one prior standard deviation of it does to the
 data. Where gains multiply what the data are of (:meth:`Templated.behind`), they multiply T, too.
-
-Powers and temperatures that add to the data in proportion: d = A m + T (x - mean) / std + n.
+Powers and temperatures add to the data in proportion: d = A m + T (x - mean) / std + n.
 """
 
 from __future__ import annotations
@@ -18,18 +15,19 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
 from statistics import NormalDist
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, LowRankCovariance
 
 
@@ -38,17 +36,19 @@ class Chart(eqx.Module):
 
     Values are unconstrained (numpyro's ``biject_to``). Sites that are not among :attr:`names` are
     handed on as they are.
+
+    Attributes
+    ----------
+    factorises : bool
+        Whether it factorises matrices at every evaluation.
     """
+
+    factorises: ClassVar[bool] = False
 
     @property
     @abstractmethod
     def names(self) -> tuple[str, ...]:
         """The sites whose coordinates it changes or needs."""
-
-    @property
-    def factorises(self) -> bool:
-        """Whether it factorises matrices at every evaluation."""
-        return False
 
     @abstractmethod
     def to_values(
@@ -88,17 +88,17 @@ class Systematic(eqx.Module):
 
     Both methods take a ``LinearGaussian`` and return one, so that systematics are applied one
     after the other.
+
+    Attributes
+    ----------
+    needs_sky : bool
+        Whether it has so many unknowns that the sky has to be sampled together with them.
+    changes_coupling : bool
+        Whether A depends on it: if not, A is made dense once and for all.
     """
 
-    @property
-    def needs_sky(self) -> bool:
-        """Whether it has so many unknowns that the sky has to be sampled together with them."""
-        return False
-
-    @property
-    def changes_coupling(self) -> bool:
-        """Whether A depends on it: if not, A is made dense once and for all."""
-        return True
+    needs_sky: ClassVar[bool] = False
+    changes_coupling: ClassVar[bool] = True
 
     def chart(self, model: LinearGaussian) -> Chart | None:
         """Return coordinates of its sites, and of the sky's, in which ridges are straight.
@@ -169,6 +169,8 @@ class AdditiveNoise(Systematic):
         The data that the covariance is over.
     """
 
+    changes_coupling: ClassVar[bool] = False
+
     name: str = eqx.field(static=True)
     layout: DataLayout
 
@@ -179,10 +181,6 @@ class AdditiveNoise(Systematic):
     @property
     def needs_sky(self) -> bool:
         return self.covariance().rank > MOST_COLLAPSED
-
-    @property
-    def changes_coupling(self) -> bool:
-        return False
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         return replace(model, noise=model.noise + self.covariance())
@@ -235,9 +233,7 @@ class Marginalised(Systematic):
 class Scale(Systematic):
     """A systematic without a Gaussian term: marginalised, it stays at its median."""
 
-    @property
-    def changes_coupling(self) -> bool:
-        return False
+    changes_coupling: ClassVar[bool] = False
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Return the model as it is."""
@@ -253,11 +249,6 @@ def multiplied(model: LinearGaussian, response: Float[Array, " data"]) -> Linear
     """Multiply the mean of a model's data, of sky and offset, by gains."""
     offset = None if model.offset is None else model.offset * response
     return replace(model, coupling=model.coupling.with_response(response), offset=offset)
-
-
-def scalar(value: float | Float[Array, ""]) -> Float[Array, ""]:
-    """Convert a number to a float64 array: a run value that JAX traces, not structure."""
-    return jnp.asarray(value, dtype=jnp.float64)
 
 
 def scalar_or_none(value: float | Float[Array, ""] | None) -> Float[Array, ""] | None:
@@ -382,15 +373,13 @@ class LinearUnknowns(Templated):
         Gains that the templates are seen through in N; None for ones.
     """
 
+    changes_coupling: ClassVar[bool] = False
+
     names: tuple[str, ...] = eqx.field(static=True)
     means: Float[Array, " unknowns"]
     stds: Float[Array, " unknowns"]
     templates: Float[Array, "data unknowns"]
     response: Float[Array, " data"] | None = None
-
-    @property
-    def changes_coupling(self) -> bool:
-        return False
 
     @property
     def unit(self) -> str:

@@ -172,7 +172,7 @@ def test_workers_that_cannot_do_it_are_refused(engine, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"does not see '.*gone'; command and workers have to sh"):
         DaskEngine(engine.client).work_in(tmp_path / "gone")
     with monkeypatch.context() as patch:
-        patch.setattr(dask_engine, "versions", lambda: "lusee_bayes 0.0 and Python 3.0")
+        patch.setattr(dask_engine, "code_versions", lambda: "lusee_bayes 0.0 and Python 3.0")
         with pytest.raises(InputError, match=r"has lusee_bayes .*, the command lusee_bayes 0.0 an"):
             DaskEngine(engine.client).work_in(tmp_path)
     with pytest.raises(RuntimeError, match="call work_in first"):

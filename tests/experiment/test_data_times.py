@@ -28,12 +28,12 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.schedule import Run, read_schedule
 from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities
 from lusee_bayes.instrument.waterfalls import write_waterfall
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.runs.cost import posterior_cost, simulation_cost
 from lusee_bayes.runs.data_run import run_simulate
 from lusee_bayes.runs.forecasting import default_variations, expected_posterior, forecast
-from lusee_bayes.testing.cases import small_scenario
-from lusee_bayes.testing.checks import assert_refused
+from lusee_bayes.testing.contracts import assert_refused
+from lusee_bayes.testing.scenarios import small_scenario
 
 STEP = 7200.0
 # from the stamps to the beginning of the windows

@@ -20,11 +20,11 @@ from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.term import measured_visibilities
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.results.map_result import map_result
 from lusee_bayes.sky.prior import read_spectrum
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 
 def flagged(whole: Visibilities, flags: np.ndarray) -> Visibilities:

@@ -28,7 +28,7 @@ from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.noise.radiometer import exact_blocks
 from lusee_bayes.results.unknowns import unknowns_report
 from lusee_bayes.runs.data_run import run_simulate_flight
-from lusee_bayes.testing.checks import assert_refused
+from lusee_bayes.testing.contracts import assert_refused
 
 FREQUENCIES = [10.0, 25.0]
 SMALL = ["lmax=4", f"frequencies_mhz={FREQUENCIES}", "flight={per_kelvin_v2_hz: 1e-21}"]

@@ -21,7 +21,7 @@ from lusee_bayes.instrument.products import to_matrix
 from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.judge.plausibility import SIGNIFICANT, about_information, require_plausible
 from lusee_bayes.noise.radiometer import radiometer_noise
-from lusee_bayes.testing.checks import assert_refused
+from lusee_bayes.testing.contracts import assert_refused
 
 FALSE_ALARM = 1e-4
 

@@ -35,7 +35,7 @@ from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.schedule import Run
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import (
     Covariance,
     LowRankCovariance,
@@ -49,7 +49,7 @@ from lusee_bayes.noise.instrument_errors import (
 from lusee_bayes.noise.radiometer import radiometer_noise
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.systematic import AdditiveNoise
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 GAIN = "noise.gain.sigma=0.01"
 SHIFT = "noise.beam.shift_mhz=4"

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
+from made_skies import SmoothSky, SpottySky
 
 from lusee_bayes.core.harmonics import mode_numbers, turn_about_z
 from lusee_bayes.experiment.model import radiometer
@@ -22,7 +23,6 @@ from lusee_bayes.instrument.products import labels
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.noise.instrument_errors import GainDrift, with_gains
 from lusee_bayes.sky.sky_source import Sky, SkySource
-from lusee_bayes.testing.cases import SmoothSky, SpottySky
 
 LABELS = labels(4)
 

@@ -16,7 +16,7 @@ from lusee_bayes.flight.flags import (
     threshold,
 )
 from lusee_bayes.flight.session import AVERAGING, channel_mhz
-from lusee_bayes.testing.checks import assert_refused
+from lusee_bayes.testing.contracts import assert_refused
 
 MHZ = channel_mhz("centre")
 FRAMES, ROWS = 2.0**20, 400

@@ -10,7 +10,7 @@ import pytest
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.flight.clock import Clock, clock_of, read_clock
-from lusee_bayes.testing.checks import assert_refused
+from lusee_bayes.testing.contracts import assert_refused
 
 RECORD = {
     "format_version": 1,

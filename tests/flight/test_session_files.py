@@ -40,7 +40,7 @@ from lusee_bayes.flight.session_files import (
     write_session,
 )
 from lusee_bayes.instrument.products import labels
-from lusee_bayes.testing.checks import assert_refused
+from lusee_bayes.testing.contracts import assert_refused
 
 
 @pytest.fixture

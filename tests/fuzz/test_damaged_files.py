@@ -32,7 +32,7 @@ from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
 from lusee_bayes.runs.data_run import run_simulate_flight
 from lusee_bayes.sky.sky_files import write_alms
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 FEW, MANY = 6, 150 * SCALE
 

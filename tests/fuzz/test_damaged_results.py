@@ -22,7 +22,7 @@ import lusee_bayes as lb
 from lusee_bayes.report.pages import write_report
 from lusee_bayes.results.finished_runs import read_runs
 from lusee_bayes.sampling.hmc import Sampler
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 FEW, MANY = 5, 60 * SCALE
 

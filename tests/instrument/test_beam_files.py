@@ -26,7 +26,7 @@ from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.instrument.beams.luseepy_files import FIELDS, ScalarBeam
 from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.products import labels, to_matrix
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 LMAX, PORTS = 47, 4
 

@@ -17,7 +17,7 @@ from lusee_bayes.instrument.beams.source import (
     ResponseBeams,
     ScalarFileBeams,
 )
-from lusee_bayes.testing.checks import check_beam_source
+from lusee_bayes.testing.contracts import check_beam_source
 
 FREQUENCY, LMAX, TURNED_DEG = 25.0, 6, 30.0
 

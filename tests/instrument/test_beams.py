@@ -8,20 +8,18 @@ import pytest
 from assertions import close
 from numpy.polynomial import Polynomial
 from numpy.polynomial.legendre import Legendre
-from reference import SPEED_OF_LIGHT, hemisphere, real_harmonics
+from reference import SPEED_OF_LIGHT, hemisphere, real_harmonics, unit_vectors
 from scipy.special import eval_legendre, factorial
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mode_numbers, n_modes, polar_functions, synthesis_matrix
-from lusee_bayes.instrument.beams import fields
 from lusee_bayes.instrument.beams.fields import (
     AntennaFields,
     HemisphereGrid,
     ProductBeams,
-    displaced,
     mean_auto_integral,
+    product_beams,
     stokes_beam,
-    unit_vectors,
 )
 from lusee_bayes.instrument.beams.luseepy_files import (
     BandLimitedGrid,
@@ -73,7 +71,6 @@ def test_the_grid_integrates_over_the_hemisphere():
     expected = [2 * np.pi, np.pi, 2 * np.pi / 3, 0.0]
     np.testing.assert_allclose(GRID.integrate(fields), expected, rtol=0, atol=1e-13)
     assert (np.diff(GRID.theta) > 0).all()
-    np.testing.assert_allclose(np.linalg.norm(unit_vectors(GRID), axis=0), 1.0, rtol=1e-14)
 
 
 def test_uniform_hemisphere():
@@ -92,7 +89,7 @@ def test_uniform_hemisphere():
 
 def test_short_vertical_dipole():
     fields = short_dipole([0, 0, 1])
-    got = np.asarray(fields(fields, 10.0, LMAX, normalise=False).modes)[0]
+    got = np.asarray(product_beams(fields, 10.0, LMAX, normalise=False).modes)[0]
     power = Polynomial([1.0, 0.0, -1.0]) / 2  # sin^2 theta / 2
     expected = np.zeros(n_modes(LMAX))
     for ell in range(LMAX + 1):
@@ -104,7 +101,7 @@ def test_short_vertical_dipole():
 
 @pytest.mark.parametrize(("axis", "sign"), [([1, 0, 0], -1.0), ([0, 1, 0], 1.0)])
 def test_short_horizontal_dipole(axis, sign):
-    got = np.asarray(fields(short_dipole(axis), 10.0, LMAX, normalise=False).modes)[0]
+    got = np.asarray(product_beams(short_dipole(axis), 10.0, LMAX, normalise=False).modes)[0]
     # |E|^2 = 1 - sin^2 theta cos^2 phi (East) = (1 + z^2)/2 - (1 - z^2)/2 cos 2 phi
     even, odd = Polynomial([0.25, 0.0, 0.25]), sign * Polynomial([0.25, 0.0, -0.25])
     expected = np.zeros(n_modes(LMAX))
@@ -120,7 +117,7 @@ def test_short_horizontal_dipole(axis, sign):
 
 
 def test_only_the_sky_above_the_horizon_answers():
-    beams = fields(random_fields(0, 2, GRID), 10.0, LMAX, normalise=False)
+    beams = product_beams(random_fields(0, 2, GRID), 10.0, LMAX, normalise=False)
     sky = np.random.default_rng(1).standard_normal(n_modes(LMAX))
     theta, phi = (a.ravel() for a in np.meshgrid(GRID.theta, GRID.phi, indexing="ij"))
     above = (synthesis_matrix(theta, phi, LMAX) @ sky).reshape(len(GRID.theta), -1)
@@ -130,7 +127,7 @@ def test_only_the_sky_above_the_horizon_answers():
     np.testing.assert_allclose(np.asarray(beams.modes) @ sky, expected, rtol=0, atol=1e-12 * scale)
     # and by an independent rule with scipy's harmonics, above the horizon alone
     theta, phi, solid_angle = hemisphere(40, 90)
-    one = fields(short_dipole([0, 0, 1]), 10.0, 4, normalise=False).modes[0]
+    one = product_beams(short_dipole([0, 0, 1]), 10.0, 4, normalise=False).modes[0]
     temperature = real_harmonics(theta, phi, 4) @ sky[:25]
     brute = np.sum(solid_angle * np.sin(theta) ** 2 / 2 * temperature)
     np.testing.assert_allclose(np.asarray(one) @ sky[:25], brute, rtol=1e-12)
@@ -161,21 +158,23 @@ def test_power_is_positive():
     # a sky of positive temperature: T_sky = 1 + 0.9 z is one
     sky = jnp.zeros(n_modes(LMAX)).at[0].set(np.sqrt(4 * np.pi))
     sky = sky.at[2].set(0.9 * np.sqrt(4 * np.pi / 3))
-    v = to_matrix(fields(fields, 10.0, LMAX).modes @ sky)
+    v = to_matrix(product_beams(fields, 10.0, LMAX).modes @ sky)
     assert np.linalg.eigvalsh(np.asarray(v)).min() > 0.0
 
 
 def test_displaced_copies_are_an_interferometer():
     frequency = 20.0
     positions = np.array([[0.0, 0.0, 0.0], [3.0, -1.0, 0.5], [-2.0, 4.0, 1.0]])
-    fields = displaced(short_dipole([1, 0, 0]), positions, frequency)
-    beams = fields(fields, frequency, LMAX, normalise=False)
+    one = short_dipole([1, 0, 0])
+    k = 2 * np.pi * frequency * 1e6 / SPEED_OF_LIGHT
+    phase = np.exp(1j * k * np.tensordot(positions, unit_vectors(GRID), 1))
+    fields = AntennaFields(one.e_theta * phase, one.e_phi * phase, GRID)
+    beams = product_beams(fields, frequency, LMAX, normalise=False)
     sky = np.random.default_rng(6).standard_normal(n_modes(6))
     theta, phi, solid_angle = hemisphere(60, 121)
     temperature = real_harmonics(theta, phi, 6) @ sky
     n = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
     power = (1 - n[0] ** 2) / 2
-    k = 2 * np.pi * frequency * 1e6 / SPEED_OF_LIGHT
     got = np.asarray(to_matrix(jnp.asarray(np.asarray(beams.modes)[:, : n_modes(6)] @ sky)))
     for i in range(3):
         for j in range(3):
@@ -188,25 +187,25 @@ def test_displaced_copies_are_an_interferometer():
 def test_normalised_autos_average_to_one():
     fields = random_fields(7, 3, GRID)
     uniform = np.sqrt(4 * np.pi)  # the monopole coefficient of a sky of 1 K
-    raw = fields(fields, 10.0, 4, normalise=False)
-    scaled = fields(fields, 10.0, 4)
+    raw = product_beams(fields, 10.0, 4, normalise=False)
+    scaled = product_beams(fields, 10.0, 4)
     autos = auto_indices(3)
     mean = np.mean(np.asarray(raw.modes)[autos, 0]) * uniform
     np.testing.assert_allclose(mean, mean_auto_integral(fields), rtol=1e-13)
     assert np.mean(np.asarray(scaled.modes)[autos, 0]) * uniform == pytest.approx(1.0, rel=1e-13)
     np.testing.assert_allclose(scaled.modes, np.asarray(raw.modes) / mean, rtol=1e-12)
     # Q is scaled by the same Stokes I integral, which keeps |Q| <= I
-    q = fields(fields, 10.0, 4, stokes="Q").modes
-    q_raw = fields(fields, 10.0, 4, stokes="Q", normalise=False).modes
+    q = product_beams(fields, 10.0, 4, stokes="Q").modes
+    q_raw = product_beams(fields, 10.0, 4, stokes="Q", normalise=False).modes
     np.testing.assert_allclose(q, np.asarray(q_raw) / mean, rtol=1e-12)
 
 
 def test_a_smaller_lmax_is_a_slice():
     fields = random_fields(8, 2, GRID)
-    large, small = (fields(fields, 10.0, lmax).modes for lmax in (LMAX, 5))
+    large, small = (product_beams(fields, 10.0, lmax).modes for lmax in (LMAX, 5))
     np.testing.assert_allclose(large[:, : n_modes(5)], small, rtol=0, atol=1e-14)
-    assert fields(fields, 10.0, 5).labels == ("00R", "01R", "01I", "11R")
-    assert fields(fields, 10.0, 5).lmax == 5
+    assert product_beams(fields, 10.0, 5).labels == ("00R", "01R", "01I", "11R")
+    assert product_beams(fields, 10.0, 5).lmax == 5
 
 
 def test_modes_keep_leading_axes_and_refuse_a_coarse_azimuth():
@@ -224,8 +223,6 @@ def test_fields_are_checked():
         AntennaFields(good.e_theta.astype(jnp.complex64), good.e_phi, GRID)
     with pytest.raises(InputError, match=r"e_theta has shape \(1, 127, 128\), expected"):
         AntennaFields(good.e_theta[:, 1:], good.e_phi[:, 1:], GRID)
-    with pytest.raises(InputError, match="give the pattern of one antenna, got 2"):
-        displaced(random_fields(0, 2, GRID), np.zeros((2, 3)), 10.0)
 
 
 def test_unknown_stokes_and_products_are_refused():

@@ -26,8 +26,8 @@ from lusee_bayes.instrument.beams.monopoles import (
     read_receiver,
 )
 from lusee_bayes.instrument.beams.sampled import read_beam
-from lusee_bayes.instrument.products import labels, to_matrix
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.instrument.products import labels, to_matrix, to_real
+from lusee_bayes.testing.scenarios import small_scenario
 
 VACUUM = physical_constants["characteristic impedance of vacuum"][0]
 LMAX, MOON = 47, 250.0
@@ -71,10 +71,17 @@ def simulated(luseepy, test_data, frequency, times, *, fixed_axis=False) -> np.n
         sky = dict(file)
     modes = from_healpy(sky["alm"][list(sky["freq"]).index(frequency)])
     observation = replace(lb.read_waterfall(path).observation.select(times), fixed_axis=fixed_axis)
-    beams = response.beams(frequency, LMAX, grid=response.luseepy_grid, unit="V2/Hz")
+    beams = response.beams(frequency, LMAX, grid=response.luseepy_grid)
     seen = np.asarray(lb.CouplingMatrix.observe(beams, observation) @ jnp.asarray(modes))
-    moon = np.asarray(response.background(frequency, MOON, unit="V2/Hz"))
-    return seen.reshape(16, -1) + moon[:, None]
+    moon = response.background(frequency, MOON)
+    return volts(response, frequency, seen.reshape(16, -1) + moon[:, None])
+
+
+def volts(response, frequency, kelvin) -> np.ndarray:
+    """Beams, backgrounds or data in V^2/Hz at the receivers' inputs, of those in K."""
+    root, matrix = np.sqrt(response.per_kelvin(frequency)), np.asarray(to_matrix(kelvin))
+    scale = (root[:, None] * root[None]).reshape(4, 4, *(1,) * (matrix.ndim - 2))
+    return np.asarray(to_real(matrix * scale))
 
 
 def off(got, expected) -> float:
@@ -112,7 +119,7 @@ def test_other_conventions_are_noticed(luseepy, test_data):
         response, h_theta=response.h_theta[..., mirrored], h_phi=-response.h_phi[..., mirrored]
     )
     unloaded = replace(response, receiver=None)
-    moonless = right - np.asarray(response.background(25.0, MOON, unit="V2/Hz"))
+    moonless = right - volts(response, 25.0, response.background(25.0, MOON)[:, None])[:, 0]
     wrong = [
         signs * right,
         right[::-1],
@@ -125,12 +132,8 @@ def test_other_conventions_are_noticed(luseepy, test_data):
         assert off(case, expected) > 1e-4
 
 
-def test_kelvin_and_volts_are_one_thing(luseepy):
+def test_the_background_grows_with_the_ground(luseepy):
     response = luseepy[0]
-    root = np.sqrt(response.per_kelvin(25.0))
-    kelvin = np.asarray(to_matrix(response.beams(25.0, 8).modes))
-    volts = np.asarray(to_matrix(response.beams(25.0, 8, unit="V2/Hz").modes))
-    within(kelvin * (root[:, None] * root[None])[..., None], volts, 1e-12 * volts.max())
     moon = np.asarray(response.background(25.0, MOON)) / np.asarray(response.background(25.0, 1.0))
     np.testing.assert_allclose(moon, MOON, rtol=1e-12)
 
@@ -199,15 +202,12 @@ def test_volts_of_short_dipoles(tmp_path):
     m = zl @ np.linalg.inv(za + zl)
     np.testing.assert_allclose(response.circuit(f).loading, m, rtol=1e-12)
     expected = m @ open_ @ m.conj().T
-    beams = response.beams(f, 2, unit="V2/Hz")
-    got = np.asarray(to_matrix(beams.modes))[..., 0] * np.sqrt(4 * np.pi)
+    beams = volts(response, f, response.beams(f, 2).modes)
+    got = np.asarray(to_matrix(beams))[..., 0] * np.sqrt(4 * np.pi)
     close(got, expected, 1e-6)
     # half sky, half Moon
-    close(
-        np.asarray(to_matrix(response.background(f, 1.0, unit="V2/Hz")[:, None]))[..., 0],
-        expected,
-        1e-6,
-    )
+    got = volts(response, f, response.background(f, 1.0)[:, None])
+    close(to_matrix(got)[..., 0], expected, 1e-6)
 
 
 def varied(images):
@@ -244,22 +244,23 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
     m = zl @ np.linalg.inv(za + zl)
     expected = np.einsum("ai,ijm,bj->abm", m, between(open_, part), m.conj())
     largest = np.abs(expected).max()
-    got = np.asarray(to_matrix(response.beams(f, 3, unit="V2/Hz").modes))
+    got = np.asarray(to_matrix(volts(response, f, response.beams(f, 3).modes)))
     # the file's single precision
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-6 * largest)
-    splined = replace(response, interpolation="spline").beams(f, 3, unit="V2/Hz")
-    assert np.abs(np.asarray(to_matrix(splined.modes)) - expected).max() > 1e-2 * largest
+    splined = replace(response, interpolation="spline")
+    splined = volts(splined, f, splined.beams(f, 3).modes)
+    assert np.abs(np.asarray(to_matrix(splined)) - expected).max() > 1e-2 * largest
     warm = 4 * Boltzmann * 250.0 * m @ between(response.moon_resistance, part) @ m.conj().T
-    got = np.asarray(to_matrix(response.background(f, 250.0, unit="V2/Hz")[:, None]))[..., 0]
-    close(got, warm, 1e-12)
+    got = volts(response, f, response.background(f, 250.0)[:, None])
+    close(to_matrix(got)[..., 0], warm, 1e-12)
     enclosure = 4 * Boltzmann * m @ ((za + za.conj().T) / 2) @ m.conj().T
     np.testing.assert_allclose(response.per_kelvin(f), enclosure.diagonal().real, rtol=1e-12)
     # nothing is interpolated where the file has the frequency, to luseepy's 1e-6 MHz
     opened = replace(response, receiver=None)
-    exact = opened.beams(20.0, 3, unit="V2/Hz").modes
-    near = opened.beams(20.0 + 9e-7, 3, unit="V2/Hz").modes
+    exact = opened.beams(20.0, 3).modes
+    near = opened.beams(20.0 + 9e-7, 3).modes
     np.testing.assert_array_equal(near, exact)
-    splined = replace(opened, interpolation="spline").beams(20.0, 3, unit="V2/Hz").modes
+    splined = replace(opened, interpolation="spline").beams(20.0, 3).modes
     close(splined, exact, 1e-13)
 
 
@@ -307,8 +308,8 @@ def test_losses_emit_at_the_antennas_temperature(tmp_path):
     response = read_beam(write(tmp_path / "response.fits", change=lossy))
     m = response.circuit(20.0).loading
     expected = 4 * Boltzmann * 300.0 * 0.5 * m @ m.conj().T
-    got = np.asarray(to_matrix(response.background(20.0, 0.0, 300.0, unit="V2/Hz")[:, None]))
-    close(got[..., 0], expected, 1e-9)
+    got = volts(response, 20.0, response.background(20.0, 0.0, 300.0)[:, None])
+    close(to_matrix(got)[..., 0], expected, 1e-9)
 
 
 def test_open_ports_and_turns(tmp_path):
@@ -316,8 +317,10 @@ def test_open_ports_and_turns(tmp_path):
     np.testing.assert_array_equal(loading_matrix(response.impedance[0], None), np.eye(4))
     open_ = replace(response, receiver=None)
     # a quarter turn makes East North: each port takes the place of the next
-    plain = np.asarray(to_matrix(open_.beams(20.0, 5, unit="V2/Hz").modes))
-    turned = np.asarray(to_matrix(open_.beams(20.0, 5, turn_deg=90.0, unit="V2/Hz").modes))
+    plain, turned = (
+        np.asarray(to_matrix(volts(open_, 20.0, open_.beams(20.0, 5, turn_deg=turn).modes)))
+        for turn in (0.0, 90.0)
+    )
     place = [1, 2, 3, 0]
     expected = plain[np.ix_(place, place)]
     np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-6 * np.abs(plain).max())
@@ -345,12 +348,10 @@ def test_files_that_cannot_be_used(tmp_path, options, message):
         read_beam(write(tmp_path / "response.fits", **options))
 
 
-def test_no_extrapolation_and_no_other_unit(tmp_path):
+def test_no_extrapolation(tmp_path):
     response = read_beam(write(tmp_path / "response.fits"))
     with pytest.raises(lb.InputError, match="from 10 to 40 MHz, not at 50"):
         response.beams(50.0, 4)
-    with pytest.raises(lb.InputError, match="unknown unit 'mK'"):
-        response.fields.__wrapped__(response, 20.0, unit="mK")
 
 
 # --- in scenarios -------------------------------------------------------------------------------

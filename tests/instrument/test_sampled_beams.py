@@ -11,9 +11,10 @@ import pytest
 import xarray as xr
 from assertions import close, refused
 from astropy.io import fits
+from reference import unit_vectors
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings, unit_vectors, wavenumber
+from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings, wavenumber
 from lusee_bayes.instrument.beams.monopoles import Monopoles
 from lusee_bayes.instrument.beams.sampled import (
     SampledFileBeams,
@@ -23,8 +24,8 @@ from lusee_bayes.instrument.beams.sampled import (
 )
 from lusee_bayes.instrument.products import labels, to_real
 from lusee_bayes.report.describe import describe
-from lusee_bayes.testing.cases import small_scenario
-from lusee_bayes.testing.checks import check_beam_source
+from lusee_bayes.testing.contracts import check_beam_source
+from lusee_bayes.testing.scenarios import small_scenario
 
 FREQUENCY, LMAX, NSIDE = 25.0, 4, 16
 THETA, PHI = healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2))

@@ -18,7 +18,7 @@ from scipy.stats import chi2, kstest
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.solver import FORMS
 from lusee_bayes.results.map_result import map_result
 

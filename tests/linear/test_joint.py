@@ -11,8 +11,9 @@ from lusee_bayes.core.arrays import on_device, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear import joint
 from lusee_bayes.linear.joint import channel_sky, paired, solve_directly
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
+from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 FREQUENCIES = np.array([10.0, 17.0, 25.0, 40.0])
@@ -54,9 +55,13 @@ def models(prior, seed=4):
     for k in range(len(FREQUENCIES)):
         n = 12 + 3 * k
         a = jnp.asarray(rng.standard_normal((n, N_MODES)))
-        level = 0.1 * float(np.sqrt(np.asarray(prior.of_channel(k).variance()).mean()))
+        spectrum = prior.mixing[k] ** 2 @ prior.spectra
+        if prior.residual is not None:
+            spectrum = spectrum + prior.residual[k]
+        own = HarmonicPrior(spectrum)
+        level = 0.1 * float(np.sqrt(np.asarray(own.variance()).mean()))
         noise = DiagonalCovariance(jnp.asarray(level**2 * rng.uniform(0.5, 2.0, n)))
-        made.append(LinearGaussian(a, prior.of_channel(k), noise))
+        made.append(LinearGaussian(a, own, noise))
     return made
 
 

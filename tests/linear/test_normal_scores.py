@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.linear.model import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.priors.families import FREEDOM, Hyperprior, IsotropicFamily
 from lusee_bayes.priors.learning import learn

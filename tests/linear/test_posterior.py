@@ -27,7 +27,7 @@ from lusee_bayes.judge.chi2 import (
     signal_to_noise,
 )
 from lusee_bayes.linear import posterior as posterior_module
-from lusee_bayes.linear.model import LinearGaussian, deviation_model, updated
+from lusee_bayes.linear.linear_gaussian import LinearGaussian, deviation_model, updated
 from lusee_bayes.linear.solver import FORMS
 from lusee_bayes.results.updatable import read_updatable
 

@@ -180,7 +180,7 @@ def test_one_group_is_everything():
 def test_precise_data_of_one_day_are_judged_by_product(monkeypatch):
     """A as a matrix: K^-1 of all data, which nothing predicts, has no root in 64 bits."""
     monkeypatch.setattr(
-        residuals_module, "leave_out", lambda m, _, d: DenseLeftOut(m, d.data, d.layout)
+        "lusee_bayes.judge.residuals.leave_out", lambda m, _, d: DenseLeftOut(m, d.data, d.layout)
     )
     model, data = simulated("noise.radiometer.factor=1e-6", "observation.runs=[{cycles: 0.03}]")
     found = judged(model, data)

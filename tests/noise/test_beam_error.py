@@ -10,7 +10,12 @@ from reference import real_harmonics
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith, monopole_beams, placed
+from lusee_bayes.instrument.beams.monopoles import (
+    Monopoles,
+    Regolith,
+    monopole_beams,
+    with_values,
+)
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise.instrument_errors import (
     beam_error_noise,
@@ -151,7 +156,7 @@ def test_a_turntable_offset_is_an_angle_of_the_turntable():
 def test_unknown_parameters_name_the_nearest():
     for use in (
         lambda: derivative("lenght_m", FREQUENCY, LMAX, antennas()),
-        lambda: placed(antennas(), {"lenght_m": 0.1}),
+        lambda: with_values(antennas(), {"lenght_m": 0.1}),
     ):
         with pytest.raises(
             lb.InputError, match="unknown beam parameter 'lenght_m'; did you mean 'length_m'"

@@ -24,7 +24,7 @@ from lusee_bayes.noise.covariance import (
     TimeBandedCovariance,
     TimeBlockCovariance,
 )
-from lusee_bayes.testing.checks import TOL, check_covariance, close
+from lusee_bayes.testing.contracts import TOL, check_covariance, close
 
 N_PRODUCTS, N_TIMES = 3, 4
 FLAGS = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)

@@ -17,7 +17,7 @@ from lusee_bayes.results.draws import deviations
 from lusee_bayes.results.map_result import map_result
 from lusee_bayes.sky.sky_files import write_alms
 from lusee_bayes.sky.sky_source import FileSource, GalaxySource
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 NSIDE, LMAX = 8, 6
 N_MODES = (LMAX + 1) ** 2

@@ -17,8 +17,8 @@ from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.report.cube_page import FIGURES as CUBE_FIGURES
 from lusee_bayes.report.cube_page import cube_page
 from lusee_bayes.results.unknowns import unknowns_report
-from lusee_bayes.runs import cube, map_run
-from lusee_bayes.runs.cube import cube_result
+from lusee_bayes.runs import channels, map_run
+from lusee_bayes.runs.channels import cube_result
 
 RECEIVER, GROUND = "noise.receiver={power_k: 2000, slope: -2}", "noise.regolith={std_k: 30}"
 TABLE = "noise.gain_table={std: 0.01}"
@@ -71,7 +71,7 @@ def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch
 def test_a_resumed_run_has_them_too(response_file, tmp_path, monkeypatch):
     scenario = cube_of(response_file, RECEIVER, GROUND)
     whole = cube_result(scenario, tmp_path / "whole").unknowns
-    inform, done = cube.inform, []
+    inform, done = channels.inform, []
 
     def once(experiment, *arguments):
         if done:
@@ -80,7 +80,7 @@ def test_a_resumed_run_has_them_too(response_file, tmp_path, monkeypatch):
         return inform(experiment, *arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(cube, "inform", once)
+        patch.setattr(channels, "inform", once)
         with pytest.raises(KeyboardInterrupt):
             cube_result(scenario, tmp_path / "resumed")
     resumed = cube_result(scenario, tmp_path / "resumed").unknowns
@@ -97,8 +97,8 @@ def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(
     scenario = cube_of(
         response_file, RECEIVER, GROUND, "joint=true", spectral, frequencies="[15, 20, 25]"
     )
-    cube = cube_result(scenario, tmp_path)
-    prior = cube.components.prior
+    channels = cube_result(scenario, tmp_path)
+    prior = channels.components.prior
     n_modes, n_own = 16, 5
     stds = [np.sqrt(np.asarray(per_mode(c))) for c in (prior.spectra[0], *prior.residual)]
     stds = np.concatenate([*stds, np.ones(3 * n_own)])
@@ -120,7 +120,7 @@ def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(
         np.concatenate(rows), stds, np.concatenate(noise), np.concatenate(rest)
     )
     alone = pd.concat(tables, ignore_index=True)
-    table = cube.unknowns.table
+    table = channels.unknowns.table
     scale, own = table["prior_std"].to_numpy(), slice(4 * n_modes, None)
     std = scale * expected.std[own]
     off = (table["value"] - table["prior"] - scale * expected.mean[own]) / std
@@ -129,4 +129,4 @@ def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(
     np.testing.assert_allclose(table["true"], alone["true"], rtol=1e-12)
     # other channels do tell: the test would see a table of each channel's own data
     assert (np.abs(table["value"] - alone["value"]) / std).max() > 0.05
-    assert all(channel.unknowns.null is None for channel in cube.channels)
+    assert all(channel.unknowns.null is None for channel in channels.channels)

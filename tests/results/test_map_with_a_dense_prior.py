@@ -15,7 +15,7 @@ from lusee_bayes.results.diagnostics import region_rows
 from lusee_bayes.results.map_files import posterior_dataset
 from lusee_bayes.results.map_result import MapResult, map_result
 from lusee_bayes.results.updatable import read_updatable
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 LMAX = 6
 

@@ -14,8 +14,7 @@ from reference_linear import Answer, white_posterior
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import radiometer, true_values
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.runs import cube as cube_module
-from lusee_bayes.runs.cube import cube_result
+from lusee_bayes.runs.channels import cube_result
 
 FREQUENCIES, OCTAVES = np.array([15.0, 20.0, 22.0]), 0.4
 RECEIVER = (

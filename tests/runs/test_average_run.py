@@ -16,7 +16,7 @@ from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.runs.data_run import run_average
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 LMAX = 5
 MEANS = ("observation.window=mean", "observation.step_s=1800")

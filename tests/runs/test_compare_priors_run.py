@@ -16,7 +16,7 @@ from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.results.map_result import map_result
 from lusee_bayes.runs.compare_run import run_compare_priors
 from lusee_bayes.sky.sky_files import write_alms
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 SIZES = {"lmax": 8, "cycles": 0.15}
 SMALL = ["--set", "lmax=8", "--set", "observation.runs.0.cycles=0.15"]

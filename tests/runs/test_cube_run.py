@@ -22,9 +22,9 @@ from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.term import Around
 from lusee_bayes.judge.chi2 import signal_to_noise
 from lusee_bayes.report import html
-from lusee_bayes.runs import cube, map_run
+from lusee_bayes.runs import channels, map_run
 from lusee_bayes.runs import folder as folder_module
-from lusee_bayes.runs.cube import cube_result, lmax_of_fields, positive_skies
+from lusee_bayes.runs.channels import cube_result, lmax_of_fields, positive_skies
 from lusee_bayes.runs.map_run import run_map
 from lusee_bayes.sampling.datatree import read_datatree
 from lusee_bayes.sky.sky_files import SkyCube
@@ -70,16 +70,16 @@ def numbers_alone(monkeypatch):
 
 @pytest.mark.long
 def test_independent_channels_are_maps_of_each_frequency(independent):
-    cube = posterior_of(independent)
-    np.testing.assert_array_equal(cube["frequency"], [20.0, 25.0, 30.0])
-    assert cube["draws"].dims == ("frequency", "draw", "mode") and cube.sizes["draw"] == 3
+    channels = posterior_of(independent)
+    np.testing.assert_array_equal(channels["frequency"], [20.0, 25.0, 30.0])
+    assert channels["draws"].dims == ("frequency", "draw", "mode") and channels.sizes["draw"] == 3
     for number, frequency in enumerate((20, 25, 30)):
         settings = [*SMALL[1::2], f"frequency_mhz={frequency}", f"seed={1 + number}"]
         experiment = build(load_scenario("fiducial", settings))
         data = experiment.data
         model = full_model(experiment.setup, Around(data))
         expected = model.condition(data.data)
-        here, std = cube.isel(frequency=number), np.asarray(expected.std())
+        here, std = channels.isel(frequency=number), np.asarray(expected.std())
         assert (np.abs(here["mean"] - np.asarray(expected.mean)) / std).max() < 1e-6
         # standard deviations of the normal equations
         np.testing.assert_allclose(here["std"], std, rtol=1e-4)
@@ -112,7 +112,7 @@ def test_runs_take_names_strings_and_data_in_memory(tmp_path, monkeypatch, numbe
 
 @pytest.mark.long
 def test_files_of_a_cube_agree_with_each_other(joint, capsys):
-    cube = posterior_of(joint)
+    channels = posterior_of(joint)
     assert run("info", joint / "posterior.nc") == 0
     said = capsys.readouterr().out
     assert "25 modes (lmax 4) at 3 frequencies from 20 to 30 MHz, one posterior for all" in said
@@ -121,21 +121,21 @@ def test_files_of_a_cube_agree_with_each_other(joint, capsys):
     nside = load_scenario("fiducial", SMALL[1::2]).map_nside
     for name in ("mean", "truth"):
         read = SkyCube.read(joint / f"{name}.fits")
-        np.testing.assert_allclose(read.frequencies_mhz, cube["frequency"])
+        np.testing.assert_allclose(read.frequencies_mhz, channels["frequency"])
         for k in range(3):
-            expected = modes_to_map(cube[name].values[k], nside)
+            expected = modes_to_map(channels[name].values[k], nside)
             np.testing.assert_allclose(read.map_at(20.0 + 5 * k), expected, rtol=1e-12)
     assert SkyCube.read(joint / "std.fits").pixels.shape == (3, healpy.nside2npix(nside))
     with (joint / "spectra.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [float(r["frequency_mhz"]) for r in rows] == list(np.repeat([20.0, 25.0, 30.0], 5))
     for name, column in (("mean", "snr"), ("independent_mean", "snr_independent")):
-        snr = signal_to_noise(cube[name].values[1], cube["truth"].values[1])
+        snr = signal_to_noise(channels[name].values[1], channels["truth"].values[1])
         np.testing.assert_allclose([float(r[column]) for r in rows[5:10]], snr, rtol=1e-9)
     assert "20 to 30 MHz" in (joint / "report.html").read_text()
-    maps = cube["mixing"].values @ cube["component_mean"].values
+    maps = channels["mixing"].values @ channels["component_mean"].values
     # the rest of each channel is a few percent of it
-    assert 0 < np.abs(maps - cube["mean"].values).max() < 0.2 * np.abs(maps).max()
+    assert 0 < np.abs(maps - channels["mean"].values).max() < 0.2 * np.abs(maps).max()
 
 
 @pytest.mark.long
@@ -149,15 +149,15 @@ def test_the_independent_means_of_a_joint_run_are_those_of_an_independent_run(jo
 @pytest.fixture
 def made(monkeypatch):
     """Channels whose posterior was really computed, in order."""
-    done, inform = [], cube.inform
+    done, inform = [], channels.inform
 
     def counting(experiment, *arguments):
         done.append(experiment.scenario.frequency_mhz)
         return inform(experiment, *arguments)
 
-    for module in (engine_module, cube):
+    for module in (engine_module, channels):
         monkeypatch.setattr(module, "ThisProcess", lambda *_: ThisProcess(1))
-    monkeypatch.setattr(cube, "inform", counting)
+    monkeypatch.setattr(channels, "inform", counting)
     return done
 
 
@@ -195,9 +195,9 @@ def gap(tmp_path_factory):
     path = tmp_path_factory.mktemp("gap") / "w.fits"
     assert run("simulate", "fiducial", *THREE, "-o", path, "-q") == 0
     with fits.open(path, mode="update") as file:
-        (cube,) = [hdu for hdu in file if hdu.data is not None and hdu.data.ndim == 3]
-        axis = cube.data.shape.index(3)
-        np.moveaxis(cube.data, axis, 0)[1] = np.nan
+        (channels,) = [hdu for hdu in file if hdu.data is not None and hdu.data.ndim == 3]
+        axis = channels.data.shape.index(3)
+        np.moveaxis(channels.data, axis, 0)[1] = np.nan
     return path
 
 
@@ -230,7 +230,8 @@ def test_a_channel_that_cannot_be_mapped_leaves_the_others_as_they_are(
 
 def head_of(folder):
     """What a report says of channels that could not be mapped."""
-    return html.unmapped(folder / "summary.json", json.loads((folder / "summary.json").read_text()))
+    path = folder / "summary.json"
+    return "\n".join(html.sentences(path, json.loads(path.read_text()), "unmapped"))
 
 
 def test_too_few_channels_for_a_joint_posterior_are_named(gap, tmp_path, numbers_alone):
@@ -243,7 +244,7 @@ def test_too_few_channels_for_a_joint_posterior_are_named(gap, tmp_path, numbers
 def test_a_run_with_a_channel_that_cannot_be_mapped_goes_on(
     gap, tmp_path, made, monkeypatch, numbers_alone
 ):
-    inform = cube.inform
+    inform = channels.inform
 
     def some(*arguments):
         if made:
@@ -251,7 +252,7 @@ def test_a_run_with_a_channel_that_cannot_be_mapped_goes_on(
         return inform(*arguments)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(cube, "inform", some)
+        patch.setattr(channels, "inform", some)
         run_map(three(), tmp_path, data=gap)
     assert made == [20]
     result = run_map(three(), tmp_path, data=gap).result
@@ -292,18 +293,20 @@ def test_files_of_a_run_agree_with_each_other(tmp_path, capsys):
     assert main([*command, "--draws", "3", "-o", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
     assert "spectral.model=positive" in said and "prior.model=isotropic is not used" in said
-    cube = xr.load_dataset(tmp_path / "out" / "posterior.nc", engine="h5netcdf")
-    assert cube["component_mean"].attrs["units"] == "1" and cube["mean"].attrs["units"] == "K"
-    assert cube["component_mean"].shape == (2, n_modes(6))  # 1.5 times the maps' lmax
+    channels = xr.load_dataset(tmp_path / "out" / "posterior.nc", engine="h5netcdf")
+    assert (
+        channels["component_mean"].attrs["units"] == "1" and channels["mean"].attrs["units"] == "K"
+    )
+    assert channels["component_mean"].shape == (2, n_modes(6))  # 1.5 times the maps' lmax
     skies = positive_skies(scenario_of("spectral.sources=false"))
-    exponents = cube["mixing"].values @ cube["component_mean"].values
-    for k, draws in enumerate(cube["draws"].values):
+    exponents = channels["mixing"].values @ channels["component_mean"].values
+    for k, draws in enumerate(channels["draws"].values):
         assert (skies.values(k, exponents[k]) > 0).all()
         # what residuals and point sources, which this sky has not, add is small
-        common, mean = skies.modes(k, exponents[k]), cube["mean"].values[k]
+        common, mean = skies.modes(k, exponents[k]), channels["mean"].values[k]
         assert np.abs(common - mean).max() < 0.1 * np.abs(mean).max()
         # three draws of each mode are within five standard deviations of the mean
-        assert (np.abs(draws - mean) < 5.0 * cube["std"].values[k]).all()
+        assert (np.abs(draws - mean) < 5.0 * channels["std"].values[k]).all()
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["joint"]["components"] == ["level", "index"]
     assert "spectral.model=positive" in summary["joint"]["prior"]
@@ -321,8 +324,8 @@ def test_joint_maps_of_low_frequencies_are_no_worse_than_independent_ones(tmp_pa
         "fiducial",
         ["lmax=10", "joint=true", "spectral.model=positive", f"frequencies_mhz={frequencies}"],
     )
-    cube = cube_result(scenario, tmp_path)
-    mean, truth, independent = (cube.stacked(n) for n in ("mean", "truth", "independent"))
+    channels = cube_result(scenario, tmp_path)
+    mean, truth, independent = (channels.stacked(n) for n in ("mean", "truth", "independent"))
     # but for the monopole, which all know well
     worse = np.linalg.norm((independent - truth)[:, 1:], axis=1)
     better = np.linalg.norm((mean - truth)[:, 1:], axis=1)
@@ -330,7 +333,7 @@ def test_joint_maps_of_low_frequencies_are_no_worse_than_independent_ones(tmp_pa
     nside = scenario.map_nside
     lon, lat = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)
     centre = (np.abs((lon + 180.0) % 360.0 - 180.0) < 10.0) & (np.abs(lat) < 10.0)
-    for channel in cube.channels:
+    for channel in channels.channels:
         z = (modes_to_map(channel.mean - channel.truth, nside) / channel.pixel_std)[centre]
         # lmax 10 resolves one or two places there: 3 sigma at most
         assert np.sqrt((z**2).mean()) < 3.0

@@ -12,11 +12,11 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.results.sample_result import SampleResult
-from lusee_bayes.runs.sampling import coordinates
+from lusee_bayes.runs.sample_run import coordinates
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.programs import load_program, numpyro_promotion
 from lusee_bayes.sky import log_normal
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 LMAX = 4
 NO_SOURCES = "log_normal={sources: false}"

@@ -30,7 +30,7 @@ from lusee_bayes.experiment.experiment import Experiment, build, infer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.results import sample_result as results
 from lusee_bayes.runs import validate_run
-from lusee_bayes.runs.sampling import sample_result
+from lusee_bayes.runs.sample_run import sample_result
 from lusee_bayes.sampling import hmc
 from lusee_bayes.sampling.datatree import read_datatree
 from lusee_bayes.sampling.hmc import CHUNK, Sampler

@@ -1,9 +1,7 @@
 """Draws on disk: what is written comes back, and what cannot be trusted is refused."""
 
-import json
 import os
 import re
-import shutil
 
 import numpy as np
 import pytest
@@ -96,8 +94,6 @@ def test_a_run_that_has_just_begun(tmp_path):
     assert run.draws() == {}
     run.append(25, [np.zeros(2)], {})
     assert run.draws() == {}
-    run.remove()
-    assert not run.folder.exists()
 
 
 def test_what_a_kill_left_half_written_is_ignored(folder):
@@ -237,52 +233,3 @@ def test_an_unreadable_marker_is_bad_input(folder, content):
     (folder / hmc.IDENTITY).write_text(content)
     with pytest.raises(InputError, match=re.escape(str(folder))):
         again(folder)
-
-
-def test_a_removal_that_is_killed_leaves_nothing_that_looks_complete(folder, monkeypatch):
-    """Killed after any number of deleted files, the folder resumes to the same draws or is new."""
-    whole = again(folder).draws()["sky"]
-    for survivors in range(1, N_CHUNKS + 3):
-        copy = folder.parent / f"copy-{survivors}"
-        shutil.copytree(folder, copy)
-        _kill_removal(copy, survivors, monkeypatch)
-        if not copy.exists():
-            continue
-        try:
-            run = again(copy)
-            kept = run.draws().get("sky", whole[:, :0])
-            last = run.last()
-        except InputError:
-            continue
-        # what is there is the beginning of the run, up to where it would go on
-        np.testing.assert_array_equal(kept, whole[:, : kept.shape[1]])
-        done = 0 if last is None else last.iteration
-        assert kept.shape[1] == max(0, done - N_DRAWS)
-
-
-class _KilledError(BaseException):
-    pass
-
-
-def _kill_removal(folder, survivors, monkeypatch):
-    """Remove the folder, but stop when only ``survivors`` of its files are left."""
-    left = len(list(folder.iterdir()))
-
-    def guarded(real):
-        def delete(*args, **kwargs):
-            nonlocal left
-            if left <= survivors:
-                raise _KilledError
-            left -= 1
-            return real(*args, **kwargs)
-
-        return delete
-
-    run = Checkpoints(folder, json.loads((folder / hmc.IDENTITY).read_text()), resume=True)
-    with monkeypatch.context() as patch:
-        for name in ("unlink", "remove"):
-            patch.setattr(os, name, guarded(getattr(os, name)))
-        try:
-            run.remove()
-        except _KilledError:
-            assert folder.exists() or list(folder.parent.glob(f"*{folder.name}*"))

@@ -15,6 +15,7 @@ import numpy as np
 import numpyro
 import pytest
 from arviz_stats.base import array_stats
+from experiments import draw_within
 from numpyro import distributions as dist
 from reference_linear import matrices, random_covariance, z_of
 from reference_linear import posterior as naive_posterior
@@ -22,7 +23,7 @@ from scipy.stats import lognorm, multivariate_normal
 
 import lusee_bayes as lb
 from lusee_bayes.sampling import hmc as inference
-from lusee_bayes.sampling.hmc import CHUNK, STATISTICS, Checkpoints, Sampler, draw_within, sample
+from lusee_bayes.sampling.hmc import CHUNK, STATISTICS, Checkpoints, Sampler, sample
 from lusee_bayes.sampling.programs import latent_sites
 
 ROOT = Path(lb.__file__).resolve().parents[1]
@@ -417,28 +418,6 @@ def test_chains_within_a_program_follow_each_data_sets_posterior(gaussian):
         t = (means.mean(0) - expected) / (means.std(0, ddof=1) / np.sqrt(n_sets))
         # Student's t with 63 degrees of freedom reaches a fifth further than a normal at 1e-6
         assert np.abs(t).max() < 1.2 * z_of(t.size)
-
-
-@pytest.mark.long
-def test_thinning_keeps_every_nth_draw():
-    sampler = Sampler(warmup=20, draws=12, algorithm="hmc")
-    promotion, ranks = in_numpyros_types()
-    with promotion, ranks:
-        every, third = (
-            np.asarray(
-                draw_within(
-                    bent,
-                    {"y": jnp.asarray(1.5)},
-                    jax.random.PRNGKey(3),
-                    Sampler(**{**vars(sampler), "draws": 12 // thin}),
-                    thin=thin,
-                )["x"]
-            )
-            for thin in (1, 3)
-        )
-    # the same iterations; programs that are compiled apart may round apart: 20 iterations of a
-    # smooth motion, each of a few steps, amplify that by far less than 1e6
-    np.testing.assert_allclose(third, every[2::3], rtol=1e-9)
 
 
 # ---- several devices

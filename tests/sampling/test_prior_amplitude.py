@@ -19,7 +19,7 @@ from scipy.stats import lognorm, norm
 
 import lusee_bayes as lb
 from lusee_bayes.sampling.hmc import Sampler, sample
-from lusee_bayes.sampling.programs import collapsed_skies, load_program
+from lusee_bayes.sampling.programs import collapsed_draws, load_program
 
 PROGRAM = load_program("prior_amplitude")
 
@@ -201,5 +201,5 @@ def test_skies_obey_the_law_of_total_variance(case, grid, sites):
     total = grid.mean_variance + grid.variance_of_means
     arguments = case.arguments()
     data = arguments.pop("data")
-    skies = collapsed_skies(PROGRAM, arguments, data, sites, jax.random.key(2))
+    skies = collapsed_draws(PROGRAM, arguments, data, sites, jax.random.key(2))
     assert_variances(skies, grid.sky_mean, total)

@@ -21,12 +21,11 @@ from lusee_bayes.cli.main import main
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.sampling.program_checks import require_sampleable
 from lusee_bayes.sampling.programs import (
-    collapsed_skies,
+    collapsed_draws,
     is_collapsed,
     load_program,
     numpyro_promotion,
     program_names,
-    replicated_data,
 )
 
 SPECTRUM = np.array([4.0, 1.0, 0.5])
@@ -282,7 +281,7 @@ def test_skies_at_fixed_sites_follow_the_analytic_posterior(gaussian, collapsed,
     program, values, s, n, offset = collapsed[name]
     data = np.asarray(gaussian.sample(jax.random.key(1))[1])
     arguments = program.arguments(gaussian)
-    skies = collapsed_skies(program, arguments, data, repeated(values), jax.random.key(2))
+    skies = collapsed_draws(program, arguments, data, repeated(values), jax.random.key(2))
     assert isinstance(skies, np.ndarray)
     assert skies.shape == (2, 5000, 9)
     expected = posterior(gaussian.coupling.dense(), s, n, data, offset)
@@ -307,7 +306,7 @@ def test_every_draw_has_its_own_sites(gaussian, collapsed):
     for at in known:
         levels[at] = 1e-12
     arguments = program.arguments(gaussian)
-    skies = collapsed_skies(program, arguments, data, {"noise_level": levels}, jax.random.key(4))
+    skies = collapsed_draws(program, arguments, data, {"noise_level": levels}, jax.random.key(4))
     white = np.linalg.inv(np.linalg.cholesky(np.asarray(gaussian.noise.dense())))
     best = np.linalg.lstsq(white @ np.asarray(gaussian.coupling.dense()), white @ data)[0]
     near = np.abs(skies - best).max(2)
@@ -315,9 +314,9 @@ def test_every_draw_has_its_own_sites(gaussian, collapsed):
     assert {(int(c), int(d)) for c, d in np.argwhere(near < 1e-3)} == set(known)
     others = skies[levels > 1]
     assert np.unique(others[:, 0]).size == len(others)
-    again = collapsed_skies(program, arguments, data, {"noise_level": levels}, jax.random.key(4))
+    again = collapsed_draws(program, arguments, data, {"noise_level": levels}, jax.random.key(4))
     np.testing.assert_array_equal(again, skies)
-    other = collapsed_skies(program, arguments, data, {"noise_level": levels}, jax.random.key(5))
+    other = collapsed_draws(program, arguments, data, {"noise_level": levels}, jax.random.key(5))
     assert (other[levels > 1] != others).all()
 
 
@@ -327,7 +326,7 @@ def test_replicated_data_are_the_skies_seen_with_new_noise(gaussian, collapsed, 
     sky, data = (np.asarray(x) for x in gaussian.sample(jax.random.key(6)))
     skies = np.broadcast_to(sky, (2, 5000, 9))
     arguments = program.arguments(gaussian)
-    seen = replicated_data(program, arguments, data, repeated(values), skies, jax.random.key(7))
+    seen = collapsed_draws(program, arguments, data, repeated(values), jax.random.key(7), skies)
     assert seen.shape == (2, 5000, N_DATA)
     mean = np.asarray(gaussian.coupling.dense()) @ sky + offset
     assert_draws_follow(seen.reshape(-1, N_DATA), mean, n)
@@ -343,9 +342,9 @@ def test_each_sky_is_seen_in_its_own_place(gaussian, collapsed):
     program, values, *_ = collapsed["sky_marginal"]
     data = np.asarray(gaussian.sample(jax.random.key(8))[1])
     skies = np.stack([np.full((3, 9), 1e6), np.full((3, 9), -2e6)])
-    seen = replicated_data(
-        program, program.arguments(gaussian), data, repeated(values, (2, 3)), skies,
-        jax.random.key(9),
+    seen = collapsed_draws(
+        program, program.arguments(gaussian), data, repeated(values, (2, 3)), jax.random.key(9),
+        skies,
     )  # fmt: skip
     # noise of order one on data of order 1e6
     np.testing.assert_allclose(seen, skies @ np.asarray(gaussian.coupling.dense()).T, atol=20.0)

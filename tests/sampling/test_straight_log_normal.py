@@ -13,7 +13,7 @@ from scipy import optimize
 from lusee_bayes.core.arrays import on_device
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.information import Information
-from lusee_bayes.sampling.log_normal import (
+from lusee_bayes.sampling.log_normal_program import (
     AMPLITUDE,
     STRUCTURE,
     TILT,

@@ -14,7 +14,7 @@ from scipy import stats
 import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import build, infer
 from lusee_bayes.instrument.products import DataLayout, auto_indices
-from lusee_bayes.runs.sampling import coordinates, sample_result
+from lusee_bayes.runs.sample_run import coordinates, sample_result
 from lusee_bayes.sampling.hmc import Sampler, sample
 from lusee_bayes.sampling.mode import summary
 from lusee_bayes.sampling.programs import load_program, numpyro_promotion

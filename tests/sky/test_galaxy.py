@@ -83,7 +83,7 @@ def slabs(lon_deg, lat_deg, frequency_mhz, steps=100_000):
 
 def one_line(lon_deg, lat_deg, frequency_mhz, electrons=1.0):
     lon, lat = np.array([float(lon_deg)]), np.array([float(lat_deg)])
-    synchrotron, depth = galaxy.line_of_sight(lon, lat, frequency_mhz, electrons)
+    synchrotron, depth = galaxy.Slabs.towards(lon, lat).synchrotron(frequency_mhz, electrons)
     row = 0 if lat_deg >= 0 else 1
     return synchrotron[row, 0], depth[row, 0]
 
@@ -156,7 +156,7 @@ def test_with_electrons_the_integral_is_that_of_tiny_steps(
     lon_deg, lat_deg, frequency_mhz, tolerance
 ):
     # Slabs of constant j and kappa: second order in the depth of one, which is 100 times less
-    # at 10 MHz than at 1 MHz. Tolerances: see the measured errors in line_of_sight.
+    # at 10 MHz than at 1 MHz. Tolerances: see the measured errors of Slabs.
     slab, source = slabs(lon_deg, lat_deg, frequency_mhz)
     got, depth = one_line(lon_deg, lat_deg, frequency_mhz)
     assert got == pytest.approx(np.sum(source * np.exp(slab / 2 - np.cumsum(slab))), rel=tolerance)
@@ -207,7 +207,7 @@ def test_an_isothermal_slab_between_two_emitters_has_the_closed_form(tau):
 def test_brightness_solves_the_equation_of_transfer(lon_deg, lat_deg):
     # dT/ds = j - kappa (T - T_e), marched from the background to the Sun by the trapezoidal rule,
     # whose error, (kappa ds)^2 tau / 12, is 2e-4 through the Vela shell at most. The tolerance is
-    # the quadrature's at 10 MHz (line_of_sight).
+    # the quadrature's at 10 MHz (Slabs).
     frequency_mhz = 25.0
     slab, source = slabs(lon_deg, lat_deg, frequency_mhz)
     temperature = 1.2 * (frequency_mhz / 1e3) ** -2.58
@@ -395,7 +395,8 @@ def test_unmeasured_turnovers_are_those_of_the_embedded_electrons(name):
     # Rounded to 0.1 MHz of 1.2: 4 % in nu_t, 9 % in depth; the nu^-2.1 law adds up to 7 %.
     source = SOURCES[name]
     lon_deg, lat_deg = source.galactic()
-    _, depth = galaxy.line_of_sight(np.array([lon_deg]), np.array([lat_deg]), source.turnover_mhz)
+    slabs = galaxy.Slabs.towards(np.array([lon_deg]), np.array([lat_deg]))
+    _, depth = slabs.synchrotron(source.turnover_mhz)
     assert depth[0 if lat_deg > 0 else 1, 0] == pytest.approx(1.0, rel=0.16)
 
 

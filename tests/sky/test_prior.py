@@ -20,14 +20,14 @@ from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.judge.residuals import residuals
-from lusee_bayes.linear.model import LinearGaussian, updated
+from lusee_bayes.linear.linear_gaussian import LinearGaussian, updated
 from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.noise.instrument_errors import beam_error_noise
 from lusee_bayes.priors.families import Hyperprior, IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales, windows
 from lusee_bayes.sampling.distributions import Marginal, SkyPrior
 from lusee_bayes.sky.prior import DensePrior, HarmonicPrior, IndependentPrior, PixelPrior
-from lusee_bayes.testing.checks import check_prior
+from lusee_bayes.testing.contracts import check_prior
 
 SPECTRUM = np.array([4.0, 1.0, 0.0, 0.25])  # nothing at ell = 2
 LMAX, NSIDE = 3, 2

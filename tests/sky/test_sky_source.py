@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from assertions import refused
 from astropy.io import fits
+from made_skies import SmoothSky, SpottySky
 from reference import real_harmonics
 
 import lusee_bayes as lb
@@ -32,8 +33,7 @@ from lusee_bayes.sky.sky_source import (
     read_sky_file,
     sky_from_file,
 )
-from lusee_bayes.testing.cases import SmoothSky, SpottySky
-from lusee_bayes.testing.checks import assert_refused, check_sky_source
+from lusee_bayes.testing.contracts import assert_refused, check_sky_source
 
 NSIDE, LMAX = 16, 8
 # healpy's iterated quadrature of a map of NSIDE 16 without power above ell = 4, rms

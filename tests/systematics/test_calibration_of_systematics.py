@@ -11,7 +11,7 @@ from dataclasses import replace
 import equinox as eqx
 import numpy as np
 import pytest
-from experiments import four_ports
+from experiments import draw_within, four_ports
 from numpyro import handlers
 from scipy import stats
 
@@ -23,7 +23,7 @@ from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.results.unknowns import GAIN, SKY, unknowns_report
-from lusee_bayes.sampling.hmc import Sampler, draw_within
+from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sampling.validation import FALSE_ALARM, N_DRAWS, Ranks, calibrate
 from lusee_bayes.systematics.gain_drifts import SCALES

@@ -41,7 +41,7 @@ from lusee_bayes.sampling.programs import latent_sites
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.systematics.sky_unknowns import Source, SpectrumBands
 from lusee_bayes.systematics.systematic import normal_within
-from lusee_bayes.testing.cases import small_scenario
+from lusee_bayes.testing.scenarios import small_scenario
 
 # Cas A is up, For A has an amplitude for every two of the six samples, and the last lies near the
 # north pole of the Moon, 24 degrees below the horizon for ever
@@ -128,7 +128,7 @@ def test_the_circularly_polarised_part_enters_linearly():
     fornax = "ra_deg: 50.67, dec_deg: -37.21, flux_jy: 1"
     circular = [f"{{name: V {v}, stokes_v: {v}, {fornax}}}" for v in (0.0, 1.0, -1.0, 0.3)]
     scenario = small_scenario(f"sources.list=[{', '.join(circular)}]")
-    found = source_responses(scenario, e.observation, scenario.beam.source().monopoles, 25.0)
+    found = source_responses(scenario, e.observation, scenario.beam.source(), 25.0)
     none, right, left, some = (np.asarray(r) for r in found)
     largest = np.abs(none).max()
     slope = 0.5 * (right - left)
@@ -324,7 +324,7 @@ def experiment_with(*overrides: str) -> lb.Experiment:
 def test_unknown_sources_name_the_nearest(source, message):
     scenario, setup = small_scenario(f"sources.list=[{source}]"), with_cas_a()
     with refused(message):
-        source_responses(scenario, setup.observation, setup.instrument.monopoles, 25.0)
+        source_responses(scenario, setup.observation, setup.beam_source, 25.0)
 
 
 def test_a_source_of_which_nothing_is_known_needs_a_flux():

@@ -1,25 +1,16 @@
 """Fields of antennas on the sphere, and the beams of products made of them.
 
-Quadrature over the hemisphere above the horizon.
+**Quadrature.** A beam ends at the horizon. Gauss-Legendre nodes in cos theta over [0, 1] never see
+the cut, so harmonic coefficients converge exponentially where pixel sums ring. Azimuth is uniform:
+a Fourier sum there is exact up to aliasing.
 
-A beam ends at the horizon. Gauss-Legendre nodes in cos theta over [0, 1] never see the cut, so
-harmonic coefficients converge exponentially where pixel sums ring. Azimuth is uniform: a Fourier
-sum there is exact up to aliasing.
-
-Electric-field patterns of antennas: their response to a wave from every direction.
-
-Interpolation between the directions and the frequencies of a file.
-
-The beam B_k of every correlation product, and its spherical-harmonic coefficients.
-
-Functions on HEALPix pixels in other directions above the horizon.
-
-A ring of pixels is a Fourier series in phi. Order m of a smooth function passes the zenith as
-f_m(-theta) = (-1)^m f_m(theta), and is zero there unless m is: splines in theta need no end at the
-zenith, and no rings that have too few pixels for an order (4 i in ring number i). The error is that
-of cubic splines with the distance h = 1 / NSIDE of rings at most, 5/384 (h l)^4 of a pattern of
-degree l, and in the last step to the horizon, which is extrapolated, up to 35 times that. Orders 3
-pass for orders 1 in the first ring, by (h l)^3 / 43 of the pattern there.
+**HEALPix pixels** are interpolated to other directions above the horizon. A ring of pixels is a
+Fourier series in phi. Order m of a smooth function passes the zenith as f_m(-theta) = (-1)^m
+f_m(theta), and is zero there unless m is: splines in theta need no end at the zenith, and no rings
+that have too few pixels for an order (4 i in ring number i). The error is that of cubic splines
+with the distance h = 1 / NSIDE of rings at most, 5/384 (h l)^4 of a pattern of degree l, and in the
+last step to the horizon, which is extrapolated, up to 35 times that. Orders 3 pass for orders 1 in
+the first ring, by (h l)^3 / 43 of the pattern there.
 """
 
 from __future__ import annotations
@@ -197,46 +188,6 @@ class AntennaFields(Described, eqx.Module):
         return self.e_theta.shape[0]
 
 
-def unit_vectors(grid: HemisphereGrid) -> Float[np.ndarray, "3 theta phi"]:
-    """East, North and up components of every direction of the grid."""
-    sin, cos = np.sin(grid.theta)[:, None], np.cos(grid.theta)[:, None]
-    ones = np.ones((1, grid.n_phi))
-    return np.stack([sin * np.cos(grid.phi), sin * np.sin(grid.phi), cos * ones])
-
-
-def displaced(
-    one: AntennaFields, positions_m: Float[np.ndarray, "antennas 3"], frequency_mhz: float
-) -> AntennaFields:
-    """Put identical copies of one antenna at several places; nothing couples them.
-
-    E_i = E exp(i k n.r_i), so that V_ij is the interferometer's integral of
-    B I exp(i k n.(r_i - r_j)).
-
-    Parameters
-    ----------
-    one : AntennaFields
-        Of one antenna.
-    positions_m : (antennas, 3) array
-        East, North, up, in metres.
-    frequency_mhz : float
-
-    Returns
-    -------
-    AntennaFields
-
-    Raises
-    ------
-    InputError
-        If ``one`` has more than one antenna.
-    """
-    if one.n_antennas != 1:
-        raise InputError(f"give the pattern of one antenna, got {one.n_antennas}")
-    require_shape("positions_m", positions_m, (None, 3))
-    path = np.einsum("ac,ctp->atp", positions_m, unit_vectors(one.grid))
-    phase = phasor(wavenumber(frequency_mhz) * path)
-    return AntennaFields(one.e_theta * phase, one.e_phi * phase, one.grid)
-
-
 # between the frequencies of a file: luseepy's rule, straight lines between products of fields and
 # between impedances, or cubic splines through fields and impedances
 Interpolation = Literal["linear", "spline"]
@@ -286,7 +237,7 @@ def at_frequency(
     known_mhz: Float[np.ndarray, " frequencies"],
     frequency_mhz: float,
     *parts: np.ndarray,
-    interpolation: Interpolation = "linear",
+    rule: Interpolation = "linear",
 ) -> list[np.ndarray]:
     """Interpolate arrays in frequency.
 
@@ -298,7 +249,7 @@ def at_frequency(
         Growing.
     frequency_mhz : float
     *parts : (frequencies, ...) array
-    interpolation : {"linear", "spline"}
+    rule : {"linear", "spline"}
 
     Returns
     -------
@@ -314,7 +265,7 @@ def at_frequency(
     places = neighbours(path, known_mhz, frequency_mhz)
     if len(places) == 1:
         return [np.asarray(part[places[0][0]]) for part in parts]
-    if interpolation == "linear":
+    if rule == "linear":
         return [np.asarray(sum(weight * part[k] for k, weight in places)) for part in parts]
     degree = min(3, len(known_mhz) - 1)
     splines = [scipy.interpolate.make_interp_spline(known_mhz, part, k=degree) for part in parts]

@@ -1,17 +1,14 @@
 """Beams in luseepy's files: responses of the ports, and scalar beams.
 
-What the headers of luseepy's beam files state about their own conventions.
+Their headers may state their conventions, which are checked; a word that is absent, or "UNKNOWN",
+as luseepy writes where it was not given any, states nothing. For data that luseepy has made there
+are its own quadratures over the directions of a file.
 
-A word that is absent, or "UNKNOWN", as luseepy writes where it was not given any, states nothing.
-
-luseepy's quadrature over the directions of a file, for data that luseepy has made.
-
-Coupled antennas over ground, with their receivers, from the four-port files of luseepy.
-
-FITS version 3: bare effective lengths H_theta, H_phi (port, frequency, theta, phi) in m, RMS, of a
-wave arriving from (theta, phi), phi from East towards North; impedance ZA and its resistive parts
-Rsky, Rmoon, Rloss (frequency, port, port) in Ohm, with ZA + ZA^H = 2 (Rsky + Rmoon + Rloss); freq
-in MHz, theta and phi in degrees. At the receivers' inputs, one-sided, ::
+**Responses** are those of coupled antennas over ground, with their receivers. FITS version 3: bare
+effective lengths H_theta, H_phi (port, frequency, theta, phi) in m, RMS, of a wave arriving from
+(theta, phi), phi from East towards North; impedance ZA and its resistive parts Rsky, Rmoon, Rloss
+(frequency, port, port) in Ohm, with ZA + ZA^H = 2 (Rsky + Rmoon + Rloss); freq in MHz, theta and
+phi in degrees. At the receivers' inputs, one-sided, ::
 
     V_ab = k eta0 / lambda^2 int (M Ht)_a conj((M Ht)_b) + (M Hp)_a conj((M Hp)_b) T dOmega
            + 4 k (M (T_moon Rmoon + T_antenna Rloss) M^H)_ab    in V^2/Hz.
@@ -20,11 +17,10 @@ An enclosure of 1 K makes U = 4 k M (ZA + ZA^H) / 2 M^H; V_ab / sqrt(U_aa U_bb) 
 frequencies of the file luseepy interpolates impedances and the integrals of open ports (M left out)
 linearly, and takes M of the interpolated ZA.
 
-The field pattern of one arm, used once for each port, from the scalar files of luseepy.
-
-FITS version 2: images Etheta_real, Etheta_imag, EPhi_real, EPhi_imag (frequency, theta, phi), the
-response to a wave arriving from (theta, phi), phi from East towards North, time convention
-exp(+i w t); gain_conv g(frequency), freq in MHz, Z_real and Z_imag in Ohm. Visibilities in K are ::
+**Scalar beams** are the field pattern of one arm, used once for each port. FITS version 2: images
+Etheta_real, Etheta_imag, EPhi_real, EPhi_imag (frequency, theta, phi), the response to a wave
+arriving from (theta, phi), phi from East towards North, time convention exp(+i w t); gain_conv
+g(frequency), freq in MHz, Z_real and Z_imag in Ohm. Visibilities in K are ::
 
     T_ij = sqrt(g_i g_j) / (4 pi) int (Et_i conj(Et_j) + Ep_i conj(Ep_j)) I dOmega,
 
@@ -34,10 +30,11 @@ the frequencies of the file luseepy interpolates g and the integrals linearly, n
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -215,13 +212,11 @@ RESPONSE_LAYOUT = Layout(
 )
 # files hold the matrices in single precision; three of them are added up
 RESISTANCE_TOLERANCE = 1e-6
-UNITS = ("K", "V2/Hz")
-Unit = Literal["K", "V2/Hz"]
 
 
 @dataclass(frozen=True)
-class PortResponse:
-    """Coupled antennas at several frequencies.
+class LuseepyBeam(ABC):
+    """What a file holds in directions of a grid, at several frequencies.
 
     Attributes
     ----------
@@ -230,6 +225,77 @@ class PortResponse:
     frequencies_mhz : (frequencies,) array
     theta : (theta,) array
         From 0 to pi / 2 in equal steps; azimuths are 2 pi k / n_phi.
+    interpolation : {"linear", "spline"}
+        Between the frequencies: luseepy's rule, products of fields linearly and so impedances, or
+        cubic splines through fields and impedances.
+    """
+
+    path: str
+    frequencies_mhz: Float[np.ndarray, " frequencies"]
+    theta: Float[np.ndarray, " theta"]
+    interpolation: Interpolation = field(default="linear", kw_only=True)
+
+    @property
+    @abstractmethod
+    def n_phi(self) -> int:
+        """Number of azimuths."""
+
+    @abstractmethod
+    def fields(self, frequency_mhz: float, **how: Any) -> AntennaFields:
+        """Return the fields of the ports; their products are beams per K and sr."""
+
+    @abstractmethod
+    def _linear(self, frequency_mhz: float, lmax: int, **how: Any) -> Float[np.ndarray, "_ modes"]:
+        """Coefficients of the beams of all products by luseepy's rule."""
+
+    def beams(self, frequency_mhz: float, lmax: int, **how: Any) -> ProductBeams:
+        """Return the beams of all products.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+        lmax : int
+        **how
+            Arguments of :meth:`fields`.
+
+        Returns
+        -------
+        ProductBeams
+            In K per K.
+
+        Raises
+        ------
+        InputError
+            As of :meth:`fields`.
+        """
+        if self.interpolation == "spline":
+            modes = product_modes(self.fields(frequency_mhz, **how), lmax, normalise=False)
+        else:
+            modes = self._linear(frequency_mhz, lmax, **how)
+        return ProductBeams(modes, float(frequency_mhz))
+
+    def interpolated(self, frequency_mhz: float) -> Interpolation | None:
+        """Return how values at this frequency are interpolated; None where the file has it."""
+        return self.interpolation if len(self._neighbours(frequency_mhz)) > 1 else None
+
+    def _neighbours(self, frequency_mhz: float) -> list[tuple[int, float]]:
+        return neighbours(self.path, self.frequencies_mhz, frequency_mhz)
+
+    def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
+        known, rule = self.frequencies_mhz, self.interpolation
+        return at_frequency(self.path, known, frequency_mhz, *parts, rule=rule)
+
+    def _grid(self, grid: HemisphereGrid | None) -> HemisphereGrid:
+        """A grid, or by default nodes that integrate across the horizon exactly."""
+        return grid or HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
+
+
+@dataclass(frozen=True)
+class PortResponse(LuseepyBeam):
+    """Coupled antennas at several frequencies.
+
+    Attributes
+    ----------
     h_theta, h_phi : (frequencies, ports, theta, phi) complex array
         Effective lengths in m.
     impedance : (frequencies, ports, ports) complex array
@@ -238,25 +304,17 @@ class PortResponse:
         Rmoon and Rloss in Ohm.
     receiver : Receiver or None
         What is connected to the ports; None leaves them open.
-    interpolation : {"linear", "spline"}
-        Between the frequencies: luseepy's rule, impedances and products of fields linearly, or
-        cubic splines through impedances and fields.
     """
 
-    path: str
-    frequencies_mhz: Float[np.ndarray, " frequencies"]
-    theta: Float[np.ndarray, " theta"]
     h_theta: Complex[np.ndarray, "frequencies ports theta phi"]
     h_phi: Complex[np.ndarray, "frequencies ports theta phi"]
     impedance: Complex[np.ndarray, "frequencies ports ports"]
     moon_resistance: Complex[np.ndarray, "frequencies ports ports"]
     loss_resistance: Complex[np.ndarray, "frequencies ports ports"]
     receiver: Receiver | None = JFETReceiver()
-    interpolation: Interpolation = "linear"
 
     @property
     def n_phi(self) -> int:
-        """Number of azimuths."""
         return self.h_theta.shape[3]
 
     @property
@@ -274,14 +332,9 @@ class PortResponse:
         return self.circuit(frequency_mhz).per_kelvin.diagonal().real
 
     def fields(
-        self,
-        frequency_mhz: float,
-        *,
-        grid: HemisphereGrid | None = None,
-        turn_deg: float = 0.0,
-        unit: Unit = "K",
+        self, frequency_mhz: float, *, grid: HemisphereGrid | None = None, turn_deg: float = 0.0
     ) -> AntennaFields:
-        """Return the fields of the ports; their products are beams in ``unit`` per K and sr.
+        """Return the fields of the ports; their products are beams in K per K and sr.
 
         Between the frequencies of the file this is so with splines only. With linear interpolation
         the fields themselves are interpolated here, for pictures; use :meth:`beams` for products.
@@ -294,8 +347,6 @@ class PortResponse:
             rule of luseepy.
         turn_deg : float
             How far the instrument is turned, from East towards North.
-        unit : {"K", "V2/Hz"}
-            V^2/Hz are those at the receivers' inputs.
 
         Returns
         -------
@@ -304,43 +355,25 @@ class PortResponse:
         Raises
         ------
         InputError
-            Outside the frequencies of the file, or for an unknown unit.
+            Outside the frequencies of the file.
         """
         opened = self._open(self._at(frequency_mhz, self.h_theta, self.h_phi), grid, turn_deg)
-        mixing = self._mixing(frequency_mhz, unit) / (SPEED_OF_LIGHT / (1e6 * frequency_mhz))
+        mixing = self._mixing(frequency_mhz) / (SPEED_OF_LIGHT / (1e6 * frequency_mhz))
         parts = (np.tensordot(mixing, part, axes=1) for part in (opened.e_theta, opened.e_phi))
         return AntennaFields(*parts, opened.grid)
 
-    def beams(
-        self,
-        frequency_mhz: float,
-        lmax: int,
-        *,
-        grid: HemisphereGrid | None = None,
-        turn_deg: float = 0.0,
-        unit: Unit = "K",
-    ) -> ProductBeams:
-        """Return the beams of all products, in ``unit`` per K; arguments as of :meth:`fields`."""
-        if self.interpolation == "spline":
-            fields = self.fields(frequency_mhz, grid=grid, turn_deg=turn_deg, unit=unit)
-            modes = product_modes(fields, lmax, normalise=False)
-            return ProductBeams(modes, float(frequency_mhz))
+    def _linear(self, frequency_mhz, lmax, *, grid=None, turn_deg=0.0):
         opened = np.zeros((N_ANTENNAS**2, (lmax + 1) ** 2))
-        for k, weight in neighbours(self.path, self.frequencies_mhz, frequency_mhz):
+        for k, weight in self._neighbours(frequency_mhz):
             fields = self._open([self.h_theta[k], self.h_phi[k]], grid, turn_deg)
             wavelength = SPEED_OF_LIGHT / (1e6 * self.frequencies_mhz[k])
             opened += weight / wavelength**2 * product_modes(fields, lmax, normalise=False)
-        mixing = self._mixing(frequency_mhz, unit)
+        mixing = self._mixing(frequency_mhz)
         seen = np.einsum("ai,ijm,bj->abm", mixing, to_matrix(opened), mixing.conj(), optimize=True)
-        return ProductBeams(to_real(seen), float(frequency_mhz))
+        return to_real(seen)
 
     def background(
-        self,
-        frequency_mhz: float,
-        moon_k: float,
-        antenna_k: float = 0.0,
-        *,
-        unit: Unit = "K",
+        self, frequency_mhz: float, moon_k: float, antenna_k: float = 0.0
     ) -> Float[Array, " products"]:
         """Return the visibilities without any sky: what the Moon and lossy antennas emit.
 
@@ -349,7 +382,6 @@ class PortResponse:
         frequency_mhz : float
         moon_k, antenna_k : float
             Temperatures of the Moon and of the antennas in K.
-        unit : {"K", "V2/Hz"}
 
         Returns
         -------
@@ -362,36 +394,20 @@ class PortResponse:
         """
         circuit = self.circuit(frequency_mhz)
         seen = circuit.emitted(moon_k * circuit.moon_ohm + antenna_k * circuit.loss_ohm)
-        if unit == "K":
-            root = np.sqrt(self.per_kelvin(frequency_mhz))
-            seen = seen / (root[:, None] * root[None])
-        return to_real(seen)
+        root = np.sqrt(self.per_kelvin(frequency_mhz))
+        return to_real(seen / (root[:, None] * root[None]))
 
-    def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
-        return at_frequency(
-            self.path,
-            self.frequencies_mhz,
-            frequency_mhz,
-            *parts,
-            interpolation=self.interpolation,
-        )
-
-    def _mixing(self, frequency_mhz: float, unit: str) -> Complex[np.ndarray, "ports ports"]:
+    def _mixing(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
         """M, scaled such that products of open ports' fields / wavelength become beams."""
-        if unit not in UNITS:
-            raise InputError(f"unknown unit '{unit}'; {nearest(unit, UNITS)}")
         # product beams are halves of the sums over polarisations
-        scale = np.full(N_ANTENNAS, np.sqrt(2.0 * Boltzmann * VACUUM_OHM))
-        if unit == "K":
-            scale = scale / np.sqrt(self.per_kelvin(frequency_mhz))
+        scale = np.sqrt(2.0 * Boltzmann * VACUUM_OHM) / np.sqrt(self.per_kelvin(frequency_mhz))
         return scale[:, None] * self.circuit(frequency_mhz).loading
 
     def _open(
         self, parts: list[np.ndarray], grid: HemisphereGrid | None, turn_deg: float
     ) -> AntennaFields:
         """The effective lengths of one frequency on a grid, of ports that are open."""
-        if grid is None:
-            grid = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
+        grid = self._grid(grid)
         turned = (np.stack([on_grid(h, self.theta, grid, turn_deg) for h in p]) for p in parts)
         return AntennaFields(*turned, grid)
 
@@ -465,39 +481,26 @@ TAPER_WIDTH = 0.03
 
 
 @dataclass(frozen=True)
-class ScalarBeam:
+class ScalarBeam(LuseepyBeam):
     """The pattern of one arm at several frequencies.
 
     Attributes
     ----------
-    path : str
-        The file, for error messages.
-    frequencies_mhz : (frequencies,) array
-    theta : (theta,) array
-        From 0 to pi / 2 in equal steps; azimuths are 2 pi k / n_phi.
     e_theta, e_phi : (frequencies, theta, phi) complex array
         Fields in the unit of the file.
     gain : (frequencies,) array
         gain_conv of the file.
     impedance : (frequencies,) complex array or None
         Of the arm in Ohm; None where the file has none.
-    interpolation : {"linear", "spline"}
-        Between the frequencies: luseepy's rule, products of fields and gain linearly, or cubic
-        splines through the fields and the gain.
     """
 
-    path: str
-    frequencies_mhz: Float[np.ndarray, " frequencies"]
-    theta: Float[np.ndarray, " theta"]
     e_theta: Complex[np.ndarray, "frequencies theta phi"]
     e_phi: Complex[np.ndarray, "frequencies theta phi"]
     gain: Float[np.ndarray, " frequencies"]
     impedance: Complex[np.ndarray, " frequencies"] | None = None
-    interpolation: Interpolation = "linear"
 
     @property
     def n_phi(self) -> int:
-        """Number of azimuths."""
         return self.e_theta.shape[2]
 
     @property
@@ -542,27 +545,17 @@ class ScalarBeam:
         *parts, gain = self._at(frequency_mhz, self.e_theta, self.e_phi, self.gain)
         return self._put_up(parts, float(gain), grid, taper, rotations_deg)
 
-    def beams(
-        self,
-        frequency_mhz: float,
-        lmax: int,
-        *,
-        grid: HemisphereGrid | None = None,
-        taper: bool = True,
-        rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
-    ) -> ProductBeams:
-        """Return the beams of all products, in K per K; arguments as of :meth:`fields`."""
-        if self.interpolation == "spline":
-            fields = self.fields(frequency_mhz, grid=grid, taper=taper, rotations_deg=rotations_deg)
-            modes = product_modes(fields, lmax, normalise=False)
-        else:
-            (gain,) = self._at(frequency_mhz, self.gain)
-            modes = np.zeros((len(rotations_deg) ** 2, (lmax + 1) ** 2))
-            for k, weight in neighbours(self.path, self.frequencies_mhz, frequency_mhz):
-                parts = [self.e_theta[k], self.e_phi[k]]
-                fields = self._put_up(parts, float(gain), grid, taper, rotations_deg)
-                modes += weight * product_modes(fields, lmax, normalise=False)
-        return ProductBeams(modes, float(frequency_mhz))
+    def _linear(self, frequency_mhz, lmax, **how):
+        (gain,) = self._at(frequency_mhz, self.gain)
+        return sum(
+            weight
+            * product_modes(
+                self._put_up([self.e_theta[k], self.e_phi[k]], float(gain), **how),
+                lmax,
+                normalise=False,
+            )
+            for k, weight in self._neighbours(frequency_mhz)
+        )
 
     def impedance_at(self, frequency_mhz: float) -> complex | None:
         """Return the arm's impedance in Ohm, or None. InputError outside the file's frequencies."""
@@ -572,13 +565,7 @@ class ScalarBeam:
         return complex(ohm)
 
     def background(
-        self,
-        frequency_mhz: float,
-        moon_k: float,
-        *,
-        grid: HemisphereGrid | None = None,
-        taper: bool = True,
-        rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
+        self, frequency_mhz: float, moon_k: float, **how: Any
     ) -> Float[Array, " products"]:
         """Return the visibilities without any sky: what ground of ``moon_k`` kelvin emits.
 
@@ -591,8 +578,8 @@ class ScalarBeam:
         frequency_mhz : float
         moon_k : float
             Temperature of the ground in K.
-        grid, taper, rotations_deg
-            As of :meth:`fields`.
+        **how
+            Arguments of :meth:`fields`.
 
         Returns
         -------
@@ -604,30 +591,20 @@ class ScalarBeam:
         InputError
             Outside the frequencies of the file.
         """
-        beams = self.beams(frequency_mhz, 0, grid=grid, taper=taper, rotations_deg=rotations_deg)
-        sky = np.sqrt(4.0 * np.pi) * beams.modes[:, 0]
-        return moon_k * (to_real(np.eye(len(rotations_deg), dtype=np.complex128)) - sky)
-
-    def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
-        return at_frequency(
-            self.path,
-            self.frequencies_mhz,
-            frequency_mhz,
-            *parts,
-            interpolation=self.interpolation,
-        )
+        sky = np.sqrt(4.0 * np.pi) * self.beams(frequency_mhz, 0, **how).modes[:, 0]
+        n_ports = round(np.sqrt(len(sky)))
+        return moon_k * (to_real(np.eye(n_ports, dtype=np.complex128)) - sky)
 
     def _put_up(
         self,
         parts: list[np.ndarray],
         gain: float,
-        grid: HemisphereGrid | None,
-        taper: bool,
-        rotations_deg: tuple[float, ...],
+        grid: HemisphereGrid | None = None,
+        taper: bool = True,
+        rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
     ) -> AntennaFields:
         """The fields of one arm, one for each port, with the scale that the gain gives them."""
-        if grid is None:
-            grid = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
+        grid = self._grid(grid)
         scale = np.full(len(grid.theta), np.sqrt(2.0 * gain / (4.0 * np.pi)))
         if taper:
             below = np.arctan((grid.theta - np.pi / 2.0) / TAPER_WIDTH) / np.pi + 0.5

@@ -1,12 +1,9 @@
 """Monopoles on a lossy ground: fields, circuit, receiver and their parameters.
 
-Reflection of a plane wave off the layered lunar ground.
-
-The package's own antenna model: thin monopoles above layered ground.
-
-An arm of length L points outwards and up from the feed, at height h over the ground; its current
-is I(s) ~ sin k(L - s). A wave from direction n reaches it directly and off the ground, so its
-response to the theta and phi components is
+This is the package's own antenna model: thin monopoles above layered ground. An arm of length L
+points outwards and up from the feed, at height h over the ground; its current is I(s) ~ sin k(L -
+s). A wave from direction n reaches it directly and off the ground, so its response to the theta and
+phi components is
 
     E = int I(s) [ u.e exp(i k n.r) + u.e' exp(i k n'.r - 2 i k h n_z) ] ds,   r = s u,
 
@@ -14,18 +11,12 @@ with u the arm, n' = n mirrored in the ground and e' the reflected polarisation.
 between arms, no lander: this is good enough for the paper's findings, and differentiable in all
 parameters.
 
-The parameters of the embedded antennas by name, with their domains.
+**Circuit.** Antennas of impedance matrix ZA with open-circuit voltages v make the voltages M v at
+the inputs of receivers of impedance ZL (Thevenin's theorem), M = ZL (ZA + ZL)^-1. ZL is that of
+luseepy's models of receivers.
 
-The receivers' input impedance ZL, of luseepy's models of receivers.
-
-Coupled antennas and their receivers as a circuit, at one frequency.
-
-Antennas of impedance matrix ZA with open-circuit voltages v make the voltages M v at the inputs of
-receivers of impedance ZL (Thevenin's theorem), M = ZL (ZA + ZL)^-1.
-
-The beam of every product in given directions: the exact response to a point source.
-
-Harmonic coefficients up to lmax blur a point source; the field pattern itself does not.
+**Point sources** are blurred by harmonic coefficients up to lmax, but not by the field pattern
+itself (:func:`beams_towards`).
 """
 
 from __future__ import annotations
@@ -42,13 +33,7 @@ from jaxtyping import Complex, Float
 from scipy.constants import Boltzmann
 
 from lusee_bayes.core.arrays import Array, as_complex, compiled, namespace
-from lusee_bayes.core.checks import (
-    is_traced,
-    require_finite,
-    require_float64,
-    require_positive,
-    require_shape,
-)
+from lusee_bayes.core.checks import is_traced, require_array, require_finite, require_positive
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.layouts import Layout, Variable
@@ -69,7 +54,7 @@ N_LAYERS = 8
 DEPTH_M = 100.0
 
 
-def _scalar(x) -> Float[Array, ""]:
+def _array(x) -> Float[Array, "..."]:
     return namespace(x).asarray(x, dtype=np.float64)
 
 
@@ -96,9 +81,9 @@ class Regolith(eqx.Module):
     Grimm 2018, fits to the surface electrical properties experiment of Apollo 17.
     """
 
-    surface_permittivity: Float[Array, ""] = eqx.field(default=3.7, converter=_scalar)
-    deep_permittivity: Float[Array, ""] = eqx.field(default=6.1, converter=_scalar)
-    loss_tangent: Float[Array, ""] = eqx.field(default=0.01, converter=_scalar)
+    surface_permittivity: Float[Array, ""] = eqx.field(default=3.7, converter=_array)
+    deep_permittivity: Float[Array, ""] = eqx.field(default=6.1, converter=_array)
+    loss_tangent: Float[Array, ""] = eqx.field(default=0.01, converter=_array)
 
     def __check_init__(self):
         require_positive("surface_permittivity", self.surface_permittivity)
@@ -115,9 +100,7 @@ class Regolith(eqx.Module):
         return as_complex(real, -real * self.loss_tangent)
 
     def reflection(
-        self,
-        cos_theta: Float[Array, " theta"],
-        frequency_mhz: float | Float[Array, ""],
+        self, cos_theta: Float[Array, " theta"], frequency_mhz: float | Float[Array, ""]
     ) -> tuple[Complex[Array, " theta"], Complex[Array, " theta"]]:
         """Return the reflection coefficients for waves that arrive at zenith angle theta.
 
@@ -147,7 +130,8 @@ class Regolith(eqx.Module):
         sin2 = 1.0 - cosine**2
         eps = [xp.ones((), dtype=np.complex128), *self.permittivities()]
         # vertical wave numbers over k; the root with Im <= 0 decays downwards under exp(+i w t)
-        vertical = [cosine] + [_decaying_root(e - sin2) for e in eps[1:]]
+        roots = [xp.sqrt(e - sin2) for e in eps[1:]]
+        vertical = [cosine] + [xp.where(root.imag > 0, -root, root) for root in roots]
         s, p = xp.zeros_like(vertical[0]), xp.zeros_like(vertical[0])
         for upper in range(N_LAYERS - 1, -1, -1):
             q0, q1 = vertical[upper], vertical[upper + 1]
@@ -162,19 +146,8 @@ class Regolith(eqx.Module):
         return s, p
 
 
-def _decaying_root(z: Complex[Array, " theta"]) -> Complex[Array, " theta"]:
-    """The root with Im <= 0, which decays downwards under exp(+i w t)."""
-    xp = namespace(z)
-    root = xp.sqrt(z)
-    return xp.where(root.imag > 0, -root, root)
-
-
 # ports 0, 1, 2, 3 point North, East, South, West; phi counts from East towards North
 PORT_AZIMUTHS_DEG = (90.0, 0.0, -90.0, 180.0)
-
-
-def _array(x) -> Float[Array, "..."]:
-    return namespace(x).asarray(x, dtype=np.float64)
 
 
 class Monopoles(eqx.Module):
@@ -220,9 +193,11 @@ class Monopoles(eqx.Module):
     ) -> AntennaFields:
         """Return the field patterns on a grid, with the phase centre at the feed for all arms."""
         require_positive("frequency_mhz", frequency_mhz)
-        e_theta, e_phi = self.towards(frequency_mhz, grid.theta[:, None], grid.phi[None])
-        return AntennaFields(e_theta, e_phi, grid)
+        # an array, so that all frequencies share one program
+        frequency = _array(frequency_mhz)
+        return AntennaFields(*self.towards(frequency, grid.theta[:, None], grid.phi[None]), grid)
 
+    @compiled
     def towards(
         self,
         frequency_mhz: float | Float[Array, ""],
@@ -242,30 +217,15 @@ class Monopoles(eqx.Module):
         -------
         e_theta, e_phi : (antennas, ...) complex array
         """
-        # an array, so that all frequencies share one program
-        return self._towards(_array(frequency_mhz), theta, phi)
-
-    @compiled
-    def _towards(
-        self,
-        frequency_mhz: Float[Array, ""],
-        theta: Float[Array, "*#directions"],
-        phi: Float[Array, "*#directions"],
-    ) -> tuple[Complex[Array, "antennas *directions"], Complex[Array, "antennas *directions"]]:
         k = wavenumber(frequency_mhz)
         xp = namespace(self, frequency_mhz, theta, phi)
         cos, sin = xp.cos(theta)[None], xp.sin(theta)[None]
         tilt = xp.radians(self.zenith_angle_deg)
-        azimuth = xp.radians(self.azimuths_deg + self.turntable_offset_deg).reshape(
-            -1, *(1,) * phi.ndim
-        )
-        relative = phi[None] - azimuth
+        azimuth = xp.radians(self.azimuths_deg + self.turntable_offset_deg)
+        relative = phi[None] - azimuth.reshape(-1, *(1,) * phi.ndim)
         # the arm along the horizontal direction of the wave, across it, and up
-        along, across, up = (
-            xp.sin(tilt) * xp.cos(relative),
-            -xp.sin(tilt) * xp.sin(relative),
-            xp.cos(tilt),
-        )
+        along, across = xp.sin(tilt) * xp.cos(relative), -xp.sin(tilt) * xp.sin(relative)
+        up = xp.cos(tilt)
         s, p = (
             r.reshape(cos.shape) for r in self.regolith.reflection(cos.reshape(-1), frequency_mhz)
         )
@@ -388,7 +348,7 @@ def parameter(name: str) -> Parameter:
     return PARAMETERS[name]
 
 
-def placed(monopoles: Monopoles, values: Mapping[str, float | Float[Array, ""]]) -> Monopoles:
+def with_values(monopoles: Monopoles, values: Mapping[str, float | Float[Array, ""]]) -> Monopoles:
     """Return the antennas with other values of the named parameters.
 
     Raises
@@ -419,17 +379,16 @@ class Receiver(ABC):
     ----------
     luseepy_name : str
         Of the class that luseepy has for it.
+    luseepy_parameters : dict of str
+        What that class takes, by its names: the names of the attributes here.
     """
 
     luseepy_name: ClassVar[str]
+    luseepy_parameters: ClassVar[dict[str, str]] = {}
 
     @abstractmethod
     def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
         """Return ZL in Ohm. InputError at a frequency that the receiver does not know."""
-
-    @abstractmethod
-    def luseepy_parameters(self) -> dict[str, tuple[float, ...]]:
-        """Return what luseepy's class takes, by its names."""
 
 
 @dataclass(frozen=True)
@@ -452,6 +411,10 @@ class JFETReceiver(Receiver):
     """
 
     luseepy_name: ClassVar[str] = "JFETReceiver"
+    luseepy_parameters: ClassVar[dict[str, str]] = {
+        "C_pf": "capacitance_pf", "L_nh": "inductance_nh", "Rp_ohm": "parallel_ohm",
+        "Rs_ohm": "series_ohm", "a": "skin_ohm", "n": "skin_power",
+    }  # fmt: skip
 
     capacitance_pf: tuple[float, ...] = (33.79, 35.32, 34.89, 36.85)
     inductance_nh: tuple[float, ...] = (35.0, 36.4, 34.7, 8.5)
@@ -468,16 +431,6 @@ class JFETReceiver(Receiver):
         z = z + parallel / (1.0 + 1j * w * parallel * 1e-12 * np.array(self.capacitance_pf))
         return np.diag(z)
 
-    def luseepy_parameters(self) -> dict[str, tuple[float, ...]]:
-        return {
-            "C_pf": self.capacitance_pf,
-            "L_nh": self.inductance_nh,
-            "Rp_ohm": self.parallel_ohm,
-            "Rs_ohm": self.series_ohm,
-            "a": self.skin_ohm,
-            "n": self.skin_power,
-        }
-
 
 @dataclass(frozen=True)
 class CapacitorReceiver(Receiver):
@@ -489,14 +442,12 @@ class CapacitorReceiver(Receiver):
     """
 
     luseepy_name: ClassVar[str] = "IdealCapacitorReceiver"
+    luseepy_parameters: ClassVar[dict[str, str]] = {"C_pf": "capacitance_pf"}
 
     capacitance_pf: tuple[float, ...] = (30.0, 30.0, 30.0, 30.0)
 
     def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
         return np.diag(1.0 / (2.0e-6j * np.pi * frequency_mhz * np.array(self.capacitance_pf)))
-
-    def luseepy_parameters(self) -> dict[str, tuple[float, ...]]:
-        return {"C_pf": self.capacitance_pf}
 
 
 @dataclass(frozen=True)
@@ -522,8 +473,14 @@ class MeasuredReceiver(Receiver):
         (ohm,) = at_frequency(self.path, self.frequencies_mhz, frequency_mhz, self.load_ohm)
         return ohm
 
-    def luseepy_parameters(self) -> dict[str, tuple[float, ...]]:
-        return {}
+
+def receiver_of(
+    path: str | Path, arrays: Mapping[str, np.ndarray], mhz: str, real: str, imaginary: str
+) -> MeasuredReceiver | None:
+    """Return the loads of a file's arrays with these names; None where it has none."""
+    if not {mhz, real, imaginary} <= set(arrays):
+        return None
+    return MeasuredReceiver(str(path), arrays[mhz], arrays[real] + 1j * arrays[imaginary])
 
 
 def read_receiver(path: str | Path) -> MeasuredReceiver:
@@ -544,7 +501,7 @@ def read_receiver(path: str | Path) -> MeasuredReceiver:
         For a missing or damaged file, or one that has no such images.
     """
     images = read_fits(path, LAYOUT, "check beam.receiver").arrays
-    return MeasuredReceiver(str(path), images["freq"], images["ZL_real"] + 1j * images["ZL_imag"])
+    return receiver_of(path, images, "freq", *LOADS)
 
 
 @dataclass(frozen=True)
@@ -648,13 +605,18 @@ def beams_towards(
         parameter.
     """
     require_positive("frequency_mhz", frequency_mhz)
-    require_shape("directions", directions, (None, 3))
-    require_float64("directions", directions)
-    require_finite("directions", directions)
-    _require_unit(directions)
+    require_array("directions", directions, (None, 3))
+    if not is_traced(directions):
+        length = np.linalg.norm(np.asarray(directions), axis=1)
+        bad = np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)
+        if bad.size:
+            raise InputError(
+                f"directions must be unit vectors, number {bad[0]} has length "
+                f"{length[bad[0]]:.6g}; divide them by their length"
+            )
     monopoles = Monopoles() if monopoles is None else monopoles
     # an array: one compilation for all frequencies
-    frequency = namespace(frequency_mhz).asarray(frequency_mhz, dtype=np.float64)
+    frequency = _array(frequency_mhz)
     patterns = _patterns(frequency, directions, monopoles, stokes)
     return patterns / _normalisation(frequency, monopoles)
 
@@ -681,15 +643,3 @@ def _normalisation(frequency_mhz: Float[Array, ""], monopoles: Monopoles) -> Flo
     grid = HemisphereGrid.for_lmax(NORMALISATION_LMAX)
     e_theta, e_phi = monopoles.towards(frequency_mhz, grid.theta[:, None], grid.phi[None])
     return mean_auto_integral(AntennaFields(e_theta, e_phi, grid))
-
-
-def _require_unit(directions: Float[Array, "directions 3"]) -> None:
-    if is_traced(directions):
-        return
-    length = np.linalg.norm(np.asarray(directions), axis=1)
-    bad = np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)
-    if bad.size:
-        raise InputError(
-            f"directions must be unit vectors, number {bad[0]} has length {length[bad[0]]:.6g}; "
-            "divide them by their length"
-        )

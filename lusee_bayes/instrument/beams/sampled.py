@@ -1,30 +1,22 @@
 """Beams that were sampled: on a grid of directions, by another program, in a file.
 
-The directions that beams are sampled in, and interpolation between them.
+They are known in directions of a grid or of HEALPix pixels, at some frequencies: either E_theta and
+E_phi of every antenna, or the beam of every product. Frame: topocentric at turntable angle zero,
+theta from the zenith, phi from East towards North; time goes as exp(+i w t). Nothing is received
+from below the horizon.
 
-Beams of one's own: known in directions of a grid or of HEALPix pixels, at some frequencies.
+**Files** of the package are netCDF, or FITS with images of the same names. ``frequency_mhz``
+(frequency), growing; then either ``e_theta_real``, ``e_theta_imag``, ``e_phi_real`` and
+``e_phi_imag`` (frequency, antenna, directions), or ``product_beam`` (frequency, product,
+directions). Directions are (theta, phi) with ``theta_deg`` (theta) and ``phi_deg`` (phi), or
+(pixel): HEALPix, RING. Attributes, words of the primary header in FITS: ``format``, ``absolute`` (0
+or 1, see :class:`.SampledBeams`), and ``products``, the labels of product beams in their order.
 
-Either E_theta and E_phi of every antenna, or the beam of every product. Frame: topocentric at
-turntable angle zero, theta from the zenith, phi from East towards North; time goes as exp(+i w t).
-Nothing is received from below the horizon.
+**pyuvdata** is optional (the extra ``uvdata``). A UVBeam of type efield holds, for every feed, the
+response to the components of the field along azimuth and zenith angle (``az_za``), or along phi and
+theta (``healpix``); azimuth is phi, from East towards North.
 
-Files of beams of one's own: netCDF, or FITS with images of the same names.
-
-``frequency_mhz`` (frequency), growing; then either ``e_theta_real``, ``e_theta_imag``,
-``e_phi_real`` and ``e_phi_imag`` (frequency, antenna, directions), or ``product_beam`` (frequency,
-product, directions). Directions are (theta, phi) with ``theta_deg`` (theta) and ``phi_deg`` (phi),
-or (pixel): HEALPix, RING. Attributes, words of the primary header in FITS: ``format``, ``absolute``
-(0 or 1, see :class:`.SampledBeams`), and ``products``, the labels of product beams in their order.
-
-Sampled beams as a source of beams.
-
-pyuvdata's UVBeam as sampled beams; pyuvdata is optional (the extra ``uvdata``).
-
-A UVBeam of type efield holds, for every feed, the response to the components of the field along
-azimuth and zenith angle (``az_za``), or along phi and theta (``healpix``); azimuth is phi, from
-East towards North.
-
-Read beam files: luseepy's, scalar or four-port, sampled beams, and pyuvdata's UVBeam.
+:func:`read_beam` reads all of these, and luseepy's files.
 """
 
 from __future__ import annotations
@@ -297,16 +289,8 @@ class SampledBeams(Described):
             raise InputError(
                 f"{self.path} has beams of products, not the E fields of antennas, which this needs"
             )
-        e_theta, e_phi = at_frequency(
-            self.path,
-            self.frequencies_mhz,
-            frequency_mhz,
-            self.e_theta,
-            self.e_phi,
-            interpolation="spline",
-        )
-        fields = self.directions.vectors_on(e_theta, e_phi, grid, turn_deg)
-        return AntennaFields(*fields, grid)
+        parts = self._at(frequency_mhz, self.e_theta, self.e_phi)
+        return AntennaFields(*self.directions.vectors_on(*parts, grid, turn_deg), grid)
 
     def patterns(
         self, frequency_mhz: float, grid: HemisphereGrid, turn_deg: float = 0.0
@@ -320,10 +304,11 @@ class SampledBeams(Described):
         """
         if self.products is None:
             return np.asarray(stokes_beam(self.fields(frequency_mhz, grid, turn_deg)))
-        (beams,) = at_frequency(
-            self.path, self.frequencies_mhz, frequency_mhz, self.products, interpolation="spline"
-        )
+        (beams,) = self._at(frequency_mhz, self.products)
         return to_matrix(self.directions.scalars_on(beams, grid, turn_deg))
+
+    def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
+        return at_frequency(self.path, self.frequencies_mhz, frequency_mhz, *parts, rule="spline")
 
     def beams(
         self,
@@ -451,7 +436,7 @@ def sampled_beams(
 FIELDS = ("e_theta_real", "e_theta_imag", "e_phi_real", "e_phi_imag")
 POWER = "product_beam"
 WHAT = "sampled beams"
-HINT = "lusee_bayes.sampled_beams(...).write makes one of arrays"
+HINT = "lusee_bayes.write_sampled_beams makes one of sampled_beams(...)"
 
 
 def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
@@ -474,10 +459,7 @@ def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
         "theta_deg": Variable(("theta",), low=0.0, high=180.0, grows=True, unit="deg"),
         "phi_deg": Variable(("phi",), low=0.0, high=360.0, grows=True, unit="deg"),
     }
-    attributes = {
-        "absolute": Attribute("boolean"),
-        "products": Attribute("text", optional=fields),
-    }
+    attributes = {"absolute": Attribute("boolean"), "products": Attribute("text", optional=fields)}
     return Layout(
         WHAT,
         {
@@ -626,10 +608,6 @@ class SampledFileBeams(BeamSource):
     def n_ports(self) -> int:
         return self.sampled.n_ports
 
-    @property
-    def emits(self) -> bool:
-        return False
-
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         return self.sampled.fields(frequency_mhz, grid, self.turntable_offset_deg)
 
@@ -639,15 +617,8 @@ class SampledFileBeams(BeamSource):
         return self.sampled.patterns(frequency_mhz, grid, self.turntable_offset_deg)
 
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
-        return self.sampled.beams(
-            frequency_mhz,
-            lmax,
-            turn_deg=self.turntable_offset_deg,
-            normalise=self.normalise,
-        )
-
-    def background(self, frequency_mhz: float) -> Float[Array, " products"]:
-        return np.zeros(self.n_ports**2)
+        turn_deg, normalise = self.turntable_offset_deg, self.normalise
+        return self.sampled.beams(frequency_mhz, lmax, turn_deg=turn_deg, normalise=normalise)
 
 
 def is_uvbeam_file(path: str | Path) -> bool:
@@ -760,10 +731,10 @@ def read_beam(path: str | Path) -> ScalarBeam | PortResponse | SampledBeams:
         If there is no file, or as the reader of its kind.
     """
     path = require_file(path, "beam file", "check beam.file")
-    return READERS[kind_of(path)](path)
+    return READERS[beam_kind(path)](path)
 
 
-def kind_of(path: str | Path) -> str:
+def beam_kind(path: str | Path) -> str:
     """Return the kind of a beam file, the ``model`` of a scenario; others are luseepy's scalar.
 
     Raises

@@ -21,7 +21,6 @@ from lusee_bayes.instrument.beams.fields import (
     HemisphereGrid,
     Interpolation,
     ProductBeams,
-    neighbours,
     stokes_beam,
 )
 from lusee_bayes.instrument.beams.luseepy_files import ROTATIONS_DEG, PortResponse, ScalarBeam
@@ -41,9 +40,9 @@ class BeamSource(ABC):
         """Number of ports; there are n_ports^2 real products."""
 
     @property
-    @abstractmethod
     def emits(self) -> bool:
         """Whether ground or antennas emit, so that :meth:`background` is not zero."""
+        return False
 
     @abstractmethod
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
@@ -98,7 +97,6 @@ class BeamSource(ABC):
             If the source has no beams at this frequency.
         """
 
-    @abstractmethod
     def background(self, frequency_mhz: float) -> Float[Array, " products"]:
         """Return the visibilities without any sky: what the ground and lossy antennas emit.
 
@@ -116,6 +114,7 @@ class BeamSource(ABC):
         InputError
             If the source emits but has no beams at this frequency.
         """
+        return np.zeros(self.n_ports**2)
 
     def impedance(self, frequency_mhz: float) -> complex | None:
         """Return the impedance of one arm in Ohm; None where it is not known.
@@ -174,18 +173,11 @@ class EmbeddedBeams(BeamSource):
     def n_ports(self) -> int:
         return self.antennas.azimuths_deg.size
 
-    @property
-    def emits(self) -> bool:
-        return False
-
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         return self.antennas.fields(frequency_mhz, grid)
 
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         return monopole_beams(frequency_mhz, lmax, self.antennas)
-
-    def background(self, frequency_mhz: float) -> Float[Array, " products"]:
-        return np.zeros(self.n_ports**2)
 
     @property
     def monopoles(self) -> Monopoles:
@@ -227,32 +219,27 @@ class ScalarFileBeams(BeamSource):
         return self.moon_k != 0.0
 
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
-        return self.beam.fields(frequency_mhz, grid=grid, **self._placement)
+        return self.beam.fields(frequency_mhz, **(self._placement | {"grid": grid}))
 
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
-        return self.beam.beams(frequency_mhz, lmax, grid=self._grid, **self._placement)
+        return self.beam.beams(frequency_mhz, lmax, **self._placement)
 
     def background(self, frequency_mhz: float) -> Float[Array, " products"]:
         if not self.emits:
-            return np.zeros(self.n_ports**2)
-        return self.beam.background(frequency_mhz, self.moon_k, grid=self._grid, **self._placement)
+            return super().background(frequency_mhz)
+        return self.beam.background(frequency_mhz, self.moon_k, **self._placement)
 
     def impedance(self, frequency_mhz: float) -> complex | None:
         return self.beam.impedance_at(frequency_mhz)
 
     def interpolated(self, frequency_mhz: float) -> Interpolation | None:
-        beam = self.beam
-        there = neighbours(beam.path, beam.frequencies_mhz, frequency_mhz)
-        return beam.interpolation if len(there) > 1 else None
-
-    @property
-    def _grid(self) -> HemisphereGrid | None:
-        return self.beam.luseepy_grid if self.luseepy_quadrature else None
+        return self.beam.interpolated(frequency_mhz)
 
     @property
     def _placement(self) -> dict[str, Any]:
+        grid = self.beam.luseepy_grid if self.luseepy_quadrature else None
         rotations = tuple(angle + self.turntable_offset_deg for angle in self.rotations_deg)
-        return {"taper": self.taper, "rotations_deg": rotations}
+        return {"grid": grid, "taper": self.taper, "rotations_deg": rotations}
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,19 +279,16 @@ class ResponseBeams(BeamSource):
 
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         grid = self.response.luseepy_grid if self.luseepy_quadrature else None
-        return self.response.beams(
-            frequency_mhz, lmax, grid=grid, turn_deg=self.turntable_offset_deg
-        )
+        turn_deg = self.turntable_offset_deg
+        return self.response.beams(frequency_mhz, lmax, grid=grid, turn_deg=turn_deg)
 
     def background(self, frequency_mhz: float) -> Float[Array, " products"]:
         if not self.emits:
-            return np.zeros(self.n_ports**2)
+            return super().background(frequency_mhz)
         return self.response.background(frequency_mhz, self.moon_k, self.antenna_k)
 
     def interpolated(self, frequency_mhz: float) -> Interpolation | None:
-        response = self.response
-        there = neighbours(response.path, response.frequencies_mhz, frequency_mhz)
-        return response.interpolation if len(there) > 1 else None
+        return self.response.interpolated(frequency_mhz)
 
     def behind(self, receiver: Receiver | None) -> BeamSource:
         if receiver is None or self.receiver_said:

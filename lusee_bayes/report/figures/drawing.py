@@ -1,17 +1,12 @@
-"""What figures share: styles, axes, maps in Mollweide's projection.
+"""What figures share: colours, axes, and Galactic maps in Mollweide's projection.
 
-What figures are drawn with: colours, the projection of beams, colour bars.
+A view of a map is a picture of fixed size: which pixels make up each of its points is worked out
+once for all maps of one NSIDE, and a map is then a sum of four numbers a point.
 
-Galactic Mollweide views of HEALPix maps.
-
-A view is a picture of fixed size: which pixels make up each of its points is worked out once for
-all maps of one NSIDE, and a map is then a sum of four numbers a point.
-
-The beam through which maps are drawn, so that bright edges have no rings.
-
-Coefficients that end abruptly at lmax ring: beside the Galactic plane a truth of lmax = 47 falls
-to half of the real sky, and one of lmax = 24 below zero. A Gaussian beam with a tenth left at lmax
-takes the rings to the per cent level. It is for the eye only: files and numbers are without it.
+Maps are drawn through a beam, so that bright edges have no rings: coefficients that end abruptly at
+lmax ring, and beside the Galactic plane a truth of lmax = 47 falls to half of the real sky, and one
+of lmax = 24 below zero. A Gaussian beam with a tenth left at lmax takes the rings to the per cent
+level. It is for the eye only: files and numbers are without it.
 """
 
 from __future__ import annotations
@@ -43,6 +38,11 @@ from lusee_bayes.instrument.beams.fields import HemisphereGrid
 # safe for colour-blind readers: perceptually uniform, and a blue-orange pair (Okabe-Ito) for lines
 SEQUENTIAL, DIVERGING = "inferno", "PuOr_r"
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#666666"
+# distinct without colour vision (Okabe-Ito), and by their lines
+COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#56B4E9", "#000000")
+LINES = ("-", "--", "-.", ":")
+# inches, across and down
+Size = tuple[float | int, float | int]
 # of PNGs: a fifth larger than with 6, and written in a third of the time
 COMPRESSION = 2
 
@@ -55,6 +55,25 @@ def save(figure: Figure, path: Path, dpi: int) -> None:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     imsave(path, canvas.buffer_rgba(), dpi=dpi, pil_kwargs={"compress_level": COMPRESSION})
+
+
+def framed(size: Size, rows: int = 1, columns: int = 1, **options: object):
+    """Make a figure of some size and its axes, one or an array of them, laid out by themselves."""
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, **options)
+
+
+def in_places(
+    size: Size, rows: int = 1, columns: int = 1, **places: float
+) -> tuple[Figure, list[Axes]]:
+    """Make a figure and all its axes in fixed places, which needs no layout."""
+    figure = Figure(figsize=size)
+    return figure, list(figure.subplots(rows, columns, gridspec_kw=places, squeeze=False).flat)
+
+
+def temperatures(pixels: Float[np.ndarray, "..."], lowest: float = 0.5) -> LogNorm:
+    """A logarithmic scale over all positive pixels but the extreme ones (per cent: ``lowest``)."""
+    return LogNorm(*np.percentile(pixels[pixels > 0], [lowest, 99.8]))
 
 
 def seen_range(
@@ -188,6 +207,23 @@ def mollweide(
     axes.set(xlim=(-1.09 * EDGE[0], 1.02 * EDGE[0]), ylim=(-1.03 * EDGE[1], 1.03 * EDGE[1]))
     axes.set_axis_off()
     return image
+
+
+def sky_panel(
+    axes: Axes,
+    title: str,
+    pixels: Float[np.ndarray, " pixels"],
+    norm: Normalize,
+    cmap: str = SEQUENTIAL,
+    unit: str = "K",
+    *,
+    altitude: Float[np.ndarray, " pixels"] | None = None,
+    **bar: float,
+) -> None:
+    """Draw a map (:func:`mollweide`) with its title and a colour bar of its own."""
+    image = mollweide(axes, pixels, norm=norm, cmap=cmap, highest_altitude=altitude)
+    colour_bar(axes.figure, image, axes, label=unit, extend="both", **bar)
+    axes.set_title(title)
 
 
 def view(pixels: Float[np.ndarray, " pixels"]) -> Float[np.ndarray, "height width"]:

@@ -1,17 +1,11 @@
-"""Figures of maps, spectra and fidelity: of a channel, of a cube, of several runs.
-
-Figures of one channel: its data, its beams, its maps and its spectra.
-
-Figures of a run of several frequencies.
-
-Figures of several finished runs: their maps on one scale, their curves in one panel.
-"""
+"""Figures of maps, spectra and fidelity: of a channel, of a cube, of several finished runs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
@@ -23,16 +17,20 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.chi2 import ell_cross
 from lusee_bayes.report.figures.drawing import (
     BLUE,
+    COLOURS,
     DIVERGING,
     GREY,
+    LINES,
     ORANGE,
     SEQUENTIAL,
-    colour_bar,
-    mollweide,
+    framed,
+    in_places,
     orthographic,
     seen_range,
     shown,
+    sky_panel,
     taper_fwhm_deg,
+    temperatures,
     without_minor_ticks,
 )
 from lusee_bayes.results.channel import ChannelResult
@@ -42,8 +40,7 @@ from lusee_bayes.results.finished_runs import FinishedRun
 
 def data_vector(data: Visibilities) -> Figure:
     """The data vector as the paper draws it: products side by side, time running within each."""
-    figure = Figure(figsize=(11, 4))
-    axes = figure.subplots(gridspec_kw={"left": 0.08, "right": 0.99, "bottom": 0.13, "top": 0.91})
+    figure, (axes,) = in_places((11, 4), left=0.08, right=0.99, bottom=0.13, top=0.91)
     n_times = data.layout.n_times
     axes.plot(data.grid().ravel(), color=BLUE, lw=0.7)
     for k in range(1, data.layout.n_products):
@@ -69,9 +66,8 @@ def beams(setup: Setup) -> Figure:
     if not setup.scenario.beam.is_file:
         names = {0: "auto 00 (North)", 2: "|cross 02| (opposite)", 1: "|cross 01| (perpendicular)"}
     panels = [(name, patterns[0, k]) for k, name in names.items() if k < len(patterns)]
-    figure = Figure(figsize=(11, 4))
     places = {"left": 0.01, "right": 0.99, "bottom": 0.02, "top": 0.82, "wspace": 0.04}
-    grid_of_axes = np.atleast_1d(figure.subplots(1, len(panels), gridspec_kw=places))
+    figure, grid_of_axes = in_places((11, 4), 1, len(panels), **places)
     for axes, (title, pattern) in zip(grid_of_axes, panels, strict=True):
         image = orthographic(axes, grid, pattern)
         axes.set_title(title)
@@ -92,25 +88,21 @@ def sky_maps(channel: ChannelResult) -> Figure:
         percent = 100.0 * (mean - sky) / level
         span = np.percentile(np.abs(percent), 99.0)
         extra = {"mean - truth": (percent, Normalize(-span, span), DIVERGING, "% of the mean sky")}
-    positive = np.percentile(sky[sky > 0], [0.05, 99.8])
-    temperature = (LogNorm(*positive), SEQUENTIAL, "K")
-    bounds = LogNorm(*seen_range(channel.pixel_std, channel.highest_altitude))
+    altitude, scale = channel.highest_altitude, temperatures(sky, 0.05)
     panels = {
-        **({"truth": (sky, *temperature)} if extra else {}),
-        "posterior mean": (mean, *temperature),
+        **({"truth": (sky, scale)} if extra else {}),
+        "posterior mean": (mean, scale),
         **extra,
-        "posterior standard deviation": (channel.pixel_std, bounds, SEQUENTIAL, "K"),
+        "posterior standard deviation": (
+            channel.pixel_std,
+            LogNorm(*seen_range(channel.pixel_std, altitude)),
+        ),
     }
     rows = (len(panels) + 1) // 2
-    figure = Figure(figsize=(12, 3.6 * rows))
     places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.88, "wspace": 0.06}
-    grid_of_axes = figure.subplots(rows, 2, gridspec_kw=places | {"hspace": 0.12}).ravel()
-    for axes, (title, (pixels, norm, cmap, unit)) in zip(grid_of_axes, panels.items(), strict=True):
-        image = mollweide(
-            axes, pixels, norm=norm, cmap=cmap, highest_altitude=channel.highest_altitude
-        )
-        colour_bar(figure, image, axes, label=unit, shrink=0.8, extend="both", pad=0.03)
-        axes.set_title(title)
+    figure, grid_of_axes = in_places((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
+    for axes, (title, panel) in zip(grid_of_axes, panels.items(), strict=True):
+        sky_panel(axes, title, *panel, altitude=altitude, shrink=0.8, pad=0.03)
     figure.suptitle(
         f"{channel.frequency_mhz:g} MHz, Galactic coordinates; dashed: never above the horizon\n"
         f"{', '.join(list(panels)[:-1])}: seen through a beam of "
@@ -121,40 +113,46 @@ def sky_maps(channel: ChannelResult) -> Figure:
 
 def map_fidelity(channel: ChannelResult) -> Figure:
     """rho_ell and SNR_ell where the truth is known, and how much of each ell the prior supplies."""
-    sky_spectra = channel.spectra()
-    known = "snr" in sky_spectra
-    figure = Figure(figsize=(12 if known else 5, 4))
+    spectra = channel.spectra()
+    known = "snr" in spectra
     places = {"left": 0.06 if known else 0.14, "right": 0.98, "bottom": 0.13, "top": 0.9}
-    axes = np.atleast_1d(
-        figure.subplots(1, 3 if known else 1, gridspec_kw=places | {"wspace": 0.25})
-    )
-    ell = sky_spectra["ell"][1:]
-    axes[-1].plot(ell, sky_spectra["prior_fraction"][1:], color=BLUE)
-    axes[-1].axhline(0.5, color=GREY, lw=0.8, ls=":")
-    axes[-1].set(ylabel="share of the variance from the prior", ylim=(0, 1.02))
+    figure, panels = in_places((12 if known else 5, 4), 1, 3 if known else 1, **places, wspace=0.25)
+    _fidelity(panels, spectra, color=BLUE)
+    panels[-1].axhline(0.5, color=GREY, lw=0.8, ls=":")
     if known:
-        axes[0].plot(ell, sky_spectra["rho"][1:], color=BLUE)
-        axes[0].axhline(0.0, color=GREY, lw=0.8)
-        axes[0].set(ylabel=r"correlation with the truth $\rho_\ell$", ylim=(-0.25, 1.05))
-        axes[1].semilogy(ell, sky_spectra["snr"][1:], color=BLUE)
-        axes[1].axhline(1.0, color=GREY, lw=0.8, ls=":")
-        axes[1].set(ylabel=r"$\mathrm{SNR}_\ell$")
-        without_minor_ticks(axes[1].yaxis)
-        cross = ell_cross(sky_spectra["snr"])
+        panels[0].axhline(0.0, color=GREY, lw=0.8)
+        panels[1].axhline(1.0, color=GREY, lw=0.8, ls=":")
+        without_minor_ticks(panels[1].yaxis)
+        cross = ell_cross(spectra["snr"])
         if cross is not None:
-            axes[1].axvline(cross, color=ORANGE, lw=1, ls="--", label=f"first below 1: {cross}")
-            axes[1].legend(frameon=False)
-    for panel in axes:
-        panel.set(xlabel=r"multipole $\ell$", xlim=(1, ell[-1]))
+            panels[1].axvline(cross, color=ORANGE, lw=1, ls="--", label=f"first below 1: {cross}")
+            panels[1].legend(frameon=False)
+    for axes in panels:
+        axes.set(xlim=(1, spectra["ell"][-1]))
     figure.suptitle(f"Fidelity at {channel.frequency_mhz:g} MHz")
     return figure
+
+
+def _fidelity(
+    panels: Sequence[Axes], spectra: Mapping[str, np.ndarray], label: str | None = None, **style
+) -> None:
+    """Curves of the prior's share in the last panel, and of rho and SNR before it, if there are."""
+    ell = spectra["ell"][1:]
+    panels[-1].plot(ell, spectra["prior_fraction"][1:], label=label, **style)
+    panels[-1].set(ylabel="share of the variance from the prior", ylim=(0, 1.02))
+    if len(panels) > 1:
+        panels[0].plot(ell, spectra["rho"][1:], **style)
+        panels[0].set(ylabel=r"correlation with the truth $\rho_\ell$", ylim=(-0.25, 1.05))
+        panels[1].semilogy(ell, spectra["snr"][1:], **style)
+        panels[1].set(ylabel=r"$\mathrm{SNR}_\ell$")
+    for axes in panels:
+        axes.set(xlabel=r"multipole $\ell$")
 
 
 def sky_spectra(channel: ChannelResult) -> Figure:
     """C_ell of prior, posterior mean, truth and posterior variance."""
     columns = channel.spectra()
-    figure = Figure(figsize=(6, 4.5))
-    axes = figure.subplots(gridspec_kw={"left": 0.13, "right": 0.97, "bottom": 0.12, "top": 0.92})
+    figure, (axes,) = in_places((6, 4.5), left=0.13, right=0.97, bottom=0.12, top=0.92)
     ell = columns["ell"]
     styles = {
         "cl_prior": ("prior", GREY, "-"),
@@ -181,31 +179,21 @@ def channel_maps(cube: CubeResult) -> Figure:
     n = len(cube.frequencies_mhz)
     shown = np.unique(np.linspace(0, n - 1, min(n, SHOWN)).round().astype(int))
     mean, pixel_std = cube.maps()["mean"], cube.stacked("pixel_std")
-    figure = Figure(figsize=(12, 3.4 * len(shown) + 0.4), layout="constrained")
-    for row, k in enumerate(shown):
-        positive = LogNorm(*np.percentile(mean[k][mean[k] > 0], [0.5, 99.8]))
-        altitude = cube.channels[k].highest_altitude
-        spread = LogNorm(*seen_range(pixel_std[k], altitude))
-        for column, (title, pixels, norm, unit) in enumerate(
-            (
-                ("posterior mean", mean[k], positive, "K"),
-                ("standard deviation", pixel_std[k], spread, "K"),
-            )
-        ):
-            axes = figure.add_subplot(len(shown), 2, 2 * row + column + 1)
-            image = mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
-            colour_bar(figure, image, axes, label=unit, shrink=0.85, extend="both")
-            axes.set_title(f"{cube.frequencies_mhz[k]:g} MHz: {title}")
+    figure, rows = framed((12, 3.4 * len(shown) + 0.4), len(shown), 2, squeeze=False)
+    for k, (left, right) in zip(shown, rows, strict=True):
+        name = f"{cube.frequencies_mhz[k]:g} MHz"
+        options = {"altitude": cube.channels[k].highest_altitude, "shrink": 0.85}
+        spread = LogNorm(*seen_range(pixel_std[k], cube.channels[k].highest_altitude))
+        sky_panel(left, f"{name}: posterior mean", mean[k], temperatures(mean[k]), **options)
+        sky_panel(right, f"{name}: standard deviation", pixel_std[k], spread, **options)
     return figure
 
 
 def channel_spectra(cube: CubeResult) -> Figure:
     """Brightness against frequency in some directions, with one standard deviation."""
     landmarks = cube.landmarks()
-    figure = Figure(figsize=(11, 7), layout="constrained")
-    for axes, (name, values) in zip(
-        figure.subplots(2, 2, sharex=True).flat, landmarks.items(), strict=True
-    ):
+    figure, panels = framed((11, 7), 2, 2, sharex=True)
+    for axes, (name, values) in zip(panels.flat, landmarks.items(), strict=True):
         f, mean, std = cube.frequencies_mhz, values["mean"], values["std"]
         axes.errorbar(f, mean, std, color=BLUE, fmt=".", ms=4, lw=1, label="posterior")
         if "truth" in values:
@@ -226,8 +214,7 @@ def channel_fidelity(cube: CubeResult) -> Figure:
     values = snr if known else cube.stacked("prior_fraction")
     label = r"$\mathrm{SNR}_\ell$" if known else "share of the variance from the prior"
     norm = LogNorm(0.3, 30.0) if known else Normalize(0.0, 1.0)
-    figure = Figure(figsize=(12, 4.4), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = framed((12, 4.4), 1, 2)
     ell, channel = np.arange(values.shape[1]), np.arange(values.shape[0])
     image = left.pcolormesh(
         ell[1:], channel, values[:, 1:], norm=norm, cmap=SEQUENTIAL, shading="nearest"
@@ -251,8 +238,7 @@ def channel_fidelity(cube: CubeResult) -> Figure:
 
 def chi2(cube: CubeResult) -> Figure:
     """chi^2 that judges every channel, over its mean if the model holds."""
-    figure = Figure(figsize=(8, 4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = framed((8, 4))
     fits = cube.fits()
     ratio, width = fits.chi2 / fits.degrees, np.sqrt(2.0 / fits.degrees)
     axes.fill_between(
@@ -266,48 +252,28 @@ def chi2(cube: CubeResult) -> Figure:
     return figure
 
 
-# distinct without colour vision (Okabe-Ito), and by their lines
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000")
-LINES = ("-", "--", "-.", ":")
-
-
 def maps_of_runs(runs: Sequence[FinishedRun]) -> Figure:
     """Posterior mean and standard deviation of every run, each kind on one scale."""
-    means = np.concatenate([run.mean for run in runs])
-    positive = LogNorm(*np.percentile(means[means > 0], [0.5, 99.8]))
+    scale = temperatures(np.concatenate([run.mean for run in runs]))
     bounds = [seen_range(run.std, run.diagnostics["highest_altitude"].values) for run in runs]
     spread = LogNorm(min(low for low, _ in bounds), max(high for _, high in bounds))
-    figure = Figure(figsize=(12, 3.4 * len(runs) + 0.4), layout="constrained")
-    for row, run in enumerate(runs):
-        altitude = run.diagnostics["highest_altitude"].values
-        for column, (title, pixels, norm) in enumerate(
-            (("mean", run.mean, positive), ("standard deviation", run.std, spread))
-        ):
-            axes = figure.add_subplot(len(runs), 2, 2 * row + column + 1)
-            image = mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
-            colour_bar(figure, image, axes, label="K", shrink=0.85, extend="both")
-            axes.set_title(f"{run.name}: {title}")
+    figure, rows = framed((12, 3.4 * len(runs) + 0.4), len(runs), 2, squeeze=False)
+    for run, (left, right) in zip(runs, rows, strict=True):
+        options = {"altitude": run.diagnostics["highest_altitude"].values, "shrink": 0.85}
+        sky_panel(left, f"{run.name}: mean", run.mean, scale, **options)
+        sky_panel(right, f"{run.name}: standard deviation", run.std, spread, **options)
     return figure
 
 
 def curves_of_runs(runs: Sequence[FinishedRun]) -> Figure:
     """rho_ell and SNR_ell where the truth is known, and the prior's share, of every run."""
     known = all("snr" in run.spectra for run in runs)
-    figure = Figure(figsize=(12 if known else 6, 4.2), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, 3 if known else 1))
+    figure, panels = framed((12 if known else 6, 4.2), 1, 3 if known else 1, squeeze=False)
+    panels = list(panels.flat)
     for k, run in enumerate(runs):
         style = {"color": COLOURS[k % len(COLOURS)], "ls": LINES[k % len(LINES)], "lw": 1.3}
-        ell = run.spectra["ell"][1:]
-        panels[-1].plot(ell, run.spectra["prior_fraction"][1:], label=run.name, **style)
-        if known:
-            panels[0].plot(ell, run.spectra["rho"][1:], **style)
-            panels[1].semilogy(ell, run.spectra["snr"][1:], **style)
-    panels[-1].set(ylabel="share of the variance from the prior", ylim=(0, 1.02))
+        _fidelity(panels, run.spectra, run.name, **style)
     if known:
-        panels[0].set(ylabel=r"correlation with the truth $\rho_\ell$", ylim=(-0.25, 1.05))
-        panels[1].set(ylabel=r"$\mathrm{SNR}_\ell$")
         panels[1].axhline(1.0, color=GREY, lw=0.8)
-    for axes in panels:
-        axes.set(xlabel=r"multipole $\ell$")
     panels[-1].legend(frameon=False, fontsize=8)
     return figure

@@ -1,14 +1,8 @@
-"""Figures of forecasts and of priors side by side.
-
-The figure of a plan: the information in every variation, side by side.
-
-The figure of one data set under several priors: evidence, coverage, errors.
-"""
+"""Figures of forecasts, and of one data set under several priors, side by side."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,8 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from lusee_bayes.core.harmonics import power_spectrum
 from lusee_bayes.judge.coverage import LEVELS
-from lusee_bayes.report.figures.drawing import BLUE, GREY, ORANGE
-from lusee_bayes.report.figures.maps import COLOURS, LINES
+from lusee_bayes.report.figures.drawing import BLUE, COLOURS, GREY, LINES, ORANGE, framed
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast
 from lusee_bayes.results.prior_comparison import PriorComparison
 
@@ -26,22 +19,12 @@ from lusee_bayes.results.prior_comparison import PriorComparison
 STYLES = ((BLUE, "o"), (ORANGE, "s"), ("#009E73", "^"), ("#000000", "D"))
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One number of a forecast: the words of its axis, and its ``value`` (None: there is none)."""
-
-    label: str
-    attribute: str
-
-    def value(self, forecast: Forecast) -> float | int | None:
-        return getattr(forecast, self.attribute)
-
-
-PANELS = (
-    Panel("information about the sky [bits]", "information_bits"),
-    Panel("modes with expected SNR > 1 [number]", "modes"),
-    Panel(r"first $\ell$ with expected SNR$_\ell$ < 1", "ell_cross"),
-)
+# numbers of a forecast, with the words of their axes; one that is None is not reached
+PANELS = {
+    "information_bits": "information about the sky [bits]",
+    "modes": "modes with expected SNR > 1 [number]",
+    "ell_cross": r"first $\ell$ with expected SNR$_\ell$ < 1",
+}
 
 
 def forecasts(planned: Sequence[Forecast]) -> Figure:
@@ -49,20 +32,19 @@ def forecasts(planned: Sequence[Forecast]) -> Figure:
 
     Dashed: each scenario as given. An open marker beyond lmax: SNR > 1 at every ell.
     """
-    rows = row_positions(planned)
+    rows = _row_positions(planned)
     sources = list(dict.fromkeys(f.variation.source for f in planned))
-    height = 1.6 + 0.23 * (max(rows.values()) + 1)
-    figure = Figure(figsize=(11.5, height), layout="constrained")
-    axes = figure.subplots(1, len(PANELS), sharey=True)
+    size = (11.5, 1.6 + 0.23 * (max(rows.values()) + 1))
+    figure, axes = framed(size, 1, len(PANELS), sharey=True)
     for number, source in enumerate(sources):
         mine = [f for f in planned if f.variation.source == source]
         # beside one another, so that equal values do not hide
         lower = 0.2 * (number - (len(sources) - 1) / 2)
         own = {row: y + lower for row, y in rows.items()}
-        for panel, axis in zip(PANELS, axes, strict=True):
-            draw(axis, panel, mine, own, STYLES[number % len(STYLES)], len(sources) == 1)
-    for panel, axis in zip(PANELS, axes, strict=True):
-        axis.set_xlabel(panel.label)
+        for name, axis in zip(PANELS, axes, strict=True):
+            _marks(axis, name, mine, own, STYLES[number % len(STYLES)], len(sources) == 1)
+    for label, axis in zip(PANELS.values(), axes, strict=True):
+        axis.set_xlabel(label)
         axis.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         axis.grid(axis="x", alpha=0.3, lw=0.5)
         for (_, name), y in rows.items():
@@ -71,19 +53,15 @@ def forecasts(planned: Sequence[Forecast]) -> Figure:
         axis.margins(x=0.14)
         axis.tick_params(axis="y", length=0)
         axis.spines[["top", "right", "left"]].set_visible(False)
-    label_rows(axes[0], rows)
+    _label_rows(axes[0], rows)
     if len(sources) > 1:
-        figure.legend(
-            *axes[0].get_legend_handles_labels(),
-            loc="outside lower center",
-            ncols=4,
-            frameon=False,
-        )
-    figure.suptitle(title(planned, sources))
+        handles = axes[0].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=4, frameon=False)
+    figure.suptitle(_title(planned, sources))
     return figure
 
 
-def row_positions(planned: Sequence[Forecast]) -> dict[tuple[str, str], int]:
+def _row_positions(planned: Sequence[Forecast]) -> dict[tuple[str, str], int]:
     """The row of every (family, variation) and of each family's own name, (family, "")."""
     rows: dict[tuple[str, str], int] = {}
     families = dict.fromkeys(f.variation.family for f in planned)
@@ -96,9 +74,9 @@ def row_positions(planned: Sequence[Forecast]) -> dict[tuple[str, str], int]:
     return rows
 
 
-def draw(
+def _marks(
     axes: Axes,
-    panel: Panel,
+    number: str,
     mine: Sequence[Forecast],
     rows: dict[tuple[str, str], float],
     style: tuple[str, str],
@@ -107,7 +85,7 @@ def draw(
     """The marks of one scenario in one panel; ``numbers``: with their values beside them."""
     colour, marker = style
     for forecast in mine:
-        value = panel.value(forecast)
+        value = getattr(forecast, number)
         # without a crossing, one ell beyond the last
         x = len(forecast.snr_squared) if value is None else value
         y = rows[forecast.variation.family, forecast.variation.name]
@@ -116,21 +94,15 @@ def draw(
         axes.plot(x, y, marker, color=colour, mfc=face, ms=6, label=label)
         if numbers:
             text = f"> {x - 1}" if value is None else f"{value:.0f}"
-            axes.annotate(
-                text,
-                (x, y),
-                (7, 0),
-                textcoords="offset points",
-                va="center",
-                fontsize=8,
-                bbox={"fc": "white", "ec": "none", "pad": 0.8},
-            )
-    reference = panel.value(mine[0])
+            box = {"fc": "white", "ec": "none", "pad": 0.8}
+            style = {"textcoords": "offset points", "va": "center", "fontsize": 8, "bbox": box}
+            axes.annotate(text, (x, y), (7, 0), **style)
+    reference = getattr(mine[0], number)
     if reference is not None:
         axes.axvline(reference, color=colour, lw=0.9, ls="--", zorder=0)
 
 
-def label_rows(axes: Axes, rows: dict[tuple[str, str], int]) -> None:
+def _label_rows(axes: Axes, rows: dict[tuple[str, str], int]) -> None:
     """Name every row from the top down; the families' names stand out."""
     axes.set_yticks(list(rows.values()), [name or family for family, name in rows])
     axes.set_ylim(max(rows.values()) + 0.7, -0.7)
@@ -141,7 +113,7 @@ def label_rows(axes: Axes, rows: dict[tuple[str, str], int]) -> None:
             tick.set_color(GREY)
 
 
-def title(planned: Sequence[Forecast], sources: Sequence[str]) -> str:
+def _title(planned: Sequence[Forecast], sources: Sequence[str]) -> str:
     """What was planned, with frequency and lmax where all have the same."""
     scenarios = [f.variation.scenario for f in planned]
     found = ", ".join(sources) if len(sources) == 1 else f"{len(sources)} scenarios"
@@ -163,8 +135,7 @@ MARKERS = {"product": "s", "day": "o"}
 def priors(result: PriorComparison) -> Figure:
     """Draw differences of ln evidence and of ln p, coverage by latitude, and spectra of errors."""
     known = result.known_sky
-    figure = Figure(figsize=(14 if known else 9.5, 4.4), layout="constrained")
-    panels = figure.subplots(1, 3 if known else 2)
+    figure, panels = framed((14 if known else 9.5, 4.4), 1, 3 if known else 2)
     _evidence(panels[0], result)
     if known:
         _coverage(panels[1], result)

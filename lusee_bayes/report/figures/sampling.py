@@ -1,13 +1,8 @@
-"""Figures of chains and draws.
-
-Figures that show whether chains can be trusted: ArviZ's, and the analytic posterior.
-
-Figures of sampled runs and of their validation. Each function returns a matplotlib Figure.
-"""
+"""Figures of chains and draws: whether they can be trusted, and what they say."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import arviz_base
 import arviz_plots
@@ -15,7 +10,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 from matplotlib import pyplot
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from lusee_bayes.core.harmonics import mode_numbers
@@ -27,10 +22,12 @@ from lusee_bayes.report.figures.drawing import (
     GREY,
     ORANGE,
     SEQUENTIAL,
-    colour_bar,
-    mollweide,
+    Size,
+    framed,
     note,
     plain_ticks,
+    sky_panel,
+    temperatures,
 )
 from lusee_bayes.results.sample_result import SampleResult
 from lusee_bayes.sampling.hmc import N_BINS
@@ -42,7 +39,6 @@ N_RANKS, N_PAIRS = 8, 5
 # draws of a chain from which ranks and densities can be estimated
 FEWEST = 4
 TOO_FEW = f"not drawn: a chain has fewer than {FEWEST} draws, or has not moved"
-SIZE = {"layout": "constrained"}
 
 Quantities = dict[str, Float[np.ndarray, "chains draws"]]
 
@@ -52,47 +48,26 @@ def ranks(quantities: Quantities) -> Figure:
 
     The grey band holds 99 % of the curves of chains that agree.
     """
-    title = "Ranks among the draws of all chains, one curve for each chain"
     chosen = dict(list(quantities.items())[:N_RANKS])
-    if not _vary(chosen.values()):
-        return note(title, TOO_FEW)
-    rows = (len(chosen) + 3) // 4
-    collection = arviz_plots.plot_rank(
-        arviz_base.from_dict({"posterior": chosen}),
-        backend="matplotlib",
-        figure_kwargs={**SIZE, "figsize": (12, 2.6 * rows + 0.4)},
-    )
-    return _figure(collection, title)
+    size = (12, 2.6 * ((len(chosen) + 3) // 4) + 0.4)
+    title = "Ranks among the draws of all chains, one curve for each chain"
+    return _drawn(arviz_plots.plot_rank, "posterior", chosen, title, size)
 
 
 def energy(statistics: xr.Dataset) -> Figure:
     """Energies of the draws about their mean, their changes from draw to draw, and BFMI."""
-    title, energies = (
-        "Energies; BFMI below 0.3: chains that move slowly",
-        statistics["energy"],
-    )
-    if not _vary([energies.values]):
-        return note(title, TOO_FEW)
-    tree = arviz_base.from_dict({"sample_stats": {"energy": energies.values}})
-    collection = arviz_plots.plot_energy(
-        tree, backend="matplotlib", figure_kwargs={**SIZE, "figsize": (11, 3.6)}
-    )
-    return _figure(collection, title)
+    energies = {"energy": statistics["energy"].values}
+    title = "Energies; BFMI below 0.3: chains that move slowly"
+    return _drawn(arviz_plots.plot_energy, "sample_stats", energies, title, (11, 3.6))
 
 
 def pairs(quantities: Quantities) -> Figure:
     """Draws of the first quantities against each other."""
     chosen = dict(list(quantities.items())[:N_PAIRS])
-    if not _vary(chosen.values()):
-        return note("Pairs of quantities", TOO_FEW)
     side = 2.2 * len(chosen) + 0.6
-    collection = arviz_plots.plot_pair(
-        arviz_base.from_dict({"posterior": chosen}),
-        visuals={"scatter": {"alpha": 0.3}, "divergence": False},
-        backend="matplotlib",
-        figure_kwargs={**SIZE, "figsize": (side, side)},
-    )
-    figure = _figure(collection, "Pairs of quantities")
+    visuals = {"scatter": {"alpha": 0.3}, "divergence": False}
+    size, title = (side, side), "Pairs of quantities"
+    figure = _drawn(arviz_plots.plot_pair, "posterior", chosen, title, size, visuals=visuals)
     for axes in figure.axes:
         plain_ticks(axes, 3)
         axes.tick_params(labelsize=8)
@@ -101,13 +76,32 @@ def pairs(quantities: Quantities) -> Figure:
     return figure
 
 
+def _drawn(
+    plot: Callable[..., arviz_plots.PlotCollection],
+    group: str,
+    quantities: Quantities,
+    title: str,
+    size: Size,
+    **options: object,
+) -> Figure:
+    """ArviZ's figure, which pyplot then forgets; a note where draws do not suffice for it."""
+    if not _vary(quantities.values()):
+        return note(title, TOO_FEW)
+    tree = arviz_base.from_dict({group: quantities})
+    frame = {"layout": "constrained", "figsize": size}
+    collection = plot(tree, backend="matplotlib", figure_kwargs=frame, **options)
+    figure = collection.viz["figure"].item()
+    figure.suptitle(title)
+    pyplot.close(figure)
+    return figure
+
+
 def against_analytic(tree: xr.DataTree) -> Figure:
     """Means and standard deviations of the sky's draws against the analytic posterior."""
     skies, constants = tree["posterior"][SKY].values, tree["constant_data"]
     mean, std = constants["analytic_mean"].values, constants["analytic_std"].values
     flat = skies.reshape(-1, skies.shape[-1])
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = framed((11, 4), 1, 2)
     dots = {"ls": "", "marker": ".", "ms": 3, "color": BLUE}
     left.plot((flat.mean(axis=0) - mean) / std, **dots)
     left.axhline(0.0, color=GREY, lw=0.8)
@@ -126,14 +120,6 @@ def _vary(quantities: Iterable[Float[np.ndarray, "chains draws"]]) -> bool:
     )
 
 
-def _figure(collection: arviz_plots.PlotCollection, title: str) -> Figure:
-    """The figure of a collection, which pyplot then forgets."""
-    figure = collection.viz["figure"].item()
-    figure.suptitle(title)
-    pyplot.close(figure)
-    return figure
-
-
 # four chains that are distinct without colour vision (Okabe-Ito), again from the first after that
 CHAIN_COLOURS = (BLUE, ORANGE, "#009E73", "#000000")
 
@@ -144,7 +130,6 @@ def uncertainty(run: SampleResult) -> Figure:
     chains, draws = run.skies.shape[:2]
     if chains * draws < 2:
         return note("Uncertainty of the drawn maps", "not drawn: a single draw has no spread")
-    positive = np.percentile(maps["mean"][maps["mean"] > 0], [0.5, 99.8])
     level = maps["mean"].mean()
     width = maps["upper"] - maps["lower"]
     spread, interval = 100.0 * maps["std"] / level, 100.0 * width / level
@@ -154,7 +139,7 @@ def uncertainty(run: SampleResult) -> Figure:
     limit = np.percentile(np.abs(skewness), 99.0)
     percent = "% of the mean sky"
     panels = [
-        ("mean of the draws", maps["mean"], LogNorm(*positive), SEQUENTIAL, "K"),
+        ("mean of the draws", maps["mean"], temperatures(maps["mean"]), SEQUENTIAL, "K"),
         ("standard deviation", spread, _range(spread), SEQUENTIAL, percent),
         ("width of the 90 % interval", interval, _range(interval), SEQUENTIAL, percent),
         (
@@ -167,12 +152,9 @@ def uncertainty(run: SampleResult) -> Figure:
     ]
     nside = run.experiment.scenario.map_nside
     altitude = highest_altitude(run.experiment.data.observation, nside)
-    figure = Figure(figsize=(12, 7.2), layout="constrained")
-    for position, (title, pixels, norm, cmap, unit) in enumerate(panels):
-        axes = figure.add_subplot(2, 2, position + 1)
-        image = mollweide(axes, pixels, norm=norm, cmap=cmap, highest_altitude=altitude)
-        colour_bar(figure, image, axes, label=unit, shrink=0.85, extend="both")
-        axes.set_title(title)
+    figure, grid_of_axes = framed((12, 7.2), 2, 2)
+    for axes, panel in zip(grid_of_axes.flat, panels, strict=True):
+        sky_panel(axes, *panel, altitude=altitude, shrink=0.85)
     figure.suptitle(
         f"{chains} x {draws} draws of {run.tree.attrs['program']} at "
         f"{run.experiment.scenario.frequency_mhz:g} MHz, Galactic coordinates; dashed: never above "
@@ -188,8 +170,8 @@ def _range(values: Float[np.ndarray, " pixels"]) -> Normalize:
 def traces(run: SampleResult) -> Figure:
     """Draws of other sites, of the first modes and of landmarks against time, with histograms."""
     columns = list(run.quantities().items())[:8]
-    figure = Figure(figsize=(11, 1.7 * len(columns) + 0.8), layout="constrained")
-    grid = figure.subplots(len(columns), 2, width_ratios=(3, 1), squeeze=False)
+    size = (11, 1.7 * len(columns) + 0.8)
+    figure, grid = framed(size, len(columns), 2, width_ratios=(3, 1), squeeze=False)
     for (left, right), (name, draws) in zip(grid, columns, strict=True):
         # a range of a few rounding errors cannot be cut into bins
         moved = np.ptp(draws) > 1e-12 * np.abs(draws).max()
@@ -214,8 +196,7 @@ def traces(run: SampleResult) -> Figure:
 
 def comparison(result: Comparison) -> Figure:
     """HMC against the analytic posterior: means, variances, covariance, effective sizes."""
-    figure = Figure(figsize=(11, 7), layout="constrained")
-    (means, variances), (covariance, sizes) = figure.subplots(2, 2)
+    figure, ((means, variances), (covariance, sizes)) = framed((11, 7), 2, 2)
     ell, _ = mode_numbers(round(np.sqrt(len(result.mean_z))) - 1)
     limit = result.checks[0].upper
     dots = {"ls": "", "marker": ".", "ms": 3, "color": BLUE}
@@ -252,8 +233,8 @@ def comparison(result: Comparison) -> Figure:
 def rank_statistics(ranks: Ranks) -> Figure:
     """Rank histograms with the band of 99 % of the bins, and coverage of the regions."""
     shown = np.unique(np.linspace(0, len(ranks.names) - 1, 11).astype(int))
-    figure = Figure(figsize=(12, 7), layout="constrained")
-    panels = figure.subplots(3, 4).ravel()
+    figure, panels = framed((12, 7), 3, 4)
+    panels = panels.ravel()
     low, high = ranks.band()
     centres = (np.arange(N_BINS) + 0.5) / N_BINS
     histogram, p_values = ranks.histogram(), ranks.p_values()

@@ -1,8 +1,4 @@
-"""Small scenarios and skies that tests share.
-
-Small scenarios that tests share.
-
-Skies that no prior of the package draws: one too smooth for it, and one too spotty.
+"""Skies that no prior of the package draws: one too smooth for it, and one too spotty.
 
 Error bars have to hold for them, too. Both are positive, of about the Galaxy's brightness, and
 have the same pattern at all frequencies.
@@ -17,32 +13,7 @@ from jaxtyping import Float
 
 from lusee_bayes.core.harmonics import map_to_modes, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.sky.sky_source import Sky, SkySource
-
-
-def small_scenario(*overrides: str, lmax: int = 6, cycles: float = 0.02) -> Scenario:
-    """Return a small version of the paper's scenario: 49 modes and, by default, 96 data.
-
-    Tests that use the same sizes share the compiled programs.
-
-    Parameters
-    ----------
-    *overrides : str
-        ``key.path=value``, as on the command line.
-    lmax : int
-        Highest ell.
-    cycles : float
-        Length of the observation, in lunar days.
-
-    Returns
-    -------
-    Scenario
-        ``fiducial`` at these sizes: the embedded Galaxy without point sources.
-    """
-    sizes = [f"lmax={lmax}", f"observation.runs.0.cycles={cycles}"]
-    return load_scenario("fiducial", [*sizes, *overrides])
-
 
 # of the patterns, that of the mean sky; finer than they are wide
 NSIDE = 64

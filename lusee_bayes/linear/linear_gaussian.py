@@ -1,17 +1,14 @@
 """The linear Gaussian model d = A m + n, and its update with new data.
 
-The linear Gaussian model d = A m + n: a distribution over data, and its posterior over m.
-
-::
+It is a distribution over data, with a posterior over m, ::
 
     Lambda = A^T N^-1 A + S^-1,    C = Lambda^-1,    mean = C A^T N^-1 d
 
 The posterior is computed in a map-space form, of the size of the sky, or a data-space form, of the
 size of the data; :mod:`lusee_bayes.linear.solver` has the algebra of both.
 
-Update a posterior with new data; the old data are not needed any more.
-
-With the posterior m = m1 + R z, z ~ N(0, 1), new data d = A m + offset + n are data of z, ::
+A posterior is updated with new data without the old ones. With the posterior m = m1 + R z, z ~ N(0,
+1), new data d = A m + offset + n are data of z, ::
 
     d = (A R) z + (offset + A m1) + n,
 
@@ -30,8 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array, on_processor
-from lusee_bayes.core.checks import Described, require_finite, require_float64, require_shape
+from lusee_bayes.core.arrays import Array, DataVector, on_processor
+from lusee_bayes.core.checks import Described, require_array
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.instrument.coupling import Coupling, as_coupling
@@ -66,7 +63,7 @@ class LinearGaussian(Described, eqx.Module):
     coupling: Coupling = eqx.field(converter=as_coupling)
     prior: Prior
     noise: Covariance
-    offset: Float[Array, " data"] | None = None
+    offset: DataVector | None = None
 
     def __check_init__(self):
         n_data, n_unknowns = self.coupling.shape
@@ -81,9 +78,7 @@ class LinearGaussian(Described, eqx.Module):
                 "unknowns; give both the same lmax"
             )
         if self.offset is not None:
-            require_float64("the offset", self.offset)
-            require_shape("the offset", self.offset, (n_data,))
-            require_finite("the offset", self.offset)
+            require_array("the offset", self.offset, (n_data,))
 
     def description(self) -> tuple[str, ...]:
         offset = "" if self.offset is None else " + offset"
@@ -99,7 +94,7 @@ class LinearGaussian(Described, eqx.Module):
         """Number of data."""
         return self.coupling.shape[0]
 
-    def predict(self, sky: Float[Array, " unknowns"]) -> Float[Array, " data"]:
+    def predict(self, sky: Float[Array, " unknowns"]) -> DataVector:
         """Predict the mean data of a sky, without noise.
 
         Parameters
@@ -120,7 +115,7 @@ class LinearGaussian(Described, eqx.Module):
         seen = self.coupling @ sky
         return seen if self.offset is None else seen + self.offset
 
-    def chi2(self, sky: Float[Array, " unknowns"], data: Float[Array, " data"]) -> Float[Array, ""]:
+    def chi2(self, sky: Float[Array, " unknowns"], data: DataVector) -> Float[Array, ""]:
         """Compute ``|L^-1 (d - A m - offset)|^2``, with N = L L^T.
 
         Parameters
@@ -146,7 +141,7 @@ class LinearGaussian(Described, eqx.Module):
         centred = data if model.offset is None else data - model.offset
         return gradient_and_misfit(model.coupling, model.noise.factor(), centred, sky)[1]
 
-    def sample(self, key: PRNGKeyArray) -> tuple[Float[Array, " unknowns"], Float[Array, " data"]]:
+    def sample(self, key: PRNGKeyArray) -> tuple[Float[Array, " unknowns"], DataVector]:
         """Draw a sky from the prior, and data of that sky.
 
         Parameters
@@ -194,7 +189,7 @@ class LinearGaussian(Described, eqx.Module):
             raise InputError(f"unknown form '{form}'; {nearest(form, FORMS)}")
         return factorise(self.coupling, self.prior, self.noise, self.offset, form)
 
-    def condition(self, data: Float[Array, " data"], form: str | None = None) -> Posterior:
+    def condition(self, data: DataVector, form: str | None = None) -> Posterior:
         """Compute the posterior over the sky given data.
 
         Parameters
@@ -227,7 +222,7 @@ class LinearGaussian(Described, eqx.Module):
         enough = self.n_data >= self.prior.size
         return self.prior.invertible and enough and has_structure(self.coupling, self.noise)
 
-    def inform(self, data: Float[Array, " data"]) -> tuple[Information, Posterior]:
+    def inform(self, data: DataVector) -> tuple[Information, Posterior]:
         """Compute the information of data, and the posterior; see :meth:`Information.of`.
 
         Parameters
@@ -249,7 +244,7 @@ class LinearGaussian(Described, eqx.Module):
         """
         return Information.of(self.coupling, self.prior, self.noise, self.offset, data)
 
-    def log_prob(self, data: Float[Array, " data"]) -> Float[Array, ""]:
+    def log_prob(self, data: DataVector) -> Float[Array, ""]:
         """Compute the evidence ln p(d), with the sky integrated out. Differentiable.
 
         Parameters
@@ -311,7 +306,7 @@ def deviation_model(posterior: Posterior, model: LinearGaussian) -> LinearGaussi
     )
 
 
-def updated(posterior: Posterior, model: LinearGaussian, data: Float[Array, " data"]) -> Posterior:
+def updated(posterior: Posterior, model: LinearGaussian, data: DataVector) -> Posterior:
     """Compute the posterior given earlier data and new ones with independent noise.
 
     Gain drifts that go on from the earlier data into the new ones are not independent: they couple

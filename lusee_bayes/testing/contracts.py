@@ -1,21 +1,13 @@
 """Checks that every kind of a protocol has to pass.
 
-The contract of covariances.
-
-Bad input has to be refused.
-
-The contract of beam sources.
-
-The contract of coupling matrices.
-
-The contract of priors.
-
-The contract of sky sources.
+One function for each protocol: covariances, beam sources, coupling matrices, priors and sources of
+skies. Bad input has to be refused in a sentence.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -133,12 +125,11 @@ def check_covariance(
     # the square root: L L^T = N, whiten = L^-1, whiten_transpose = L^-T
     root = np.asarray(got["root"])
     close(root @ root.T, dense)
-    close(got["inverse_root"], np.linalg.inv(root))
-    close(got["inverse_root_transpose"], np.linalg.inv(root).T)
+    own = np.linalg.inv(root)
+    close(got["inverse_root"], own)
+    close(got["inverse_root_transpose"], own.T)
     close(got["back"], xs)
-    for value, matrix in zip(
-        got["one"], (root, np.linalg.inv(root), np.linalg.inv(root).T), strict=True
-    ):
+    for value, matrix in zip(got["one"], (root, own, own.T), strict=True):
         close(value, matrix @ x)
 
     # scaled
@@ -165,19 +156,20 @@ def check_slopes(cov: Covariance, dense: np.ndarray) -> None:
     np.testing.assert_allclose(of_scale, -x @ inverse @ x / 4.0, rtol=TOL)
 
 
-def _assert_draws_follow(draws: np.ndarray, covariance: np.ndarray) -> None:
-    """Second moments of draws (draws, entries) scatter by sqrt((C_ii C_jj + C_ij^2) / n) (Wick)."""
-    variance = np.diag(covariance)
+def _assert_draws_follow(
+    draws: np.ndarray, covariance: np.ndarray, mean: np.ndarray | float = 0.0
+) -> None:
+    """Moments of draws scatter by sqrt(C_ii / n), and sqrt((C_ii C_jj + C_ij^2) / n) (Wick)."""
+    variance, deviations = np.diag(covariance), draws - mean
+    second = np.sqrt(np.outer(variance, variance) + covariance**2)
     for found, expected, scatter in (
-        (draws.mean(0), 0.0, np.sqrt(variance)),
-        (
-            draws.T @ draws / len(draws),
-            covariance,
-            np.sqrt(np.outer(variance, variance) + covariance**2),
-        ),
+        (deviations.mean(0), 0.0, np.sqrt(variance)),
+        (deviations.T @ deviations / len(draws), covariance, second),
     ):
-        worst = np.abs(found - expected) / scatter * np.sqrt(len(draws))
-        assert worst.max() < norm.isf(FALSE_ALARM / (2 * worst.size))
+        worst = np.abs(found - expected) * np.sqrt(len(draws))
+        # what has no variance is exact, but for the rounding of a square root
+        limit = norm.isf(FALSE_ALARM / (2 * worst.size)) * scatter + 1e-9 * second.max()
+        assert (worst < limit).all()
 
 
 # relative error that sums of a few thousand terms may make
@@ -330,10 +322,7 @@ def check_coupling(coupling: Coupling, dense: Float[np.ndarray, "data unknowns"]
     sky, data = rng.standard_normal(n_unknowns), rng.standard_normal(n_data)
     m, d = jnp.asarray(sky), jnp.asarray(data)
 
-    def same(got, expected):
-        atol = ROUNDING * np.abs(expected).max()
-        np.testing.assert_allclose(got, expected, rtol=0, atol=atol)
-
+    same = partial(close, tol=ROUNDING)
     # A, A m and A^T d are those of the matrix, alone and inside transformations
     assert coupling.shape == dense.shape
     assert coupling.response is None
@@ -411,15 +400,15 @@ def check_prior(prior: Prior, covariance: np.ndarray, mean: np.ndarray | None = 
     inputs = u, a, white @ white.T, matrix @ matrix.T
     found = on_host(eqx.filter_jit(_numbers_of_prior)(on_device(prior), *map(jnp.asarray, inputs)))
     for name, value in _numbers_of_prior(on_host(prior), *map(np.array, inputs)).items():
-        _close(value, found[name])
+        close(value, found[name])
     root = found["root"]
-    _close(root @ root.T, covariance)
-    _close(found["covariance"], covariance)
-    _close(found["variance"], np.diag(covariance))
-    _close(found["coloured"], u @ root.T)
-    _close(found["columns"], a @ root)
-    _close(found["sandwich"], root.T @ inputs[3] @ root)
-    _close(found["colour_covariance"], root @ inputs[2] @ root.T)
+    close(root @ root.T, covariance)
+    close(found["covariance"], covariance)
+    close(found["variance"], np.diag(covariance))
+    close(found["coloured"], u @ root.T)
+    close(found["columns"], a @ root)
+    close(found["sandwich"], root.T @ inputs[3] @ root)
+    close(found["colour_covariance"], root @ inputs[2] @ root.T)
     expected = np.zeros(n) if mean is None else mean
     if prior.invertible:
         _check_inverse(prior, covariance, root, u, a @ root)
@@ -429,13 +418,13 @@ def check_prior(prior: Prior, covariance: np.ndarray, mean: np.ndarray | None = 
     if prior.white_mean is None:
         assert mean is None
     else:
-        _close(prior.colour(prior.white_mean), expected)
+        close(prior.colour(prior.white_mean), expected)
     wide = prior.widened(3.0)
-    _close(wide.covariance(), 9.0 * covariance)
+    close(wide.covariance(), 9.0 * covariance)
     if mean is not None:
-        _close(wide.colour(wide.white_mean), expected)
+        close(wide.colour(wide.white_mean), expected)
     assert prior.sample(jax.random.key(1)).shape == (n,)
-    _check_draws(np.asarray(prior.sample(jax.random.key(0), DRAWS)), expected, covariance)
+    _assert_draws_follow(np.asarray(prior.sample(jax.random.key(0), DRAWS)), covariance, expected)
 
 
 def _numbers_of_prior(prior: Prior, u, a, white, matrix):
@@ -457,10 +446,10 @@ def _check_inverse(
     powerless = np.diag(covariance) == 0
     for one in (on_host(prior), on_device(prior)):
         back = np.asarray(one.whiten(one.colour(u)))
-        _close(back, np.where(powerless, 0.0, u))
-        _close(one.whiten(one.colour(u[0, 0])), back[0, 0])
+        close(back, np.where(powerless, 0.0, u))
+        close(one.whiten(one.colour(u[0, 0])), back[0, 0])
         restored = np.asarray(one.whiten_columns(columns))
-        _close(restored @ root, columns)
+        close(restored @ root, columns)
         assert (restored[:, powerless] == 0.0).all()
     if powerless.any():
         assert_refused(prior.require_density)
@@ -468,25 +457,6 @@ def _check_inverse(
         return
     prior.require_density()
     np.testing.assert_allclose(prior.log_det(), 0.5 * np.linalg.slogdet(covariance)[1], atol=TOL)
-
-
-def _close(got: object, expected: object) -> None:
-    expected = np.asarray(expected)
-    np.testing.assert_allclose(got, expected, rtol=0, atol=TOL * np.abs(expected).max())
-
-
-def _check_draws(draws: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> None:
-    """Moments of draws scatter by sqrt(C_ii / n), and sqrt((C_ii C_jj + C_ij^2) / n) (Wick)."""
-    variance, deviations = np.diag(covariance), draws - mean
-    second = np.sqrt(np.outer(variance, variance) + covariance**2)
-    for found, expected, scatter in (
-        (deviations.mean(0), 0.0, np.sqrt(variance)),
-        (deviations.T @ deviations / DRAWS, covariance, second),
-    ):
-        worst = np.abs(found - expected) * np.sqrt(DRAWS)
-        # what has no variance is exact, but for the rounding of a square root
-        limit = norm.isf(FALSE_ALARM / (2 * worst.size)) * scatter + 1e-9 * second.max()
-        assert (worst < limit).all()
 
 
 def check_sky_source(

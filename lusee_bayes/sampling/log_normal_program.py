@@ -1,8 +1,7 @@
 """A log-normal sky as a program samples it.
 
-The prior of a positive sky, its C_ell known or not: what the program ``log_normal`` samples.
-
-Coordinates in which the posterior of a log-normal sky is straight, for the program of that name.
+The program ``log_normal`` samples a positive sky whose C_ell are known or not, in coordinates in
+which its posterior is straight.
 
 The data know some combinations of the map to 1e-6 of what the prior allows. In the logarithm s of
 the sky these are curved surfaces: what the data leave open moves the map by s + s^2 / 2 + ..., and
@@ -48,7 +47,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 
 from lusee_bayes.core.arrays import Array, on_device, on_host
-from lusee_bayes.core.checks import Described, number, require_positive, require_shape
+from lusee_bayes.core.checks import require_positive, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.linalg import (
@@ -66,7 +65,7 @@ from lusee_bayes.systematics.systematic import SKY, Chart
 STRUCTURE, AMPLITUDE, TILT = "structure", "amplitude", "tilt"
 
 
-class LogNormalPrior(Described, eqx.Module):
+class LogNormalPrior(eqx.Module):
     """A log-normal sky with C_ell = A^2 ((ell + 1) / 10)^tilt of its logarithm.
 
     ln A and the tilt are known, or Gaussian about these values.
@@ -123,14 +122,6 @@ class LogNormalPrior(Described, eqx.Module):
         if self.log_amplitude_std is not None:
             require_positive("the standard deviation of ln A", self.log_amplitude_std)
             require_positive("the standard deviation of the tilt", self.tilt_std)
-
-    def description(self) -> tuple[str, ...]:
-        known = "known" if self.log_amplitude_std is None else "not known"
-        return (
-            f"log-normal sky, A = {number(self.amplitude, '.4g')} and tilt = "
-            f"{number(self.tilt, '.4g')} {known}",
-            *self.sky.description(),
-        )
 
     @property
     def samples_spectrum(self) -> bool:
@@ -308,9 +299,7 @@ class LogNormalMode:
 
 
 def find_mode(
-    sky: LogNormalSky,
-    information: Information,
-    start: Float[np.ndarray, " unknowns"] | None = None,
+    sky: LogNormalSky, information: Information, start: Float[np.ndarray, " unknowns"] | None = None
 ) -> LogNormalMode:
     """Climb to the mode of p(u | d).
 
@@ -340,7 +329,8 @@ def find_mode(
     here, moved, damping, least = information.recentred(sky.modes(white)), np.inf, 0.0, 0.0
     for steps in range(MAX_STEPS + 1):
         jacobian = sky.jacobian(white)
-        curvature = _curvature(here, jacobian)
+        curvature = symmetric_product(jacobian.T @ here.matrix, jacobian)
+        curvature[np.diag_indices(len(curvature))] += 1.0
         lower = checked_cholesky("the curvature of the posterior", curvature)
         slope = white - jacobian.T @ here.vector
         half = solve_lower(lower, slope[:, None], transpose=False)
@@ -365,14 +355,6 @@ def find_mode(
         f"{moved:.2g} standard deviations); the data are far from anything that the template "
         "allows: check their scale, or raise log_normal.scale_std"
     )
-
-
-def _curvature(
-    information: Information, jacobian: Float[np.ndarray, "modes unknowns"]
-) -> Float[np.ndarray, "unknowns unknowns"]:
-    curvature = symmetric_product(jacobian.T @ information.matrix, jacobian)
-    curvature[np.diag_indices(len(curvature))] += 1.0
-    return curvature
 
 
 def _energy(information: Information, white: Float[np.ndarray, " unknowns"]) -> float:

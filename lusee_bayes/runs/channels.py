@@ -1,12 +1,10 @@
-"""The channels of a cube, each by itself, tied, or in one posterior.
+"""The channels of a cube, each by itself, tied, or in one posterior; a stopped run goes on.
 
-Positive skies of the channels of a run: their most probable fields.
+Channels are worked out alone, and then all together where a joint posterior of component maps, or
+positive skies, are asked for, from the information of every channel.
 
-The joint posterior of the component maps, from the information of every channel.
-
-Channels whose receivers have smooth spectra: each worked out alone, then all tied together.
-
-What port i's power is off by, z_i(f) in prior standard deviations, is a Gaussian process::
+Where receivers have smooth spectra, channels are tied. What port i's power is off by, z_i(f) in
+prior standard deviations, is a Gaussian process::
 
     K(f, f') = exp(-(log2 f - log2 f')^2 / (2 smooth_octaves^2)),    ports independent.
 
@@ -16,8 +14,6 @@ means E and covariance V of z, becomes that given all data (:mod:`.amplitudes`) 
     mean of m + G (E' - E),    covariance of m + G (V' - V) G^T,    G = Cov(m, z) V^-1,
 
 since m depends on other channels through z alone, and so do ground and gains.
-
-The channels of a cube, each on its own, tied, or in one posterior; a stopped run goes on.
 """
 
 from __future__ import annotations
@@ -51,7 +47,6 @@ from lusee_bayes.linear.positive_joint import (
     learn_laws,
     positive_sky,
 )
-from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.channel import ChannelResult, channel_of_information
 from lusee_bayes.results.cube import Components, CubeResult
 from lusee_bayes.results.draws import deviations, draw_key, posterior_draws
@@ -64,7 +59,6 @@ from lusee_bayes.runs.channel_files import (
 )
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.sky.positive_skies import PositiveSkies
-from lusee_bayes.sky.spectral_prior import SpectralPrior
 from lusee_bayes.sky.template import EmbeddedTemplate, galactic_share
 
 # highest ell of the fields, over that of the map
@@ -182,64 +176,44 @@ def solve_components(
         If data are too precise to be solved for, or positive skies do not settle.
     """
     channels = scenario.channels()
-    at_hand = ChannelsInFiles(channels, files, engine, stages)
+    at_hand, mode = ChannelsInFiles(channels, files, engine, stages), None
     if scenario.spectral.model == "positive":
-        return _positive(scenario, at_hand, n_draws, stages)
-    small = [files.read(channel, "information", ["reference", "sky"]) for channel in channels]
-    reference = np.array([np.asarray(s["reference"]) for s in small])
-    skies = np.array([np.asarray(s["sky"]) for s in small])
-    prior = scenario.spectral.prior(np.array(scenario.frequencies_mhz), skies)
-    return _direct(prior, scenario, at_hand, reference, n_draws, stages)
-
-
-def _positive(
-    scenario: Scenario, channels: ChannelsInFiles, n_draws: int, stages: Stages
-) -> Components:
-    mode = positive_mode(scenario, channels, stages)
+        mode = positive_mode(scenario, at_hand, stages)
+        prior, posterior, chi2 = mode.prior, mode.posterior, mode.energy
+    else:
+        small = [files.read(channel, "information", ["reference", "sky"]) for channel in channels]
+        reference, skies = (
+            np.array([np.asarray(s[name]) for s in small]) for name in ("reference", "sky")
+        )
+        prior = scenario.spectral.prior(np.array(scenario.frequencies_mhz), skies)
+        information = at_hand.summed(prior, reference, lambda _, information: information)
     with stages("joint posterior"):
-        found = _gaussian(mode.prior, mode.posterior, scenario, n_draws, mode.energy)
-    return replace(found, refinement=mode.moved, mode=mode)
-
-
-def _direct(
-    prior: SpectralPrior,
-    scenario: Scenario,
-    channels: ChannelsInFiles,
-    reference: np.ndarray,
-    n_draws: int,
-    stages: Stages,
-) -> Components:
-    information = channels.summed(prior, reference, lambda _, information: information)
-    with stages("joint posterior"):
-        posterior = component_posterior(information, prior)
-        chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
-        return _gaussian(prior, posterior, scenario, n_draws, chi2)
-
-
-def _gaussian(
-    prior: SpectralPrior,
-    posterior: Posterior,
-    scenario: Scenario,
-    n_draws: int,
-    chi2: float,
-) -> Components:
-    components, modes = prior.n_components, posterior.mean.shape[0] // prior.n_components
-    spread = jax.block_until_ready(paired(posterior.covariance(), prior))
-    draws = posterior.sample(draw_key(scenario), n_draws)
-    return Components(
-        prior,
-        posterior.mean.reshape(components, modes),
-        spread,
-        draws.reshape(n_draws, components, modes),
-        chi2,
-        float(posterior.log_evidence),
-        float(posterior.information_bits()),
-        float(posterior.refinement),
-    )
+        if mode is None:
+            posterior = component_posterior(information, prior)
+            chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
+        shape = (prior.n_components, posterior.mean.shape[0] // prior.n_components)
+        return Components(
+            prior,
+            posterior.mean.reshape(shape),
+            jax.block_until_ready(paired(posterior.covariance(), prior)),
+            posterior.sample(draw_key(scenario), n_draws).reshape(n_draws, *shape),
+            chi2,
+            float(posterior.log_evidence),
+            float(posterior.information_bits()),
+            float(posterior.refinement) if mode is None else mode.moved,
+            mode=mode,
+        )
 
 
 # numbers of a channel's own posterior
 NUMBERS = ("log_evidence", "information_bits", "chi2_model", "refinement")
+# arrays of it in a file, with their dimensions
+ARRAYS = {
+    "mean": ("mode",),
+    "covariance": ("mode", "mode_2"),
+    "draws": ("alone_draw", "mode"),
+    "compared": ("alone_more", "mode"),
+}
 # what the key of draws is folded with: numbers of channels are smaller
 TIED = 1 << 20
 
@@ -339,22 +313,14 @@ class ChannelAlone:
     def to_dataset(self) -> xr.Dataset:
         """All of it, for :meth:`from_dataset`."""
         found = self.known.to_dataset()
-        own = xr.Dataset(
-            {
-                "alone_mean": ("mode", self.mean),
-                "alone_covariance": (("mode", "mode_2"), self.covariance),
-                "alone_draws": (("alone_draw", "mode"), self.draws),
-                "alone_compared": (("alone_more", "mode"), self.compared),
-            }
-        )
+        own = {f"alone_{name}": (dims, getattr(self, name)) for name, dims in ARRAYS.items()}
         numbers = {f"alone_{name}": self.numbers[name] for name in NUMBERS}
-        return found.merge(own).assign_attrs(found.attrs | numbers)
+        return found.merge(xr.Dataset(own)).assign_attrs(found.attrs | numbers)
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset) -> ChannelAlone:
         """The inverse of :meth:`to_dataset`."""
-        names = ("mean", "covariance", "draws", "compared")
-        arrays = (np.asarray(dataset[f"alone_{name}"]) for name in names)
+        arrays = (np.asarray(dataset[f"alone_{name}"]) for name in ARRAYS)
         numbers = {name: float(dataset.attrs[f"alone_{name}"]) for name in NUMBERS}
         return cls(ChannelInformation.from_dataset(dataset), *arrays, numbers)
 
@@ -465,8 +431,7 @@ def cube_result(
     def observe(channel: Scenario) -> None:
         if files.has(channel, wanted):
             return
-        measured = None if data is None else read_data(data, channel)
-        experiment = build(channel, measured)
+        experiment = build(channel, None if data is None else read_data(data, channel))
         if truth:
             experiment = with_truth(experiment)
         with explained(experiment):
@@ -490,15 +455,8 @@ def cube_result(
             alone = ChannelAlone(known, mean, covariance, draws - mean, rest, numbers)
             files.write(channel, wanted, alone.to_dataset())
             return
-        found = channel_of_information(
-            known.observed,
-            information,
-            mean,
-            covariance,
-            draws,
-            compared=compared,
-            **numbers,
-        )
+        given = (known.observed, information, mean, covariance, draws)
+        found = channel_of_information(*given, compared=compared, **numbers)
         files.write(channel, wanted, found.to_dataset())
 
     def refusal(channel: Scenario) -> str:
@@ -538,14 +496,8 @@ def cube_result(
         skies = Tasks(write_sky, range(len(mapped)), [names_of((c,)) for c in mapped])
         engine.each(skies, stages, "joint skies")
     found = tuple(ChannelResult.from_dataset(files.read(c, "result")) for c in mapped)
-    return CubeResult(
-        scenario,
-        found,
-        components,
-        stages.seconds,
-        unmapped,
-        tie_log_evidence=tie_log_evidence,
-    )
+    tied_evidence = {"tie_log_evidence": tie_log_evidence}
+    return CubeResult(scenario, found, components, stages.seconds, unmapped, **tied_evidence)
 
 
 def _without(unmapped: dict[float, str], scenario: Scenario) -> Scenario:
@@ -578,25 +530,15 @@ def _write_joint_sky(
     if files.has(channel, "result"):
         return
     known = ChannelInformation.from_dataset(files.read(channel, "information"))
+    draws = components.draws
     if components.mode is not None:
+        spread = np.asarray(components.spread)
         sky = positive_sky(
-            components.mode,
-            number,
-            known.information,
-            np.asarray(components.spread),
-            np.asarray(components.draws),
-            key,
+            components.mode, number, known.information, spread, np.asarray(draws), key
         )
     else:
-        sky = channel_sky(
-            components.prior,
-            number,
-            known.information,
-            components.mean,
-            components.spread,
-            components.draws,
-            key,
-        )
+        means = (components.mean, components.spread, draws)
+        sky = channel_sky(components.prior, number, known.information, *means, key)
     found = channel_of_information(
         known.observed,
         known.information,

@@ -1,13 +1,4 @@
-"""Figures that judge data: residuals, pointing, unknowns, sessions.
-
-Figures of what diagnostics.nc holds: draws as maps, residuals by product and time.
-
-Which offset of clock and pointing each day would prefer.
-
-Receivers, ground and gain table against frequency.
-
-Flight data: gain states and flags in time, products before and after, gains and noise.
-"""
+"""Figures that judge data: draws and residuals, pointing, unknowns, and sessions with flags."""
 
 from __future__ import annotations
 
@@ -17,7 +8,7 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -32,8 +23,11 @@ from lusee_bayes.report.figures.drawing import (
     GREY,
     ORANGE,
     colour_bar,
+    framed,
+    in_places,
     mollweide,
     plain_ticks,
+    temperatures,
     without_minor_ticks,
 )
 from lusee_bayes.results.cube import CubeUnknowns
@@ -47,14 +41,13 @@ LEAST_P = 1e-10
 def draws_of_posterior(found: xr.Dataset) -> Figure:
     """Draws of the posterior as Galactic maps, on one scale."""
     maps = found["draws"].values
-    positive = np.percentile(maps[maps > 0], [0.5, 99.8])
+    scale = temperatures(maps)
     altitude = found["highest_altitude"].values
     rows = (len(maps) + 1) // 2
-    figure = Figure(figsize=(12, 3.6 * rows))
     places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.9, "wspace": 0.02}
-    grid_of_axes = figure.subplots(rows, 2, gridspec_kw=places | {"hspace": 0.12}).ravel()
+    figure, grid_of_axes = in_places((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
     for k, (axes, pixels) in enumerate(zip(grid_of_axes, maps, strict=True)):
-        image = mollweide(axes, pixels, norm=LogNorm(*positive), highest_altitude=altitude)
+        image = mollweide(axes, pixels, norm=scale, highest_altitude=altitude)
         axes.set_title(f"draw {k + 1}")
     colour_bar(figure, image, figure.axes, label="K", shrink=0.7, extend="both", pad=0.02)
     figure.suptitle(f"Draws of the posterior at {found.attrs['frequency_mhz']:g} MHz")
@@ -121,8 +114,9 @@ def pointing_by_day(preferred: pd.DataFrame) -> Figure:
         As :class:`.PointingReport` has it.
     """
     names = list(dict.fromkeys(preferred["offset"]))
-    figure = Figure(figsize=(12, 0.6 + 2.1 * len(names)), layout="constrained")
-    panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    size = (12, 0.6 + 2.1 * len(names))
+    figure, panels = framed(size, len(names), sharex=True, squeeze=False)
+    panels = panels[:, 0]
     for axes, name in zip(panels, names, strict=True):
         mine = preferred[preferred["offset"] == name]
         days, whole = mine[mine["first_day"] >= 0].dropna(), mine[mine["first_day"] < 0].dropna()
@@ -155,8 +149,9 @@ def unknowns_by_frequency(unknowns: CubeUnknowns) -> Figure:
     table = unknowns.table
     names = list(dict.fromkeys(table["unknown"]))
     n_rows = -(-len(names) // PANELS_IN_A_ROW)
-    figure = Figure(figsize=(13, 0.6 + 2.5 * n_rows), layout="constrained")
-    panels = list(figure.subplots(n_rows, PANELS_IN_A_ROW, squeeze=False).flat)
+    size = (13, 0.6 + 2.5 * n_rows)
+    figure, panels = framed(size, n_rows, PANELS_IN_A_ROW, squeeze=False)
+    panels = list(panels.flat)
     for axes, name in zip(panels, names, strict=False):
         rows = table[table["unknown"] == name]
         f, value, std, prior, before = (
@@ -191,10 +186,10 @@ def time_line(reduced: Reduced) -> Figure:
     """Draw the gain of every port and what was flagged, over time."""
     days = _days(reduced)
     reasons = [k for k in range(1, len(REASONS)) if (reduced.reason == k).any()]
-    lines = [name for name in ("lines",) if (reduced.lines > 0).any()]
+    lines = bool((reduced.lines > 0).any())
     names = [REASONS[k] for k in reasons] + (["some channels"] if lines else [])
-    figure = Figure(figsize=(12, 3.4 + 0.25 * len(names)), layout="constrained")
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(4, max(len(names), 1)))
+    size, heights = (12, 3.4 + 0.25 * len(names)), (4, max(len(names), 1))
+    figure, (top, bottom) = framed(size, 2, sharex=True, height_ratios=heights)
     level = reduced.level[reduced.bin_of]
     n_ports = level.shape[1]
     for port in range(n_ports):
@@ -227,8 +222,7 @@ def time_line(reduced: Reduced) -> Figure:
 
 def waterfall(reduced: Reduced, band: int) -> Figure:
     """Draw the 16 products of a band over time, before and after flags."""
-    figure = Figure(figsize=(13, 9), layout="constrained")
-    panels = figure.subplots(4, 4, sharex=True)
+    figure, panels = framed((13, 9), 4, 4, sharex=True)
     first = np.searchsorted(reduced.bin_of, np.arange(reduced.values.shape[2]))
     days = _days(reduced)[first]
     n_bins = reduced.values.shape[2]
@@ -269,13 +263,9 @@ def calibration(reduced: Reduced) -> Figure:
     Of one band the gains at its frequency are points with error bars, and both kinds of scatter
     have a place of their own.
     """
-    figure = Figure(figsize=(12, 4.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = framed((12, 4.2), 1, 2)
     _gains(left, reduced)
-    if len(reduced.frequencies_mhz) == 1:
-        _scatter_of_one(right, reduced)
-    else:
-        _scatter(right, reduced)
+    _scatter(right, reduced)
     right.axhline(1.0, color=GREY, lw=0.8)
     right.set_ylabel("scatter over radiometer noise")
     found = np.concatenate([reduced.line_scatter, reduced.scatter, [1.0]])
@@ -318,34 +308,29 @@ def _gains(left: Axes, reduced: Reduced) -> None:
 
 
 def _scatter(right: Axes, reduced: Reduced) -> None:
-    for values, colour, mark, name in (
-        (reduced.line_scatter, BLUE, "o", "channels about a smooth spectrum"),
-        (reduced.scatter, ORANGE, "s", "spectra about a smooth curve in time"),
-    ):
-        if np.isfinite(values).any():
-            right.plot(
-                reduced.frequencies_mhz, values, mark, color=colour, label=name, fillstyle="none"
-            )
-    right.set_xlabel("frequency [MHz]")
-    if right.get_legend_handles_labels()[0]:
-        right.legend(frameon=False, fontsize=8)
-
-
-def _scatter_of_one(right: Axes, reduced: Reduced) -> None:
     kinds = (
         (reduced.line_scatter, BLUE, "o", "channels about\na smooth spectrum"),
         (reduced.scatter, ORANGE, "s", "spectra about\na smooth curve in time"),
     )
-    for place, (values, colour, mark, _) in enumerate(kinds):
-        if np.isfinite(values[0]):
+    alone = len(reduced.frequencies_mhz) == 1
+    for place, (values, colour, mark, name) in enumerate(kinds):
+        known = np.isfinite(values).any()
+        if known and alone:
             right.plot([place], values, mark, ms=8, color=colour)
-            right.annotate(
-                f"{values[0]:.3f}", (place, values[0]), (12, 8), textcoords="offset points"
-            )
-        else:
+            at = (place, values[0])
+            right.annotate(f"{values[0]:.3f}", at, (12, 8), textcoords="offset points")
+        elif known:
+            style = {"color": colour, "label": name.replace("\n", " "), "fillstyle": "none"}
+            right.plot(reduced.frequencies_mhz, values, mark, **style)
+        elif alone:
             right.text(place, 0.5, "not known", ha="center", color=GREY)
-    right.set_xticks(range(len(kinds)), [kind[-1] for kind in kinds])
-    right.set_xlim(-0.6, len(kinds) - 0.4)
+    if alone:
+        right.set_xticks(range(len(kinds)), [kind[-1] for kind in kinds])
+        right.set_xlim(-0.6, len(kinds) - 0.4)
+        return
+    right.set_xlabel("frequency [MHz]")
+    if right.get_legend_handles_labels()[0]:
+        right.legend(frameon=False, fontsize=8)
 
 
 def _days(reduced: Reduced) -> Float[np.ndarray, " rows"]:
