@@ -69,7 +69,7 @@ def test_scientific_notation_without_a_sign_is_a_number(tmp_path):
     assert load_scenario(path).noise.radiometer.bandwidth_hz == 1e6
 
 
-# a line for each rule and kind of mistake; what single numbers and words may be: test_keys.py
+# a line for each rule and kind of mistake; what single numbers and words may be is below
 SHIFT, PARAMETERS = "noise.beam.shift_mhz=4", "noise.beam.parameters={length_m: 0.1}"
 SCHEDULE = "observation={schedule: nights.csv, window: mean, step_s: 20000, %s}"
 FOUR = "frequencies_mhz=[10, 15, 20, 30]"

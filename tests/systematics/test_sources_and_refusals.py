@@ -308,9 +308,6 @@ def experiment_with(*overrides: str) -> lb.Experiment:
     return lb.Experiment(setup, simulate(setup))
 
 
-# --- in the scenario ------------------------------------------------------------------------------
-
-
 # --- sources --------------------------------------------------------------------------------------
 
 
@@ -406,7 +403,6 @@ def test_bands_beyond_the_highest_ell():
         ("gains", ["noise.gain.sigma=0.01"], "noise.gain"),
         ("gain_scales", ["noise.gain.sigma=0.01"], "noise.gain"),
         ("instrument", ["noise.beam.shift_mhz=4"], "noise.beam"),
-        ("instrument", ["noise.beam.parameters={length_m: 0.1}"], "noise.beam"),
     ],
 )
 def test_nothing_is_counted_twice(program, overrides, section):
