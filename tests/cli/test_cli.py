@@ -27,11 +27,7 @@ from lusee_bayes.runs import map_run
 from lusee_bayes.runs import map_run as runs
 from lusee_bayes.runs.folder import Output
 
-SMALL = [
-    argument
-    for override in ["lmax=6", "observation.runs.0.cycles=0.1"]
-    for argument in ("--set", override)
-]
+SMALL = ["--set", "lmax=6", "--set", "observation.runs.0.cycles=0.1"]
 
 
 @pytest.fixture(scope="module")

@@ -77,10 +77,7 @@ WRONG = [
     ("compare-priors fiducial --priors isotropic,local", "'local'; did you mean 'local_scales'?"),
     ("compare-priors fiducial --priors isotropic", "1 given, and a comparison needs two or more"),
     ("compare-priors fiducial --priors isotropic,isotropic", "give each prior once"),
-    (
-        "compare-priors fiducial --priors isotropic,isotropic-sky --data file",
-        "C_ell of the scenario's sky",
-    ),
+    ("compare-priors fiducial --priors isotropic,isotropic-sky --data file", "scenario's sky"),
     ("compare-priors fiducial --set frequencies_mhz=[10,20]", "is for a single frequency"),
     ("compare-priors fiducial --set prior.tilt_std=0.1", "something is to be sampled"),
     ("compare", "two"),

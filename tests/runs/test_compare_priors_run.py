@@ -21,15 +21,8 @@ from lusee_bayes.testing.scenarios import small_scenario
 SIZES = {"lmax": 8, "cycles": 0.15}
 SMALL = ["--set", "lmax=8", "--set", "observation.runs.0.cycles=0.15"]
 PRIORS = list(NAMED)
-FILES = {
-    "priors.csv",
-    "priors.json",
-    "priors.md",
-    "provenance.json",
-    "report.html",
-    "scenario.yaml",
-    "manifest.json",
-}
+RECORDS = {"provenance.json", "report.html", "scenario.yaml", "manifest.json"}
+FILES = {"priors.csv", "priors.json", "priors.md", *RECORDS}
 
 
 @pytest.fixture(scope="module")
