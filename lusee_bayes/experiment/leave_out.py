@@ -45,7 +45,7 @@ WORST = 0.3
 ARRAYS, MOST_MEMORY = 5, 0.5
 
 
-class Group(NamedTuple):
+class BadGroup(NamedTuple):
     """A product or a day.
 
     Attributes
@@ -65,7 +65,7 @@ class Group(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Comparison:
+class TimeComparison:
     """Times and data against their prediction by all others.
 
     Attributes
@@ -86,7 +86,7 @@ class Comparison:
     z: Grid
 
     @classmethod
-    def of(cls, left_out: DenseLeftOut, data: Visibilities) -> Comparison:
+    def of(cls, left_out: DenseLeftOut, data: Visibilities) -> TimeComparison:
         """Leave out every time, one after the other."""
         layout, n = left_out.layout, data.layout.n_times
         counts = np.bincount(layout.time, minlength=n)
@@ -99,9 +99,9 @@ class Comparison:
         known = np.asarray(layout.present) & np.isfinite(z) & (degrees > 0.0)
         return cls(data, left_out, chi2, degrees, np.where(known, z, 0.0))
 
-    def without(self, gone: GridFlags) -> Comparison:
+    def without(self, gone: GridFlags) -> TimeComparison:
         """Compare the others, with the same model."""
-        return Comparison.of(self.left_out.without(gone), self.data)
+        return TimeComparison.of(self.left_out.without(gone), self.data)
 
     @property
     def ratio(self) -> Float[np.ndarray, " times"]:
@@ -142,7 +142,7 @@ class Comparison:
         found[product[alone], np.flatnonzero(alone)] = True
         return found
 
-    def worst_group(self, false_alarm: float) -> Group | None:
+    def worst_group(self, false_alarm: float) -> BadGroup | None:
         """Find the product or day that stands out and without which chi^2 falls most.
 
         Parameters
@@ -152,7 +152,7 @@ class Comparison:
 
         Returns
         -------
-        Group or None
+        BadGroup or None
             None if none stands out.
         """
         left_out = self.left_out
@@ -176,7 +176,7 @@ class Comparison:
         if not out.any():
             return None
         kind, name, mine = groups[some[np.where(out, chi2 - degrees, -np.inf).argmax()]]
-        return Group(kind, name, mine, sum(of == kind for of, _, _ in groups))
+        return BadGroup(kind, name, mine, sum(of == kind for of, _, _ in groups))
 
 
 def _judged(missed: list[Missed], counts: Int[np.ndarray, " n"]) -> tuple[Vector, Vector]:
@@ -194,7 +194,7 @@ def _tail(chi2: Vector, degrees: Vector) -> Vector:
     return np.where(some, found, 1.0)
 
 
-def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Comparison | None:
+def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> TimeComparison | None:
     """Leave out every time.
 
     Under a prior that is wide enough for any sky (:mod:`lusee_bayes.judge.residuals`), so that
@@ -211,7 +211,7 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Compar
 
     Returns
     -------
-    Comparison or None
+    TimeComparison or None
         None where it would need too much memory.
     """
     if _memory(setup, data) > MOST_MEMORY * memory_limit():
@@ -223,7 +223,7 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Compar
         model = on_host(model_about(setup, Around(data))[0])
         prior = model.prior.widened(WIDER)
     left_out = DenseLeftOut(replace(model, prior=prior), data.data, data.layout)
-    return Comparison.of(left_out, data)
+    return TimeComparison.of(left_out, data)
 
 
 def _memory(setup: Setup, data: Visibilities) -> float:
@@ -276,7 +276,7 @@ class Fitting:
         mean; 0 where the others do not tell.
     remark : str
         What is to be said; empty if there is nothing.
-    groups : tuple of Group
+    groups : tuple of BadGroup
         Products and days that are flagged as a whole.
     share : float
         Of the values, flagged.
@@ -290,7 +290,7 @@ class Fitting:
     rounds: int
     chi2: Float[np.ndarray, " times"]
     remark: str = ""
-    groups: tuple[Group, ...] = ()
+    groups: tuple[BadGroup, ...] = ()
     share: float = 0.0
     refused: bool = False
     cause: str = ""
@@ -448,13 +448,13 @@ class _Limits:
 
 
 def _one_by_one(
-    start: Comparison,
+    start: TimeComparison,
     gone: GridFlags,
     groups: GridFlags,
     limits: _Limits,
     false_alarm: float,
     least: float,
-) -> tuple[Comparison, GridFlags | None]:
+) -> tuple[TimeComparison, GridFlags | None]:
     """Flag times and values, the worst first; ``groups`` are among what is ``gone`` from ``start``.
 
     Of what is left, and what goes in all; or of what was left before that was too much, and None.
@@ -469,8 +469,8 @@ def _one_by_one(
 
 
 def _eliminated(
-    start: Comparison, gone: GridFlags, limits: _Limits, false_alarm: float
-) -> tuple[tuple[GridFlags, tuple[Group, ...]] | None, str]:
+    start: TimeComparison, gone: GridFlags, limits: _Limits, false_alarm: float
+) -> tuple[tuple[GridFlags, tuple[BadGroup, ...]] | None, str]:
     """What goes under one model, besides what is ``gone``; None if that is too much.
 
     And what is to be said of an auto that cannot go.
@@ -506,7 +506,7 @@ def _about_auto(port: int | None) -> str:
     )
 
 
-def _remark(gone: GridFlags, groups: tuple[Group, ...], share: float, false_alarm: float) -> str:
+def _remark(gone: GridFlags, groups: tuple[BadGroup, ...], share: float, false_alarm: float) -> str:
     single = gone & ~np.any([np.zeros_like(gone), *(group.data for group in groups)], axis=0)
     whole = gone.all(axis=0) & single.any(axis=0)
     n_single, n = int(single[:, ~whole].sum()), gone.shape[1]

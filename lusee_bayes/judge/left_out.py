@@ -70,7 +70,7 @@ from lusee_bayes.core.linalg import cholesky, inverse_from_cholesky, solve_lower
 from lusee_bayes.instrument.coupling import CouplingMatrix, turned_about_pole
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.model import LinearGaussian
-from lusee_bayes.linear.normal_matrix import summed
+from lusee_bayes.linear.normal_matrix import sum_over_times
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import Covariance, LowRankUpdate
 
@@ -633,7 +633,7 @@ class StructuredLeftOut(LeftOut):
         coupling = self._complete if used.all() else of_products(self._complete, used)
         within = weights[used] if weights.ndim == 2 else weights[used][:, used]
         left = self._precision.copy()
-        left[:n, :n] -= self._prior.sandwich(summed(coupling, within))
+        left[:n, :n] -= self._prior.sandwich(sum_over_times(coupling, within))
         if len(self._q):
             taken = self._pulled(coupling, weighted[used])
             left[n:, :n] -= taken

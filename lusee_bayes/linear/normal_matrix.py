@@ -302,7 +302,7 @@ def _base(noise: Covariance) -> Covariance:
 
 
 def _within_times(coupling: CouplingMatrix, noise: Covariance) -> Array:
-    return summed(coupling, noise.time_weights(coupling.layout))
+    return sum_over_times(coupling, noise.time_weights(coupling.layout))
 
 
 def _with_templates(coupling: CouplingMatrix, noise: LowRankUpdate) -> Array:
@@ -324,7 +324,7 @@ NORMAL_MATRICES: dict[type[Covariance], Callable[..., Array]] = {
 }
 
 
-def summed(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> ModesMatrix:
+def sum_over_times(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> ModesMatrix:
     """Compute A^T W A for weights W within times.
 
     Parameters
