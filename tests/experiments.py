@@ -10,11 +10,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from numpyro.infer.util import log_density
 
 from lusee_bayes.experiment.experiment import Experiment, build, program_pieces
-from lusee_bayes.experiment.model import full_model, simulate
+from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
+from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.term import Around
 from lusee_bayes.sampling.hmc import WHITE_SUFFIX, whitened
 from lusee_bayes.sampling.programs import Program, latent_sites, numpyro_promotion
@@ -60,6 +62,13 @@ def density(
     with numpyro_promotion():
         got, trace = log_density(program.model, (), arguments, values)
     return float(got), trace
+
+
+def parts(setup: Setup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A, and the standard deviations of the prior and of radiometer noise."""
+    variances = setup.prior.variance(), radiometer(setup).diagonal()
+    prior, noise = (np.sqrt(np.asarray(variance)) for variance in variances)
+    return np.asarray(setup.coupling.dense()), prior, noise
 
 
 def draw_within(program, arguments, key, sampler, whitening=None, thin=1) -> dict[str, Any]:

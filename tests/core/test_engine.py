@@ -1,7 +1,8 @@
-"""Tasks in threads of this process: order, progress, failures, and the tree of a sum."""
+"""Tasks in threads: order, progress, failures, the tree of a sum, and what is shared."""
 
 from __future__ import annotations
 
+import io
 import os
 import socketserver
 import threading
@@ -10,8 +11,9 @@ from dataclasses import replace
 from threading import Barrier, get_ident
 
 import pytest
+from rich.console import Console
 
-from lusee_bayes.core import engines
+from lusee_bayes.core import engines, progress
 from lusee_bayes.core.engine import Demand, Tasks, ThisProcess, in_threads, once
 from lusee_bayes.core.engines import open_engine
 from lusee_bayes.core.errors import InputError
@@ -189,3 +191,15 @@ def test_pieces_run_side_by_side():
         return get_ident()
 
     assert len(set(in_threads(meet, range(2)))) == 2
+
+
+@pytest.mark.parametrize(("line_s", "expected"), [(0.0, range(5, 100, 5)), (10.0, [])])
+def test_a_file_has_a_line_for_each_five_percent_of_long_stages(line_s, expected, monkeypatch):
+    monkeypatch.setattr(progress, "LINE_S", line_s)
+    file = io.StringIO()
+    with Stages(Console(file=file)).progress("channels [x]", 200) as done:
+        for number in range(1, 201):
+            done(number, "20 MHz")
+    *lines, last = file.getvalue().splitlines()
+    assert lines == [f"  channels [x]: {2 * p} of 200 ({p}%) 20 MHz" for p in expected]
+    assert last.split()[-1] == "s"

@@ -219,11 +219,6 @@ def dense_generators(lmax):
     return [block_diag(*[k[axis] for k in per_ell]) for axis in range(3)]
 
 
-def test_rotations_are_orthogonal():
-    d = dense(h.Rotation.from_matrix(random_rotation(0), TURNED))
-    np.testing.assert_allclose(d @ d.T, np.eye(n_modes(TURNED)), rtol=0, atol=1e-12)
-
-
 def test_product_of_rotations():
     g, k = random_rotation(1), random_rotation(2)
     dg, dk, both = (h.Rotation.from_matrix(x, TURNED) for x in (g, k, g @ k))

@@ -21,7 +21,6 @@ from lusee_bayes.core.reading import (
     read_json,
     read_table,
     read_yaml,
-    require_file,
 )
 
 LAYOUT = Layout(
@@ -90,13 +89,6 @@ def test_what_no_memory_holds_is_not_read(tmp_path, monkeypatch):
             )
 
 
-def test_pipes_and_folders_are_no_files(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    for path, message in ((tmp_path / "pipe", "neither a file"), (tmp_path, "is a folder")):
-        with pytest.raises(InputError, match=message):
-            require_file(path, "an example")
-
-
 def test_tables_objects_and_arrays(tmp_path):
     (tmp_path / "t.csv").write_text("ell,name\n0,a\n1,b\n")
     table = Layout("a table", {"ell": Variable(("row",)), "name": Variable(("row",), "text")})
@@ -120,11 +112,8 @@ def path(tmp_path):
     return tmp_path / "x.h5"
 
 
-def test_a_whole_file_is_readable(path):
-    require_readable_hdf5(path)
-
-
 def test_a_file_without_end_is_refused(path, monkeypatch):
+    require_readable_hdf5(path)
     monkeypatch.setattr(formats, "LIMIT_S", 0.2)
     monkeypatch.setattr(formats, "_read_all", lambda path, size: time.sleep(60))
     start = time.monotonic()

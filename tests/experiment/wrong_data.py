@@ -60,7 +60,6 @@ def measured(
     beams: Callable[[Setup], ProductBeams] = lambda setup: setup.beams,
     distort: Callable[[Setup, np.ndarray], np.ndarray] = lambda setup, v: v,
     seen_by: Scenario | None = None,
-    truth_known: bool = True,
 ) -> Visibilities:
     """Data that ``truth`` describes, of a sky, with their noise; dated as ``seen_by`` says.
 
@@ -77,8 +76,8 @@ def measured(
         np.asarray(setup.layout.gather(signal) + noise),
         setup.layout,
         nominal.observation,
-        (truth if seen_by is None else seen_by).frequency_mhz,
-        sky.modes if truth_known else None,
+        nominal.scenario.frequency_mhz,
+        sky.modes,
     )
 
 

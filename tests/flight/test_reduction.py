@@ -1,16 +1,13 @@
 """Reduced spectra against the sums written out, one spectrum after the other."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from astropy.time import Time
 from naive_flight import FLIGHT_ORDER, naive_band
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.flight import reduction
-from lusee_bayes.flight.clock import read_clock
 from lusee_bayes.flight.flags import KnownLines
 from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.flight.recipe import Recipe
@@ -224,23 +221,6 @@ def test_bins_that_do_not_fit_are_taken_out(reduced):
     assert (less.reason[0][[3, 108]] == NO_FIT).all()
     assert less.shares(0)[REASONS[NO_FIT]] > 0
     np.testing.assert_array_equal(less.values[1], reduced.values[1])
-
-
-def test_a_clock_file_corrects_the_utc_that_a_session_states(flight, table, tmp_path):
-    record = {"format_version": 1, "time_scale": "utc", "source": "tracking", "rate": 1.0 + 1e-6}
-    stated, true = "2027-01-25T00:00:00", "2027-01-25T00:00:46"
-    (tmp_path / "clock.json").write_text(
-        json.dumps(record | {"stated_utc_isot": stated, "clock_reference_isot": true})
-    )
-    clock = read_clock(tmp_path / "clock.json")
-    before, after = (
-        reduce_sessions(sessions(flight, "d"), recipe(table, clock=c)) for c in (None, clock)
-    )
-    elapsed = (before.observation.times - Time(stated)).sec
-    moved = (after.observation.times - before.observation.times).sec
-    np.testing.assert_allclose(moved, 46.0 + 1e-6 * elapsed, rtol=0, atol=1e-6)
-    assert after.sessions[0]["clock"] == "session, corrected by the clock file"
-    assert "clock.json" in after.notes()[0] and not before.notes()
 
 
 def test_what_contradicts_itself_is_refused(flight, table):

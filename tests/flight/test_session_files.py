@@ -74,15 +74,6 @@ def test_what_a_session_says(flight):
     assert (session.lon_deg, session.lat_deg) == (float(truth["lon_deg"]), float(truth["lat_deg"]))
 
 
-def test_spectra_are_read_piece_by_piece(flight):
-    session = read_session(flight / "session_b.h5")
-    with session.spectra() as read, h5py.File(session.path) as file:
-        whole = file["spectra/data"][()]
-        np.testing.assert_array_equal(read(3, 9), whole[3:9])
-        np.testing.assert_array_equal(read(39, 40), whole[39:])
-    assert np.isnan(whole[5, 4]).all()
-
-
 def test_fits_and_hdf5_hold_the_same(flight):
     a, b = (read_session(flight / f"session_a.{kind}") for kind in ("h5", "fits"))
     assert b.kind == "FITS"

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import warnings
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,8 @@ import h5py
 import numpy as np
 from astropy.io import fits
 from hypothesis import strategies as st
+
+from lusee_bayes.core.errors import InputError
 
 FRACTION = st.floats(0.0, 1.0)
 # words of extensions that say what they hold
@@ -197,3 +202,22 @@ CHANGE = {
 def change_items(path: Path, change: tuple[Any, ...]) -> None:
     """Apply :func:`item_changes`, to whatever the file is."""
     CHANGE[path.suffix](path, change)
+
+
+TRIED: Counter[str] = Counter()
+# how many times as many inputs the long run tries
+SCALE = int(os.environ.get("LUSEE_BAYES_FUZZ", "1"))
+
+
+def require_answer(what: str, call: Callable[[], object]) -> None:
+    """Assert that a call succeeds, or says in one sentence why it cannot; anything else fails."""
+    try:
+        call()
+    except InputError as error:
+        message = str(error)
+        assert message and "\n" not in message, repr(message)
+        # sentences are read by people
+        assert len(message) < 1500, message
+        TRIED[f"{what}: refused"] += 1
+    else:
+        TRIED[f"{what}: accepted"] += 1

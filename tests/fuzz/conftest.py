@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import outcomes
+import changes
 import pytest
 from hypothesis import HealthCheck, Phase, settings
 
@@ -20,8 +20,8 @@ settings.load_profile("here")
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """How many inputs were tried."""
-    if outcomes.TRIED:
+    if changes.TRIED:
         terminalreporter.section("inputs tried")
-        for what, number in sorted(outcomes.TRIED.items()):
+        for what, number in sorted(changes.TRIED.items()):
             terminalreporter.line(f"{number:7d}  {what}")
-        terminalreporter.line(f"{outcomes.TRIED.total():7d}  in all")
+        terminalreporter.line(f"{changes.TRIED.total():7d}  in all")

@@ -7,9 +7,9 @@ import re
 from collections import Counter
 
 import pytest
+from changes import SCALE, TRIED
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from outcomes import SCALE, TRIED
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.errors import InputError

@@ -10,11 +10,10 @@ import h5py
 import numpy as np
 import pytest
 from astropy.io import fits
-from changes import byte_changes, change_bytes, change_items, item_changes
+from changes import SCALE, byte_changes, change_bytes, change_items, item_changes, require_answer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from layout_4 import write_layout_4
-from outcomes import SCALE, require_answer
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.data_files import read_data

@@ -6,10 +6,17 @@ import shutil
 from pathlib import Path
 
 import pytest
-from changes import CHANGE, byte_changes, change_bytes, change_items, item_changes
+from changes import (
+    CHANGE,
+    SCALE,
+    byte_changes,
+    change_bytes,
+    change_items,
+    item_changes,
+    require_answer,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from outcomes import SCALE, require_answer
 
 import lusee_bayes as lb
 from lusee_bayes.report.pages import write_report

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-from typing import Any, get_args
 
 import pytest
+from changes import SCALE, require_answer
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from outcomes import SCALE, require_answer
-from pydantic import BaseModel
 
 from lusee_bayes.cli.options import parse_frequencies
 from lusee_bayes.cli.plan_command import own_variations
 from lusee_bayes.core.reading import parse_yaml
+from lusee_bayes.experiment.keys import scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.runs.cost import posterior_cost, require_fits
 
@@ -41,23 +40,7 @@ VALUES = st.recursive(
 )
 
 
-def paths(model: type[BaseModel], parents: str = "") -> list[str]:
-    """Every key that a scenario may have."""
-    found = []
-    for name, field in model.model_fields.items():
-        found.append(f"{parents}{name}")
-        for section in sections(field.annotation):
-            found += paths(section, f"{parents}{name}.")
-    return sorted(set(found))
-
-
-def sections(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [found for part in get_args(annotation) for found in sections(part)]
-
-
-PATHS = paths(Scenario)
+PATHS = sorted({*(key.path for key in scenario_keys())})
 
 
 def load(overrides: list[str]) -> None:

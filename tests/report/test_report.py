@@ -198,15 +198,6 @@ def test_a_page_without_groups(tmp_path, monkeypatch):
     assert "By product" not in page and run.result.verdict() in page
 
 
-@pytest.mark.long
-def test_summaries_of_sampled_runs(sampled):
-    page = (sampled / "report.html").read_text()
-    told = json.loads((sampled / "sampling.json").read_text())
-    assert f"{told['chains']} x 50 draws of sky" in page
-    for quantity in ("Galactic centre", "r_hat", "ess_bulk", "lusee_bayes", "observation:"):
-        assert quantity in page
-
-
 # --- in a browser -------------------------------------------------------------------------------
 
 CHECK = """<script>

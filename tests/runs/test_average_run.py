@@ -132,16 +132,10 @@ def test_bad_input_is_a_sentence(path, tmp_path, monkeypatch, capsys, arguments,
     assert [p.name for p in tmp_path.iterdir()] == ["data.nc"]
 
 
-@pytest.mark.parametrize(
-    ("text", "seconds"),
-    [("30s", 30.0), ("10min", 600.0), ("2h", 7200.0), ("1d", 86400.0), (" 1.5 h", 5400.0),
-     (".5min", 30.0), ("1e3s", 1000.0)],
-)  # fmt: skip
-def test_lengths_of_time(text, seconds):
-    assert parse_duration(text) == seconds
-
-
-@pytest.mark.parametrize("text", ["", "h", "2", "0s", "-2h", "2 hours", "1e999d", "nan s", "٣s"])
-def test_what_is_no_length_of_time(text):
-    with pytest.raises(InputError, match="is not a length of time; .* 30s, 10min, 2h or 1d"):
-        parse_duration(text)
+def test_lengths_of_time():
+    lengths = {"30s": 30.0, "10min": 600.0, "2h": 7200.0, "1d": 86400.0, " 1.5 h": 5400.0}
+    for text, seconds in (lengths | {".5min": 30.0, "1e3s": 1000.0}).items():
+        assert parse_duration(text) == seconds
+    for text in ("", "h", "2", "0s", "-2h", "2 hours", "1e999d", "nan s", "٣s", "2h 30min"):
+        with pytest.raises(InputError, match="is not a length of time; .* 30s, 10min, 2h or 1d"):
+            parse_duration(text)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from assertions import refused, within
-from experiments import density, four_ports, program_arguments
+from experiments import density, four_ports, parts, program_arguments
 from reference_linear import white_posterior
 from scipy.optimize import least_squares
 from scipy.stats import norm
@@ -164,9 +164,7 @@ def test_receivers_sampled_have_the_density_of_the_closed_form(response_file):
     assert set(trace) == {*values, "data"}
     t = columns(response_file, setup.layout.n_times)
     rest = np.asarray(e.data.data) - np.asarray(setup.offset) - t @ z
-    prior = np.sqrt(np.asarray(setup.prior.variance()))
-    noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
-    a = np.asarray(setup.coupling.dense())
+    a, prior, noise = parts(setup)
     expected = white_posterior(a, prior, noise, rest).log_prob
     expected += norm.logpdf(z).sum() - 4 * np.log(200.0) - np.log(30.0)
     # chi^2 of 1e7, each of whose squares is right to 1e-10 of itself
@@ -310,9 +308,7 @@ def test_rounds_find_the_mode_and_the_first_order_does_not(experiment):
     setup, d = experiment.setup, np.asarray(experiment.data.data)
     found = lb.infer(experiment)
     assert found.rounds > 2
-    a, offset = np.asarray(setup.coupling.dense()), np.asarray(setup.offset)
-    prior = np.sqrt(np.asarray(setup.prior.variance()))
-    noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    (a, prior, noise), offset = parts(setup), np.asarray(setup.offset)
     linear = np.concatenate([np.asarray(s.templates) for s in found.systematics[:2]], axis=1)
     rows = np.concatenate([a * prior, linear], axis=1)
 
@@ -419,8 +415,7 @@ def test_clock_and_pointing_beside_it_settle_in_the_same_rounds(response_file):
     setup, d = experiment.setup, np.asarray(experiment.data.data)
     found = lb.infer(experiment)
     assert [type(s).__name__ for s in found.moving] == ["PointingOffsets", "GainTable"]
-    prior = np.sqrt(np.asarray(setup.prior.variance()))
-    noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    _, prior, noise = parts(setup)
     turntable = offset_posterior(found)[0]["turntable_deg"] / 0.05
     _, *rest = found.systematics
     linear = np.concatenate([np.asarray(s.templates) for s in rest[:2]], axis=1)
@@ -458,10 +453,9 @@ def test_sampled_the_density_is_the_closed_form(response_file):
     got, trace = density(program, program_arguments(program, e), {"gain_table": z})
     assert set(trace) == {"gain_table", "data"}
     factors = per_port(z)
-    a = factors[:, None] * np.asarray(setup.coupling.dense())
+    a, prior, noise = parts(setup)
+    a = factors[:, None] * a
     rest = np.asarray(e.data.data) - factors * np.asarray(setup.offset)
-    noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
-    prior = np.sqrt(np.asarray(setup.prior.variance()))
     expected = white_posterior(a, prior, noise, rest).log_prob + norm.logpdf(z).sum()
     assert abs(expected) > 1e4
     # chi^2 of 1e7, each of whose squares is right to 1e-10 of itself

@@ -30,7 +30,6 @@ from lusee_bayes.systematics.systematic import (
     MOST_COLLAPSED,
     AdditiveNoise,
     Marginalised,
-    uncertain_scale,
 )
 
 LMAX, N_DATA = 4, 40
@@ -152,15 +151,6 @@ def test_the_medians_change_nothing(case):
         assert site["value"].dtype == np.float64
         off = site["value"] if name == "tilt" else jnp.log(site["value"])
         assert abs(float(off)) < 5 * 0.5 * 1.25 / np.sqrt(15)
-
-
-def test_an_uncertain_scale():
-    prior = uncertain_scale(0.01, 0.5)
-    for z in (-2.0, 0.0, 1.0):
-        value = 0.01 * np.exp(0.5 * z)
-        assert float(prior.cdf(jnp.asarray(value))) == pytest.approx(norm.cdf(z), abs=1e-14)
-        expected = lognorm.logpdf(value, 0.5, scale=0.01)
-        assert float(prior.log_prob(jnp.asarray(value))) == pytest.approx(expected, rel=1e-13)
 
 
 def test_marginalised_they_stay_as_they_are(case):

@@ -19,6 +19,7 @@ from lusee_bayes.experiment.instrument_terms import gain_drifts
 from lusee_bayes.experiment.model import full_model, radiometer
 from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import all_products
+from lusee_bayes.systematics.gain_drifts import GainDrifts
 
 GAINS = "noise.gain={sigma: %g, correlation_h: 10, treatment: %s, visibilities: %s}"
 # of the product (1 + g)(1 + g'), with the gains and the sky by hand
@@ -184,7 +185,7 @@ def test_drifts_too_strong_for_the_coordinates_have_none():
     gaussian, drifts, chart = pieces("log_sigma_std")
     assert chart is not None
     strong = lb.GainDrift(0.1, 10.0)
-    kinder = lb.systematics.GainDrifts(**{**vars(drifts), "drift": strong})
+    kinder = GainDrifts(**{**vars(drifts), "drift": strong})
     assert kinder.chart(gaussian) is None
 
 
