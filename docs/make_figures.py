@@ -22,7 +22,7 @@ from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, true_values
 from lusee_bayes.experiment.rounds import Inference
-from lusee_bayes.judge.chi2 import ell_cross, signal_to_noise
+from lusee_bayes.judge.measures import ell_cross, signal_to_noise
 from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar, mollweide, shown
 from lusee_bayes.report.figures.maps import sky_maps
 from lusee_bayes.results.map_result import map_result

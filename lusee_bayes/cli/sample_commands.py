@@ -106,7 +106,8 @@ def validate_command(
     simulations
         Data sets for simulation-based calibration.
     """
-    from lusee_bayes.sampling.hmc import Sampler, require_draws, require_simulations
+    from lusee_bayes.sampling.hmc import Sampler
+    from lusee_bayes.sampling.least import require_draws, require_simulations
 
     require_simulations(simulations)
     require_draws(draws)

@@ -41,8 +41,10 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing, offset_kind, offset_names, with_offsets
 from lusee_bayes.instrument.products import all_products, auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.judge.chi2 import WIDER, ChiSquare, expected_chi2, stands_out, two_sided, with_sky
+from lusee_bayes.judge.chi2 import ChiSquare, stands_out, two_sided
+from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.judge.residuals import Residuals
+from lusee_bayes.judge.split import WIDER, with_sky
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior

@@ -33,9 +33,9 @@ from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.judge.chi2 import WIDER, Split
 from lusee_bayes.judge.left_out import DenseLeftOut, Missed
 from lusee_bayes.judge.residuals import HOURS_A_DAY
+from lusee_bayes.judge.split import WIDER, Split
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 

@@ -18,12 +18,7 @@ from lusee_bayes.core.arrays import Draws, Modes, Pixels
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.harmonics import columns_to_maps, lmax_of, mode_numbers
 from lusee_bayes.core.lazy import healpy, special
-
-# of the intervals whose coverage is counted
-LEVELS = (0.50, 0.68, 0.90, 0.95)
-# names of the levels in files
-NAMES = tuple(f"{100 * level:.0f}" for level in LEVELS)
-
+from lusee_bayes.judge.levels import LEVELS, NAMES
 
 REST = ("rms", "rms_scatter", "largest", "allowed")
 # draws that tell the scatter: it is then known to 4 %

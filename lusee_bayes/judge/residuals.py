@@ -25,16 +25,7 @@ from jaxtyping import Int
 from lusee_bayes.core.arrays import DataVector, on_host
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.judge.chi2 import (
-    ChiSquare,
-    Fit,
-    Level,
-    Split,
-    probability,
-    stands_out,
-    two_sided,
-    with_sky,
-)
+from lusee_bayes.judge.chi2 import ChiSquare, Fit, Level, probability, stands_out, two_sided
 from lusee_bayes.judge.left_out import (
     NOT_TOLD,
     DenseLeftOut,
@@ -43,6 +34,7 @@ from lusee_bayes.judge.left_out import (
     StructuredLeftOut,
     base_and_templates,
 )
+from lusee_bayes.judge.split import Split, with_sky
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Shaped
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
-from lusee_bayes.judge.chi2 import ell_cross
+from lusee_bayes.judge.measures import ell_cross
 
 Cases = Mapping[str, xr.Dataset]
 

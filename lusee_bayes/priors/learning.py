@@ -41,7 +41,9 @@ from lusee_bayes.core.arrays import Draws, Square, on_host
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cholesky, invert_lower
-from lusee_bayes.judge.chi2 import ChiSquare, Split, expected_chi2, stands_out
+from lusee_bayes.judge.chi2 import ChiSquare, stands_out
+from lusee_bayes.judge.measures import expected_chi2
+from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily

@@ -18,7 +18,7 @@ OWN_FORMATS = {
     formats.POSTERIOR_CUBE: "describe_results:describe_posterior_cube",
     formats.BEAMS: "describe_data:describe_sampled_beams",
     formats.DIAGNOSTICS: "describe_results:describe_diagnostics",
-    formats.SAMPLES: "describe_results:describe_samples",
+    formats.SAMPLES: "describe_runs:describe_samples",
     formats.REDUCED: "describe_data:describe_reduced",
     formats.GAINS: "describe_data:describe_gains",
 }
@@ -54,7 +54,7 @@ def describe(path: str | Path) -> str:
         If the file is missing, or of none of these kinds; for a folder that no run has written.
     """
     if Path(path).is_dir():
-        path, kind = Path(path), "describe_results:describe_folder"
+        path, kind = Path(path), "describe_runs:describe_folder"
     else:
         path = require_file(path, "file")
         kind = OWN_FORMATS.get(formats.format_of(path) or "")

@@ -10,7 +10,7 @@ import xarray as xr
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_table
 from lusee_bayes.judge.chi2 import probability
-from lusee_bayes.judge.coverage import LEVELS, NAMES
+from lusee_bayes.judge.levels import LEVELS, NAMES
 from lusee_bayes.report import html
 from lusee_bayes.report.explorer import explorer
 from lusee_bayes.report.sections import flight_section, map_unknowns

@@ -20,15 +20,15 @@ from lusee_bayes.core.checks import Described, extent
 from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, power_spectrum
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
-from lusee_bayes.judge.chi2 import (
-    ChiSquare,
+from lusee_bayes.judge.chi2 import ChiSquare
+from lusee_bayes.judge.coverage import Counts, Coverage, latitudes
+from lusee_bayes.judge.measures import (
     correlation,
     ell_cross,
     expected_chi2,
     highest_altitude,
     signal_to_noise,
 )
-from lusee_bayes.judge.coverage import Counts, Coverage, latitudes
 from lusee_bayes.judge.plausibility import about_information
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import pixel_std

@@ -6,18 +6,12 @@ pixel, posterior of regions, and point-spread functions.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import xarray as xr
 from jaxtyping import Float, Int8
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import DataVector, Grid, ModesMatrix, on_host
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.formats import read_dataset
 from lusee_bayes.core.harmonics import (
     azimuth_functions,
     lmax_of,
@@ -33,46 +27,9 @@ from lusee_bayes.judge.measures import strengths, strengths_in_words
 from lusee_bayes.judge.residuals import Residuals
 from lusee_bayes.linear.posterior import prior_pixel_std
 from lusee_bayes.results.channel import ChannelResult
+from lusee_bayes.results.diagnostics_file import group_variables
 from lusee_bayes.results.draws import posterior_draws
-from lusee_bayes.results.saved import DIAGNOSTICS
 from lusee_bayes.sky.prior import Prior
-
-
-def write_diagnostics(dataset: xr.Dataset, path: Path) -> None:
-    """Write to netCDF; maps of draws and shares in single precision."""
-    if not dataset.sizes["group"]:  # files hold no empty arrays
-        dataset = dataset.drop_dims("group")
-    encoding = {name: {"dtype": "float32"} for name in ("draws", "prior_fraction")}
-    dataset.to_netcdf(path, engine="h5netcdf", encoding=encoding)
-
-
-def read_diagnostics(path: str | Path) -> xr.Dataset:
-    """What :func:`write_diagnostics` wrote. InputError for anything else."""
-    found = read_dataset(path, formats.DIAGNOSTICS, DIAGNOSTICS, "lusee-bayes map writes one")
-    empty = group_variables({})
-    if "group" not in found.sizes:
-        return found.assign(empty)
-    # files hold no empty arrays, so that all are absent, or none
-    missing = sorted(empty.keys() - found.keys())
-    if missing:
-        raise InputError(f"{path} has groups without {missing[0]}; lusee-bayes map writes them")
-    return found
-
-
-# what is told of a group of data
-GROUP = {"kind": np.str_, "name": np.str_, "n": np.int64} | dict.fromkeys(
-    ("degrees", "chi2", "p", "others_p"), np.float64
-)
-
-
-def group_variables(kinds: Mapping[str, Sequence[Any]]) -> dict[str, tuple[str, np.ndarray]]:
-    """One row for every group (``linear.residuals.Group``) that was left out, by its kind."""
-    groups = [{"kind": kind, **vars(group)} for kind, found in kinds.items() for group in found]
-    return {
-        f"group_{name}": ("group", np.array([group[name] for group in groups], dtype=dtype))
-        for name, dtype in GROUP.items()
-    }
-
 
 REGION_NSIDE = 8
 N_DRAWS = 4

@@ -23,7 +23,7 @@ from lusee_bayes.experiment.data_files import Data, names_of_data
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.results.diagnostics import read_diagnostics
+from lusee_bayes.results.diagnostics_file import read_diagnostics
 from lusee_bayes.results.saved import MAP_SUMMARY, PROVENANCE, SPECTRA
 from lusee_bayes.sky.sky_files import SkyMap
 

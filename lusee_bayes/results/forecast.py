@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from lusee_bayes.core.arrays import Ells
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.judge.chi2 import ell_cross
+from lusee_bayes.judge.measures import ell_cross
 
 AS_GIVEN = "as given"
 

@@ -26,7 +26,8 @@ from lusee_bayes.experiment.model import true_values
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.flight.reduced import Reduced
-from lusee_bayes.judge.chi2 import LEVELS, RULE, effective_resolution_deg
+from lusee_bayes.judge.chi2 import LEVELS, RULE
+from lusee_bayes.judge.measures import effective_resolution_deg
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.linear.linear_gaussian import composed, deviation_model

@@ -16,8 +16,8 @@ from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment, infer
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.judge.chi2 import Split
 from lusee_bayes.judge.residuals import HeldOut, held_out
+from lusee_bayes.judge.split import Split
 from lusee_bayes.results.channel import (
     ChannelResult,
     channel_of_posterior,

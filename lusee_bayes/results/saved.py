@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.judge.chi2 import LEVELS
-from lusee_bayes.judge.coverage import NAMES
+from lusee_bayes.judge.levels import NAMES
 
 NUMBER, COUNT, TEXT = Attribute(), Attribute("integer", low=0.0), Attribute("text")
 SIZE, SHARE, FLAG = Attribute(low=0.0), Attribute(low=0.0, high=1.0), Attribute("boolean")

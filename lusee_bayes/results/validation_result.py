@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lusee_bayes.judge.coverage import LEVELS
+from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.results.sample_result import SampleResult
 from lusee_bayes.sampling.validation import Check, Comparison, Ranks
 

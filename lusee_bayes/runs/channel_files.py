@@ -27,7 +27,8 @@ from lusee_bayes.experiment.data_files import Data, digest_of
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.judge.chi2 import ChiSquare, Split
+from lusee_bayes.judge.chi2 import ChiSquare
+from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.joint import ComponentSums, summed_information
 from lusee_bayes.results.channel import Observed

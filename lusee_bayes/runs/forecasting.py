@@ -34,7 +34,7 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import DataLayout, all_products
-from lusee_bayes.judge.chi2 import effective_resolution_deg, prior_fraction_per_ell
+from lusee_bayes.judge.measures import effective_resolution_deg, prior_fraction_per_ell
 from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior

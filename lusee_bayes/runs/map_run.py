@@ -22,7 +22,7 @@ from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.flight.reduced import Reduced, write_reduced
 from lusee_bayes.report.figures import judgement, maps
 from lusee_bayes.results.cube import CubeResult
-from lusee_bayes.results.diagnostics import write_diagnostics
+from lusee_bayes.results.diagnostics_file import write_diagnostics
 from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.map_files import cards, write_cube, write_map, write_posterior
 from lusee_bayes.results.map_result import MapResult, map_result

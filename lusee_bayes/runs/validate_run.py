@@ -16,7 +16,8 @@ from lusee_bayes.results.validation_result import ValidationResult
 from lusee_bayes.runs.cost import demand_of, measured_experiment, posterior_cost
 from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, json_file, text_file
 from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_folder, sample_result
-from lusee_bayes.sampling.hmc import Sampler, require_draws, require_simulations
+from lusee_bayes.sampling.hmc import Sampler
+from lusee_bayes.sampling.least import require_draws, require_simulations
 from lusee_bayes.sampling.programs import load_program
 from lusee_bayes.sampling.validation import BATCH, N_DRAWS, calibrate_sky, validate_draws
 

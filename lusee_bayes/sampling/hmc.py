@@ -659,25 +659,3 @@ class _Run:
             return state
         mesh = Mesh(np.asarray(devices), ("chain",))
         return jax.device_put(state, NamedSharding(mesh, PartitionSpec("chain")))
-
-
-# bins of a rank histogram, and the simulations that each should expect
-N_BINS, PER_BIN = 20, 5
-LEAST_DRAWS = 100
-
-
-def require_simulations(n: int) -> None:
-    """Raise InputError for too few data sets: each bin of the histogram should expect five."""
-    if n < PER_BIN * N_BINS:
-        raise InputError(
-            f"calibration needs at least {PER_BIN * N_BINS} simulations, {PER_BIN} for each of "
-            f"the {N_BINS} bins of a rank histogram, got {n}; raise --simulations"
-        )
-
-
-def require_draws(n: int) -> None:
-    """Raise InputError for fewer draws of a chain than a comparison needs."""
-    if n < LEAST_DRAWS:
-        raise InputError(
-            f"a comparison needs {LEAST_DRAWS} draws of each chain, got {n}; raise --draws"
-        )

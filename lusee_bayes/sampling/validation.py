@@ -40,11 +40,11 @@ from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.judge.coverage import LEVELS
+from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.linear.solver import Solver
-from lusee_bayes.sampling.hmc import N_BINS, require_draws, require_simulations
+from lusee_bayes.sampling.least import N_BINS, require_draws, require_simulations
 
 # ranks among 99 draws take 100 values, so that LEVELS are met exactly
 N_DRAWS = 99

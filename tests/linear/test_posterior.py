@@ -17,7 +17,7 @@ from lusee_bayes.core.harmonics import pixel_matrix, to_healpy
 from lusee_bayes.experiment.model import base_model, full_model
 from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.judge.chi2 import (
+from lusee_bayes.judge.measures import (
     correlation,
     effective_resolution_deg,
     ell_cross,

@@ -15,20 +15,11 @@ import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.judge.chi2 import (
-    FALSE_ALARM,
-    LEVELS,
-    WIDER,
-    ChiSquare,
-    Split,
-    stands_out,
-    two_sided,
-    widened,
-    worst,
-)
+from lusee_bayes.judge.chi2 import FALSE_ALARM, LEVELS, ChiSquare, stands_out, two_sided, worst
 from lusee_bayes.judge.left_out import DenseLeftOut
 from lusee_bayes.judge.measures import data_freedom, preferences
 from lusee_bayes.judge.residuals import residuals
+from lusee_bayes.judge.split import WIDER, Split, widened
 
 RUNS = "observation.runs=[{cycles: 0.03}, {cycles: 0.03, turntable_deg: 40}, {cycles: 0.02}]"
 

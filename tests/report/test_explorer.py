@@ -22,7 +22,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
 from lusee_bayes.core.lazy import healpy as lazy_healpy
 from lusee_bayes.report.explorer import BUDGET, KERNEL_NSIDE, nside_of_page, std_scale
-from lusee_bayes.results.diagnostics import read_diagnostics
+from lusee_bayes.results.diagnostics_file import read_diagnostics
 
 NODE = shutil.which("node")
 # elements that remember; a canvas whose context keeps the last image

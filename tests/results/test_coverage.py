@@ -12,7 +12,8 @@ import pytest
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.experiment.experiment import build, under_sky
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.judge.coverage import LEVELS, N_DRAWS, Counts, Coverage
+from lusee_bayes.judge.coverage import N_DRAWS, Counts, Coverage
+from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.results.draws import deviations
 from lusee_bayes.results.map_result import map_result
 from lusee_bayes.sky.sky_files import write_alms

@@ -10,8 +10,9 @@ from scipy import stats
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.judge.chi2 import FALSE_ALARM, WIDER, ChiSquare
+from lusee_bayes.judge.chi2 import FALSE_ALARM, ChiSquare
 from lusee_bayes.judge.cube_fit import ChannelFits
+from lusee_bayes.judge.split import WIDER
 
 FREQUENCIES = np.linspace(5.0, 50.0, 46)
 

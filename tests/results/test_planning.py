@@ -18,7 +18,7 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.products import DataLayout, all_products
-from lusee_bayes.judge.chi2 import ell_cross
+from lusee_bayes.judge.measures import ell_cross
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.solver import FORMS
 from lusee_bayes.results.forecast import Variation, forecast_rows

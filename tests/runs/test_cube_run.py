@@ -20,7 +20,7 @@ from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.term import Around
-from lusee_bayes.judge.chi2 import signal_to_noise
+from lusee_bayes.judge.measures import signal_to_noise
 from lusee_bayes.report import html
 from lusee_bayes.runs import channels, map_run
 from lusee_bayes.runs import folder as folder_module

@@ -14,7 +14,7 @@ from lusee_bayes.core.harmonics import lmax_of
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.judge.chi2 import ell_cross
+from lusee_bayes.judge.measures import ell_cross
 from lusee_bayes.report.figures.drawing import (
     BLUE,
     COLOURS,

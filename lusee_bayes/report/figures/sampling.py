@@ -14,8 +14,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from lusee_bayes.core.harmonics import mode_numbers
-from lusee_bayes.judge.chi2 import highest_altitude
-from lusee_bayes.judge.coverage import LEVELS
+from lusee_bayes.judge.levels import LEVELS
+from lusee_bayes.judge.measures import highest_altitude
 from lusee_bayes.report.figures.drawing import (
     BLUE,
     DIVERGING,
@@ -30,7 +30,7 @@ from lusee_bayes.report.figures.drawing import (
     temperatures,
 )
 from lusee_bayes.results.sample_result import SampleResult
-from lusee_bayes.sampling.hmc import N_BINS
+from lusee_bayes.sampling.least import N_BINS
 from lusee_bayes.sampling.validation import Comparison, Ranks
 from lusee_bayes.systematics.systematic import SKY
 

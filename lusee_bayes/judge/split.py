@@ -1,0 +1,125 @@
+"""chi^2 of data in two parts: what no sky explains, and what the prior does not expect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lusee_bayes.core.arrays import Square, on_host
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.linalg import cholesky, solve_lower, times_lower
+from lusee_bayes.judge.chi2 import ChiSquare
+from lusee_bayes.judge.measures import expected_chi2
+from lusee_bayes.linear.posterior import Posterior
+
+# k over the sky's own size, in units of the prior
+WIDER = 10.0
+
+
+@dataclass(frozen=True)
+class Split:
+    """chi^2 of data in its two parts.
+
+    Attributes
+    ----------
+    instrument : ChiSquare
+        What no sky explains: tests A and N.
+    prior : ChiSquare
+        The rest: tests the prior, if A and N are right.
+    wide : Posterior
+        Given the same data under the wide prior.
+    """
+
+    instrument: ChiSquare
+    prior: ChiSquare
+    wide: Posterior
+
+    @classmethod
+    def of(cls, posterior: Posterior, chi2: float, n_data: int) -> Split:
+        """Split chi^2 of the data behind a posterior.
+
+        Parameters
+        ----------
+        posterior : Posterior
+            In any form.
+        chi2 : float
+            Of the data under the model, sky included.
+        n_data : int
+
+        Raises
+        ------
+        InputError
+            As :func:`widened`.
+        """
+        posterior = on_host(posterior)
+        known = n_data - expected_chi2(posterior, n_data)
+        size = max(1.0, np.sqrt(float(posterior.prior_chi2()) / known)) if known > 0 else 1.0
+        try:
+            wide, less = widened(posterior, WIDER * size)
+        except InputError:
+            # data that do not fit ask for a sky that is stronger by orders of magnitude, under
+            # which numbers of 64 bits do not tell noise from sky; they stand out under this, too
+            wide, less = widened(posterior, WIDER)
+        degrees = n_data - with_sky(n_data - expected_chi2(wide, n_data))
+        instrument = ChiSquare(chi2 - less, float(degrees))
+        return cls(instrument, ChiSquare(less, float(n_data - degrees)), wide)
+
+
+def with_sky(directions: float) -> float:
+    """Degrees of freedom that measured directions of the sky take: a little is left of each."""
+    return (1.0 - 1.0 / WIDER**2) * directions
+
+
+def widened(posterior: Posterior, factor: float) -> tuple[Posterior, float]:
+    """Compute the posterior given the same data under a prior with wider standard deviations.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        With NumPy's arrays.
+    factor : float
+        By which the prior's standard deviations are multiplied, about the same mean.
+
+    Returns
+    -------
+    Posterior
+        Under the wider prior.
+    float
+        By how much chi^2 of the data under the model is smaller than before.
+
+    Raises
+    ------
+    InputError
+        If Lambda_k cannot be factorised.
+    """
+    prior, lower = posterior.prior, np.tril(posterior.lower)
+    off = posterior.white_mean - (0.0 if prior.white_mean is None else prior.white_mean)
+    # with a basis, outside of its span the posterior is the prior
+    inside = off if posterior.basis is None else posterior.basis.T @ off
+    precision = factor**2 * times_lower(lower, lower, transpose=True)
+    precision[np.diag_indices(len(precision))] -= factor**2 - 1.0
+    root = cholesky(precision, overwrite=True)
+    if not np.isfinite(np.diagonal(root)).all():
+        raise InputError(
+            "the data are too precise for the normal equations to tell noise from sky; use fewer "
+            "data at once"
+        )
+    half = solve_lower(root, inside[:, None], transpose=False)
+    step = (factor**2 - 1.0) * solve_lower(root, half, transpose=True)[:, 0]
+    less = (1.0 - factor**-2) * float(inside @ (inside + step))
+    moved = step if posterior.basis is None else posterior.basis @ step
+    log_evidence = posterior.log_evidence + 0.5 * less + _log_diagonal(lower) - _log_diagonal(root)
+    wide = Posterior(
+        prior.widened(factor),
+        (posterior.white_mean + moved) / factor,
+        root,
+        posterior.basis,
+        np.asarray(log_evidence),
+        posterior.refinement,
+    )
+    return wide, less
+
+
+def _log_diagonal(lower: Square) -> float:
+    return float(np.log(np.diagonal(lower)).sum())
