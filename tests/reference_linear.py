@@ -45,8 +45,8 @@ def posterior(a, s, n, d, offset=0.0) -> Answer:
 def resolution_rows(posterior, directions) -> np.ndarray:
     """y^T R of linear combinations y of the modes, one a row: R = 1 - C S^-1."""
     prior, y = posterior.prior, np.asarray(directions)
-    root = np.asarray(prior.colour(np.eye(prior.rank))).T
-    return y - np.linalg.solve(root @ root.T, np.asarray(posterior.covariance()) @ y.T).T
+    covariance = np.asarray(posterior.covariance())
+    return y - np.linalg.solve(np.asarray(prior.covariance()), covariance @ y.T).T
 
 
 def posterior_by_precision(a, s, n, d) -> Answer:

@@ -210,7 +210,7 @@ def test_a_clock_that_the_sessions_do_not_say_is_told_in_one_line(of_two_bands, 
     # nothing to say where the session says it itself
     known = lb.load_scenario("fiducial", [*TWO_BANDS, "flight.simulated.clock=known"])
     made = run_simulate_flight(known, tmp_path)
-    clock = f"flight.clock={simulated[0].flight.clock}"
+    clock = f"flight.clock={of_two_bands[0].flight.clock}"
     for given in ((), (clock,)):
         both = reduce_files(list(made.sessions), lb.load_scenario(str(made.scenario), given))
         assert both.notes() == ()
