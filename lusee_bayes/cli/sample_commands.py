@@ -106,7 +106,6 @@ def validate_command(
     simulations
         Data sets for simulation-based calibration.
     """
-    from lusee_bayes.sampling.hmc import Sampler
     from lusee_bayes.sampling.least import require_draws, require_simulations
 
     require_simulations(simulations)
@@ -115,6 +114,7 @@ def validate_command(
     from lusee_bayes.cli.tables import checks_table
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.validate_run import demand_of_calibration, run_validate
+    from lusee_bayes.sampling.hmc import Sampler
 
     with engine.open(demand_of_calibration(resolved)) as opened:
         run = run_validate(

@@ -13,12 +13,9 @@ from scipy import optimize
 from lusee_bayes.core.arrays import on_device
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.information import Information
+from lusee_bayes.sampling.log_normal_prior import AMPLITUDE, STRUCTURE, TILT, LogNormalPrior
 from lusee_bayes.sampling.log_normal_program import (
-    AMPLITUDE,
-    STRUCTURE,
-    TILT,
     LogNormalMode,
-    LogNormalPrior,
     coordinates_of,
     find_mode,
     learn_spectrum,
