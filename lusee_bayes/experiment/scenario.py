@@ -348,14 +348,14 @@ def load_scenario(
     return _validate(tree, "the scenario" if isinstance(source, Scenario) else source)
 
 
-def _validate(tree: dict[str, Any], source: str | Path) -> Scenario:
+def _validate(tree: dict[Any, Any], source: str | Path) -> Scenario:
     try:
         return Scenario.model_validate(tree)
     except ValidationError as error:
         raise InputError(one_sentence(error, str(source), Scenario)) from error
 
 
-def _read_yaml(source: str | Path) -> dict[str, Any]:
+def _read_yaml(source: str | Path) -> dict[Any, Any]:
     names = scenario_names()
     if os.path.exists(user_path(source)):
         tree = read_yaml(user_path(source), "a scenario")

@@ -296,6 +296,11 @@ class Map:
             found = found + self.covariance @ (gradient - found / model.prior.variance())
         return found
 
+    def chi2(self, data):
+        """Of data under the model, any sky of the prior being possible."""
+        mean = self.mean(data)
+        return float(self.model.chi2(mean, data) + (mean**2 / self.model.prior.variance()).sum())
+
     def squared(self, shift):
         """Square of a shift of the map in standard deviations, correlations counted."""
         return float(shift @ np.linalg.solve(self.covariance, shift))
