@@ -107,6 +107,8 @@ def test_lack_of_memory_or_disk_is_tried_again(engine, tmp_path):
     assert len(list(tmp_path.glob("10-*"))) == 4
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_a_task_whose_worker_dies_is_done_again_elsewhere(engine, tmp_path):
     def die(k):
         if k == 2 and attempts(tmp_path, k) < 3:
@@ -136,6 +138,8 @@ def test_a_task_whose_worker_dies_is_done_again_elsewhere(engine, tmp_path):
     assert engine.each(tasks_of(abs, 4), Stages(), "s") == [0, 1, 2, 3]
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_a_task_that_takes_too_much_memory_is_named(tmp_path):
     def hold(k):
         if k == 1:

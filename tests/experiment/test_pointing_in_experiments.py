@@ -117,7 +117,7 @@ def test_ignored_the_report_points_at_it(known_sky):
 def test_where_nothing_is_off_the_report_is_silent():
     none = "true_values: {clock_s: 0, turntable_0_deg: 0, turntable_1_deg: 0}"
     nothing = f"noise.pointing={{clock_s: 60, turntable_deg: 0.3, {none}, treatment: ignored}}"
-    setup = about_a_mean(set_up(scenario_of(TWO_RUNS, nothing)), 1e-2, 5)
+    setup = about_a_mean(set_up(scenario_of(TWO_RUNS, nothing, lmax=6)), 1e-2, 5)
     experiment = Experiment(setup, simulate(setup))
     found = infer(experiment)
     assert diagnosis(experiment, found).fits
@@ -228,7 +228,9 @@ def test_simulation_based_calibration():
     assert ((pulls**2).sum(0) < high).all()
 
 
-@pytest.mark.parametrize("size", [0.2, 1.0])
+@pytest.mark.parametrize(
+    "size", [0.2, pytest.param(1.0, marks=[pytest.mark.long, pytest.mark.essential])]
+)
 def test_offsets_that_can_stand_for_one_another_settle(size):
     """At one turntable angle clock, turntable and lean to the East turn the sky nearly alike.
 

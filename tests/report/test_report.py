@@ -170,7 +170,7 @@ def test_a_corrupted_product_is_pointed_at(tmp_path, factor):
     run_map(scenario, tmp_path / "out", data=tmp_path / "bad.nc")
     page = (tmp_path / "out" / "report.html").read_text()
     told = {1.2: "without product 12R .*: leave it out", 1.02: "any one of .* do not tell which"}
-    assert re.search(rf'class="verdict bad">Does not fit .*{told[factor]}', page)
+    assert re.search(rf'class="verdict bad">Does not fit.*{told[factor]}', page)
     assert re.search(r"<tr class=bad><td>12R</td>", page)
     found = read_diagnostics(tmp_path / "out" / "diagnostics.nc")
     suspects = np.atleast_1d(found.attrs["suspects"])
