@@ -28,7 +28,7 @@ from lusee_bayes.core.files import LOCK
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import Experiment, build, infer
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.runs import validate_run
+from lusee_bayes.runs import sample_run, validate_run
 from lusee_bayes.runs.sample_run import sample_result
 from lusee_bayes.sampling import hmc
 from lusee_bayes.sampling.datatree import read_datatree
