@@ -203,7 +203,7 @@ class ChannelsInFiles:
         found = self.engine.each(tasks, self.stages, "joint sums")
         return {name: np.stack([np.asarray(one[name]) for one in found]) for name in shapes}
 
-    def summed_information(
+    def summed(
         self,
         prior: SpectralPrior,
         reference: Float[np.ndarray, "channels modes"],

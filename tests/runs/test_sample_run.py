@@ -28,8 +28,7 @@ from lusee_bayes.core.files import LOCK
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import Experiment, build, infer
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.results import sample_result as results
-from lusee_bayes.runs import validate_run
+from lusee_bayes.runs import sample_run, validate_run
 from lusee_bayes.runs.sample_run import sample_result
 from lusee_bayes.sampling import hmc
 from lusee_bayes.sampling.datatree import read_datatree
@@ -132,7 +131,7 @@ def no_sampling(runs, monkeypatch):
     def fail(*_, **__):
         raise AssertionError("it began to sample")
 
-    monkeypatch.setattr(results, "sample", fail)
+    monkeypatch.setattr(sample_run, "sample", fail)
 
 
 def assert_one_sentence(capsys, *words):
