@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
@@ -275,6 +276,10 @@ def _stds(setup: Setup, names: tuple[str, ...]) -> Float[np.ndarray, " offsets"]
 GAIN_DRAW, SCALE_DRAW = 2, 6
 
 
+# NumPyro's handlers are those of all threads, in which channels and cases are simulated
+_HANDLERS = Lock()
+
+
 class GainTerm(Term):
     """``noise.gain``; simulated data hold drawn drifts."""
 
@@ -285,7 +290,7 @@ class GainTerm(Term):
 
     def drawn(self, setup: Setup, section: Any, key: PRNGKeyArray) -> Truth:
         # the scales where they are not known; the prior is the program's own
-        with numpyro.handlers.seed(rng_seed=jax.random.fold_in(key, SCALE_DRAW)):
+        with _HANDLERS, numpyro.handlers.seed(rng_seed=jax.random.fold_in(key, SCALE_DRAW)):
             drift = gain_drifts(setup, Around()).scales()
         return {"gain_sigma": float(drift.sigma), "gain_correlation_h": float(drift.correlation_h)}
 

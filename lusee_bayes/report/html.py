@@ -119,7 +119,7 @@ def table(
 
 
 def cells(
-    table: Mapping[str, Sequence[object]], layout: Layout, forms: Sequence[str]
+    table: Mapping[str, Iterable[object]], layout: Layout, forms: Sequence[str]
 ) -> list[tuple[str, ...]]:
     """The rows of a table that was read, each column in its form."""
     rows = zip(*(table[name] for name in layout.variables), strict=True)
