@@ -14,6 +14,7 @@ from reference_linear import Answer, white_posterior
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import radiometer, true_values
 from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.runs import channels
 from lusee_bayes.runs.channels import cube_result
 
 FREQUENCIES, OCTAVES = np.array([15.0, 20.0, 22.0]), 0.4
@@ -180,7 +181,7 @@ def test_a_resumed_run_is_the_same(scenario, folder, cube, tmp_path, monkeypatch
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     for frequency in (15, 22):
         (tmp_path / "channels" / f"{frequency}.result.nc").unlink()
-    monkeypatch.setattr(cube_module, "inform", None)
+    monkeypatch.setattr(channels, "inform", None)
     resumed = cube_result(scenario, tmp_path)
     assert resumed.log_evidence == cube.log_evidence
     for here, there in zip(resumed.channels, cube.channels, strict=True):
