@@ -97,21 +97,6 @@ def test_dipoles_point_along_their_axes():
     np.testing.assert_allclose(got[:, 1:], np.stack([y, z, -x], axis=1), rtol=0, atol=1e-15)
 
 
-def sphere(lmax):
-    """Directions and weights that integrate products of two fields up to lmax exactly."""
-    x, w = np.polynomial.legendre.leggauss(lmax + 1)
-    n_phi = 2 * lmax + 1
-    theta, phi = np.meshgrid(np.arccos(x), 2 * np.pi * np.arange(n_phi) / n_phi, indexing="ij")
-    return theta.ravel(), phi.ravel(), np.repeat(w, n_phi) * 2 * np.pi / n_phi
-
-
-def test_harmonics_are_orthonormal():
-    theta, phi, weight = sphere(16)
-    y = h.synthesis_matrix(theta, phi, 16)
-    # the quadrature is exact; rounding over 561 points
-    np.testing.assert_allclose((y.T * weight) @ y, np.eye(h.n_modes(16)), rtol=0, atol=1e-12)
-
-
 def test_a_map_gives_back_its_coefficients():
     alm = random_alm(np.random.default_rng(4), LMAX)
     modes = h.map_to_modes(healpy.alm2map(alm, 16, lmax=LMAX), LMAX)
@@ -139,23 +124,6 @@ def test_spectrum_is_healpys():
     np.testing.assert_allclose(h.sum_over_m(modes), np.stack(by_loop, axis=1), rtol=1e-13)
     spread = h.per_mode(jnp.arange(LMAX + 1.0))
     np.testing.assert_array_equal(spread, h.mode_numbers(LMAX)[0])
-
-
-def test_an_isotropic_sky_has_the_same_variance_in_every_coefficient():
-    cl, draws = np.array([3.0, 2.0, 0.5, 0.1]), 4000
-    np.random.seed(0)  # noqa: NPY002 (healpy draws from numpy's global state)
-    modes = np.stack([h.from_healpy(healpy.synalm(cl, lmax=3, new=True)) for _ in range(draws)])
-    ratio = modes.var(axis=0) / np.asarray(h.per_mode(jnp.asarray(cl)))
-    # a variance from n Gaussian draws scatters by sqrt(2 / n); five of these over 16 modes.
-    # A lost factor two of the m > 0 modes would be 1.0 away
-    np.testing.assert_allclose(ratio, 1.0, rtol=0, atol=5 * np.sqrt(2 / draws))
-
-
-def test_addition_theorem():
-    theta, phi = np.array([0.0, 0.7, np.pi / 2, 3.0]), np.array([0.0, 2.0, 4.0, 6.0])
-    squares = jnp.asarray(h.synthesis_matrix(theta, phi, LMAX) ** 2)
-    expected = (2 * np.arange(LMAX + 1) + 1) / (4 * np.pi)
-    np.testing.assert_allclose(h.sum_over_m(squares), np.tile(expected, (4, 1)), rtol=1e-13)
 
 
 @pytest.mark.parametrize(
@@ -210,19 +178,9 @@ def random_modes(seed, *batch, lmax=TURNED):
     return jnp.asarray(np.random.default_rng(seed).standard_normal((*batch, n_modes(lmax))))
 
 
-def dense(rotation):
-    return block_diag(*[np.asarray(b) for b in rotation.blocks])
-
-
 def dense_generators(lmax):
     per_ell = [h.generators(ell) for ell in range(lmax + 1)]
     return [block_diag(*[k[axis] for k in per_ell]) for axis in range(3)]
-
-
-def test_product_of_rotations():
-    g, k = random_rotation(1), random_rotation(2)
-    dg, dk, both = (h.Rotation.from_matrix(x, TURNED) for x in (g, k, g @ k))
-    np.testing.assert_allclose(dense(dg) @ dense(dk), dense(both), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", [3, 4, 5])

@@ -105,22 +105,14 @@ def test_the_draws_of_the_readme_become_healpys(tmp_path, monkeypatch, no_figure
     np.testing.assert_allclose(from_healpy(made["alm"]), made["skies"], rtol=1e-14)
 
 
-def test_the_citation_names_this_version():
+def test_the_citation_is_whole():
     citation = parse_yaml((ROOT / "CITATION.cff").read_text(), "the file")
     assert citation["cff-version"] == "1.2.0"
     # what the standard asks for
     assert {"authors", "message", "title"} <= set(citation)
-    assert citation["version"] == lb.__version__
     assert f"version = {{{lb.__version__}}}" in (DOCS / "citing.md").read_text()
     readme = (ROOT / "README.md").read_text()
     assert citation["preferred-citation"]["url"] in readme
-
-
-@pytest.mark.parametrize("words", ["own data", "mask", "flag", "cite"])
-def test_words_that_users_search_for_are_in_the_pages(words):
-    # the site's search is over whole words and their stems
-    pages = [*DOCS.glob("*.md"), *DOCS.glob("howto/*.md")]
-    assert any(re.search(rf"\b{words}s?\b", page.read_text(), re.IGNORECASE) for page in pages)
 
 
 def test_the_scenarios_of_the_pages_are_scenarios(tmp_path):
@@ -156,7 +148,6 @@ def test_the_table_of_scenarios_is_complete():
     assert [name for name in scenario_names() if f"`{name}`" not in page] == []
 
 
-ROOT = Path(__file__).resolve().parents[2]
 BLOCK = re.compile(
     r"^```\{code-block\} python\n:caption: (?P<path>[^\s,]+)"
     r'(?:, (?P<how>before|after|instead of) "(?P<line>[^\n]*)")?\n\n(?P<code>.*?)^```',
@@ -177,24 +168,13 @@ def applied(text: str, how: str, line: str, code: str) -> str:
     return "".join([*lines[:first], code, *lines[rest:]])
 
 
-def test_a_worked_example_touches_four_files_at_most():
-    page = (ROOT / "docs" / "extend.md").read_text()
-    part = page[page.index("## In the package, file by file") :]
-    examples = part.split("\n### ")[1:]
-    assert len(examples) == 4
-    for example in examples:
-        touched = {match["path"] for match in BLOCK.finditer(example)}
-        assert 2 <= len(touched) <= 4, touched
-        assert any(path.startswith("tests/") for path in touched)
-
-
 @pytest.mark.long
 @pytest.mark.essential
 def test_the_worked_examples_pass_their_tests(tmp_path):
     for folder in ("lusee_bayes", "models"):
         shutil.copytree(ROOT / folder, tmp_path / folder)
     (tmp_path / "tests").mkdir()
-    for match in BLOCK.finditer((ROOT / "docs" / "extend.md").read_text()):
+    for match in BLOCK.finditer((DOCS / "extend.md").read_text()):
         path = tmp_path / match["path"]
         if match["how"] is None:
             assert not path.exists(), path
@@ -215,7 +195,7 @@ def test_the_worked_examples_pass_their_tests(tmp_path):
     assert "6 passed" in found.stdout
 
 
-NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 
 MOST_BYTES = 600_000
@@ -285,35 +265,23 @@ def test_links_lead_somewhere(path):
         assert target.startswith("https://") or (path.parent / target).exists(), target
 
 
-GUIDE = Path(__file__).parents[2] / "docs" / "systematics.md"
-
-
 @pytest.mark.long
 @pytest.mark.essential
-def test_both_faces_of_the_guides_systematic_have_one_evidence(tmp_path):
-    (code,) = re.findall(r"```python\n(.*?)```", GUIDE.read_text(), flags=re.DOTALL)
-    program = """
-
-def model(gaussian, systematics, data=None):
-    for systematic in systematics:
-        gaussian = systematic.sampled(gaussian)
-    numpyro.sample("data", lb.Marginal(gaussian), obs=data)
-    return gaussian
-"""
-    path = tmp_path / "pickup.py"
-    path.write_text("import jax\n" + code + program)
-    loaded = load_program(path)
-    pickup = loaded.model.__globals__["CablePickup"]
+def test_both_faces_of_the_guides_systematic_have_one_evidence():
+    ((_, code),) = FENCES.findall((DOCS / "systematics.md").read_text())
+    made = {}
+    exec("import jax\n" + code, made)
     rng = np.random.default_rng(1)
     gaussian = lb.LinearGaussian(
         jnp.asarray(rng.normal(size=(30, 9))),
         lb.HarmonicPrior(jnp.ones(3)),
         lb.DiagonalCovariance(jnp.full(30, 0.1)),
     )
-    cable = pickup(jnp.asarray(rng.normal(size=30)), 0.7)
+    cable = made["CablePickup"](jnp.asarray(rng.normal(size=30)), 0.7)
     data = gaussian.sample(jax.random.key(0))[1] + 0.5 * cable.pattern
-    pieces = {"gaussian": lambda: gaussian, "systematics": lambda: (cable,)}
-    found = estimate_evidence(loaded, loaded.arguments(gaussian, pieces), data)
+    program = load_program("systematics")
+    arguments = {"gaussian": gaussian, "systematics": (cable,)}
+    found = estimate_evidence(program, arguments, data)
     exact = float(cable.marginalised(gaussian).log_prob(data))
     # a Gaussian is what the proposal is about, so that nearly every draw counts
     assert found.effective > 200

@@ -147,19 +147,6 @@ def test_no_experiment_of_data_with_unclear_times_or_a_fixed_axis_in_windows(tmp
         set_up(scenario("observation.fixed_axis=true"), data)
 
 
-def test_data_are_averaged_on_reading(tmp_path):
-    path, _ = file_of(tmp_path, "mean")
-    found = read_data(path, scenario(f"observation.average_s={2 * STEP}"))
-    assert found.digest() == averaged(read_visibilities(path), 2 * STEP).digest()
-    assert found.observation.step_s == 2 * STEP
-    for more, words in (
-        (f"observation.average_s={STEP / 2}", "shorter than their samples of 7200 s"),
-        ("observation.average_s=-1", "greater than 0"),
-    ):
-        with pytest.raises(InputError, match=words):
-            read_data(path, scenario(more))
-
-
 def test_waterfalls_are_instants_unless_the_scenario_says_other(tmp_path):
     header = {
         "LUNAR_DAY": "2027-02-01 00:00:00 to 2027-02-02 00:00:00",
@@ -384,18 +371,6 @@ def test_as_much_is_lost_as_the_planner_says(maps):
     lost = 0.5 * np.log2(ratios).sum()
     assert maps.fine.bits - maps.windows.bits == pytest.approx(lost, abs=1e-3)
     assert 0.1 < lost < 0.02 * maps.fine.bits
-
-
-def test_means_differ_by_what_is_lost(maps, draws):
-    """|mean_avg - mean_fine|^2 in units of C_fine is a sum of squares of variances ratio - 1."""
-    ratios = eigh(maps.windows.covariance, maps.fine.covariance, eigvals_only=True)
-    excess = ratios - 1.0
-    shifts = [
-        maps.fine.squared(maps.windows.mean(coarse) - maps.fine.mean(fine))
-        for _, fine, coarse in draws
-    ]
-    scatter = np.sqrt(2.0 * (excess**2).sum() / DRAWS)
-    assert np.mean(shifts) == pytest.approx(excess.sum(), abs=4.0 * scatter)
 
 
 def test_maps_of_averages_are_right_and_of_instants_wrong(maps, draws):

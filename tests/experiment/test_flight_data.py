@@ -12,10 +12,8 @@ import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.data_files import read_data
 from lusee_bayes.experiment.experiment import build, infer
-from lusee_bayes.experiment.flight_data import per_kelvin_of, reduce_files, visibilities_of
+from lusee_bayes.experiment.flight_data import per_kelvin_of, reduce_files
 from lusee_bayes.experiment.flight_simulation import simulate_flight
-from lusee_bayes.experiment.leave_out import without
-from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.flight.gain_model import synthetic_gains
@@ -171,42 +169,6 @@ def test_bursts_of_an_hour_are_found_and_little_else(tmp_path):
     burst = truth["burst"]
     assert (reduced.reason[0][burst] == BURST).mean() >= 0.95
     assert (reduced.reason[0][~burst] == BURST).mean() <= 1e-3
-
-
-@pytest.mark.long
-def test_a_map_of_disturbed_spectra_is_that_of_clean_ones(tmp_path):
-    """Every spectrum is a sample: their noise is the same with and without disturbances."""
-    rows = 1000
-    plain = ["lmax=8", "frequencies_mhz=[25]", "frequency_mhz=25"]
-    plain += ["noise.radiometer={form: exact, temperature: measured}"]
-    bursts = DISTURBED.replace("9.8, ", "").replace("comb_share: 0.05, ", "")
-    bursts = bursts.replace("absent_share: 0.02", "burst_factor: 100")
-    reduced, truth = simulated(tmp_path / "a", *plain, bursts, rows=rows, step_s=42.0)
-    clean, _ = simulated(tmp_path / "b", *plain, rows=rows, step_s=42.0)
-    scenario = load_scenario(str(tmp_path / "a" / "scenario.yaml"), ["observation.average_s=null"])
-    exact = scenario.model_copy(update={"flight": None})
-    reason = reduced.reason[0]
-    burst = truth["burst"] & ~truth["saturated"]
-    assert min(burst.sum(), truth["saturated"].sum(), truth["tone"].sum()) > 15
-    assert (reason[burst] == BURST).mean() >= 0.95
-    assert (reason[truth["saturated"]] == SATURATED).all()
-    assert (reason[~burst & ~truth["saturated"]] != USED).mean() <= 1e-3
-    experiment = build(scenario, visibilities_of(reduced, scenario))
-    found = infer(experiment).posterior
-    # the clean spectra of the same times: those that are flagged are lost to both
-    gone = np.ones((16, rows), dtype=bool)
-    gone[:, reduced.bins_at(0)] = experiment.fitting.flagged
-    whole = build(exact, visibilities_of(clean, scenario))
-    same = settled(*without(whole.setup, whole.data, gone)).posterior
-    moved = (np.asarray(found.mean) - np.asarray(same.mean)) / np.asarray(same.std())
-    assert np.sqrt(np.mean(moved**2)) < 0.1
-    assert np.abs(moved).max() < 0.2
-    # and what would come of it without flags
-    noise = {"n_averaged": clean.n_averaged, "reason": clean.reason}
-    unflagged = replace(reduced, values=reduced.before, **noise)
-    spoilt = infer(build(exact, visibilities_of(unflagged, scenario))).posterior
-    off = (np.asarray(spoilt.mean) - np.asarray(same.mean)) / np.asarray(same.std())
-    assert np.abs(off).max() > 5.0
 
 
 def test_products_that_are_absent_are_absent(tmp_path):

@@ -23,7 +23,6 @@ from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.waterfalls import read_waterfall
 
@@ -119,14 +118,3 @@ def test_posteriors_of_gaussian_skies(naive, test_data, quadrature, calibrated):
         assert_draws_follow(white, np.zeros(white.shape[1]), np.eye(white.shape[1]))
     else:
         assert p < 1e-6
-
-
-def test_the_packages_matrix_is_that_of_the_naive_sum(naive, test_data):
-    beam = read_beam(test_data / "luseepy" / "synthetic_monopole_beam.fits")
-    waterfall = read_waterfall(test_data / "luseepy" / "waterfall_exact_engine.fits")
-    observation = waterfall.observation.select(np.isin(np.arange(328), [0, 200]))
-    beams = beam.beams(FREQUENCY, 6, grid=beam.luseepy_grid)
-    ours = np.asarray(lb.CouplingMatrix.observe(beams, observation).dense()).reshape(16, 2, -1)
-    for k, time in enumerate(observation.times):
-        # the expansion in the tilt of the Moon's axis
-        np.testing.assert_allclose(ours[:, k], naive.rows(time, 6), rtol=0, atol=1e-9)

@@ -458,19 +458,6 @@ def test_what_is_listed_of_a_key_is_enforced_and_the_key_is_named(key):
             load_scenario("fiducial", [*of_kind(key), f"{key.path}={value}"])
 
 
-def test_units_are_those_of_the_names():
-    units = {
-        "v2_hz" if key.path.endswith("_v2_hz") else key.path.rsplit("_", 1)[-1]: key.unit
-        for key in KEYS
-        if key.unit
-    }
-    assert units == {
-        "mhz": "MHz", "hz": "Hz", "deg": "degrees", "m": "m", "s": "s", "h": "h", "k": "K",
-        "day": "s/day", "v2_hz": "V²/Hz",
-        "jy": "Jy", "pf": "pF", "nh": "nH", "ohm": "Ohm",
-    }  # fmt: skip
-
-
 def test_a_section_is_listed_alone_and_a_wrong_one_is_corrected():
     assert {key.path.split(".")[1] for key in scenario_keys("noise.gain")} == {"gain"}
     assert [key.path for key in scenario_keys("lmax")] == ["lmax"]

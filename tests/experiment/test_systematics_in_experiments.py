@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from experiments import small_experiment
-from scipy.stats import chi2, kstest
 
 from lusee_bayes.experiment import model as model_module
 from lusee_bayes.experiment.experiment import Experiment, build, infer
@@ -32,10 +31,6 @@ from lusee_bayes.experiment.term import AdditiveTerm, Around, Term, Truth
 from lusee_bayes.experiment.terms import TERMS
 from lusee_bayes.instrument.beams.monopoles import monopole_beams
 from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.pointing import Pointing
-from lusee_bayes.instrument.schedule import Run
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import (
     Covariance,
     LowRankCovariance,
@@ -44,10 +39,7 @@ from lusee_bayes.noise.covariance import (
 )
 from lusee_bayes.noise.instrument_errors import (
     GainDrift,
-    with_gains,
 )
-from lusee_bayes.noise.radiometer import radiometer_noise
-from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.systematic import AdditiveNoise
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -91,9 +83,6 @@ def test_the_gain_terms_model_is_the_papers():
     np.testing.assert_allclose(ignoring.coupling.dense(), rows, rtol=0, atol=1e-15)
     built = build(small_scenario(GAIN, cycles=0.2)).setup
     np.testing.assert_array_equal(built.signal, plain_setup.signal)
-
-
-# --- evidence ---------------------------------------------------------------------------------
 
 
 # --- what the gain term is built around -------------------------------------------------------
@@ -171,57 +160,6 @@ def test_the_seed_decides_every_draw(term):
     # by much more than radiometer noise: the systematic is drawn anew
     level = np.sqrt(np.asarray(radiometer(other.setup).diagonal())).max()
     assert difference_of_seeds.max() > 20 * level
-
-
-# --- gains that really drift ------------------------------------------------------------------
-
-LMAX, N_MODES, N_DRAWS, SEED = 6, 49, 400, 20270115
-SPECTRUM = 1e8 * (1.0 + np.arange(LMAX + 1.0)) ** -2.5
-
-
-def p_value(skies, means, covariance) -> float:
-    """Kolmogorov-Smirnov of (m - mean)^T C^-1 (m - mean) against chi^2 of 49 degrees."""
-    scale = np.sqrt(np.repeat(SPECTRUM, 2 * np.arange(LMAX + 1) + 1))
-    off = (np.asarray(skies) - np.asarray(means)) / scale
-    scaled = np.asarray(covariance) / np.outer(scale, scale)
-    roots = np.linalg.cholesky(scaled)
-    z = np.linalg.solve(roots, off[..., None])[..., 0]
-    return kstest((z**2).sum(1), chi2(N_MODES).cdf).pvalue
-
-
-@pytest.mark.long
-@pytest.mark.essential
-def test_calibrated_with_gains_that_really_drift():
-    """(1 + g_i)(1 + g_j) V_ij on skies of the prior, N around each true signal; sigma_g = 1e-3."""
-    observation = Observation.from_runs([Run(0.02)])
-    pointing = Pointing.of(observation, LMAX)
-    coupling = CouplingMatrix.build(monopole_beams(25.0, LMAX), pointing)
-    prior, layout = HarmonicPrior(jnp.asarray(SPECTRUM)), coupling.layout
-    monopole = jnp.zeros(N_MODES).at[0].set(2e4 * np.sqrt(4 * np.pi))
-    radiometer = radiometer_noise(layout.scatter(coupling @ monopole), layout, form="paper")
-    sigma, hours, rng = 1e-3, observation.hours, np.random.default_rng(SEED)
-    lag = hours[:, None] - hours[None]
-    value, vector = np.linalg.eigh(sigma**2 * np.exp(-(lag**2) / 200.0))
-    root = vector * np.sqrt(np.maximum(value, 0.0))
-    gains = rng.normal(size=(N_DRAWS, 4, len(hours))) @ root.T
-    skies = rng.normal(size=(N_DRAWS, N_MODES)) * np.sqrt(np.asarray(prior.variance()))
-    added = rng.normal(size=(N_DRAWS, layout.size)) * np.sqrt(np.asarray(radiometer.diagonal()))
-    drift = GainDrift(sigma)
-    width = drift.width(hours)
-
-    @jax.jit
-    @jax.vmap
-    def condition(sky, gain, noise):
-        signal = layout.scatter(coupling @ sky)
-        data = layout.gather(with_gains(signal, gain)) + noise
-        around = radiometer + drift.covariance(signal, hours, layout, width)
-        models = (LinearGaussian(coupling, prior, n) for n in (around, radiometer))
-        posteriors = [m.factorise("map").condition(data) for m in models]
-        return [(p.mean, p.covariance()) for p in posteriors]
-
-    right, wrong = condition(jnp.asarray(skies), jnp.asarray(gains), jnp.asarray(added))
-    assert p_value(skies, *right) > 0.01
-    assert p_value(skies, *wrong) < 1e-10
 
 
 # --- a new noise term of a scenario: in N, in simulated data, among what is sampled ---------------
@@ -339,18 +277,6 @@ def test_simulated_data_hold_it_whatever_its_treatment(registered):
     )
     other = np.asarray(simulate(reseeded).data - simulate(bare).data)
     assert np.abs(other - added["ignored"]).max() > 1.0
-
-
-def test_a_whole_experiment_knows_its_noise(registered):
-    """chi^2 of noise about the true signal: right with the hum in N, absurd without it."""
-    experiment = build(with_hum(sigma_k=100.0))
-    setup = experiment.setup
-    off = experiment.data.data - setup.layout.gather(setup.signal)
-    right = float((off * full_model(setup, Around(experiment.data)).noise.solve(off)).sum())
-    wrong = float((off**2 / radiometer(setup).diagonal()).sum())
-    n = off.shape[0]
-    assert abs(right - n) < 5 * np.sqrt(2 * n)
-    assert wrong > 100 * n
 
 
 # --- a term with values of its own ----------------------------------------------------------------

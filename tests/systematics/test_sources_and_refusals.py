@@ -56,20 +56,19 @@ def built() -> Setup:
     return small_experiment(LIST).setup
 
 
-def setup_of(treatment: str = "marginalised", seed: int = 1) -> Setup:
-    """Neither the treatment nor the seed enters what was built (A, the beams, the responses)."""
-    scenario = small_scenario(LIST, f"sources.treatment={treatment}", f"seed={seed}")
-    return replace(built(), scenario=scenario)
+def setup_of(treatment: str = "marginalised") -> Setup:
+    """The treatment does not enter what was built (A, the beams, the responses)."""
+    return replace(built(), scenario=small_scenario(LIST, f"sources.treatment={treatment}"))
 
 
 @lru_cache
-def experiment(treatment: str = "marginalised", seed: int = 1) -> Setup:
-    setup = setup_of(treatment, seed)
+def experiment(treatment: str = "marginalised") -> lb.Experiment:
+    setup = setup_of(treatment)
     return lb.Experiment(setup, simulate(setup))
 
 
-def data(treatment: str = "marginalised", seed: int = 1):
-    return experiment(treatment, seed).data
+def data(treatment: str = "marginalised"):
+    return experiment(treatment).data
 
 
 def columns() -> np.ndarray:
