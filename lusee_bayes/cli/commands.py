@@ -12,18 +12,17 @@ MODULES = {
     "plan_command": ("plan",),
     "look_commands": ("compare", "compare-priors", "report", "info", "keys", "paper"),
 }
-# the summary, what else there is to know, and examples
-COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
+# the summary with what else there is to know, and examples
+COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "simulate": (
         "Simulate the visibilities of a scenario.",
-        "",
         (
             "lusee-bayes simulate fiducial --set seed=2 -o data.nc",
             "lusee-bayes simulate fiducial --frequencies 10:30:5 -o waterfall.fits",
         ),
     ),
     "average": (
-        "Average data over longer times, and say what that costs.",
+        "Average data over longer times, and say what that costs.\n\n"
         "Data then need less memory and time to map. The cost is information about the map, in "
         "bits, by the forecast that plan makes.",
         (
@@ -32,7 +31,7 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         ),
     ),
     "reduce": (
-        "Calibrate, flag and average sessions of the spectrometer.",
+        "Calibrate, flag and average sessions of the spectrometer.\n\n"
         "What the files leave open (gain table, bin origin, what the times are, a clock) is said "
         "by the scenario. map does the same with --data SESSION..., for its own frequencies.",
         (
@@ -42,7 +41,6 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     ),
     "map": (
         "Make a posterior map of a scenario, or of given data.",
-        "",
         (
             "lusee-bayes map fiducial --set frequency_mhz=10 -o output/ten",
             "lusee-bayes map fiducial --data data.nc -o output/measured",
@@ -54,7 +52,7 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         ),
     ),
     "sample": (
-        "Sample the posterior of a NumPyro program by Hamiltonian Monte Carlo.",
+        "Sample the posterior of a NumPyro program by Hamiltonian Monte Carlo.\n\n"
         "Draws are written during the run: after an interruption, --resume continues it.",
         (
             "lusee-bayes sample fiducial --set lmax=20 --draws 500 -o output/hmc",
@@ -64,19 +62,18 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     ),
     "plan": (
         "Forecast the information in observations, without data.",
-        "",
         (
             "lusee-bayes plan fiducial gain_1e-2 -o output/plan",
             "lusee-bayes plan fiducial --vary frequency_mhz=10,25,40",
         ),
     ),
     "validate": (
-        "Check the posterior by HMC and by simulated data sets.",
+        "Check the posterior by HMC and by simulated data sets.\n\n"
         "Ends with exit code 1 if a check fails; validation.md holds the thresholds.",
         ("lusee-bayes validate gain_1e-2 --set lmax=8 -o output/check",),
     ),
     "paper": (
-        "Reproduce the figures of the reference paper and judge its claims.",
+        "Reproduce the figures of the reference paper and judge its claims.\n\n"
         "Cases that were computed before with the same scenario and version are kept, so that an "
         "interrupted run continues where it stopped.",
         (
@@ -86,17 +83,14 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     ),
     "report": (
         "Write report.html of a finished run again.",
-        "",
         ("lusee-bayes report output/fiducial",),
     ),
     "compare": (
         "Set finished map runs side by side.",
-        "",
         ("lusee-bayes compare output/fiducial output/gain_1e-2",),
     ),
     "compare-priors": (
         "Map one data set under several priors, and say which of them it prefers.",
-        "",
         (
             "lusee-bayes compare-priors fiducial --set lmax=31 -o output/priors",
             "lusee-bayes compare-priors fiducial --data data.nc --priors isotropic,local_scales",
@@ -104,7 +98,6 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     ),
     "info": (
         "Describe the contents of files, or of runs' folders.",
-        "",
         (
             "lusee-bayes info output/fiducial",
             "lusee-bayes info output/fiducial/posterior.nc",
@@ -114,7 +107,6 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     ),
     "keys": (
         "List the keys of a scenario: meaning, unit, choices, default.",
-        "",
         ("lusee-bayes keys", "lusee-bayes keys noise.gain"),
     ),
 }
@@ -125,6 +117,5 @@ def help_of(name: str) -> str:
 
     What Markdown (the terminal) and reST (the site) both read.
     """
-    summary, more, examples = COMMANDS[name]
-    lines = [f"- ``{example}``" for example in examples]
-    return "\n".join([summary, "", more, "", "**Examples**", "", *lines])
+    text, examples = COMMANDS[name]
+    return "\n".join([text, "", "**Examples**", "", *(f"- ``{one}``" for one in examples)])

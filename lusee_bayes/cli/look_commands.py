@@ -33,7 +33,7 @@ def compare_command(
     from lusee_bayes.results.finished_runs import evidence_caveat
     from lusee_bayes.runs.compare_run import run_compare
 
-    run = run_compare(folders, output, replace=options.force, stages=options.stages())
+    run = run_compare(folders, output, **options.running())
     lines = [f"look at {output / 'comparison.html'}"]
     if (caveat := evidence_caveat(run.result)) is not None:
         lines.insert(0, caveat)
@@ -77,8 +77,7 @@ def compare_priors_command(
             truth=truth,
             name=Path(scenario).stem,
             engine=opened,
-            replace=options.force,
-            stages=options.stages(),
+            **options.running(),
         )
     lines = [*run.result.lines(), f"look at {run.folder / REPORT}"]
     options.tell(run.files, *lines, table=priors_table(run.result))
@@ -174,9 +173,8 @@ def paper_command(
     from lusee_bayes.runs.paper_run import run_paper
 
     demand = demand_of([posterior_cost(s) for s in paper_scenarios(skies=sky).values()])
-    given = {"replace": options.force, "stages": options.stages()}
     with engine.open(demand) as opened:
-        run = run_paper(output, skies=sky, engine=opened, **given)
+        run = run_paper(output, skies=sky, engine=opened, **options.running())
     verdict = (run.folder / "claims.md").read_text(encoding="utf-8").splitlines()[0]
     files = [path for path in run.files if path.suffix != ".nc"]
     options.tell(files, verdict, f"look at {run.folder}/claims.md")

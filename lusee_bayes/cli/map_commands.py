@@ -72,7 +72,7 @@ def map_command(
         output__updatable=updatable,
     )
     given = {"data": options.data, "truth": truth, "onto": onto, "diagnosed": diagnose}
-    given |= {"replace": options.force, "stages": options.stages()}
+    given |= options.running()
     folder = options.folder(scenario)
     if resolved.frequencies_mhz:
         with engine.open(demand_of_channels(resolved)) as opened:
@@ -109,7 +109,7 @@ def simulate_command(
     """
     loaded = options.load(scenario, replaces=output)
     channels = () if frequencies is None else parse_frequencies(frequencies)
-    given = {"frequencies_mhz": channels, "replace": options.force, "stages": options.stages()}
+    given = {"frequencies_mhz": channels} | options.running()
     from lusee_bayes.runs.data_run import run_simulate, run_simulate_flight
 
     if flight:
@@ -156,7 +156,7 @@ def reduce_command(
     from lusee_bayes.runs.data_run import reduced_lines, run_reduce
 
     loaded = options.load(scenario, frequencies, output, flight__clock=clock)
-    reduced = run_reduce(loaded, files, output, replace=options.force, stages=options.stages())
+    reduced = run_reduce(loaded, files, output, **options.running())
     bands = counted(len(reduced.frequencies_mhz), "band")
     options.say(*reduced_lines(reduced), f"{bands} -> {output}")
 
@@ -194,7 +194,6 @@ def average_command(
         parse_duration(to),
         output,
         information=not no_information,
-        replace=options.force,
-        stages=options.stages(),
+        **options.running(),
     )
     options.say(*run.lines(), f"{run.averaged.layout.size} visibilities -> {output}")

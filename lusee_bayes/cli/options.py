@@ -74,6 +74,10 @@ class Options:
         """What shows and times the stages of the run."""
         return Stages(self.console, verbose=self.verbose)
 
+    def running(self) -> dict[str, bool | Stages]:
+        """What every run takes."""
+        return {"replace": self.force, "stages": self.stages()}
+
     def say(self, *lines: object) -> None:
         """Print lines as they are."""
         say(self.console, *lines)

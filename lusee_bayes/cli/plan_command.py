@@ -48,11 +48,16 @@ def plan_command(
     if len(set(sources)) < len(sources):
         twice = next(s for s in sources if sources.count(s) > 1)
         raise InputError(f"the scenario '{twice}' is given twice; give each once")
-    variations = [v for s in sources for v in variations_of(s, vary, options.set_, options.console)]
+    variations: list[Variation] = []
+    for source in sources:
+        if vary:
+            variations += own_variations(source, vary, options.set_)
+        else:
+            given = default_variations(source, load_scenario(source, options.set_))
+            variations += possible(given, options.console)
     demand = demand_of([posterior_cost(v.scenario) for v in variations])
-    given = {"replace": options.force, "stages": options.stages()}
     with engine.open(demand) as opened:
-        run = run_plan(variations, output, engine=opened, **given)
+        run = run_plan(variations, output, engine=opened, **options.running())
     for source in sources:
         table = forecast_table([f for f in run.result if f.variation.source == source])
         options.tell((), table=table)
@@ -62,18 +67,6 @@ def plan_command(
         if offsets := baseline(run.result, source).offsets_line():
             options.say(f"{source}: {offsets}")
     options.say(f"look at {run.folder}/figures/plan.png")
-
-
-def variations_of(
-    source: str, vary: Sequence[str], overrides: Sequence[str], console: Console
-) -> list[Variation]:
-    """The variations of a scenario: those asked for, or else the default ones that are possible.
-
-    InputError as :func:`own_variations`.
-    """
-    if vary:
-        return own_variations(source, vary, overrides)
-    return possible(default_variations(source, load_scenario(source, overrides)), console)
 
 
 def own_variations(source: str, vary: Sequence[str], overrides: Sequence[str]) -> list[Variation]:

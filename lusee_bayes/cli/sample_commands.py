@@ -62,8 +62,7 @@ def sample_command(
         ),
         data=options.data,
         resume=resume,
-        replace=options.force,
-        stages=options.stages(),
+        **options.running(),
     )
     options.tell(run.files)
     for result in run.result:
@@ -126,8 +125,7 @@ def validate_command(
             data=options.data,
             resume=resume,
             engine=opened,
-            replace=options.force,
-            stages=options.stages(),
+            **options.running(),
         )
     verdict = f"{run.result.headline()}; look at {run.folder / REPORT}"
     options.tell(run.files, verdict, table=checks_table(run.result.checks))

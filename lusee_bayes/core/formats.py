@@ -14,7 +14,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,8 @@ from lusee_bayes.core.reading import reading, require_file
 WHOLE_BYTES = 200_000_000
 # a whole file of that size takes less than a tenth of it
 LIMIT_S = 20.0
+# what HDF5's library raises for a file that is damaged
+DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError)
 
 
 def require_readable_hdf5(path: Path) -> None:
@@ -92,16 +94,12 @@ def _read_all(path: str, size: int) -> None:
 
 def _read(item: h5py.Group | h5py.Dataset, size: int) -> None:
     for name in item.attrs:
-        try:
+        with suppress(*DAMAGE):  # the reader says it
             item.attrs[name]
-        except (OSError, KeyError, RuntimeError, ValueError, TypeError):
-            continue  # the reader says it
     if isinstance(item, h5py.Dataset) and item.size:
         whole = size <= WHOLE_BYTES and item.size * item.dtype.itemsize <= 5 * WHOLE_BYTES
-        try:
+        with suppress(*DAMAGE, MemoryError):
             item[()] if whole or not item.shape else item[(0,) * len(item.shape)]
-        except (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError):
-            return
 
 
 VISIBILITIES = "lusee_bayes visibilities 1"

@@ -397,21 +397,13 @@ def turn_about_z(
     return modes * cosine.reshape(shape) + mirrored * sine.reshape(shape)
 
 
-def turn_about_x(
-    modes: Float[Array, "*batch modes"], angle: float | Float[Array, ""]
+def turn_about(
+    axis: int, modes: Float[Array, "*batch modes"], angle: float | Float[Array, ""]
 ) -> Float[Array, "*batch modes"]:
-    """Turn fields about x, from y towards z; else as :func:`turn_about_z`."""
-    return _turn_about(0, modes, angle)
+    """Turn fields about x (axis 0), from y towards z, or about y (1), from z towards x.
 
-
-def turn_about_y(
-    modes: Float[Array, "*batch modes"], angle: float | Float[Array, ""]
-) -> Float[Array, "*batch modes"]:
-    """Turn fields about y, from z towards x; else as :func:`turn_about_z`."""
-    return _turn_about(1, modes, angle)
-
-
-def _turn_about(axis: int, modes: Array, angle: Array | float) -> Array:
+    Else as :func:`turn_about_z`.
+    """
     from_axis = _z_from(axis, round(np.sqrt(modes.shape[-1])) - 1)
     return from_axis.T(turn_about_z(from_axis(modes), angle))
 

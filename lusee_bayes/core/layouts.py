@@ -74,24 +74,15 @@ def require_mhz(where: str, mhz: Any) -> None:
 
 
 Kind = Literal["real", "complex", "integer", "boolean", "text", "word", "time"]
-# numpy's kinds of dtypes that each takes, and what it becomes
-KINDS: dict[str, tuple[str, type]] = {
-    "real": ("fiu", np.float64),
-    "complex": ("fiuc", np.complex128),
-    "integer": ("iu", np.int64),
-    "boolean": ("biu", np.bool_),
-    "text": ("UST", np.str_),
-    "word": ("UST", np.str_),
-    "time": ("M", np.datetime64),
-}
-NAMES = {
-    "real": "real numbers",
-    "complex": "complex numbers",
-    "integer": "whole numbers",
-    "boolean": "true or false",
-    "text": "text",
-    "word": "text or a whole number",
-    "time": "times (such as seconds since 2027-01-01)",
+# numpy's kinds of dtypes that each takes, what it becomes, and how it is called
+KINDS: dict[str, tuple[str, type, str]] = {
+    "real": ("fiu", np.float64, "real numbers"),
+    "complex": ("fiuc", np.complex128, "complex numbers"),
+    "integer": ("iu", np.int64, "whole numbers"),
+    "boolean": ("biu", np.bool_, "true or false"),
+    "text": ("UST", np.str_, "text"),
+    "word": ("UST", np.str_, "text or a whole number"),
+    "time": ("M", np.datetime64, "times (such as seconds since 2027-01-01)"),
 }
 
 # no quantity of this field is larger in any unit, and fourth powers have room in 64 bits
@@ -284,12 +275,10 @@ class Layout:
 
 
 def _require_kind(where: str, array: Unread, declared: Variable) -> None:
-    kind, allowed = np.dtype(array.dtype).kind, KINDS[declared.kind][0]
+    kind, (allowed, _, words) = np.dtype(array.dtype).kind, KINDS[declared.kind]
     # text of any length is kept as objects
     if kind not in allowed and not (declared.kind == "text" and kind == "O"):
-        raise InputError(
-            f"{where} holds values of type {array.dtype}, expected {NAMES[declared.kind]}"
-        )
+        raise InputError(f"{where} holds values of type {array.dtype}, expected {words}")
 
 
 def _require_dims(
@@ -385,7 +374,7 @@ def _checked_value(where: str, value: Any, declared: Attribute) -> Any:
 
 
 def _one(kind: Kind) -> str:
-    return {"real": "a number", "integer": "a whole number"}.get(kind, NAMES[kind])
+    return {"real": "a number", "integer": "a whole number"}.get(kind, KINDS[kind][2])
 
 
 def _text(where: str, value: Any) -> str:

@@ -123,10 +123,8 @@ class Stages:
 
     def _finish(self, name: str, start: float) -> None:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-        if self.console is not None:
-            memory = f"  {peak_memory_gb():6.2f} GB" if self.verbose else ""
-            text = f"  {name:<28} {self.seconds[name]:7.2f} s{memory}"
-            self.console.print(text, highlight=False, markup=False)
+        memory = f"  {peak_memory_gb():6.2f} GB" if self.verbose else ""
+        self.say(f"  {name:<28} {self.seconds[name]:7.2f} s{memory}")
 
 
 def peak_memory_gb() -> float:

@@ -269,7 +269,15 @@ class UnderAnySky:
     @classmethod
     def of(cls, setup: Setup, data: Visibilities, model: LinearGaussian) -> UnderAnySky:
         """Under a prior that allows any sky, as bright as the data ask for."""
-        return cls(setup, data, on_host(model), _any_sky(setup, data))
+        prior = on_host(setup.prior if setup.family is None else setup.family.expected())
+        power = np.asarray(prior.variance())
+        if prior.white_mean is not None:
+            power = power + np.asarray(prior.colour(prior.white_mean)) ** 2
+        autos = auto_indices(setup.beam_source.n_ports)
+        modelled = float(np.median(np.asarray(setup.signal)[autos]))
+        brighter = np.nanmedian(np.asarray(data.grid())[autos]) / modelled
+        spectrum = mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2
+        return cls(setup, data, on_host(model), spectrum)
 
     def wide(self, coupling: Coupling) -> tuple[ChiSquare, Posterior]:
         """Residual chi^2, and the posterior under the wide prior."""
@@ -312,18 +320,6 @@ class UnderAnySky:
         except InputError:  # without it, some auto is not positive
             return ChiSquare(np.inf, float(layout.size))
         return replace(self, data=data, model=model).wide(model.coupling)[0]
-
-
-def _any_sky(setup: Setup, data: Visibilities) -> Ells:
-    """C_ell of a prior that allows any sky, as bright as the data ask for, in K^2."""
-    prior = on_host(setup.prior if setup.family is None else setup.family.expected())
-    power = np.asarray(prior.variance())
-    if prior.white_mean is not None:
-        power = power + np.asarray(prior.colour(prior.white_mean)) ** 2
-    autos = auto_indices(setup.beam_source.n_ports)
-    modelled = float(np.median(np.asarray(setup.signal)[autos]))
-    brighter = np.nanmedian(np.asarray(data.grid())[autos]) / modelled
-    return mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2
 
 
 def filled(data: Visibilities) -> Grid:

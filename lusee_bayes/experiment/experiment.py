@@ -193,9 +193,7 @@ def with_truth(experiment: Experiment) -> Experiment:
     return replace(experiment, data=data)
 
 
-def under_sky(
-    setup: Setup, source: SkySource, seed: int, stages: Stages | None = None
-) -> Experiment:
+def under_sky(setup: Setup, source: SkySource, seed: int) -> Experiment:
     """Simulate data of a given sky, to be mapped with the prior of the scenario.
 
     The noise, in the data as in N, is that of the given sky; the prior knows nothing of it.
@@ -208,8 +206,6 @@ def under_sky(
         The sky; what it has above the scenario's lmax is left out.
     seed : int
         Of the noise and of the systematics.
-    stages : Stages, optional
-        Told what is being done.
 
     Raises
     ------
@@ -219,7 +215,7 @@ def under_sky(
     scenario = setup.scenario.model_copy(update={"seed": seed})
     sky = source.at(scenario.frequency_mhz, scenario.lmax)
     seen = replace(setup.under(sky), scenario=scenario)
-    return _learned(Experiment(seen, simulate(seen)), stages or Stages())
+    return _learned(Experiment(seen, simulate(seen)), Stages())
 
 
 def infer(experiment: Experiment) -> Inference:

@@ -68,7 +68,13 @@ def recipe_of(scenario: Scenario) -> Recipe:
     InputError
         If it does not say what the files leave open: gains, bin origin, what the times are.
     """
-    section = _flight_section(scenario)
+    section = scenario.flight
+    if section is None:
+        raise InputError(
+            "the data are sessions of the spectrometer, and the scenario does not say how they "
+            "become visibilities; give it a section flight, or --set 'flight={gain_table: ..., "
+            "bin_origin: centre}' (docs/howto/first_light.md)"
+        )
     if section.gain_table is None:
         raise InputError(
             "the sessions hold counts, and the scenario names no gain table; use --set "
@@ -154,13 +160,3 @@ def gain_table_of(section: FlightSection) -> GainModel:
     """
     table = read_gain_table(section.gain_table, section.gain_model)
     return table.with_component_std(section.component_std)
-
-
-def _flight_section(scenario: Scenario) -> FlightSection:
-    if scenario.flight is None:
-        raise InputError(
-            "the data are sessions of the spectrometer, and the scenario does not say how they "
-            "become visibilities; give it a section flight, or --set 'flight={gain_table: ..., "
-            "bin_origin: centre}' (docs/howto/first_light.md)"
-        )
-    return scenario.flight

@@ -367,7 +367,7 @@ def _volts_per_kelvin(scenario: Scenario) -> Float[np.ndarray, " products"]:
 
 
 def _true_kelvin(scenario: Scenario, observation: Observation) -> Grid:
-    layout = DataLayout.from_flags(np.zeros((len(all_products()), observation.n_times), dtype=bool))
+    layout = DataLayout(len(all_products()), observation.n_times)
     nothing = Visibilities(np.zeros(layout.size), layout, observation, scenario.frequency_mhz)
     setup = set_up(scenario, nothing)
     return np.asarray(true_signal(setup, true_values(setup)))

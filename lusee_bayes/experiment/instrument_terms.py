@@ -37,6 +37,7 @@ from lusee_bayes.systematics.instrument_unknowns import (
     BeamError,
     InstrumentParameters,
     PointingOffsets,
+    parameter_directions,
 )
 from lusee_bayes.systematics.systematic import Systematic
 
@@ -103,12 +104,7 @@ def beam_directions(setup: Setup) -> list[ProductBeams]:
         return []
     if not beam.parameters:
         return [instrument_errors.difference(true_beams(setup), setup.beams)]
-    frequency, lmax = setup.scenario.frequency_mhz, setup.scenario.lmax
-    directions = []
-    for name, sigma in beam.parameters.items():
-        slope = instrument_errors.derivative(name, frequency, lmax, setup.instrument.monopoles)
-        directions.append(ProductBeams(sigma * slope.modes, frequency))
-    return directions
+    return parameter_directions(setup.instrument, beam.parameters)
 
 
 def beam_rms_difference(setup: Setup) -> float | None:

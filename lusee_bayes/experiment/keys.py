@@ -114,12 +114,12 @@ def _keys_of(section: type[Section], prefix: str, kind: str) -> Iterator[Key]:
                 kind,
                 _unit(name),
                 _choices(field.annotation, field.metadata),
-                _default(field),
+                _as_yaml(field.get_default(call_default_factory=True)),
                 meanings.get(name, f"Kind of {prefix.rstrip('.')}" if name == "model" else ""),
             )
         elif field.default is None or _is_sequence(field.annotation):
             choices = "list of sections" if _is_sequence(field.annotation) else "a section"
-            yield Key(path, kind, "", choices, _default(field), meanings.get(name, ""))
+            yield Key(path, kind, "", choices, _as_yaml(field.default), meanings.get(name, ""))
         if len(inner) > 1:
             kinds = [str(one.model_fields["model"].default) for one in inner]
             meaning = f"Kind of {name}, on which the keys below depend"
@@ -196,10 +196,6 @@ def _bounds(metadata: Iterable[Any]) -> Iterator[tuple[str, str]]:
             limit = getattr(item, name, None)
             if limit is not None and abs(limit) < WIDEST:
                 yield name, f"{limit:g}"
-
-
-def _default(field: FieldInfo) -> str:
-    return _as_yaml(field.get_default(call_default_factory=True))
 
 
 def _as_yaml(value: Any) -> str:

@@ -54,14 +54,11 @@ class ComparedGroup(NamedTuple):
     name : str
     data : (products, times) array of bool
         Which data it has.
-    of : int
-        Number of groups of its kind.
     """
 
     kind: str
     name: str
     data: GridFlags
-    of: int
 
 
 @dataclass(frozen=True)
@@ -152,7 +149,7 @@ class GroupsCompared:
 
         Returns
         -------
-        Group or None
+        ComparedGroup or None
             None if none stands out.
         """
         left_out = self.left_out
@@ -162,12 +159,15 @@ class GroupsCompared:
         groups, leave = [], []
         for number in np.unique(layout.product).tolist():
             mine = np.arange(shape[0])[:, None] == number
-            groups.append(("product", self.data.labels[number], np.broadcast_to(mine, shape)))
+            name, mine = self.data.labels[number], np.broadcast_to(mine, shape)
+            groups.append(ComparedGroup("product", name, mine))
             leave.append(partial(left_out.product, number))
         for number in np.unique(day[layout.time]).tolist():
-            groups.append(("day", str(number), np.broadcast_to(day == number, shape)))
+            mine = np.broadcast_to(day == number, shape)
+            groups.append(ComparedGroup("day", str(number), mine))
             leave.append(partial(left_out.stretch, day == number))
-        counts = np.array([int((mine & np.asarray(layout.present)).sum()) for _, _, mine in groups])
+        present = np.asarray(layout.present)
+        counts = np.array([int((group.data & present).sum()) for group in groups])
         # one that holds all data has nothing to be compared with
         some = np.flatnonzero(counts < layout.size)
         missed: list[Missed] = in_threads(lambda k: leave[k](), some.tolist())
@@ -175,8 +175,7 @@ class GroupsCompared:
         out = _tail(chi2, degrees) < false_alarm
         if not out.any():
             return None
-        kind, name, mine = groups[some[np.where(out, chi2 - degrees, -np.inf).argmax()]]
-        return ComparedGroup(kind, name, mine, sum(of == kind for of, _, _ in groups))
+        return groups[some[np.where(out, chi2 - degrees, -np.inf).argmax()]]
 
 
 def _judged(missed: list[Missed], counts: Int[np.ndarray, " n"]) -> tuple[Vector, Vector]:
@@ -214,7 +213,9 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
     Comparison or None
         None where it would need too much memory.
     """
-    if _memory(setup, data) > MOST_MEMORY * memory_limit():
+    # where N couples times, it is a matrix of all data, too
+    n, across = data.layout.size, is_modelled(setup.scenario.noise.gain)
+    if 8.0 * ARRAYS * n * (setup.prior.size + n * across) > MOST_MEMORY * memory_limit():
         return None
     if settle:
         model, posterior = on_host(_conditioned(setup, data))
@@ -224,12 +225,6 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
         prior = model.prior.widened(WIDER)
     left_out = DenseLeftOut(replace(model, prior=prior), data.data, data.layout)
     return GroupsCompared.of(left_out, data)
-
-
-def _memory(setup: Setup, data: Visibilities) -> float:
-    """Bytes; where N couples times, it is a matrix of all data, too."""
-    n, across = data.layout.size, is_modelled(setup.scenario.noise.gain)
-    return 8.0 * ARRAYS * n * (setup.prior.size + (n if across else 0))
 
 
 def _conditioned(setup: Setup, data: Visibilities) -> tuple[LinearGaussian, Posterior]:

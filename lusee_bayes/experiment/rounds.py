@@ -186,7 +186,10 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
         for moving, z, centre in zip(found.moving, told, centres, strict=True):
             values |= moving.in_units(centre + step.size * (z - centre))
             if isinstance(moving, GainTable):
-                before = _before_gains(setup, found, moving, z, solved)
+                # what the data tell of visibilities before the gains: less radiometer noise, and F
+                noise = np.asarray(on_host(radiometer(setup, found.around)).mv(solved))
+                less_noise = np.asarray(found.around.data.data) - noise
+                before = less_noise / np.asarray(moving.errors.factors(z))
                 seen = moving.seen + step.size * (before - moving.seen)
             else:
                 here = np.asarray(setup.sky.modes if found.around.sky is None else found.around.sky)
@@ -216,19 +219,6 @@ def _start(setup: Setup, data: Visibilities) -> Around:
     freedom = data_freedom(model, posterior, np.concatenate(columns, axis=1))
     seen = np.asarray(model.predict(posterior.mean)) if setup.measured else None
     return Around(data, seen=seen, freedom=freedom)
-
-
-def _before_gains(
-    setup: Setup,
-    found: Inference,
-    table: GainTable,
-    z: Float[np.ndarray, " errors"],
-    solved: DataVector,
-) -> DataVector:
-    """What the data tell of the visibilities before the gains: less radiometer noise, and gains."""
-    data = found.around.data
-    noise = np.asarray(on_host(radiometer(setup, found.around)).mv(solved))
-    return (np.asarray(data.data) - noise) / np.asarray(table.errors.factors(z))
 
 
 def offset_posterior(
@@ -303,10 +293,8 @@ PRIOR_SETTLED, MAX_PRIOR_ROUNDS = 0.05, 8
 COARSE_LMAX = 24
 
 
-def with_learned_prior(
-    setup: Setup, data: Visibilities
-) -> tuple[Setup, Learned | None, Around | None]:
-    """Learn the prior from data; a prior that is given stays as it is.
+def with_learned_prior(setup: Setup, data: Visibilities) -> tuple[Setup, Learned, Around | None]:
+    """Learn the prior from data.
 
     Systematics are in N as far as they are marginalised. Where N is built around what the data
     tell, learning takes part in the rounds: N under the prior so far, the prior under this N, and
@@ -315,19 +303,18 @@ def with_learned_prior(
     Parameters
     ----------
     setup : Setup
+        With a family of priors.
     data : Visibilities
 
     Returns
     -------
     Setup
         With the prior.
-    Learned or None
+    Learned
         How it was learned.
     Around or None
         What N was built around in the last round; None where that is the data alone.
     """
-    if setup.family is None:
-        return setup, None, None
     if not rebuilds(setup):
         learned = learned_prior(setup, setup.family, about_sky(setup, data))
         return replace(setup, prior=learned.prior), learned, None

@@ -246,9 +246,9 @@ def set_up(
         complete = CouplingMatrix.build(beams, pointing)
         layout = complete.layout if data is None else data.layout
         signal = expected_signal(scenario, complete, sky, background, responses)
-        instrument = Instrument(
-            _antennas(scenario, source), pointing, layout, scenario.frequency_mhz, scenario.lmax
-        )
+        # those of a file have no parameters
+        antennas = Monopoles() if scenario.beam.is_file else source.monopoles
+        instrument = Instrument(antennas, pointing, layout, scenario.frequency_mhz, scenario.lmax)
         coupling = replace(complete, layout=layout)
     return Setup(
         scenario,
@@ -273,11 +273,6 @@ def prior_and_family(scenario: Scenario, sky: Sky) -> tuple[Prior, PriorFamily |
     """The scenario's prior, or what is expected of it before there are data, and its family."""
     family = scenario.prior.family(scenario.frequency_mhz, scenario.lmax)
     return (scenario.prior.prior(sky) if family is None else family.expected()), family
-
-
-def _antennas(scenario: Scenario, source: BeamSource) -> Monopoles:
-    """The embedded antennas that an Instrument needs; those of a file have no parameters."""
-    return Monopoles() if scenario.beam.is_file else source.monopoles
 
 
 def require_fitting(data: Visibilities, scenario: Scenario) -> None:

@@ -252,7 +252,9 @@ class IsotropicPriorSection(Section):
         """The family that data choose a prior of, up to an ell; None if C_ell is given."""
         if not self.is_learned:
             return None
-        return IsotropicFamily.around(_mean_temperature(frequency_mhz), lmax)
+        # the mean of the embedded sky, in K
+        mean = EmbeddedTemplate(frequency_mhz).modes(0)[0] / np.sqrt(4.0 * np.pi)
+        return IsotropicFamily.around(float(mean), lmax)
 
     def prior(self, sky: Sky) -> Prior:
         """S, and the mean, at the frequency and up to the lmax of a model sky."""
@@ -326,11 +328,6 @@ def _kind_of_prior(value: Any) -> Any:
     if tree["model"] != "isotropic":  # another kind in the place of the paper's prior
         tree.pop("spectrum", None)
     return without_other_kinds(tree, PRIOR_SECTIONS, strict=True)
-
-
-def _mean_temperature(frequency_mhz: float) -> float:
-    """Of the embedded sky, in K."""
-    return float(EmbeddedTemplate(frequency_mhz).modes(0)[0] / np.sqrt(4.0 * np.pi))
 
 
 PriorSection = one_of(PRIOR_SECTIONS, _kind_of_prior)

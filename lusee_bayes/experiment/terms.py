@@ -5,30 +5,18 @@ A new one is a :class:`Systematic`, its section in the schema, and its line in `
 
 from __future__ import annotations
 
-from lusee_bayes.experiment.instrument_terms import (
-    BeamErrorTerm,
-    GainTableTerm,
-    GainTerm,
-    PointingTerm,
-)
-from lusee_bayes.experiment.sky_terms import (
-    NoiseLevelTerm,
-    PriorSpectrumTerm,
-    ReceiverTerm,
-    RegolithTerm,
-    SourcesTerm,
-)
+from lusee_bayes.experiment import instrument_terms, sky_terms
 from lusee_bayes.experiment.term import Term
 
 # in the order in which they are applied to the model, and to simulated visibilities
 TERMS: tuple[Term, ...] = (
-    NoiseLevelTerm(),
-    PriorSpectrumTerm(),
-    PointingTerm(),
-    BeamErrorTerm(),
-    SourcesTerm(),
-    ReceiverTerm(),
-    RegolithTerm(),
-    GainTableTerm(),
-    GainTerm(),
+    sky_terms.NoiseLevelTerm(),
+    sky_terms.PriorSpectrumTerm(),
+    instrument_terms.PointingTerm(),
+    instrument_terms.BeamErrorTerm(),
+    sky_terms.SourcesTerm(),
+    sky_terms.ReceiverTerm(),
+    sky_terms.RegolithTerm(),
+    instrument_terms.GainTableTerm(),
+    instrument_terms.GainTerm(),
 )

@@ -39,8 +39,7 @@ from lusee_bayes.core.harmonics import (
     mode_numbers,
     n_modes,
     tilts,
-    turn_about_x,
-    turn_about_y,
+    turn_about,
     turn_about_z,
 )
 from lusee_bayes.instrument.beams.fields import ProductBeams
@@ -205,7 +204,7 @@ def _on_the_moon(modes: Float[Array, "products modes"], pointing: Pointing) -> A
     if pointing.turns is None:
         return pointing.mcmf_from_lander(modes)
     lon, lat, east, north = (pointing.turns[k] for k in range(4))
-    leaning = turn_about_x(turn_about_y(turn_about_x(modes, -north), east), -lat)
+    leaning = turn_about(0, turn_about(1, turn_about(0, modes, -north), east), -lat)
     return turn_about_z(pointing.mcmf_from_lander(leaning), lon)
 
 

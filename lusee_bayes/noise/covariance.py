@@ -286,8 +286,7 @@ class DiagonalFactor(Factor):
     def whiten(self, x):
         return x / _down(self.sigma, x)
 
-    def whiten_transpose(self, x):
-        return x / _down(self.sigma, x)
+    whiten_transpose = whiten
 
     def colour(self, z):
         return z * _down(self.sigma, z)

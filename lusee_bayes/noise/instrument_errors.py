@@ -34,7 +34,6 @@ from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.checks import (
     is_traced,
     require_array,
-    require_finite,
     require_float64,
     require_positive,
     require_shape,
@@ -82,8 +81,7 @@ def template_noise(
         require_shape("the templates' prior", prior, (n,))
         require_positive("the templates' prior variance", prior)
         return LowRankCovariance(templates * jnp.sqrt(prior)[None], "the templates")
-    require_shape("the templates' prior", prior, (n, n))
-    require_finite("the templates' prior", prior)
+    require_array("the templates' prior", prior, (n, n))
     require_symmetric("the templates' prior", prior)
     root = jnp.tril(checked_cholesky("the templates' prior", prior))
     return LowRankCovariance(templates @ root, "the templates")

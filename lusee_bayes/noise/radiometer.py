@@ -139,9 +139,9 @@ def radiometer_noise(
     """
     if form not in RADIOMETER_FORMS:
         raise InputError(f"unknown radiometer form '{form}'; {nearest(form, RADIOMETER_FORMS)}")
-    for name, value in [("bandwidth_hz", bandwidth_hz), ("step_s", step_s), ("factor", factor)]:
+    given = {"bandwidth_hz": bandwidth_hz, "step_s": step_s, "factor": factor}
+    for name, value in (given | {"duty_cycle": duty_cycle}).items():
         require_positive(f"the radiometer's {name}", value)
-    require_positive("the radiometer's duty_cycle", duty_cycle)
     if not is_traced(duty_cycle) and duty_cycle > 1.0:
         raise InputError(f"the radiometer's duty_cycle must not exceed 1, got {duty_cycle}")
     require_float64("the visibilities", visibilities)

@@ -87,19 +87,22 @@ class InstrumentParameters(Systematic):
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Add dA S dA^T for every parameter to N, dA = std times the derivative of A."""
-        noise, instrument = model.noise, self.instrument
-        for name, std in self.stds.items():
-            slope = derivative(
-                name, instrument.frequency_mhz, instrument.lmax, instrument.monopoles
-            )
-            direction = ProductBeams(std * slope.modes, instrument.frequency_mhz)
-            noise = noise + beam_error_noise(instrument.coupling_of(direction), model.prior)
+        noise = model.noise
+        for direction in parameter_directions(self.instrument, self.stds):
+            noise = noise + beam_error_noise(self.instrument.coupling_of(direction), model.prior)
         return replace(model, noise=noise)
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """Sample one site for each parameter, of its name."""
         values = {name: numpyro.sample(name, prior) for name, prior in self.priors().items()}
         return replace(model, coupling=self.instrument.dense(values))
+
+
+def parameter_directions(instrument: Instrument, stds: Mapping[str, float]) -> list[ProductBeams]:
+    """What one prior standard deviation of each parameter does to the beams, to first order."""
+    known = instrument.frequency_mhz, instrument.lmax, instrument.monopoles
+    slopes = {name: derivative(name, *known).modes for name in stds}
+    return [ProductBeams(std * slopes[name], known[0]) for name, std in stds.items()]
 
 
 class BeamError(Systematic):

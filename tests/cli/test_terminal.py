@@ -106,14 +106,14 @@ def test_info_of_a_folder(small_map, tmp_path, capsys):
     assert "a folder that no run has written" in capsys.readouterr().err
 
 
-EXAMPLES = [(name, line) for name, (_, _, lines) in COMMANDS.items() for line in lines]
+EXAMPLES = [(name, line) for name, (_, lines) in COMMANDS.items() for line in lines]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_shows_the_examples(name, capsys):
     assert main([name, "--help"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    for example in COMMANDS[name][2]:
+    for example in COMMANDS[name][1]:
         assert example in shown
     assert "Examples" in shown
 

@@ -15,7 +15,7 @@ from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import Rotation, generators, tilt_powers, turn_about_x, turn_about_y
+from lusee_bayes.core.harmonics import Rotation, generators, tilt_powers, turn_about
 from lusee_bayes.instrument.pointing import (
     LEAST_ORDER,
     OFFSETS,
@@ -176,7 +176,7 @@ def test_turns_about_horizontal_axes(axis):
     modes = np.random.default_rng(1).standard_normal((2, 49))
     vector = np.eye(3)[axis] * 0.7
     expected = Rotation.from_matrix(SpatialRotation.from_rotvec(vector).as_matrix(), 6)(modes)
-    got = (turn_about_x, turn_about_y)[axis](modes, 0.7)
+    got = turn_about(axis, modes, 0.7)
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13)
 
 
