@@ -341,7 +341,11 @@ def maps_of(lmax, step_s, cycles, to_s):
     )
 
 
-@pytest.fixture(scope="module", params=[2, 12], ids=lambda hours: f"60 s to {hours} h")
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(2, marks=pytest.mark.long), 12],
+    ids=lambda hours: f"60 s to {hours} h",
+)
 def maps(request):
     return maps_of(8, 60.0, 0.1, request.param * HOUR)
 
