@@ -99,7 +99,7 @@ def test_about_the_model_sky_the_map_is_wrong():
 
 
 def test_what_n_is_built_around_by_default():
-    scenario = wrong_data.scenario(LMAX, "noise.gain={sigma: 0.01}")
+    scenario = wrong_data.scenario(4, "noise.gain={sigma: 0.01}")
     simulated = set_up(scenario)
     data, _, _ = measured(scenario, 1)
     given = set_up(scenario, data)
@@ -183,16 +183,13 @@ def test_a_prior_that_does_not_settle_with_n_is_said_to(monkeypatch):
     assert "still moves" in " ".join(doubts(experiment, infer(experiment)))
 
 
-DIAGNOSED_LMAX = 8
-
-
-def sky(frequency_mhz=25.0, lmax=DIAGNOSED_LMAX):
-    return wrong_data.Mixed(1).at(frequency_mhz, lmax)
+def sky(lmax):
+    return wrong_data.Mixed(1).at(25.0, lmax)
 
 
 def diagnosed(wrong, scenario=None):
-    scenario = scenario or wrong_data.scenario(DIAGNOSED_LMAX)
-    data = wrong.make(scenario, sky(lmax=scenario.lmax), 1)
+    scenario = scenario or wrong_data.scenario(LMAX)
+    data = wrong.make(scenario, sky(scenario.lmax), 1)
     experiment = build(scenario, data)
     found = infer(experiment)
     chi2 = float(found.model.chi2(found.posterior.mean, data.data))
@@ -207,7 +204,7 @@ def is_named(wrong, found):
 def test_the_cause_is_named():
     """One of many: the others take minutes."""
     wrong = next(one for one in wrong_data.WRONG if one.name == "one time 2 % too high")
-    left, found = diagnosed(wrong)
+    left, found = diagnosed(wrong, wrong_data.scenario(6, "observation.step_s=30000"))
     assert left.level() == "does not fit"
     assert is_named(wrong, found) and found.proposals[0].fits
     assert wrong.cause in " ".join(found.sentences())
@@ -226,12 +223,6 @@ def test_all_wrong_data_make_a_map_and_most_causes_are_named():
         left, found = diagnosed(wrong)
         assert left.level() == "does not fit", wrong.name
         assert not any(proposal.fits for proposal in found.proposals), wrong.name
-
-
-def test_data_that_fit_need_no_mistake():
-    left, found = diagnosed(wrong_data.Wrong("good", "", wrong_data.measured))
-    assert left.level() != "does not fit"
-    assert found.fits and "fit as they are" in " ".join(found.sentences())
 
 
 @pytest.mark.long
@@ -254,7 +245,7 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
     # noise that is loud enough for the inverse of a matrix
     loud = "noise.radiometer.factor=1e6"
     scenario = wrong_data.scenario(4, "observation.step_s=60000", loud)
-    data = wrong_data.measured(scenario, sky(lmax=4), 1)
+    data = wrong_data.measured(scenario, sky(4), 1)
     setup = set_up(scenario, data)
     experiment = build(scenario, data)
     model = on_host(infer(experiment).model)
