@@ -23,7 +23,6 @@ import lusee_bayes
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
 from lusee_bayes.experiment.section import OutputSection
 from lusee_bayes.results.map_result import MapResult
-from lusee_bayes.runs import map_run
 from lusee_bayes.runs import map_run as runs
 from lusee_bayes.runs.folder import Output
 
@@ -122,14 +121,10 @@ def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
 @pytest.mark.parametrize("flag", ["covariance", "updatable"])
 def test_options_of_the_output_reach_the_scenario(flag, monkeypatch):
     """What they make is tested beside run_map."""
-    given = []
-    monkeypatch.setattr(map_run, "run_map", lambda *a, **_: given.append(a) or _stop())
+    given, stop = [], raises(KeyboardInterrupt())
+    monkeypatch.setattr(runs, "run_map", lambda *a, **_: given.append(a) or stop())
     assert run("map", "fiducial", f"--{flag}", "--draws", 7, "-o", "x", "-q") == 130
     assert given[0][0].output == OutputSection(draws=7, **{flag: True})
-
-
-def _stop():
-    raise KeyboardInterrupt
 
 
 def test_info_recognises_its_files(folder, tmp_path, capsys):
@@ -178,11 +173,8 @@ def test_an_interrupted_write_leaves_the_previous_result_whole(
     out = shutil.copytree(small_map.folder, tmp_path / "out")
     before = content(out)
 
-    def interrupt(*_, **__):
-        raise KeyboardInterrupt
-
     # the last file but the page
-    monkeypatch.setattr(MapResult, "summary", interrupt)
+    monkeypatch.setattr(MapResult, "summary", raises(KeyboardInterrupt()))
     monkeypatch.setattr(runs, "map_result", lambda *_, **__: small_map.result)
     monkeypatch.setattr(runs, "MAP", replace(runs.MAP, figures={}))
     assert run("map", "fiducial", *SMALL, "--set", "seed=2", "-o", out, "--force", "-q") == 130

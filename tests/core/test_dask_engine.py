@@ -42,7 +42,7 @@ class Said(Stages):
         self.lines.append(text)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 7, 12])
+@pytest.mark.parametrize("n", [1, 3, 12])
 def test_results_come_in_order_and_merge_as_a_tree(engine, n):
     assert engine.each(tasks_of(lambda k: k * k, n), Stages(), "s") == [k * k for k in range(n)]
     assert engine.reduced(tasks_of(str, n), joined, Stages(), "s") == tree([*map(str, range(n))])

@@ -104,17 +104,6 @@ def test_a_map_gives_back_its_coefficients():
     np.testing.assert_allclose(modes, h.from_healpy(alm), rtol=0, atol=1e-11)
 
 
-def test_a_smaller_lmax_is_a_slice():
-    theta, phi = np.array([0.4, 2.0]), np.array([1.0, -3.0])
-    large, small = h.synthesis_matrix(theta, phi, 12), h.synthesis_matrix(theta, phi, 5)
-    np.testing.assert_allclose(large[:, : h.n_modes(5)], small, rtol=0, atol=1e-14)
-    modes = h.from_healpy(random_alm(np.random.default_rng(5), 12))
-    low = h.to_healpy(jnp.asarray(modes[: h.n_modes(5)]))
-    full = h.to_healpy(jnp.asarray(modes))
-    ell, m = healpy.Alm.getlm(5)
-    np.testing.assert_array_equal(low, full[healpy.Alm.getidx(12, ell, m)])
-
-
 def test_spectrum_is_healpys():
     alm = random_alm(np.random.default_rng(6), LMAX, 2)
     modes = jnp.asarray(h.from_healpy(alm))

@@ -88,16 +88,6 @@ def test_the_errors_are_what_is_claimed(term):
     assert p > 1e-3, total / modes
 
 
-@pytest.mark.long
-@pytest.mark.essential
-def test_about_the_model_sky_the_map_is_wrong():
-    """What the default was: with drifts of 1 % about the model sky the test above fails."""
-    scenario = wrong_data.scenario(LMAX, *TERMS["gain drifts"], "noise.gain.visibilities=model")
-    data, prior, truth = measured(scenario, 1)
-    setup = replace(set_up(scenario, data), prior=prior, family=None)
-    assert distance(settled(setup, data), truth) > 3.0 * len(truth)
-
-
 def test_what_n_is_built_around_by_default():
     scenario = wrong_data.scenario(4, "noise.gain={sigma: 0.01}")
     simulated = set_up(scenario)

@@ -304,9 +304,6 @@ class Maps:
     windows: Map
     instants: Map
 
-    def average(self, values):
-        return self.averaged(values).data
-
     def averaged(self, values):
         return averaged(replace(self.samples, data=np.asarray(values)), self.to_s)
 
@@ -359,7 +356,7 @@ def draws(maps):
     for _ in range(DRAWS):
         sky = np.asarray(model.prior.colour(rng.standard_normal(model.prior.size)))
         fine = np.asarray(model.coupling @ sky) + std * rng.standard_normal(len(std))
-        found.append((sky, fine, maps.average(fine)))
+        found.append((sky, fine, maps.averaged(fine).data))
     return found
 
 

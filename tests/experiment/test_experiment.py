@@ -67,14 +67,6 @@ def test_neither_noise_nor_seed_enter_a_setup(override, tiny_experiment):
     np.testing.assert_array_equal(experiment.data.data, simulate(setup).data)
 
 
-def test_noise_of_the_simulation_has_the_level_of_n(small_experiment):
-    setup, data = small_experiment.setup, small_experiment.data
-    residual = np.asarray(data.data - setup.layout.gather(setup.signal))
-    chi2 = float((residual**2 / variances(setup)).sum())
-    n = residual.shape[0]
-    assert abs(chi2 - n) < 5 * np.sqrt(2 * n)  # chi^2 with n degrees of freedom, 5 sigma
-
-
 def test_flagged_data_are_left_out_of_a_and_n(small_experiment):
     setup, whole = small_experiment.setup, small_experiment.data
     flags = np.zeros((16, setup.observation.n_times), dtype=bool)

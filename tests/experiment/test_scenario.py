@@ -62,13 +62,6 @@ def test_overrides_reach_into_sections_that_the_file_leaves_out(tmp_path):
     assert scenario.nside is None
 
 
-def test_scientific_notation_without_a_sign_is_a_number(tmp_path):
-    # YAML 1.1 reads 1e6 as text; users write it all the same
-    path = tmp_path / "x.yaml"
-    path.write_text("noise: {radiometer: {bandwidth_hz: 1e6}}\n")
-    assert load_scenario(path).noise.radiometer.bandwidth_hz == 1e6
-
-
 # a line for each rule and kind of mistake; what single numbers and words may be is below
 SHIFT, PARAMETERS = "noise.beam.shift_mhz=4", "noise.beam.parameters={length_m: 0.1}"
 SCHEDULE = "observation={schedule: nights.csv, window: mean, step_s: 20000, %s}"

@@ -21,7 +21,6 @@ from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.products import labels
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.noise.instrument_errors import GainDrift, with_gains
 from lusee_bayes.sky.sky_source import Sky, SkySource
 
 LABELS = labels(4)
@@ -252,18 +251,8 @@ WRONG = (
 )
 
 
-def _drifting(sigma: float) -> Callable[[Scenario, Sky, int], Visibilities]:
-    def distort(setup: Setup, visibilities: np.ndarray) -> np.ndarray:
-        gains = GainDrift(sigma, 10.0).sample(jax.random.key(5), setup.observation.hours)
-        return with_gains(visibilities, gains)
-
-    return lambda scenario, sky, seed: measured(scenario, sky, seed, distort=distort)
-
-
 # what is not in the table of usual mistakes
 UNMODELLED = (
-    Wrong("gain drifts of 1e-4", "", _drifting(1e-4)),
-    Wrong("gain drifts of 1e-2", "", _drifting(1e-2)),
     Wrong("permittivity 5 % off", "", _other("beam.surface_permittivity=3.885")),
     Wrong("arms 1 degree off", "", _other("beam.zenith_angle_deg=76")),
     Wrong("three times the loss", "", _other("beam.loss_tangent=0.03")),

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import warnings
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -204,12 +203,11 @@ def change_items(path: Path, change: tuple[Any, ...]) -> None:
     CHANGE[path.suffix](path, change)
 
 
-TRIED: Counter[str] = Counter()
 # how many times as many inputs the long run tries
 SCALE = int(os.environ.get("LUSEE_BAYES_FUZZ", "1"))
 
 
-def require_answer(what: str, call: Callable[[], object]) -> None:
+def require_answer(call: Callable[[], object]) -> None:
     """Assert that a call succeeds, or says in one sentence why it cannot; anything else fails."""
     try:
         call()
@@ -218,6 +216,3 @@ def require_answer(what: str, call: Callable[[], object]) -> None:
         assert message and "\n" not in message, repr(message)
         # sentences are read by people
         assert len(message) < 1500, message
-        TRIED[f"{what}: refused"] += 1
-    else:
-        TRIED[f"{what}: accepted"] += 1

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import changes
-import pytest
 from hypothesis import HealthCheck, Phase, settings
 
 settings.register_profile(
@@ -16,12 +14,3 @@ settings.register_profile(
     suppress_health_check=list(HealthCheck),
 )
 settings.load_profile("here")
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """How many inputs were tried."""
-    if changes.TRIED:
-        terminalreporter.section("inputs tried")
-        for what, number in sorted(changes.TRIED.items()):
-            terminalreporter.line(f"{number:7d}  {what}")
-        terminalreporter.line(f"{changes.TRIED.total():7d}  in all")

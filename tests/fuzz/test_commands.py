@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
 
 import pytest
-from changes import SCALE, TRIED
+from changes import SCALE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -48,19 +47,16 @@ WRONG = [
     ("map fiducial -o /proc/nope", "nothing can be written|No such"),
     ("map fiducial -o file/x", "file' is a file; give a folder for the results"),
     ("map fiducial -o file", "'file' is a file"),
-    ("sample fiducial -o file", "'file' is a file"),
     ("simulate fiducial --flight --set flight={} -o file", "is a file"),
     ("map fiducial -o pipe", IS_PIPE),
     (f"map fiducial -o {LONG}", "too long"),
     (f"map fiducial -o {NUL}", "NUL"),
     ("simulate fiducial -o /dev/full", IS_PIPE),
     ("simulate fiducial -o .", "is a folder"),
-    ("simulate fiducial -o file/x.nc", "is a file"),
     # options
     ("mapp fiducial", "mapp"),
     ("map fiducial --draw 3", "--draw"),
     ("map fiducial --draws many", "many"),
-    ("map fiducial --draws -3", "--draws: expected .*got -3"),
     ("map fiducial --draws 1.5", "--draws: expected .*got 1.5"),
     ("sample fiducial --chains 0", "--chains: expected .*got 0"),
     ("sample fiducial --warmup 3", "at least 20, got 3"),
@@ -87,7 +83,6 @@ WRONG = [
     ("map three_cycle", "did you mean 'three_cycles'"),
     ("map three_cycle.yaml", "no scenario file at 'three_cycle.yaml'; check the path"),
     ("map three/cycles", "no scenario file at 'three/cycles'; check the path"),
-    (f"map {LONG}", "no scenario"),
     (f"map {NUL}", "no scenario"),
     ("map pipe", IS_PIPE),
     ("map .", "is a folder"),
@@ -153,7 +148,6 @@ def test_any_words(n, here, capsys, monkeypatch):
         monkeypatch.setattr(f"lusee_bayes.runs.{name}_run.run_{name}", stop)
     monkeypatch.setattr("lusee_bayes.runs.data_run.run_simulate", stop)
     before = sorted(p.name for p in here.rglob("*"))
-    codes: Counter[int] = Counter()
     commands = ["map", "sample", "simulate", "validate", "plan", "compare", "report", "info"]
 
     @settings(max_examples=n)
@@ -170,9 +164,6 @@ def test_any_words(n, here, capsys, monkeypatch):
             told, most = said.err.splitlines(), len(words) if command == "info" else 1
             assert 0 < len(told) <= max(most, 1), said.err
             assert all(line.startswith("lusee-bayes: ") for line in told), said.err
-        codes[code] += 1
 
     check()
     assert sorted(p.name for p in here.rglob("*")) == before
-    for code, number in codes.items():
-        TRIED[f"command lines: {'refused' if code else 'accepted'}"] += number

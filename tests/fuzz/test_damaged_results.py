@@ -62,10 +62,10 @@ def test_damaged_results(kind, n, tmp_path, request):
             path.unlink()
         else:
             apply(path, change)
-        require_answer(f"results of {kind}, {name}", lambda: write_report(folder))
+        require_answer(lambda: write_report(folder))
         if kind == "map":
             runs = [source, folder]
-            require_answer(f"compared with {name}", lambda: read_runs(runs))
+            require_answer(lambda: read_runs(runs))
         shutil.copy(source / name, path)
 
     @settings(max_examples=n)

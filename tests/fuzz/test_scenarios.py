@@ -58,7 +58,7 @@ def test_every_entry_with_any_value(n):
     def check(entries):
         # YAML takes JSON, and what JSON does not have (NaN, Infinity) as text
         overrides = [f"{path}={json.dumps(value)}" for path, value in entries]
-        require_answer("scenario entries", lambda: load(overrides))
+        require_answer(lambda: load(overrides))
 
     check()
 
@@ -68,8 +68,8 @@ def test_any_text_as_an_override(n):
     @settings(max_examples=n)
     @given(st.one_of(st.text(), st.builds("{}={}".format, st.sampled_from(PATHS), st.text())))
     def check(override):
-        require_answer("overrides", lambda: load([override]))
-        require_answer("variations", lambda: own_variations("fiducial", [override], []))
+        require_answer(lambda: load([override]))
+        require_answer(lambda: own_variations("fiducial", [override], []))
 
     check()
 
@@ -92,7 +92,7 @@ def test_any_file_as_a_scenario(n, tmp_path):
     )
     def check(content):
         path.write_bytes(content)
-        require_answer("scenario files", lambda: load_scenario(path))
+        require_answer(lambda: load_scenario(path))
 
     check()
 
@@ -107,6 +107,6 @@ def test_any_frequencies(n):
     @given(st.tuples(st.lists(parts, min_size=1, max_size=4), st.sampled_from(",:")))
     def check(drawn):
         text = drawn[1].join(drawn[0])
-        require_answer("frequencies", lambda: parse_frequencies(text))
+        require_answer(lambda: parse_frequencies(text))
 
     check()

@@ -518,9 +518,3 @@ def test_tables_that_are_hardly_known(response_file):
     both_refuse(
         replace(setup, calibration=wide), "of port 1 is known to 0.11 of itself, expected at"
     )
-
-
-@pytest.mark.parametrize("std", ["0", "-0.01", "0.2", "x"])
-def test_what_is_no_standard_deviation(response_file, std):
-    with pytest.raises(lb.InputError, match=r"noise\.gain_table\.std"):
-        four_ports(response_file, f"noise.gain_table={{std: {std}}}")

@@ -293,13 +293,9 @@ def test_the_map_command_writes_the_fluxes(tmp_path, capsys):
 CAS_A = "sources.list=[{name: Cas A}]"
 
 
-def with_cas_a() -> Setup:
-    return small_experiment(CAS_A).setup
-
-
 def setup_with(*overrides: str) -> Setup:
     """With a scenario of which A and the beams are the same (priors and treatments are not in)."""
-    return replace(with_cas_a(), scenario=small_scenario(CAS_A, *overrides))
+    return replace(small_experiment(CAS_A).setup, scenario=small_scenario(CAS_A, *overrides))
 
 
 def experiment_with(*overrides: str) -> lb.Experiment:
@@ -318,7 +314,7 @@ def experiment_with(*overrides: str) -> lb.Experiment:
     ],
 )
 def test_unknown_sources_name_the_nearest(source, message):
-    scenario, setup = small_scenario(f"sources.list=[{source}]"), with_cas_a()
+    scenario, setup = small_scenario(f"sources.list=[{source}]"), setup_with()
     with refused(message):
         source_responses(scenario, setup.observation, setup.beam_source, 25.0)
 
@@ -425,7 +421,7 @@ def test_what_the_scenario_does_not_have():
     with refused("the scenario has no sources.list"):
         point_sources(bare.setup)
     with refused("asks for 'gaussian', a piece of an experiment"):
-        lb.load_program("systematics").arguments(base_model(with_cas_a()))
+        lb.load_program("systematics").arguments(base_model(setup_with()))
 
 
 # --- commands -------------------------------------------------------------------------------------
