@@ -84,7 +84,6 @@ REFUSED = [
     ("nside=3", "nside is 3, .*power of two"),
     ("noise.gain=3", "noise.gain is 3, but it should be a section"),
     ("flight={simulated: {levels: MMMX}}", "levels"),
-    ("flight={simulated: {levels: MMM}}", "levels"),
     # what --set takes
     ("seed", "--set takes key.path=value, got 'seed'"),
     ("observation.runs.3.cycles=1", "'3' is not one of the entries 0..0"),
@@ -113,11 +112,9 @@ REFUSED = [
     ("prior={band_edges: [2, 4], tilt_std: 0.5}", "give either band_edges or"),
     ("prior={band_edges: [2, 4], log_amplitude_std: 0.5}", "give either band_edges or"),
     ("log_normal={amplitude: 0.1}", "give both amplitude and tilt, or neither"),
-    ("log_normal={tilt: -2}", "give both amplitude and tilt, or neither"),
     ("sky.sources=true sources.list=[{name: Cas A}]", "set sky.sources=false"),
     ("sources.list=[{name: Cas A}, {name: Vir A}, {name: Cas A}]", "'Cas A' is there twice"),
     ("sources.list=[{name: X, ra_deg: 10}]", "give both ra_deg and dec_deg, or none"),
-    ("sources.list=[{name: X, dec_deg: 10}]", "give both ra_deg and dec_deg, or none"),
     (f"prior.spectrum_file=a.txt {FOUR}", "say which in prior.file_frequency_mhz"),
     (f"prior.spectrum_file=a.txt {FOUR} joint=true", "joint takes the spectral prior"),
     (
