@@ -302,9 +302,7 @@ class Scenario(Section):
     @property
     def map_nside(self) -> int:
         """NSIDE of maps that leave the program: at least two pixels for each ell."""
-        if self.nside is not None:
-            return self.nside
-        return 2 ** max(3, (self.lmax // 2).bit_length())
+        return self.nside or 2 ** max(3, (self.lmax // 2).bit_length())
 
     def to_yaml(self) -> str:
         """The resolved scenario, defaults included."""

@@ -94,6 +94,7 @@ def ground_per_kelvin(source: BeamSource, frequency_mhz: float) -> Float[Array, 
     return np.asarray(warm.background(frequency_mhz)) - np.asarray(cold.background(frequency_mhz))
 
 
+CATALOGUE = {source.name: source for source in BRIGHT_SOURCES}
 # instants in each piece of a window for the response to a source: antennas see nothing smaller
 # than some degrees, and nothing at the horizon, where a source appears within a window
 SOURCE_NODES = 8
@@ -344,13 +345,13 @@ def _direction(source: SourceSection, observation: Observation) -> Float[np.ndar
         return galactic_unit_vector(source.ra_deg, source.dec_deg)
     if source.name in BODIES:
         return body_direction(source.name, observation)
-    known = {s.name: s for s in BRIGHT_SOURCES}
-    if source.name not in known:
+    known = CATALOGUE.get(source.name)
+    if known is None:
         raise InputError(
-            f"unknown source '{source.name}'; {nearest(source.name, [*known, *BODIES])} "
+            f"unknown source '{source.name}'; {nearest(source.name, [*CATALOGUE, *BODIES])} "
             "(or give ra_deg and dec_deg of your own)"
         )
-    return galactic_unit_vector(known[source.name].ra_deg, known[source.name].dec_deg)
+    return galactic_unit_vector(known.ra_deg, known.dec_deg)
 
 
 def expected_signal(
@@ -383,9 +384,8 @@ def mean_flux(source: SourceSection, frequency_mhz: float) -> float:
     """Mean of the prior of a source's flux, in K sr. InputError if nothing is known about it."""
     if source.flux_jy is not None:
         return float(kelvin_steradian(source.flux_jy, frequency_mhz))
-    for known in BRIGHT_SOURCES:
-        if known.name == source.name:
-            return float(known.kelvin_steradian(frequency_mhz))
+    if source.name in CATALOGUE:
+        return float(CATALOGUE[source.name].kelvin_steradian(frequency_mhz))
     raise InputError(
         f"the source '{source.name}' is not in the catalogue, so that its flux is not known; give "
         "flux_jy, the mean of its prior"

@@ -226,8 +226,7 @@ class Marginalised(Systematic):
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         return self.systematic.marginalised(model)
 
-    def sampled(self, model: LinearGaussian) -> LinearGaussian:
-        return self.systematic.marginalised(model)
+    sampled = marginalised
 
 
 class Scale(Systematic):
