@@ -191,6 +191,8 @@ def is_named(wrong, found):
     return any(wrong.cause in proposal.words for proposal in found.proposals[:3])
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_the_cause_is_named():
     """One of many: the others take minutes."""
     wrong = next(one for one in wrong_data.WRONG if one.name == "one time 2 % too high")
