@@ -16,6 +16,7 @@ from lusee_bayes.judge.coverage import N_DRAWS, Counts, Coverage
 from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.results.draws import deviations
 from lusee_bayes.results.map_result import map_result
+from lusee_bayes.runs.channel_files import from_dataset, to_dataset
 from lusee_bayes.sky.sky_files import write_alms
 from lusee_bayes.sky.sky_source import FileSource, GalaxySource
 from lusee_bayes.testing.scenarios import small_scenario
@@ -59,7 +60,7 @@ def test_pixels_are_counted_by_latitude():
     for part, (low, high) in zip(found, bands, strict=True):
         here = [k for k in range(len(b)) if low <= abs(b[k]) < high]
         compare(part, pull[here], [draw[here] for draw in drawn])
-        assert Coverage.from_row(part.row()) == part
+        assert from_dataset(to_dataset(part)) == part
 
 
 def test_modes_are_counted_by_multipole():
