@@ -267,7 +267,7 @@ def one_parameter():
     prior = family.prior(family.at(np.array([0.4])).covariance)
     learned = Learned(prior, ("theta",), np.array([0.4]), np.array([[width**2]]), 0.0, 0)
     draws = draws_with_parameters(
-        family, learned, information.posterior(prior), jax.random.key(1), 15000
+        family, learned, information.posterior(prior), jax.random.key(1), 4500
     )
     return noise, seen, draws
 
@@ -275,7 +275,7 @@ def one_parameter():
 def test_draws_are_those_of_the_integral_over_the_parameter(one_parameter):
     """Every mode: the distribution function at some points, by quadrature over theta."""
     noise, seen, draws = one_parameter
-    assert draws.shape == (15000, SIZE)
+    assert draws.shape == (4500, SIZE)
 
     theta = np.linspace(-6.0, 7.0, 2001)
     density = stats.norm.pdf(theta, 0.4, 1.0)
@@ -286,8 +286,8 @@ def test_draws_are_those_of_the_integral_over_the_parameter(one_parameter):
             below = stats.norm.cdf(at, weight * seen[k], np.sqrt(weight) * noise[k])
             expected = integrate.simpson(below * density, x=theta)
             scatter = integrate.simpson((below - expected) ** 2 * density, x=theta)
-            # 500 theta, each for 30 draws
-            error = np.sqrt(scatter / 500 + level * (1 - level) / 15000)
+            # 150 theta, each for 30 draws
+            error = np.sqrt(scatter / 150 + level * (1 - level) / 4500)
             assert abs(level - expected) < 4.0 * error
 
 
