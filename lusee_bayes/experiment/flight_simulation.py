@@ -339,8 +339,7 @@ def true_visibilities(
     InputError
         If the beams know no volts.
     """
-    known = scenario.noise.model_copy(update={"gain_table": None})
-    scenario = scenario.model_copy(update={"noise": known})
+    scenario = scenario.with_section("noise", gain_table=None)
     channels = scenario.channels() or (scenario,)
     scales = [_volts_per_kelvin(channel) for channel in channels]
     # what changes with time has to be drawn for all of it

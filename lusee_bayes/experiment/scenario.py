@@ -274,6 +274,11 @@ class Scenario(Section):
         smooth = is_modelled(receiver) and receiver.smooth_octaves is not None
         return smooth and bool(self.frequencies_mhz)
 
+    def with_section(self, name: str, **values: object) -> Scenario:
+        """The scenario with some values of a section changed."""
+        section = getattr(self, name).model_copy(update=values)
+        return self.model_copy(update={name: section})
+
     def channels(self) -> tuple[Scenario, ...]:
         """The scenario of every channel; draws of each have a seed of their own, one further."""
         alone: dict[str, Any] = {"frequencies_mhz": (), "joint": False}

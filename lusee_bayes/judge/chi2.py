@@ -30,7 +30,6 @@ scatter like a chi^2 with their means as degrees of freedom, or less.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -116,11 +115,6 @@ def two_sided(chi2: float, n: float | int) -> float:
 def stands_out(p: float, among: int) -> bool:
     """Whether a probability, one of ``among`` of a report, is too small for chance."""
     return among * p < FALSE_ALARM
-
-
-def worst(levels: Sequence[Level]) -> Level:
-    """The worst of several levels."""
-    return max(levels, key=LEVELS.index)
 
 
 def probability(p: float) -> str:

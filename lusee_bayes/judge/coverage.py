@@ -73,15 +73,6 @@ class Coverage:
             **{name: getattr(self, name) for name in REST},
         }
 
-    @classmethod
-    def from_row(cls, row: Mapping[str, float | str]) -> Coverage:
-        """The inverse of :meth:`row`."""
-        rest = {key: row[key] for key in ("name", "n", *REST)}
-        held, scatter = (
-            tuple(float(row[f"{kind}_{name}"]) for name in NAMES) for kind in ("held", "scatter")
-        )
-        return cls(held=held, scatter=scatter, **rest)
-
 
 @dataclass(frozen=True)
 class Counts:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import bdtr, chdtrc
 
-from lusee_bayes.judge.chi2 import ChiSquare, Fit, Level, probability, stands_out, two_sided, worst
+from lusee_bayes.judge.chi2 import LEVELS, ChiSquare, Fit, Level, probability, stands_out, two_sided
 
 # channels that are named in a sentence
 NAMED = 4
@@ -108,7 +108,7 @@ class ChannelFits:
     def fit(self) -> Fit:
         """The verdict of all tests, and the channels that stand out."""
         tests, p = self.tests(), self.p()
-        level = worst([test.level for test in tests])
+        level = max((test.level for test in tests), key=LEVELS.index)
         sky, misfit = "not what the prior allows", "no sky explains the data of all channels"
         if self.rest.too_small:
             sky = "weaker, or closer to the prior's mean, than the prior expects"

@@ -347,10 +347,6 @@ class Part:
         """The diagonal of D = c c^T."""
         return self.root**2 if self.root.ndim == 1 else (self.root**2).sum(2).T.ravel()
 
-    def log_det(self) -> float:
-        """ln|D| of the data that are there."""
-        return _log_det_of_roots(self.root)
-
 
 def smooth_functions(
     phases: Float[np.ndarray, "times functions"], azimuth: Float[np.ndarray, " times"]
@@ -387,19 +383,14 @@ def weigh(weights: np.ndarray, grid: Float[np.ndarray, "products times n"]) -> n
     return np.einsum("kjt,jtn->ktn", weights, grid)
 
 
-def roots_of_blocks(
-    blocks: Float[np.ndarray, "products products times"],
-) -> Float[np.ndarray, "times products products"]:
-    """Cholesky factors of blocks that are zero where a sample is missing."""
-    by_time = np.moveaxis(blocks, 2, 0)
-    present = np.diagonal(by_time, axis1=1, axis2=2) > 0
-    missing = np.eye(len(blocks)) * ~present[:, None]
-    return np.linalg.cholesky(by_time + missing) * present[:, None] * present[:, :, None]
-
-
 def _root_of_weights(weights: np.ndarray) -> np.ndarray:
-    """c of D = c c^T, for D as in :func:`weigh`."""
-    return np.sqrt(weights).ravel() if weights.ndim == 2 else roots_of_blocks(weights)
+    """c of D = c c^T, for D as in :func:`weigh`; zero where a sample is missing."""
+    if weights.ndim == 2:
+        return np.sqrt(weights).ravel()
+    by_time = np.moveaxis(weights, 2, 0)
+    present = np.diagonal(by_time, axis1=1, axis2=2) > 0
+    missing = np.eye(len(weights)) * ~present[:, None]
+    return np.linalg.cholesky(by_time + missing) * present[:, None] * present[:, :, None]
 
 
 def _log_det_of_roots(root: Float[np.ndarray, "..."]) -> float:
@@ -475,7 +466,7 @@ class StructuredLeftOut(LeftOut):
                 halves.append(w)
                 inside.append(q.T @ white)
                 outside += white @ white - inside[-1] @ inside[-1]
-                log_det += part.log_det()
+                log_det += _log_det_of_roots(part.root)
                 seen = part.coloured(q)
                 left = part.diagonal() - ((seen @ (w.T @ w)) * seen).sum(1)
                 self.inverse_diagonal[part.where] = left.reshape(self.u[part.where].shape)

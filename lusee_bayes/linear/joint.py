@@ -135,7 +135,8 @@ class ComponentSums(eqx.Module):
         ComponentSums
             Zeros, with the component maps that fit the reference skies best as reference maps.
         """
-        k, maps = prior.n_components, reference_maps(prior, reference)
+        k = prior.n_components
+        maps = np.linalg.pinv(np.asarray(prior.mixing)) @ np.asarray(reference)
         n, zero = maps.shape[1], np.zeros(())
         matrices = np.zeros((k * (k + 1) // 2, n, n))
         return cls(matrices, np.zeros((k, n)), maps, zero, zero, zero)
@@ -150,26 +151,6 @@ class ComponentSums(eqx.Module):
     def information(self) -> Information:
         """Information about all component maps in one vector, the first map first."""
         return _assembled(self)
-
-
-def reference_maps(
-    prior: SpectralPrior, reference: ChannelModes
-) -> Float[Array, "components modes"]:
-    """Fit component maps to a sky of every channel, by least squares.
-
-    Parameters
-    ----------
-    prior : SpectralPrior
-        With the spectra of the components.
-    reference : (channels, modes) array
-        A sky for every channel, in K.
-
-    Returns
-    -------
-    (components, modes) array
-        The maps, in K.
-    """
-    return np.linalg.pinv(np.asarray(prior.mixing)) @ np.asarray(reference)
 
 
 @compiled

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, Pixels, compiled, namespace
+from lusee_bayes.core.arrays import Array, ModesMatrix, Pixels, compiled, namespace
 from lusee_bayes.core.checks import Described, is_traced, number
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import (
@@ -351,32 +351,8 @@ def pixel_std(covariance: ModesMatrix, nside: int) -> Pixels:
     return np.sqrt(_on_pixels(((azimuth @ between) * azimuth).sum(2), place))
 
 
-def independent_pixel_std(variance: Modes, nside: int) -> Pixels:
-    """Compute :func:`pixel_std` of coefficients that are independent of each other.
-
-    Parameters
-    ----------
-    variance : (modes,) array
-        Of the real harmonic coefficients, in K^2.
-    nside : int
-        HEALPix resolution.
-
-    Returns
-    -------
-    (pixels,) array
-        In K, in RING order.
-    """
-    variance = np.asarray(variance)
-    lmax = lmax_of(len(variance))
-    heights, place, azimuth = _rings(nside, lmax)
-    by_order, first = modes_by_order(lmax)
-    weighted = polar_functions(heights, lmax) ** 2 * variance
-    of_orders = np.add.reduceat(weighted[:, by_order], first, axis=1)
-    return np.sqrt(_on_pixels((azimuth**2 @ of_orders[:, :, None])[:, :, 0], place))
-
-
-def prior_pixel_std(prior: Prior, nside: int, *, monopole: bool = True) -> Pixels:
-    """Compute :func:`pixel_std` of a prior.
+def prior_pixel_std(prior: Prior, nside: int) -> Pixels:
+    """Compute :func:`pixel_std` of a prior whose monopole is taken for known.
 
     Parameters
     ----------
@@ -384,23 +360,24 @@ def prior_pixel_std(prior: Prior, nside: int, *, monopole: bool = True) -> Pixel
         Over harmonic coefficients.
     nside : int
         HEALPix resolution.
-    monopole : bool
-        Whether the monopole varies, too; else it is taken for known.
 
     Returns
     -------
     (pixels,) array
         In K, in RING order.
     """
-    first = slice(0, 0 if monopole else 1)
-    if prior.independent:
-        variance = np.array(prior.variance())
-        variance[first] = 0.0
-        return independent_pixel_std(variance, nside)
-    covariance = np.array(prior.covariance())
-    covariance[first] = 0.0
-    covariance[:, first] = 0.0
-    return pixel_std(covariance, nside)
+    if not prior.independent:
+        covariance = np.array(prior.covariance())
+        covariance[0] = covariance[:, 0] = 0.0
+        return pixel_std(covariance, nside)
+    variance = np.array(prior.variance())
+    variance[0] = 0.0
+    lmax = lmax_of(len(variance))
+    heights, place, azimuth = _rings(nside, lmax)
+    by_order, first = modes_by_order(lmax)
+    weighted = polar_functions(heights, lmax) ** 2 * variance
+    of_orders = np.add.reduceat(weighted[:, by_order], first, axis=1)
+    return np.sqrt(_on_pixels((azimuth**2 @ of_orders[:, :, None])[:, :, 0], place))
 
 
 @lru_cache(maxsize=2)

@@ -100,11 +100,6 @@ def is_case(path: Path, scenario: Scenario) -> bool:
     return says(path, wanted)
 
 
-def read_case(path: Path) -> xr.Dataset:
-    """A case that was computed before."""
-    return xr.load_dataset(path, engine="h5netcdf")
-
-
 def compute_case(scenario: Scenario) -> xr.Dataset:
     """Simulate and map a scenario; all that figures and claims need of it.
 

@@ -101,9 +101,7 @@ def priors_page(folder: Path, name: str) -> str:
     path = folder / "priors.json"
     found = read_json(path, PRIORS)
     priors = _priors(path, found)
-    notes = found.get("notes")
-    if not isinstance(notes, list) or not all(isinstance(text, str) for text in notes):
-        raise InputError(f"{path}: notes is no list of texts; make the results anew")
+    notes = html.sentences(path, {"notes": None} | found, "notes")
     frequency = f"{found['frequency_mhz']:g} MHz"
     words = [(str(one["name"]), str(one["prior"])) for one in priors]
     told = [

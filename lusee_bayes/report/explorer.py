@@ -65,7 +65,7 @@ def explorer_data(folder: Path, diagnostics: xr.Dataset) -> dict[str, object]:
     altitude = diagnostics["highest_altitude"].values
     layers = [
         ("mean", "posterior mean", mean, temperature),
-        ("std", "standard deviation", std, std_scale(std, altitude)),
+        ("std", "standard deviation", std, _scale("K", *seen_range(std, altitude), log=True)),
     ]
     if truth is not None:
         limit = np.percentile(np.abs(mean - truth), 99.0)
@@ -133,13 +133,6 @@ def sky_furniture() -> dict[str, object]:
     }
 
 
-def std_scale(
-    std: Float[np.ndarray, " pixels"], altitude: Float[np.ndarray, " pixels"]
-) -> dict[str, object]:
-    """A logarithmic scale over what was seen."""
-    return _scale("K", *seen_range(std, altitude), log=True)
-
-
 def _range(values: Float[np.ndarray, " pixels"]) -> dict[str, object]:
     return _scale("", *np.percentile(values, [0.5, 99.5]))
 
@@ -180,7 +173,9 @@ def cube_data(folder: Path, frequencies_mhz: list[float]) -> dict[str, object]:
     }
     nside = healpy.npix2nside(found["mean"].shape[1])
     shown = nside_of_page(nside, len(found) * len(frequencies_mhz))
-    maps = {name: np.stack([_coarser(m, shown) for m in cube]) for name, cube in found.items()}
+    maps = {
+        name: np.stack([healpy.ud_grade(m, shown) for m in cube]) for name, cube in found.items()
+    }
     return {
         "frequencies": frequencies_mhz,
         "nside": shown,
@@ -201,13 +196,6 @@ def _read(path: Path) -> Float[np.ndarray, "channels pixels"]:
     with opened(path, CUBE.what) as hdus:
         there = {} if hdus[0].data is None else {"maps": hdus[0].data}
         return CUBE.checked(path, there, {}).arrays["maps"]
-
-
-def _coarser(pixels: Float[np.ndarray, " pixels"], nside: int) -> Float[np.ndarray, " coarser"]:
-    """Means over coarser pixels."""
-    if pixels.size == 12 * nside**2:
-        return pixels
-    return np.asarray(healpy.ud_grade(pixels, nside))
 
 
 def _quantised(cube: Float[np.ndarray, "channels pixels"]) -> dict[str, object]:

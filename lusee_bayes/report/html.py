@@ -40,12 +40,6 @@ def package_text(name: str) -> str:
     return (resources.files("lusee_bayes.report") / name).read_text(encoding="utf-8")
 
 
-def contents(sections: Sequence[tuple[str, str]]) -> str:
-    """Links to sections (anchor, title)."""
-    links = (f'<a href="#{anchor}">{escape(title)}</a>' for anchor, title in sections)
-    return f"<nav>{' '.join(links)}</nav>"
-
-
 def section(anchor: str, title: str, parts: Iterable[str]) -> str:
     """A part of the page with its heading."""
     inside = "\n".join([f"<h2>{escape(title)}</h2>", *parts])
@@ -79,10 +73,6 @@ def definitions(rows: Iterable[tuple[str, str]]) -> str:
     return f'<dl class="about">{inside}</dl>'
 
 
-def _cell(value: object) -> str:
-    return value if isinstance(value, Markup) else escape(str(value))
-
-
 def figure(folder: Path, name: str, alternative: str, caption: str) -> str:
     """A picture of a run, inside the page, with a text for those who do not see it."""
     data = base64.b64encode(figure_path(folder, name).read_bytes()).decode()
@@ -107,7 +97,9 @@ def table(
     head = "".join(f'<th scope="col">{escape(str(cell))}</th>' for cell in header)
     lines = [
         f"<tr{' class=bad' if mark else ''}>"
-        + "".join(f"<td>{_cell(cell)}</td>" for cell in row)
+        + "".join(
+            f"<td>{cell if isinstance(cell, Markup) else escape(str(cell))}</td>" for cell in row
+        )
         + "</tr>"
         for row, mark in zip(rows, marks, strict=True)
     ]
@@ -283,7 +275,9 @@ def run_page(
         ("run", "The run"): details(folder, figures),
     }
     parts = [section(*name, inside) for name, inside in sections.items()]
-    return page(title, [contents(list(sections)), *head, provenance(folder, channels), *parts])
+    links = (f'<a href="#{anchor}">{escape(name)}</a>' for anchor, name in sections)
+    contents = f"<nav>{' '.join(links)}</nav>"
+    return page(title, [contents, *head, provenance(folder, channels), *parts])
 
 
 def details(folder: Path, figures: Mapping[str, Any]) -> list[str]:

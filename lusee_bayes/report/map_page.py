@@ -18,7 +18,43 @@ from lusee_bayes.results.finished_runs import FinishedRun
 from lusee_bayes.results.saved import COVERAGE, DIAGNOSIS, POINTING, SOURCES
 
 NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "diagnostics.nc", "mean.fits", "std.fits")
-FIGURES = ("maps", "draws", "fidelity", "spectra", "data_vector", "residuals", "beams")
+# what each figure shows, for those who cannot see it, and its caption
+FIGURES = {
+    "maps": (
+        "Galactic maps: posterior mean and its standard deviation, and, where the true sky is "
+        "known, truth and difference",
+        "Posterior mean and standard deviation; truth and difference where the sky is known. "
+        "All but the standard deviation are drawn through the Gaussian beam named above the "
+        "maps, so that bright edges have no rings; files and numbers are without it.",
+    ),
+    "draws": (
+        "Galactic maps of four draws of the posterior",
+        "Draws of the posterior: skies that agree with the data and the prior. Features that "
+        "all draws share are constrained; those that differ are not.",
+    ),
+    "fidelity": (
+        "Curves over multipole ell: correlation with the truth and signal-to-noise where the "
+        "truth is known, and the share of the variance that the prior supplies",
+        "Correlation with the truth, signal-to-noise ratio, and the share of the prior.",
+    ),
+    "spectra": (
+        "Power spectra of prior, posterior mean, posterior variance and truth",
+        "Power spectra. Where the posterior variance reaches the prior, the data add no "
+        "information.",
+    ),
+    "data_vector": (
+        "The measured visibilities, product by product",
+        "The data, product by product.",
+    ),
+    "residuals": (
+        "Standardised residuals of every datum by product and time, and p-values by product",
+        "Every datum against the prediction of all others, in standard deviations.",
+    ),
+    "beams": (
+        "Beams of an auto and two crosses seen from above, North up",
+        "Beams used for the map.",
+    ),
+}
 # days in the table, the worst first
 WORST_DAYS = 5
 
@@ -62,6 +98,10 @@ def map_page(folder: Path, name: str) -> str:
     )
 
 
+def _figure(folder: Path, name: str) -> str:
+    return html.figure(folder, name, *FIGURES[name])
+
+
 def _map(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
     hidden = summary["never_observed_fraction"]
     bands = None
@@ -74,22 +114,8 @@ def _map(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
             "The share from the prior is that of a pixel's variance, the monopole left out."
         ),
         explorer(folder, found),
-        html.figure(
-            folder,
-            "maps",
-            "Galactic maps: posterior mean and its standard deviation, and, where the true sky is "
-            "known, truth and difference",
-            "Posterior mean and standard deviation; truth and difference where the sky is known. "
-            "All but the standard deviation are drawn through the Gaussian beam named above the "
-            "maps, so that bright edges have no rings; files and numbers are without it.",
-        ),
-        html.figure(
-            folder,
-            "draws",
-            "Galactic maps of four draws of the posterior",
-            "Draws of the posterior: skies that agree with the data and the prior. Features that "
-            "all draws share are constrained; those that differ are not.",
-        ),
+        _figure(folder, "maps"),
+        _figure(folder, "draws"),
         *([] if bands is None else coverage_table(bands)),
     ]
 
@@ -137,20 +163,8 @@ def _scales(folder: Path, run: FinishedRun) -> list[str]:
         )
     return [
         html.paragraph(" ".join(text)),
-        html.figure(
-            folder,
-            "fidelity",
-            "Curves over multipole ell: correlation with the truth and signal-to-noise where the "
-            "truth is known, and the share of the variance that the prior supplies",
-            "Correlation with the truth, signal-to-noise ratio, and the share of the prior.",
-        ),
-        html.figure(
-            folder,
-            "spectra",
-            "Power spectra of prior, posterior mean, posterior variance and truth",
-            "Power spectra. Where the posterior variance reaches the prior, the data add no "
-            "information.",
-        ),
+        _figure(folder, "fidelity"),
+        _figure(folder, "spectra"),
         _by_ell(run),
     ]
 
@@ -186,12 +200,7 @@ def _data(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
             "spoils the predictions of others too; the culprit is the group whose removal makes "
             "the rest fit (last column)."
         ),
-        html.figure(
-            folder,
-            "residuals",
-            "Standardised residuals of every datum by product and time, and p-values by product",
-            "Every datum against the prediction of all others, in standard deviations.",
-        ),
+        _figure(folder, "residuals"),
     ]
     marked = [
         str(x) for key in ("suspects", "extremes") for x in np.atleast_1d(found.attrs.get(key, ()))
@@ -213,14 +222,7 @@ def _data(folder: Path, summary: dict, found: xr.Dataset) -> list[str]:
         parts += [html.paragraph(f"{title}{note}"), html.table(header, cells, bad)]
     parts += _pointing(folder)
     parts += map_unknowns(folder, summary)
-    parts.append(
-        html.figure(
-            folder,
-            "data_vector",
-            "The measured visibilities, product by product",
-            "The data, product by product.",
-        )
-    )
+    parts.append(_figure(folder, "data_vector"))
     return parts
 
 
@@ -311,12 +313,5 @@ def _numbers(folder: Path, summary: dict) -> list[str]:
             html.paragraph("Point sources beside the map"),
             html.table(("source", "block", "flux [Jy]", "+- [Jy]"), cells),
         ]
-    parts.append(
-        html.figure(
-            folder,
-            "beams",
-            "Beams of an auto and two crosses seen from above, North up",
-            "Beams used for the map.",
-        )
-    )
+    parts.append(_figure(folder, "beams"))
     return parts

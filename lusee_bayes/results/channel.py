@@ -7,12 +7,10 @@ known truth, by latitude and at some multipoles.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from jaxtyping import Float, Shaped
 
 from lusee_bayes.core.arrays import Array, Ells, Modes, ModesMatrix, Pixels
@@ -86,15 +84,6 @@ class Observed:
             doubts(experiment, inference),
             unknowns,
         )
-
-
-# numbers of a channel that a file keeps as attributes
-NUMBERS = (
-    "frequency_mhz",
-    *("log_evidence", "information_bits", "chi2", "chi2_expected", "chi2_model"),
-    *("instrument_chi2", "instrument_chi2_expected", "refinement"),
-)
-COUNTS = ("n_data", "n_missing", "rounds")
 
 
 @dataclass(frozen=True, repr=False)
@@ -235,38 +224,6 @@ class ChannelResult(Described):
         }
         found = {name: (("mode",), values) for name, values in known.items() if values is not None}
         return found | ({"draws": (("draw", "mode"), self.draws)} if len(self.draws) else {})
-
-    def to_dataset(self) -> xr.Dataset:
-        """All of it, for :meth:`from_dataset`."""
-        variables = self.variables() | {
-            "draws": (("draw", "mode"), self.draws),
-            "prior_fraction": (("ell",), self.prior_fraction),
-            "pixel_std": (("pixel",), self.pixel_std),
-            "highest_altitude": (("pixel",), self.highest_altitude),
-        }
-        numbers = {name: getattr(self, name) for name in (*NUMBERS, *COUNTS)}
-        unknowns = None if self.unknowns is None else self.unknowns.summary()
-        rows = self.coverage_rows() or []
-        texts = {"doubts": self.doubts, "coverage": rows, "unknowns": unknowns}
-        told = {name: json.dumps(value) for name, value in texts.items()}
-        return xr.Dataset(variables, attrs={**numbers, **told})
-
-    @classmethod
-    def from_dataset(cls, dataset: xr.Dataset) -> ChannelResult:
-        """The inverse of :meth:`to_dataset`."""
-        arrays = {str(name): np.asarray(v) for name, v in dataset.data_vars.items()}
-        texts = ("doubts", "coverage", "unknowns")
-        told, coverage, unknowns = (json.loads(dataset.attrs[name]) for name in texts)
-        return cls(
-            truth=arrays.pop("truth", None),
-            independent=arrays.pop("independent_mean", None),
-            doubts=tuple(told),
-            coverage=tuple(map(Coverage.from_row, coverage)),
-            unknowns=None if unknowns is None else UnknownsReport.from_summary(unknowns),
-            **arrays,
-            **{name: float(dataset.attrs[name]) for name in NUMBERS},
-            **{name: int(dataset.attrs[name]) for name in COUNTS},
-        )
 
 
 def channel_of_information(

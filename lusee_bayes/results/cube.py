@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -19,13 +18,13 @@ from lusee_bayes.core.harmonics import mode_numbers, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import about_run
 from lusee_bayes.core.reading import rows_of
-from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.judge.chi2 import RULE, ChiSquare, Fit
 from lusee_bayes.judge.cube_fit import ChannelFits
 from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.results.channel import ChannelResult
+from lusee_bayes.results.map_files import about
 from lusee_bayes.results.map_result import joint_prior_sentence
 from lusee_bayes.results.unknowns import UnknownsReport
 from lusee_bayes.sky.galaxy import LANDMARKS
@@ -197,13 +196,9 @@ class CubeResult(Described):
             )
         return ", ".join(parts)
 
-    def prior_words(self) -> str:
-        """Which prior the skies of a joint posterior have, in a sentence."""
-        return joint_prior_sentence(self.scenario)
-
     def lines(self) -> list[str]:
         """What a terminal shows."""
-        prior = [] if self.components is None else [self.prior_words()]
+        prior = [] if self.components is None else [joint_prior_sentence(self.scenario)]
         unknowns = [] if self.unknowns is None else self.unknowns.lines()
         reduced = self.reduced
         notes = () if reduced is None else (reduced.flag_line().capitalize(), *reduced.notes())
@@ -292,7 +287,7 @@ class CubeResult(Described):
         if components is None:
             return None
         return {
-            "prior": self.prior_words(),
+            "prior": joint_prior_sentence(self.scenario),
             "components": list(components.prior.names),
             "solver": components.solver,
             "iterations": components.iterations,
@@ -337,11 +332,7 @@ class CubeResult(Described):
             },
             attrs={
                 "format": formats.POSTERIOR_CUBE,
-                "lmax": scenario.lmax,
-                "frame": "galactic",
-                "basis": "real orthonormal spherical harmonics, index ell^2 + ell + m",
-                "versions": json.dumps(versions()),
-                "scenario": scenario.to_yaml(),
+                **about(scenario),
                 **({"unmapped": "\n".join(self.gaps())} if self.unmapped else {}),
             },
         )

@@ -75,7 +75,7 @@ def diagnostics(
     left = channel.pixel_std**2 - monopole * with_monopole
     # the prior leaves the monopole wide open, which any data settle; with it the prior's share
     # would be close to zero everywhere
-    rest_prior = prior_pixel_std(prior, nside, monopole=False) ** 2
+    rest_prior = prior_pixel_std(prior, nside) ** 2
     share = left / rest_prior
     expected = prior.variance() - np.diagonal(covariance)
     strong = strengths_in_words(strengths(deviation, expected, rest_prior - left))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -49,15 +50,10 @@ def cards(name: str, scenario: Scenario) -> dict[str, object]:
         "BEAM": (beam.label, "the antennas"),
         "SITELON": (site.lon_deg, "selenographic longitude in degrees"),
         "SITELAT": (site.lat_deg, "selenographic latitude in degrees"),
-        "SCENHASH": scenario_hash(scenario),
+        "SCENHASH": text_hash(scenario.to_yaml()),
         "CREATOR": f"lusee_bayes {__version__}",
         **{VERSION_KEYS[package]: (v, package) for package, v in versions().items()},
     }
-
-
-def scenario_hash(scenario: Scenario) -> str:
-    """SHA-256 of the resolved scenario, as ``scenario.yaml`` holds it."""
-    return text_hash(scenario.to_yaml())
 
 
 def text_hash(text: str) -> str:
@@ -65,55 +61,51 @@ def text_hash(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def write_map(path: Path, name: str, pixels: Pixels, scenario: Scenario) -> None:
-    """Write one map of a scenario: HEALPix RING, Galactic, K, float64, for healpy.read_map."""
-    extra = [
-        (key, *value) if isinstance(value, tuple) else (key, value)
-        for key, value in cards(name, scenario).items()
-    ]
-    healpy.write_map(
-        path,
-        pixels,
-        coord="G",
-        column_names=[name.upper()],
-        column_units="K",
-        dtype=np.float64,
-        extra_header=extra,
-    )
+def write_maps(folder: Path, maps: Mapping[str, Pixels], scenario: Scenario) -> None:
+    """Write NAME.fits of maps: HEALPix RING, Galactic, K, float64, for healpy.read_map."""
+    for name, pixels in maps.items():
+        extra = [
+            (key, *value) if isinstance(value, tuple) else (key, value)
+            for key, value in cards(name, scenario).items()
+        ]
+        healpy.write_map(
+            folder / f"{name}.fits",
+            pixels,
+            coord="G",
+            column_names=[name.upper()],
+            column_units="K",
+            dtype=np.float64,
+            extra_header=extra,
+        )
 
 
-def write_cube(
-    path: Path,
-    name: str,
-    pixels: Float[np.ndarray, "frequencies pixels"],
+def write_cubes(
+    folder: Path,
+    cubes: Mapping[str, Float[np.ndarray, "frequencies pixels"]],
     frequencies_mhz: Float[np.ndarray, " frequencies"],
     scenario: Scenario,
 ) -> None:
-    """Write maps of a scenario's frequencies in the layout of sky cubes (``sky.cubes``).
+    """Write NAME.fits of maps at a scenario's frequencies, in the layout of ``sky.cubes``.
 
     One image (frequency, pixel), HEALPix RING, Galactic, K, float64; the frequencies, which its
     header can only give in even steps, are in a table behind it.
     """
-    image = fits.PrimaryHDU(np.asarray(pixels, dtype=np.float64))
-    header, frequencies = image.header, frequencies_mhz
-    for key, value in cards(name, scenario).items():
-        if key != "FREQ":
-            header[key] = value
-    header["BUNIT"], header["COORDSYS"], header["ORDERING"] = "K", "G", "RING"
-    header["NSIDE"] = scenario.map_nside
-    steps = np.diff(frequencies)
-    if not len(steps) or np.allclose(steps, steps[0], rtol=1e-9):
-        header["HIERARCH FREQ_START"] = (frequencies[0], "MHz")
-        header["FREQ_END"] = (frequencies[-1], "MHz")
-        header["HIERARCH FREQ_STEP"] = (steps[0] if len(steps) else 1.0, "MHz")
-    column = fits.Column("FREQUENCY", "D", unit="MHz", array=frequencies)
-    table = fits.BinTableHDU.from_columns([column], name="FREQUENCIES")
-    fits.HDUList([image, table]).writeto(path)
-
-
-def write_posterior(result: MapResult, path: Path) -> None:
-    """Write posterior.nc."""
-    posterior_dataset(result).to_netcdf(path, engine="h5netcdf")
+    steps = np.diff(frequencies_mhz)
+    for name, pixels in cubes.items():
+        image = fits.PrimaryHDU(np.asarray(pixels, dtype=np.float64))
+        header = image.header
+        for key, value in cards(name, scenario).items():
+            if key != "FREQ":
+                header[key] = value
+        header["BUNIT"], header["COORDSYS"], header["ORDERING"] = "K", "G", "RING"
+        header["NSIDE"] = scenario.map_nside
+        if not len(steps) or np.allclose(steps, steps[0], rtol=1e-9):
+            header["HIERARCH FREQ_START"] = (frequencies_mhz[0], "MHz")
+            header["FREQ_END"] = (frequencies_mhz[-1], "MHz")
+            header["HIERARCH FREQ_STEP"] = (steps[0] if len(steps) else 1.0, "MHz")
+        column = fits.Column("FREQUENCY", "D", unit="MHz", array=frequencies_mhz)
+        table = fits.BinTableHDU.from_columns([column], name="FREQUENCIES")
+        fits.HDUList([image, table]).writeto(folder / f"{name}.fits")
 
 
 def posterior_dataset(result: MapResult) -> xr.Dataset:
@@ -127,7 +119,8 @@ def posterior_dataset(result: MapResult) -> xr.Dataset:
     variables = {
         name: (*value, {"units": "K"}) for name, value in result.channel.variables().items()
     }
-    attrs = {"format": formats.POSTERIOR, **about(scenario)}
+    frequency = {"frequency_mhz": scenario.frequency_mhz}
+    attrs = {"format": formats.POSTERIOR, **frequency, **about(scenario)}
     if scenario.output.covariance:
         matrix = np.asarray(posterior.covariance())
         variables["covariance"] = (("mode", "mode_2"), matrix, {"units": "K2"})
@@ -154,9 +147,8 @@ def _prior_variables(prior: Prior) -> dict[str, tuple]:
 
 
 def about(scenario: Scenario) -> dict[str, object]:
-    """What a file has to say of its numbers: frequency, frame, versions, scenario."""
+    """What a file has to say of its numbers: frame, versions, scenario."""
     return {
-        "frequency_mhz": scenario.frequency_mhz,
         "lmax": scenario.lmax,
         "frame": "galactic",
         "basis": "real orthonormal spherical harmonics, index ell^2 + ell + m",

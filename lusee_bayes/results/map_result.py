@@ -116,22 +116,6 @@ def prior_sentence(experiment: Experiment) -> str:
     return f"Prior {section.model}, C_ell {section.origin}{': ' if found else ''}{found}."
 
 
-def prior_summary(experiment: Experiment) -> dict[str, object]:
-    """What summary.json says of the prior.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    """
-    learned = experiment.learned
-    return {
-        "prior": prior_sentence(experiment),
-        "prior_parameters": [] if learned is None else learned.as_rows(),
-        # the parameters integrated out, too
-        "log_evidence_learned": None if learned is None else learned.log_evidence,
-    }
-
-
 def joint_prior_sentence(scenario: Scenario) -> str:
     """Which prior the skies of a joint posterior have.
 
@@ -217,7 +201,7 @@ class MapResult(Described):
 
     def summary(self) -> dict[str, object]:
         """Figures of summary.json; null where a truth would be needed and is not known."""
-        channel = self.channel
+        channel, learned = self.channel, self.experiment.learned
         offsets = None if self.pointing is None else self.pointing.offsets
         return {
             **_figures(channel, "frequency_mhz", "ell_cross"),
@@ -231,7 +215,10 @@ class MapResult(Described):
             **_figures(channel, "n_data", "n_missing"),
             "n_modes": len(channel.mean),
             "rounds": channel.rounds,
-            **prior_summary(self.experiment),
+            "prior": prior_sentence(self.experiment),
+            "prior_parameters": [] if learned is None else learned.as_rows(),
+            # the parameters integrated out, too
+            "log_evidence_learned": None if learned is None else learned.log_evidence,
             "pointing": None if offsets is None else offsets.to_dict("records"),
             "unknowns": None if self.unknowns is None else self.unknowns.summary(),
             "beam_rms_difference": beam_rms_difference(self.experiment.setup),

@@ -71,14 +71,7 @@ class SampleResult:
     @cached_property
     def maps(self) -> dict[str, np.ndarray]:
         """Mean, standard deviation and the ends of the 90 % interval of every pixel, in K."""
-        nside = self.experiment.scenario.map_nside
-        lower, upper = mode.pixel_interval_of_draws(self.skies, nside, mode.INTERVAL)
-        return {
-            "mean": mode.pixel_mean_of_draws(self.skies, nside),
-            "std": mode.pixel_std_of_draws(self.skies, nside),
-            "lower": lower,
-            "upper": upper,
-        }
+        return mode.pixel_statistics(self.skies, self.experiment.scenario.map_nside)
 
     def headline(self) -> str:
         """The few figures that matter, in one line."""

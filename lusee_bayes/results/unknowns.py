@@ -13,14 +13,12 @@ Of clock and pointing, the offsets of the model are told, and which each day pre
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Modes, ModesMatrix, on_host
@@ -169,16 +167,6 @@ class UnknownsReport:
             "null_sentence": self.null_sentence(),
         }
 
-    @classmethod
-    def from_summary(cls, found: Mapping[str, Any]) -> UnknownsReport:
-        """The inverse of :meth:`summary`."""
-        null = None
-        if "null_direction" in found:
-            parts = found["null_direction"]
-            weights = np.array(list(parts.values()), dtype=np.float64)
-            null = NullDirection(tuple(parts), weights, found["null_share"])
-        return cls(pd.DataFrame(found["rows"]), null, found["common_gain_std_share"])
-
 
 @dataclass(frozen=True)
 class Unknowns:
@@ -257,37 +245,6 @@ class Unknowns:
         sky = np.array([[variance / self.sky_std**2]])
         blocks = np.block([[sky, mixed[None]], [mixed[:, None], inner]])
         return NullDirection.of((SKY, *self.names), blocks)
-
-    def to_dataset(self) -> xr.Dataset:
-        """All of it but the reference sky, for :meth:`from_dataset`."""
-        return xr.Dataset(
-            {
-                "unknown_mean": ("unknown", self.amplitudes.mean),
-                "unknown_pull": (("unknown", "mode"), self.amplitudes.pull),
-                "unknown_covariance": (("unknown", "unknown_2"), self.amplitudes.covariance),
-                "unknown_parts": (("part", "unknown"), self.parts),
-            },
-            attrs={
-                "unknowns": json.dumps(self.rows),
-                "unknown_names": json.dumps(self.names),
-                "unknown_sky_std": self.sky_std,
-            },
-        )
-
-    @classmethod
-    def from_dataset(cls, dataset: xr.Dataset, reference: Modes) -> Unknowns | None:
-        """The inverse of :meth:`to_dataset`; None if it has none."""
-        if "unknowns" not in dataset.attrs:
-            return None
-        names = ("mean", "pull", "covariance", "parts")
-        mean, pull, covariance, parts = (np.asarray(dataset[f"unknown_{name}"]) for name in names)
-        return cls(
-            tuple(json.loads(dataset.attrs["unknowns"])),
-            AmplitudesOfSky(mean, pull, covariance, reference),
-            tuple(json.loads(dataset.attrs["unknown_names"])),
-            parts,
-            float(dataset.attrs["unknown_sky_std"]),
-        )
 
 
 def unknowns_report(experiment: Experiment, found: Inference) -> UnknownsReport | None:

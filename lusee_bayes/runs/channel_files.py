@@ -10,10 +10,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any
 
+import jax
 import numpy as np
+import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
@@ -27,7 +31,6 @@ from lusee_bayes.experiment.data_files import Data, digest_of
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.joint import ComponentSums, summed_information
@@ -61,15 +64,60 @@ class ChannelFiles:
         """Whether it is there, whole and of this run."""
         return says(self.path(scenario, kind), {"identity": self.identity})
 
-    def write(self, scenario: Scenario, kind: str, dataset: xr.Dataset) -> None:
-        """Write it whole or not at all."""
+    def write(self, scenario: Scenario, kind: str, value: Any) -> None:
+        """Write a dataclass whole or not at all."""
         with replacing(self.path(scenario, kind)) as partial:
-            dataset.assign_attrs(identity=self.identity).to_netcdf(partial, engine="h5netcdf")
+            dataset = to_dataset(value).assign_attrs(identity=self.identity)
+            dataset.to_netcdf(partial, engine="h5netcdf")
 
-    def read(self, scenario: Scenario, kind: str, names: list[str] | None = None) -> xr.Dataset:
-        """Read all of it, or some variables."""
+    def read(self, scenario: Scenario, kind: str) -> Any:
+        """Read what was written."""
         with xr.open_dataset(self.path(scenario, kind), engine="h5netcdf") as file:
-            return (file if names is None else file[[n for n in names if n in file]]).load()
+            return from_dataset(file)
+
+    def arrays(self, scenario: Scenario, kind: str, *names: str) -> list[np.ndarray]:
+        """Read some arrays of it, each named as ``Class.field``."""
+        with xr.open_dataset(self.path(scenario, kind), engine="h5netcdf") as file:
+            return [np.asarray(file[name]) for name in names]
+
+
+def to_dataset(value: Any) -> xr.Dataset:
+    """Lay out a dataclass of arrays, tables, other dataclasses, and what JSON holds.
+
+    Arrays are variables named as ``Class.field``; a class that has some occurs once. The rest is
+    one attribute.
+    """
+    arrays = {}
+
+    def outlined(part: Any) -> dict[str, Any]:
+        if isinstance(part, pd.DataFrame):
+            return {"rows": part.to_dict("records")}
+        kind = type(part)
+        found = {"class": f"{kind.__module__}:{kind.__name__}"}
+        for field in fields(part):
+            found[field.name] = inner = getattr(part, field.name)
+            if isinstance(inner, (np.ndarray, jax.Array)):
+                name = f"{kind.__name__}.{field.name}"
+                arrays[name] = [f"{name}.{axis}" for axis in range(inner.ndim)], np.asarray(inner)
+                found[field.name] = {"array": name}
+        return found
+
+    outline = json.dumps(value, default=outlined)
+    return xr.Dataset(arrays, attrs={"outline": outline})
+
+
+def from_dataset(dataset: xr.Dataset) -> Any:
+    """The inverse of :func:`to_dataset`."""
+
+    def made(found: dict[str, Any]) -> Any:
+        if "class" in found:
+            kind = resolve_name(found.pop("class"))
+            return kind(**{k: tuple(x) if isinstance(x, list) else x for k, x in found.items()})
+        if "rows" in found:
+            return pd.DataFrame(found["rows"])
+        return np.asarray(dataset[found["array"]]) if "array" in found else found
+
+    return json.loads(dataset.attrs["outline"], object_hook=made)
 
 
 def identity_of(scenario: Scenario, data: Data | None, truth: bool, n_draws: int) -> str:
@@ -84,11 +132,6 @@ def identity_of(scenario: Scenario, data: Data | None, truth: bool, n_draws: int
     if data is not None:
         parts.append(digest_of(data))
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-
-
-# numbers that a file keeps as attributes
-OF_INFORMATION = ("misfit", "log_det", "n_data")
-OF_CHANNEL = ("frequency_mhz", "n_missing", "rounds")
 
 
 @dataclass(frozen=True)
@@ -118,49 +161,6 @@ class ChannelInformation:
         unknowns = Unknowns.of(experiment, inference, information.reference)
         observed = Observed.of(experiment, inference, split.instrument, unknowns)
         return cls(information, observed, sky)
-
-    def to_dataset(self) -> xr.Dataset:
-        """All of it, for :meth:`from_dataset`."""
-        information, observed = self.information, self.observed
-        variables = {
-            "matrix": (("mode", "mode_2"), np.asarray(information.matrix)),
-            "vector": ("mode", np.asarray(information.vector)),
-            "reference": ("mode", np.asarray(information.reference)),
-            "sky": ("mode", self.sky),
-            "prior_std": ("mode", observed.prior_std),
-            "highest_altitude": ("pixel", observed.highest_altitude),
-        }
-        if observed.truth is not None:
-            variables["truth"] = ("mode", observed.truth)
-        numbers = {name: float(getattr(information, name)) for name in OF_INFORMATION}
-        numbers |= {name: getattr(observed, name) for name in OF_CHANNEL}
-        numbers |= asdict(observed.instrument)
-        found = xr.Dataset(variables, attrs={**numbers, "doubts": json.dumps(observed.doubts)})
-        if observed.unknowns is None:
-            return found
-        own = observed.unknowns.to_dataset()
-        return found.merge(own).assign_attrs(own.attrs)
-
-    @classmethod
-    def from_dataset(cls, dataset: xr.Dataset) -> ChannelInformation:
-        """The inverse of :meth:`to_dataset`."""
-        arrays = {str(name): np.asarray(values) for name, values in dataset.data_vars.items()}
-        information = Information(
-            *(arrays[name] for name in ("matrix", "vector", "reference")),
-            *(np.asarray(float(dataset.attrs[name])) for name in OF_INFORMATION),
-        )
-        observed = Observed(
-            float(dataset.attrs["frequency_mhz"]),
-            arrays["prior_std"],
-            arrays.get("truth"),
-            arrays["highest_altitude"],
-            int(dataset.attrs["n_missing"]),
-            int(dataset.attrs["rounds"]),
-            ChiSquare(float(dataset.attrs["chi2"]), float(dataset.attrs["degrees"])),
-            tuple(json.loads(dataset.attrs["doubts"])),
-            Unknowns.from_dataset(dataset, arrays["reference"]),
-        )
-        return cls(information, observed, arrays["sky"])
 
 
 # channels that one task adds up, one after the other
@@ -238,4 +238,4 @@ def names_of(channels: tuple[Scenario, ...]) -> str:
 
 
 def _information(files: ChannelFiles, channel: Scenario) -> Information:
-    return ChannelInformation.from_dataset(files.read(channel, "information")).information
+    return files.read(channel, "information").information

@@ -24,7 +24,6 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import xarray as xr
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from lusee_bayes.core.arrays import on_host
@@ -181,10 +180,9 @@ def solve_components(
         mode = positive_mode(scenario, at_hand, stages)
         prior, posterior, chi2 = mode.prior, mode.posterior, mode.energy
     else:
-        small = [files.read(channel, "information", ["reference", "sky"]) for channel in channels]
-        reference, skies = (
-            np.array([np.asarray(s[name]) for s in small]) for name in ("reference", "sky")
-        )
+        names = ("Information.reference", "ChannelInformation.sky")
+        small = [files.arrays(channel, "information", *names) for channel in channels]
+        reference, skies = map(np.array, zip(*small, strict=True))
         prior = scenario.spectral.prior(np.array(scenario.frequencies_mhz), skies)
         information = at_hand.summed(prior, reference, lambda _, information: information)
     with stages("joint posterior"):
@@ -205,15 +203,6 @@ def solve_components(
         )
 
 
-# numbers of a channel's own posterior
-NUMBERS = ("log_evidence", "information_bits", "chi2_model", "refinement")
-# arrays of it in a file, with their dimensions
-ARRAYS = {
-    "mean": ("mode",),
-    "covariance": ("mode", "mode_2"),
-    "draws": ("alone_draw", "mode"),
-    "compared": ("alone_more", "mode"),
-}
 # what the key of draws is folded with: numbers of channels are smaller
 TIED = 1 << 20
 
@@ -234,7 +223,7 @@ class ChannelAlone:
     compared : (more, modes) array
         Draws less the mean that coverage is compared with, in K; none where no truth is known.
     numbers : dict of float
-        ``NUMBERS``, as in :class:`.ChannelResult`.
+        log_evidence, information_bits, chi2_model and refinement, as in :class:`.ChannelResult`.
     """
 
     known: ChannelInformation
@@ -310,20 +299,6 @@ class ChannelAlone:
             **(self.numbers | {"information_bits": float(bits)}),
         )
 
-    def to_dataset(self) -> xr.Dataset:
-        """All of it, for :meth:`from_dataset`."""
-        found = self.known.to_dataset()
-        own = {f"alone_{name}": (dims, getattr(self, name)) for name, dims in ARRAYS.items()}
-        numbers = {f"alone_{name}": self.numbers[name] for name in NUMBERS}
-        return found.merge(xr.Dataset(own)).assign_attrs(found.attrs | numbers)
-
-    @classmethod
-    def from_dataset(cls, dataset: xr.Dataset) -> ChannelAlone:
-        """The inverse of :meth:`to_dataset`."""
-        arrays = (np.asarray(dataset[f"alone_{name}"]) for name in ARRAYS)
-        numbers = {name: float(dataset.attrs[f"alone_{name}"]) for name in NUMBERS}
-        return cls(ChannelInformation.from_dataset(dataset), *arrays, numbers)
-
 
 def kernel(
     frequencies_mhz: Float[np.ndarray, " channels"], octaves: float
@@ -351,7 +326,7 @@ def tie_receivers(scenario: Scenario, channels: Sequence[Scenario], files: Chann
     """
     means, covariances, n_draws = [], [], 0
     for channel in channels:
-        alone = ChannelAlone.from_dataset(files.read(channel, "alone"))
+        alone = files.read(channel, "alone")
         mean, covariance = alone.receivers()
         means.append(mean)
         covariances.append(covariance)
@@ -373,10 +348,10 @@ def write_tied_sky(
     channel = channels[number]
     if files.has(channel, "result"):
         return
-    alone = ChannelAlone.from_dataset(files.read(channel, "alone"))
+    alone = files.read(channel, "alone")
     key = jax.random.fold_in(draw_key(channel), TIED + 1)
     found = alone.tied(tied.mean[number], tied.covariance[number], tied.draws[:, number], key)
-    files.write(channel, "result", found.to_dataset())
+    files.write(channel, "result", found)
 
 
 def cube_result(
@@ -438,7 +413,7 @@ def cube_result(
             information, inference = inform(experiment)
         known = ChannelInformation.of(experiment, information, inference)
         if scenario.joint:
-            files.write(channel, wanted, known.to_dataset())
+            files.write(channel, wanted, known)
             return
         posterior = on_host(inference.posterior)
         mean, covariance = posterior.mean, posterior.covariance()
@@ -453,11 +428,11 @@ def cube_result(
         if tied:
             rest = np.zeros((0, len(mean))) if compared is None else compared
             alone = ChannelAlone(known, mean, covariance, draws - mean, rest, numbers)
-            files.write(channel, wanted, alone.to_dataset())
+            files.write(channel, wanted, alone)
             return
         given = (known.observed, information, mean, covariance, draws)
         found = channel_of_information(*given, compared=compared, **numbers)
-        files.write(channel, wanted, found.to_dataset())
+        files.write(channel, wanted, found)
 
     def refusal(channel: Scenario) -> str:
         try:
@@ -495,7 +470,7 @@ def cube_result(
 
         skies = Tasks(write_sky, range(len(mapped)), [names_of((c,)) for c in mapped])
         engine.each(skies, stages, "joint skies")
-    found = tuple(ChannelResult.from_dataset(files.read(c, "result")) for c in mapped)
+    found = tuple(files.read(c, "result") for c in mapped)
     tied_evidence = {"tie_log_evidence": tie_log_evidence}
     return CubeResult(scenario, found, components, stages.seconds, unmapped, **tied_evidence)
 
@@ -529,7 +504,7 @@ def _write_joint_sky(
     channel, key = channels[number], draw_key(scenario)
     if files.has(channel, "result"):
         return
-    known = ChannelInformation.from_dataset(files.read(channel, "information"))
+    known = files.read(channel, "information")
     draws = components.draws
     if components.mode is not None:
         spread = np.asarray(components.spread)
@@ -548,4 +523,4 @@ def _write_joint_sky(
         compared=np.asarray(sky.draws) - np.asarray(sky.mean),
         independent=known.information.reference,
     )
-    files.write(channel, "result", found.to_dataset())
+    files.write(channel, "result", found)

@@ -271,18 +271,14 @@ def measured_experiment(
 def _smaller(scenario: Scenario) -> Iterator[tuple[str, float | str, Scenario]]:
     """The scenario with less of one thing at a time."""
 
-    def changed(section: str, **values: object) -> Scenario:
-        part = getattr(scenario, section).model_copy(update=values)
-        return scenario.model_copy(update={section: part})
-
     if scenario.nside is not None:
         yield "nside", 64, scenario.model_copy(update={"nside": 64})
     for draws in (1000, 100, 0):
-        yield "output.draws", draws, changed("output", draws=draws)
+        yield "output.draws", draws, scenario.with_section("output", draws=draws)
     if scenario.joint:
         yield "joint", "false", scenario.model_copy(update={"joint": False})
     for lmax in range(scenario.lmax - 1, 0, -1):
         yield "lmax", lmax, scenario.model_copy(update={"lmax": lmax})
     for times in range(1, 40):
         step_s = float(ceil(scenario.observation.step_s)) * 2.0**times
-        yield "observation.step_s", step_s, changed("observation", step_s=step_s)
+        yield "observation.step_s", step_s, scenario.with_section("observation", step_s=step_s)

@@ -428,8 +428,7 @@ def run_average(
             "averages are of one frequency; give a scenario with frequency_mhz and without "
             "frequencies_mhz"
         )
-    section = scenario.observation.model_copy(update={"average_s": None})
-    scenario = scenario.model_copy(update={"observation": section})
+    scenario = scenario.with_section("observation", average_s=None)
     with stages("data"):
         fine = read_data(data, scenario)
         with naming(names_of_data(data)[0]):

@@ -16,6 +16,7 @@ from typing import Any, Generic, TypeVar
 
 from matplotlib.figure import Figure
 from pandas import DataFrame
+from xarray import Dataset, DataTree
 
 from lusee_bayes.core.arrays import use_compilation_cache
 from lusee_bayes.core.errors import InputError, WorkersLost
@@ -201,6 +202,13 @@ def table_file(name: str, table: Callable[[Any], DataFrame | None]) -> Output:
         table(result).to_csv(folder / name, index=False)
 
     return Output(write, lambda result: table(result) is not None)
+
+
+def netcdf_file(name: str, content: Callable[[Any], Dataset | DataTree]) -> Output:
+    """A netCDF file, of a dataset or a tree of them."""
+    return Output(
+        lambda result, folder: content(result).to_netcdf(folder / name, engine="h5netcdf")
+    )
 
 
 SCENARIO = text_file("scenario.yaml", lambda result: result.scenario.to_yaml())

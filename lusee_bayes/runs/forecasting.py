@@ -180,11 +180,15 @@ def families_of_runs(scenario: Scenario) -> dict[str, dict[str, Scenario]]:
         "turned, more time": {f"{length(r)}: {angles(r)}": r for r in turned},
         "duration": {length(r): r for r in (lasting(runs, cycles) for cycles in CYCLES)},
         "nights only": {
-            length(r): at_night(r) for r in (runs_repeated(runs, n, 0.0) for n in PARTS[:2])
+            length(r): tuple(changed(run, night_only=True) for run in r)
+            for r in (runs_repeated(runs, n, 0.0) for n in PARTS[:2])
         },
     }
     return {
-        family: {name: with_runs(scenario, varied) for name, varied in members.items()}
+        family: {
+            name: scenario.with_section("observation", runs=varied)
+            for name, varied in members.items()
+        }
         for family, members in families.items()
     }
 
@@ -221,11 +225,6 @@ def lasting(runs: Sequence[RunSection], cycles: float) -> Runs:
     return tuple(changed(run, cycles=run.cycles * factor) for run in runs)
 
 
-def at_night(runs: Sequence[RunSection]) -> Runs:
-    """The runs with samples taken at night only."""
-    return tuple(changed(run, night_only=True) for run in runs)
-
-
 def angles(runs: Sequence[RunSection]) -> str:
     """Their turntable angles, in words."""
     return ", ".join(f"{run.turntable_deg:g}°" for run in runs)
@@ -237,17 +236,10 @@ def length(runs: Sequence[RunSection]) -> str:
     return f"{cycles:g} cycle{'' if cycles == 1.0 else 's'}"
 
 
-def with_runs(scenario: Scenario, runs: Runs) -> Scenario:
-    """The scenario with other runs."""
-    observation = scenario.observation.model_copy(update={"runs": runs})
-    return scenario.model_copy(update={"observation": observation})
-
-
 def with_duty_cycle(scenario: Scenario, duty_cycle: float) -> Scenario:
     """The scenario with another duty cycle of the receivers."""
     radiometer = scenario.noise.radiometer.model_copy(update={"duty_cycle": duty_cycle})
-    noise = scenario.noise.model_copy(update={"radiometer": radiometer})
-    return scenario.model_copy(update={"noise": noise})
+    return scenario.with_section("noise", radiometer=radiometer)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from lusee_bayes.report.figures import judgement, maps
 from lusee_bayes.results.cube import CubeResult
 from lusee_bayes.results.diagnostics_file import write_diagnostics
 from lusee_bayes.results.finished_runs import Provenance
-from lusee_bayes.results.map_files import cards, write_cube, write_map, write_posterior
+from lusee_bayes.results.map_files import cards, posterior_dataset, write_cubes, write_maps
 from lusee_bayes.results.map_result import MapResult, map_result
 from lusee_bayes.results.saved import REDUCED
 from lusee_bayes.runs.channel_files import CHANNELS
@@ -36,6 +36,7 @@ from lusee_bayes.runs.folder import (
     RunKind,
     RunOutcome,
     json_file,
+    netcdf_file,
     require_marginal,
     require_single_frequency,
     rows_file,
@@ -162,33 +163,18 @@ def _provenance_of_channels(
     return Provenance.of(scenario, observation, data, known_sky=known)
 
 
-def _write_maps(result: MapResult, folder: Path) -> None:
-    for name, pixels in result.channel.maps().items():
-        write_map(folder / f"{name}.fits", name, pixels, result.scenario)
-
-
 def _write_coefficients(result: MapResult, folder: Path) -> None:
     header = cards("mean", result.scenario)
     write_alms(folder / "mean_alm.fits", result.channel.mean, header)
 
 
-def _write_reduced(result: MapResult | CubeResult, folder: Path) -> None:
-    write_reduced(folder / REDUCED, result.reduced, result.scenario.to_yaml())
-
-
-def _write_cubes(result: CubeResult, folder: Path) -> None:
-    for name, pixels in result.maps().items():
-        write_cube(folder / f"{name}.fits", name, pixels, result.frequencies_mhz, result.scenario)
-
-
-def _write_posterior_cube(result: CubeResult, folder: Path) -> None:
-    result.to_dataset().to_netcdf(folder / "posterior.nc", engine="h5netcdf")
-
-
 # what maps of one frequency and of several have
 SHARED = (
     table_file("unknowns.csv", lambda result: result.unknowns and result.unknowns.table),
-    Output(_write_reduced, wanted=lambda result: result.reduced is not None),
+    Output(
+        lambda r, folder: write_reduced(folder / REDUCED, r.reduced, r.scenario.to_yaml()),
+        wanted=lambda r: r.reduced is not None,
+    ),
     SCENARIO,
     json_file("summary.json", lambda result: result.summary()),
 )
@@ -202,8 +188,8 @@ FLIGHT_FIGURES = {
 MAP = RunKind(
     "map",
     outputs=(
-        Output(lambda result, folder: write_posterior(result, folder / "posterior.nc")),
-        Output(_write_maps),
+        netcdf_file("posterior.nc", posterior_dataset),
+        Output(lambda r, folder: write_maps(folder, r.channel.maps(), r.scenario)),
         Output(_write_coefficients),
         rows_file("spectra.csv", lambda result: rows_of(result.channel.spectra())),
         table_file("sources.csv", lambda result: result.fluxes),
@@ -233,8 +219,8 @@ MAP = RunKind(
 CUBE = RunKind(
     "cube",
     outputs=(
-        Output(_write_posterior_cube),
-        Output(_write_cubes),
+        netcdf_file("posterior.nc", lambda result: result.to_dataset()),
+        Output(lambda r, folder: write_cubes(folder, r.maps(), r.frequencies_mhz, r.scenario)),
         rows_file("spectra.csv", lambda result: result.spectra()),
         *SHARED,
     ),

@@ -8,10 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import xarray as xr
+
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios, read_case
+from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios
 from lusee_bayes.paper.claims import Cases, claim_table, claims_as_markdown
 from lusee_bayes.paper.figures import FIGURES
 from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, rows_file, run_folder, text_file
@@ -80,7 +82,7 @@ def run_paper(
         names = list(scenarios)
         engine.each(Tasks(compute, names, names), stages, "cases")
         paths = {name: path_of(name) for name in names}
-        cases = {name: read_case(path) for name, path in paths.items()}
+        cases = {name: xr.load_dataset(path, engine="h5netcdf") for name, path in paths.items()}
         return RunOutcome(cases, run.path, run.write(_Computed(cases, paths), stages).files)
 
 

@@ -28,7 +28,7 @@ from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.report.figures import sampling as figures
 from lusee_bayes.results.finished_runs import Provenance
-from lusee_bayes.results.map_files import write_cube, write_map
+from lusee_bayes.results.map_files import write_cubes, write_maps
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import (
@@ -37,10 +37,11 @@ from lusee_bayes.runs.folder import (
     RunKind,
     RunOutcome,
     json_file,
+    netcdf_file,
     scenario_run,
     text_file,
 )
-from lusee_bayes.sampling.datatree import read_datatree, to_datatree, write_datatree
+from lusee_bayes.sampling.datatree import read_datatree, to_datatree
 from lusee_bayes.sampling.distributions import TimesStudentT
 from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sample
 from lusee_bayes.sampling.log_normal_program import coordinates_of
@@ -307,19 +308,13 @@ def sample_folder(
 def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Path) -> None:
     scenario, results = sampled
     frequencies = np.array(scenario.frequencies_mhz)
-    for name in ("mean", "std"):
-        pixels = np.stack([result.maps[name] for result in results])
-        write_cube(folder / f"{name}.fits", name, pixels, frequencies, scenario)
-
-
-def _write_maps(result: SampleResult, folder: Path) -> None:
-    for name, pixels in result.maps.items():
-        write_map(folder / f"{name}.fits", name, pixels, result.experiment.scenario)
+    cubes = {name: np.stack([one.maps[name] for one in results]) for name in ("mean", "std")}
+    write_cubes(folder, cubes, frequencies, scenario)
 
 
 SAMPLE_OUTPUTS = (
-    Output(lambda result, folder: write_datatree(result.tree, folder / SAMPLES)),
-    Output(_write_maps),
+    netcdf_file(SAMPLES, lambda run: run.tree),
+    Output(lambda run, folder: write_maps(folder, run.maps, run.experiment.scenario)),
     text_file("summary.csv", lambda run: run.summary_table().to_csv(index_label="quantity")),
     text_file("scenario.yaml", lambda run: run.experiment.scenario.to_yaml()),
     json_file("sampling.json", lambda run: run.figures()),

@@ -162,13 +162,8 @@ def _with_coordinates(tree: xr.DataTree, model: LinearGaussian, data: Visibiliti
     return tree.map_over_datasets(labelled)
 
 
-def write_datatree(tree: xr.DataTree, path: Path) -> None:
-    """Write every group to one netCDF file."""
-    tree.to_netcdf(path, engine="h5netcdf")
-
-
 def read_datatree(path: str | Path) -> xr.DataTree:
-    """Read a file of :func:`write_datatree`.
+    """Read a file of samples, as ``lusee-bayes sample`` writes it.
 
     Raises
     ------

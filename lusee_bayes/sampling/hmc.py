@@ -149,12 +149,15 @@ class Whitening(eqx.Module):
         return jnp.concatenate([values[name].reshape(-1) for name in self.names])
 
     def to_values(
-        self, x: Float[Array, " unknowns"]
+        self, x: Float[Array, " unknowns"], hold: Sequence[str] = ()
     ) -> tuple[dict[str, Float[Array, "..."]], Float[Array, ""]]:
-        """Compute the sites' unconstrained values at x, and ln|det| of their derivative by x."""
-        if self.chart is None:
-            return self.split(x), jnp.zeros(())
-        return self.chart.to_values(self.split(x))
+        """Compute the sites' unconstrained values at x, and ln|det| of their derivative by x.
+
+        There are no derivatives by the sites ``hold``.
+        """
+        values = self.split(x)
+        values |= {n: jax.lax.stop_gradient(values[n]) for n in hold if n in values}
+        return (values, jnp.zeros(())) if self.chart is None else self.chart.to_values(values)
 
     def from_values(self, values: Mapping[str, Float[Array, "..."]]) -> Float[Array, " unknowns"]:
         """Compute x of the sites' unconstrained values."""
@@ -522,7 +525,8 @@ def sample(
     previous = None if checkpoints is None else checkpoints.last()
     with numpyro_promotion():
         state = run.start()
-        _require_finite(state)
+        if not bool(jnp.isfinite(state.potential_energy).all()):
+            raise InputError(NOT_FINITE)
         if previous is not None:
             done, state = previous.iteration, run.restore(state, previous.state)
         total = sampler.warmup + sampler.draws
@@ -550,16 +554,6 @@ NOT_FINITE = (
     "the density is NaN or infinite where the chains begin; look for logarithms and roots of "
     "negative numbers, for scales of zero, and for data outside a support"
 )
-
-
-def _require_finite(state: HMCState) -> None:
-    """InputError if the density is NaN or infinite where the chains begin."""
-    if not bool(jnp.isfinite(state.potential_energy).all()):
-        raise InputError(NOT_FINITE)
-
-
-def _without_auxiliary(sites: dict[str, Array]) -> dict[str, Array]:
-    return {name: values for name, values in sites.items() if not name.endswith(WHITE_SUFFIX)}
 
 
 class _Run:
@@ -651,7 +645,8 @@ class _Run:
         state, rows = jax.lax.fori_loop(0, n, step, (state, rows))
         constrain = self.kernel.postprocess_fn((dynamic,), {})
         sites = jax.vmap(jax.vmap(constrain))(rows.pop("z"))
-        return state, _without_auxiliary(sites) | rows
+        sites = {n: values for n, values in sites.items() if not n.endswith(WHITE_SUFFIX)}
+        return state, sites | rows
 
     def _shared_out(self, state: HMCState) -> HMCState:
         devices = jax.local_devices()

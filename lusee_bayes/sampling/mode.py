@@ -76,18 +76,9 @@ class Potential(eqx.Module):
         parts = [np.full(int(np.prod(shape)), name in self.hold) for name, shape in sites]
         return np.flatnonzero(np.concatenate(parts))
 
-    def values(self, x: Float[Array, " n"], still: bool) -> tuple[dict[str, Array], Array]:
-        """Return the sites' values at x, and ln|det| of their Jacobian; ``still`` as in value."""
-        parts = self.shapes.split(x)
-        for name in self.hold if still else ():
-            if name in parts:
-                parts[name] = jax.lax.stop_gradient(parts[name])
-        chart = self.shapes.chart
-        return (parts, jnp.zeros(())) if chart is None else chart.to_values(parts)
-
     def value(self, x: Float[Array, " n"], still: bool = False) -> Float[Array, ""]:
         """Return it at x; ``still``: without derivatives by what is held."""
-        values, log_det = self.values(x, still)
+        values, log_det = self.shapes.to_values(x, self.hold if still else ())
         return potential_energy(self.program, (), self.arguments, values) - log_det
 
     def residual(self, x: Float[Array, " n"], still: bool = False) -> Float[Array, " data"]:
@@ -100,7 +91,7 @@ class Potential(eqx.Module):
         return sum((fn.misfit(value) for fn, value in self._predictions(x, still)), jnp.zeros(()))
 
     def _predictions(self, x: Float[Array, " n"], still: bool) -> list[tuple[Prediction, Array]]:
-        values, _ = self.values(x, still)
+        values, _ = self.shapes.to_values(x, self.hold if still else ())
 
         def place(site):
             if site["name"] in values:
@@ -425,36 +416,10 @@ CHUNK = 1024
 INTERVAL = 0.9
 
 
-def _per_pixel(
-    skies: Float[np.ndarray, "chains draws modes"],
-    nside: int,
-    reduce: Callable[[Float[np.ndarray, "draws some"]], np.ndarray],
-) -> np.ndarray:
-    """``reduce`` of all draws of every pixel, chunk by chunk."""
-    flat = skies.reshape(-1, skies.shape[-1])
-    matrix = pixel_matrix(nside, lmax_of(flat.shape[-1]))
-    parts = [reduce(flat @ matrix[i : i + CHUNK].T) for i in range(0, len(matrix), CHUNK)]
-    return np.concatenate(parts, axis=-1)
-
-
-def pixel_mean_of_draws(
-    skies: Float[np.ndarray, "chains draws modes"], nside: int
-) -> Float[np.ndarray, " pixels"]:
-    """Compute the mean of every pixel over the draws, in K."""
-    return _per_pixel(skies, nside, lambda values: values.mean(0))
-
-
-def pixel_std_of_draws(
-    skies: Float[np.ndarray, "chains draws modes"], nside: int
-) -> Float[np.ndarray, " pixels"]:
-    """Compute the standard deviation of every pixel over the draws, in K."""
-    return _per_pixel(skies, nside, lambda values: values.std(0, ddof=1))
-
-
-def pixel_interval_of_draws(
+def pixel_statistics(
     skies: Float[np.ndarray, "chains draws modes"], nside: int, probability: float = INTERVAL
-) -> Float[np.ndarray, "2 pixels"]:
-    """Compute the lower and upper end of each pixel's central credible interval.
+) -> dict[str, Float[np.ndarray, " pixels"]]:
+    """Compute what the draws say of every pixel.
 
     Parameters
     ----------
@@ -463,12 +428,12 @@ def pixel_interval_of_draws(
     nside : int
         NSIDE of the pixels.
     probability : float
-        Of the interval, between 0 and 1.
+        Of the central credible interval, between 0 and 1.
 
     Returns
     -------
-    (2, pixels) array
-        In K.
+    dict of (pixels,) array
+        ``mean``, ``std``, and the ends ``lower`` and ``upper`` of the interval, in K.
 
     Raises
     ------
@@ -478,7 +443,14 @@ def pixel_interval_of_draws(
     if not 0 < probability < 1:
         raise InputError(f"the probability of an interval must lie in 0..1, got {probability}")
     tails = [(1 - probability) / 2, (1 + probability) / 2]
-    return _per_pixel(skies, nside, lambda values: np.quantile(values, tails, axis=0))
+    flat, parts = skies.reshape(-1, skies.shape[-1]), []
+    matrix = pixel_matrix(nside, lmax_of(flat.shape[-1]))
+    for first in range(0, len(matrix), CHUNK):
+        values = flat @ matrix[first : first + CHUNK].T
+        ends = np.quantile(values, tails, axis=0)
+        parts.append([values.mean(0), values.std(0, ddof=1), *ends])
+    names = ("mean", "std", "lower", "upper")
+    return dict(zip(names, np.concatenate(parts, axis=1), strict=True))
 
 
 def disc(nside: int, l_deg: float, b_deg: float, radius_deg: float) -> Bool[np.ndarray, " pixels"]:

@@ -102,32 +102,12 @@ def test_the_draw_test_notices_sqrt_two():
         assert_draws_follow(draws + 0.1 * expected.std, expected.mean, expected.covariance)
 
 
-def test_draws_in_pixels():
-    """More unknowns than normals behind them: the covariance has rank 16 of 48."""
-    prior = lb.PixelPrior(jnp.asarray(SPECTRUM), 2)
-    for form in FORMS:
-        post, expected = conditioned(9, form, prior)
-        draws = post.sample(jax.random.key(5), 20_000)
-        assert_draws_follow(draws, expected.mean, expected.covariance)
-
-
 @cases
 def test_prior_fraction(n_data, form):
     post, expected = conditioned(n_data, form)
     got = np.asarray(post.prior_fraction())
     np.testing.assert_allclose(got, expected.std**2 / PER_MODE, rtol=TOL)
     assert ((got > 0) & (got < 1)).all()
-
-
-@cases
-def test_modes_that_the_data_do_not_see_keep_their_prior(n_data, form):
-    post, expected = conditioned(n_data, form, blind=True)
-    fraction = np.asarray(post.prior_fraction())
-    np.testing.assert_allclose(fraction[9:], 1.0, rtol=1e-14)
-    assert (fraction[:9] < 1).all()
-    np.testing.assert_allclose(np.asarray(post.mean)[9:], 0.0, atol=1e-14)
-    draws = post.sample(jax.random.key(2), 20_000)
-    assert_draws_follow(draws, expected.mean, expected.covariance)
 
 
 @cases
@@ -314,15 +294,6 @@ def test_a_row_is_what_the_map_shows_there_of_each_source(cycles, form):
         expected = y[pixels] @ np.asarray(mapped)
         peak = np.abs(rows @ y.T).max()
         np.testing.assert_allclose(rows @ y[source], expected, rtol=0, atol=1e-8 * peak)
-
-
-def test_perfect_data_resolve_everything_and_none_nothing():
-    prior = lb.HarmonicPrior(jnp.full(4, 2.0))
-    for noise, share in ((1e-9, 1.0), (1e9, 0.0)):
-        n = lb.DiagonalCovariance(jnp.full(16, noise))
-        posterior = lb.LinearGaussian(jnp.eye(16), prior, n).condition(jnp.ones(16))
-        rows = np.asarray(resolution_rows(posterior, jnp.eye(16)))
-        np.testing.assert_allclose(rows, share * np.eye(16), atol=1e-8)
 
 
 # --- new data added to a saved posterior ----------------------------------------------------------

@@ -15,7 +15,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.judge.chi2 import FALSE_ALARM, LEVELS, ChiSquare, stands_out, two_sided, worst
+from lusee_bayes.judge.chi2 import FALSE_ALARM, ChiSquare, stands_out, two_sided
 from lusee_bayes.judge.left_out import DenseLeftOut
 from lusee_bayes.judge.measures import data_freedom, preferences
 from lusee_bayes.judge.residuals import residuals
@@ -304,7 +304,7 @@ def test_the_two_parts_by_matrices(strength):
     assert found.instrument.degrees + found.prior.degrees == pytest.approx(model.n_data)
 
 
-def p_values(model, strength, n=80, truth=None):
+def p_values(model, strength, n=40, truth=None):
     rng = np.random.default_rng(5)
     parts = [split_of(model, drawn(truth or model, rng, strength))[0] for _ in range(n)]
     return np.array([[one.instrument.p, one.prior.p] for one in parts])
@@ -329,7 +329,7 @@ def test_noise_that_is_wrong_is_no_matter_of_the_prior():
     model = model_of(n_data=200)
     noise = lb.DenseCovariance(1.5 * model.noise.dense())
     truth = lb.LinearGaussian(model.coupling, model.prior, noise, model.offset)
-    instrument, _ = p_values(model, 1.0, n=20, truth=truth).T
+    instrument, _ = p_values(model, 1.0, n=10, truth=truth).T
     assert np.median(instrument) < 1e-3
 
 
@@ -348,14 +348,6 @@ def test_data_that_are_fewer_than_the_modes_leave_little():
 # --- probabilities --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("n", [1, 40, 5232])
-def test_probabilities_are_uniform_if_the_model_holds(n):
-    drawn = np.random.default_rng(1).chisquare(n, 20_000)
-    p = [two_sided(float(x), n) for x in drawn]
-    # a hundred such tests in a thousand runs of the suite would fail at 1e-4; the seed is fixed
-    assert stats.kstest(p, "uniform").pvalue > 1e-4
-
-
 def test_both_sides_count():
     for q in (1e-8, 1e-3, 0.2):
         for value in (stats.chi2.isf(q, 100), stats.chi2.ppf(q, 100)):
@@ -369,16 +361,6 @@ def test_one_rate_for_all_tests_of_a_report():
     assert not stands_out(FALSE_ALARM, 1) and stands_out(FALSE_ALARM * below, 1)
     # the best of many is nothing special
     assert not stands_out(1e-4, 10) and stands_out(1e-4, 9)
-    assert worst(["unlike the prior", "consistent"]) == "unlike the prior"
-    assert worst(list(LEVELS)) == "does not fit"
-
-
-def test_the_least_of_many_stands_out_once_in_a_thousand():
-    """Bonferroni: at most FALSE_ALARM, and for independent groups nearly that."""
-    p = np.random.default_rng(2).uniform(size=(100_000, 45)).min(axis=1)
-    found = np.mean([stands_out(float(x), 45) for x in p])
-    exact = 1.0 - (1.0 - FALSE_ALARM / 45) ** 45
-    assert found == pytest.approx(exact, abs=4 * np.sqrt(exact / len(p)))
 
 
 def test_what_was_found_is_told_with_what_was_expected():

@@ -12,10 +12,11 @@ import pytest
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.experiment.experiment import build, under_sky
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.judge.coverage import N_DRAWS, Counts, Coverage
+from lusee_bayes.judge.coverage import Counts, Coverage
 from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.results.draws import deviations
 from lusee_bayes.results.map_result import map_result
+from lusee_bayes.runs.channel_files import from_dataset, to_dataset
 from lusee_bayes.sky.sky_files import write_alms
 from lusee_bayes.sky.sky_source import FileSource, GalaxySource
 from lusee_bayes.testing.scenarios import small_scenario
@@ -59,7 +60,7 @@ def test_pixels_are_counted_by_latitude():
     for part, (low, high) in zip(found, bands, strict=True):
         here = [k for k in range(len(b)) if low <= abs(b[k]) < high]
         compare(part, pull[here], [draw[here] for draw in drawn])
-        assert Coverage.from_row(part.row()) == part
+        assert from_dataset(to_dataset(part)) == part
 
 
 def test_modes_are_counted_by_multipole():
@@ -79,7 +80,7 @@ def test_modes_are_counted_by_multipole():
 
 @pytest.fixture(scope="module")
 def ensemble():
-    """Coverage of 200 skies drawn from a prior, each seen through the same noisy instrument:
+    """Coverage of 80 skies drawn from a prior, each seen through the same noisy instrument:
     textbook formulas."""
     rng = np.random.default_rng(3)
     ell = np.repeat(np.arange(LMAX + 1), 2 * np.arange(LMAX + 1) + 1)
@@ -96,14 +97,14 @@ def ensemble():
     def coverage():
         sky = prior * rng.standard_normal(N_MODES)
         mean = covariance @ (a.T @ (a @ sky + rng.standard_normal(len(a))))
-        drawn = rng.standard_normal((N_DRAWS, N_MODES)) @ root.T
+        drawn = rng.standard_normal((100, N_MODES)) @ root.T
         return Counts.of_pixels(std, sky - mean, drawn).coverage()
 
-    return [coverage() for _ in range(200)]
+    return [coverage() for _ in range(80)]
 
 
 def test_the_scatter_is_that_of_simulated_skies(ensemble):
-    """Of 200 skies and 300 draws the ratio is known to 7 %; independent pixels would scatter a
+    """Of 80 skies and 100 draws the ratio is known to 11 %; independent pixels would scatter a
     third as much. The means of shares are the levels."""
     found = ensemble
     for k in range(4):
@@ -111,7 +112,7 @@ def test_the_scatter_is_that_of_simulated_skies(ensemble):
             values = np.array([getattr(bands[k], name) for bands in found])
             scatter = "scatter" if name == "held" else "rms_scatter"
             told = np.median([getattr(bands[k], scatter) for bands in found], axis=0)
-            np.testing.assert_allclose(values.std(0) / told, 1.0, atol=0.28)
+            np.testing.assert_allclose(values.std(0) / told, 1.0, atol=0.42)
             if name == "held":
                 off = (values.mean(0) - LEVELS) / (values.std(0) / np.sqrt(len(values)))
                 assert np.abs(off).max() < 4.0
@@ -119,8 +120,8 @@ def test_the_scatter_is_that_of_simulated_skies(ensemble):
         independent = np.sqrt(0.68 * 0.32 / pixels)
         assert found[0][k].scatter[1] > 2.0 * independent
         above = np.mean([bands[k].largest > bands[k].allowed for bands in found])
-        # 5 % +- 1.5 % of 200 skies, and as much for the quantile of 300 draws
-        assert above == pytest.approx(0.05, abs=0.06)
+        # 5 % +- 2.4 % of 80 skies, and as much for the quantile of 100 draws
+        assert above == pytest.approx(0.05, abs=0.12)
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.report.cube_page import FIGURES as CUBE_FIGURES
 from lusee_bayes.report.cube_page import cube_page
 from lusee_bayes.results.unknowns import unknowns_report
-from lusee_bayes.runs import channels, map_run
+from lusee_bayes.runs import map_run
 from lusee_bayes.runs.channels import cube_result
 
 RECEIVER, GROUND = "noise.receiver={power_k: 2000, slope: -2}", "noise.regolith={std_k: 30}"
@@ -32,6 +32,8 @@ def cube_of(response_file, *overrides, frequencies="[15, 20]"):
     return four_ports(response_file, *overrides, f"frequencies_mhz={frequencies}")
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch):
     others = {name: lambda _: Figure() for name in CUBE_FIGURES}
     drawn = {**others, "unknowns": map_run.CUBE.figures["unknowns"]}
@@ -66,27 +68,6 @@ def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch
     page = cube_page(tmp_path / "cube", "a run")
     assert line in page and sentence in page
     assert "Powers of receivers" in page and "<td>15</td><td>regolith_k</td><td>K</td>" in page
-
-
-def test_a_resumed_run_has_them_too(response_file, tmp_path, monkeypatch):
-    scenario = cube_of(response_file, RECEIVER, GROUND)
-    whole = cube_result(scenario, tmp_path / "whole").unknowns
-    inform, done = channels.inform, []
-
-    def once(experiment, *arguments):
-        if done:
-            raise KeyboardInterrupt
-        done.append(experiment.scenario.frequency_mhz)
-        return inform(experiment, *arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(channels, "inform", once)
-        with pytest.raises(KeyboardInterrupt):
-            cube_result(scenario, tmp_path / "resumed")
-    resumed = cube_result(scenario, tmp_path / "resumed").unknowns
-    assert len(done) == 1
-    pd.testing.assert_frame_equal(resumed.table, whole.table)
-    assert resumed.lines() == whole.lines()
 
 
 def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(

@@ -20,7 +20,6 @@ from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.judge.measures import ell_cross
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.linear.solver import FORMS
 from lusee_bayes.results.forecast import Variation, forecast_rows
 from lusee_bayes.runs import forecasting
 from lusee_bayes.runs.forecasting import (
@@ -29,7 +28,6 @@ from lusee_bayes.runs.forecasting import (
     expected_snr_squared,
     forecast,
     forecasts_of,
-    informed_modes,
     without_ports,
 )
 
@@ -106,15 +104,6 @@ def test_expected_snr_is_that_of_simulated_maps():
     assert predicted.ell_cross == ell_cross(np.sqrt(power.mean(0) / error.mean(0)))
 
 
-def test_turning_in_the_same_time_tells_more():
-    """The three choices differ by far more than rounding, and in this order."""
-    still, once, twice = (forecast(turned(*a)) for a in [(0,), (0, 30), (0, 30, 60)])
-    assert still.information_bits + 1 < once.information_bits
-    assert still.information_bits + 1 < twice.information_bits
-    # nearly the same time: each run loses less than one sample of two hours
-    assert 0 <= still.days - twice.days < 3 * 2 / 24
-
-
 def textbook(variation, keep=None):
     """(A, S, N) as matrices with the rows ``keep``."""
     model = full_model(set_up(variation.scenario))
@@ -177,20 +166,6 @@ def test_a_lost_antenna_is_flags():
     np.testing.assert_array_equal(got.noise.diagonal(), expected.noise.diagonal())
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_modes_do_not_depend_on_the_basis(form):
-    """m' = R m, u' = R u for any rotation R: the directions are others, their number is not."""
-    rng = np.random.default_rng(1)
-    scale = np.array([30.0, 3.0, 1.5, 1.01, 0.99, 0.5, 0.1, 0.01, 0.0])  # SNR of nine directions
-    rotation = scipy.linalg.qr(rng.normal(size=(9, 9)))[0]
-    prior = lb.HarmonicPrior(jnp.ones(3))
-    for basis in (np.eye(9), rotation):
-        a = jnp.asarray((np.diag(scale) @ basis)[:8])
-        model = LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(8)))
-        posterior = model.factorise(form).condition(jnp.zeros(8))
-        assert informed_modes(posterior) == 4
-
-
 def test_an_ell_that_is_not_seen_and_one_without_power():
     """Expected SNR^2 of 0 and NaN; neither is clipped."""
     a = jnp.eye(9)[:4]
@@ -199,14 +174,6 @@ def test_an_ell_that_is_not_seen_and_one_without_power():
     found = expected_snr_squared(model.factorise("map").condition(jnp.zeros(4)))
     assert np.isnan(found[0])
     np.testing.assert_allclose(found[1:], [3.0, 0.0], atol=1e-15)
-
-
-def test_more_data_never_tell_less():
-    assert bits("observation.runs.0.cycles=0.15") < bits()
-    # the Sun rises in the middle of it
-    sunrise = "observation.start=2027-01-25"
-    assert bits(sunrise, "observation.runs.0.night_only=true") < bits(sunrise)
-    assert bits(lost=(0, 1)) < bits(lost=(0,)) < bits()
 
 
 def test_a_duty_cycle_is_worth_the_noise_it_makes():

@@ -165,40 +165,11 @@ def test_how_many_draws_count(name, least):
     assert got.error**2 == pytest.approx((400 / got.effective - 1) / 399, rel=1e-6)
 
 
-@pytest.mark.long
-def test_more_draws_are_better():
-    few = evidence("sky_marginal")
-    many = comparison.estimate_evidence(
-        program("sky_marginal"), case().arguments(), case().data, n=6400
-    )
-    # errors scale with 1 / 4; those of 400 draws are known to some 10 %
-    assert many.effective == pytest.approx(16 * few.effective, rel=0.5)
-    assert many.error == pytest.approx(few.error / 4, rel=0.5)
-
-
 # --- the mode -------------------------------------------------------------------------------------
 
 
 @pytest.mark.long
 @pytest.mark.essential
-def test_the_mode_and_the_curvature_in_one_dimension():
-    """x = ln level is what is unconstrained, so the density is the one of x.
-
-    The mode is found to a hundredth of a standard deviation; differences over a tenth of one give
-    the curvature to 1 % for cubic and quartic terms of order one.
-    """
-    mode = np.asarray(evidence("sky_marginal").laplace.whitening.mean)[0]
-    root = np.asarray(evidence("sky_marginal").laplace.whitening.root)[0, 0]
-    fine = np.linspace(mode - 0.5, mode + 0.5, 1001)
-    best = fine[int(np.argmax([case().log_level(x) for x in fine]))]
-    h = 1e-3
-    up, at, down = (case().log_level(best + x) for x in (h, 0.0, -h))
-    std = 1.0 / np.sqrt(-(up - 2 * at + down) / h**2)
-    assert abs(mode - best) < 0.01 * std + 1e-3
-    assert abs(root) == pytest.approx(std, rel=0.02)
-
-
-@pytest.mark.long
 def test_the_mode_and_the_curvature_in_two_dimensions():
     it = evidence("prior_amplitude").laplace
     names = [name for name, _ in it.whitening.sites]

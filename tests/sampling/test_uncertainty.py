@@ -15,9 +15,7 @@ from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.sampling import mode
 from lusee_bayes.sampling.mode import (
     disc,
-    pixel_interval_of_draws,
-    pixel_mean_of_draws,
-    pixel_std_of_draws,
+    pixel_statistics,
     probability_brighter,
     region_brightness,
     sky_quantities,
@@ -61,12 +59,13 @@ def test_mean_and_standard_deviation_of_pixels(gaussian, skies):
     mean, std, _ = pixel_posterior(answer)
     n_pixels = healpy.nside2npix(NSIDE)
     # the mean of N draws scatters by std / sqrt(N), their standard deviation by std / sqrt(2 N)
-    z = (pixel_mean_of_draws(skies, NSIDE) - mean) / (std / np.sqrt(N))
+    found = pixel_statistics(skies, NSIDE)
+    z = (found["mean"] - mean) / (std / np.sqrt(N))
     assert np.abs(z).max() < z_of(n_pixels)
-    ratio = pixel_std_of_draws(skies, NSIDE) / std - 1
+    ratio = found["std"] / std - 1
     assert np.abs(ratio).max() < z_of(n_pixels) / np.sqrt(2 * N)
     of_the_package = np.asarray(posterior.std_of(pixel_matrix(NSIDE, LMAX)))
-    ratio = pixel_std_of_draws(skies, NSIDE) / of_the_package - 1
+    ratio = found["std"] / of_the_package - 1
     assert np.abs(ratio).max() < z_of(n_pixels) / np.sqrt(2 * N)
 
 
@@ -74,7 +73,7 @@ def test_mean_and_standard_deviation_of_pixels(gaussian, skies):
 def test_intervals_of_pixels_are_the_central_gaussian_ones(gaussian, skies, probability):
     mean, std, _ = pixel_posterior(gaussian[1])
     tail = (1 - probability) / 2
-    lower, upper = pixel_interval_of_draws(skies, NSIDE, probability)
+    _, _, lower, upper = pixel_statistics(skies, NSIDE, probability).values()
     # a quantile scatters by sqrt(p (1 - p) / N) / density; 1.1: tails are binomial, not normal
     error = std * np.sqrt(tail * (1 - tail) / N) / norm.pdf(norm.ppf(tail))
     limit = 1.1 * z_of(2 * len(mean))
@@ -82,30 +81,18 @@ def test_intervals_of_pixels_are_the_central_gaussian_ones(gaussian, skies, prob
     assert (np.abs(upper - (mean - std * norm.ppf(tail))) / error).max() < limit
 
 
-def test_intervals_are_of_90_percent_unless_asked(skies):
-    values = modes_to_map(skies[0, 0], NSIDE)  # any draw: the share of pixels is not asked for
-    lower, upper = pixel_interval_of_draws(skies, NSIDE)
-    maps = skies.reshape(-1, N_MODES) @ pixel_matrix(NSIDE, LMAX).T
-    inside = ((maps > lower) & (maps < upper)).mean(0)
-    # quantiles of the very draws: the share is 0.9 to one draw
-    np.testing.assert_allclose(inside, 0.9, atol=2 / N)
-    assert lower.shape == upper.shape == values.shape
-
-
-@pytest.mark.parametrize(
-    "statistic", [pixel_mean_of_draws, pixel_std_of_draws, pixel_interval_of_draws]
-)
-def test_pixels_do_not_depend_on_how_many_are_held_at_once(skies, monkeypatch, statistic):
-    whole = statistic(skies[:, :50], NSIDE)
+def test_pixels_do_not_depend_on_how_many_are_held_at_once(skies, monkeypatch):
+    whole = pixel_statistics(skies[:, :50], NSIDE)
     monkeypatch.setattr(mode, "CHUNK", 100)  # 192 pixels: 100 and 92
-    # sums of sixteen terms, perhaps in another order
-    np.testing.assert_allclose(statistic(skies[:, :50], NSIDE), whole, rtol=1e-9, atol=1e-12)
+    for name, values in pixel_statistics(skies[:, :50], NSIDE).items():
+        # sums of sixteen terms, perhaps in another order
+        np.testing.assert_allclose(values, whole[name], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("probability", [0.0, 1.0, -0.1, 90.0, float("nan")])
 def test_an_interval_of_an_impossible_probability(skies, probability):
     with pytest.raises(lb.InputError, match="probability of an interval must lie in 0..1"):
-        pixel_interval_of_draws(skies, NSIDE, probability)
+        pixel_statistics(skies, NSIDE, probability)
 
 
 @pytest.mark.parametrize(
@@ -228,7 +215,7 @@ def test_modes_that_the_sky_does_not_have(skies, asked, message):
 
 def test_skies_that_fill_no_lmax_are_refused():
     with pytest.raises(lb.InputError, match="15 coefficients do not fill any lmax"):
-        pixel_std_of_draws(np.zeros((1, 2, 15)), NSIDE)
+        pixel_statistics(np.zeros((1, 2, 15)), NSIDE)
 
 
 def test_the_summary_has_a_row_for_each_quantity_with_its_own_numbers(gaussian, skies):
