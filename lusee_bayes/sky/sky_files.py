@@ -13,7 +13,6 @@ FREQ_START, FREQ_END and FREQ_STEP in MHz. The file does not say its frame and o
 
 from __future__ import annotations
 
-import math
 import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -155,8 +154,7 @@ class SkyMap(SkyFile):
         path = user_path(path)
         hdf5 = h5py.is_hdf5(path)
         pixels = _read_hdf5(path, dataset or ULSA_DATASET) if hdf5 else _read_map(path)
-        if not _nside(pixels.size):
-            raise InputError(f"{path}: {pixels.size} values are not a HEALPix map of 12 NSIDE^2")
+        _require_healpix(path, pixels.size)
         unseen = pixels == UNSEEN
         if unseen.any():
             raise InputError(
@@ -171,15 +169,14 @@ class SkyMap(SkyFile):
     def summary(self) -> tuple[str, ...]:
         pixels = self.pixels
         return (
-            f"HEALPix sky map, NSIDE {_nside(pixels.size)}, RING, Galactic",
+            f"HEALPix sky map, NSIDE {healpy.npix2nside(pixels.size)}, RING, Galactic",
             f"mean {pixels.mean():.6g} K, from {pixels.min():.4g} to {pixels.max():.4g} K",
         )
 
 
-def _nside(n_pixels: int) -> int:
-    """NSIDE of 12 NSIDE^2 pixels; 0 if there is none."""
-    nside = math.isqrt(n_pixels // 12)
-    return nside if 12 * nside**2 == n_pixels else 0
+def _require_healpix(path: str | Path, n_pixels: int) -> None:
+    if not n_pixels or not healpy.isnpixok(n_pixels):
+        raise InputError(f"{path}: {n_pixels} values are not a HEALPix map of 12 NSIDE^2")
 
 
 def _layout(name: str) -> Layout:
@@ -472,10 +469,7 @@ class SkyCube(SkyFile):
                 f"{path}: the image has shape {pixels.shape}, expected {count} maps for {start:g} "
                 f"to {end:g} MHz in steps of {step:g}"
             )
-        if not healpy.isnpixok(pixels.shape[1]):
-            raise InputError(
-                f"{path}: {pixels.shape[1]} values are not a HEALPix map of 12 NSIDE^2"
-            )
+        _require_healpix(path, pixels.shape[1])
         return cls(str(path), start + step * np.arange(count), pixels)
 
     def map_at(self, frequency_mhz: float) -> Float[np.ndarray, " pixels"]:
