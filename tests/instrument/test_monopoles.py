@@ -190,14 +190,6 @@ def test_uniform_ground_obeys_fresnel(eps, loss, atol):
         within(p, 1.0, 2e-7)
 
 
-def test_no_vertical_reflection_at_brewsters_angle():
-    eps = 3.0
-    brewster = np.cos(np.arctan(np.sqrt(eps)))
-    s, p = uniform(eps, 0.0).reflection(np.array([brewster]), 30.0)
-    assert abs(p[0]) < 1e-15
-    assert s[0].real == pytest.approx((1 - eps) / (1 + eps), abs=1e-14)
-
-
 def test_grazing_incidence_reflects_everything_with_reversed_sign():
     s, p = lb.Regolith().reflection(np.array([1e-9]), 25.0)
     # 2 eps cos theta / n: 4e-9

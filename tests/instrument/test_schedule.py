@@ -87,15 +87,6 @@ def test_intervals_are_cut_as_by_a_loop(seed, step_s):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_no_time_is_lost_or_found(seed):
-    intervals = schedule(seed, n=8)
-    o = lb.Observation.from_schedule(intervals, step_s=777.0)
-    total = sum(one.duty_cycle * one.length_s for one in intervals)
-    # rounding of a few hundred numbers of 1e3 seconds
-    assert o.live_s.sum() == pytest.approx(total, abs=1e-8)
-
-
 def test_instants_begin_before_the_end():
     intervals = [
         Interval("2027-01-15T00:00:00", "2027-01-15T04:00:00"),  # two steps: the end is no sample

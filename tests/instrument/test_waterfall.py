@@ -117,13 +117,6 @@ def test_gaps_are_missing_samples_and_counted(tmp_path):
     assert "18 samples missing" in describe(tmp_path / "w.fits")
 
 
-@pytest.mark.parametrize(("unit", "factor"), [("mK", 1e-3), ("K", 1.0), ("kK", 1e3)])
-def test_temperatures_in_other_units_are_converted(tmp_path, unit, factor):
-    given = [lb.read_waterfall(write(tmp_path / "k.fits"))]
-    given.append(lb.read_waterfall(write(tmp_path / "u.fits", header=HEADER | {"BUNIT": unit})))
-    np.testing.assert_allclose(given[1].grid, factor * given[0].grid, rtol=1e-15)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

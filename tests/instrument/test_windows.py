@@ -140,18 +140,6 @@ def test_values_windows_and_live_times_are_those_of_loops(case, to_s):
     np.testing.assert_array_equal(found.truth, data.truth)
 
 
-@pytest.mark.parametrize("to_s", [STEP, 2.5 * STEP, 7 * STEP, 1e6])
-def test_live_time_times_value_is_conserved(to_s):
-    data = data_of(observed())
-    after = averaged(data, to_s)
-
-    def integral(data):
-        return data.grid() @ data.observation.live_s
-
-    np.testing.assert_allclose(integral(after), integral(data), rtol=1e-12)
-    assert product_live_s(after) == pytest.approx(product_live_s(data), rel=1e-12)
-
-
 @pytest.mark.parametrize("to_s", [1.5 * STEP, 2.5 * STEP, 3.25 * STEP])
 def test_no_bin_is_longer_than_asked_for(to_s):
     """Samples that do not fit: bins of whole samples, none across a run, all of them there."""
@@ -293,7 +281,7 @@ def sigma_of(v, o):
 
 
 @pytest.mark.parametrize("lmax", [12, pytest.param(47, marks=pytest.mark.long)])
-@pytest.mark.parametrize("filled", [False, True])
+@pytest.mark.parametrize("filled", [pytest.param(False, marks=pytest.mark.long), True])
 @pytest.mark.parametrize("step_s", [10.0, 600.0, 7200.0, 43200.0])
 def test_equals_the_mean_of_200_instants(step_s, filled, lmax):
     o, beams, sky = observation(step_s, filled), lb.monopole_beams(25.0, lmax), steep_sky(lmax)
@@ -332,7 +320,7 @@ def antenna_frame(o, time):
 
 @pytest.mark.parametrize(
     ("step_s", "filled", "lmax"),
-    [(7200.0, False, 20), pytest.param(43200.0, True, 47, marks=pytest.mark.long)],
+    [(7200.0, False, 12), pytest.param(43200.0, True, 47, marks=pytest.mark.long)],
 )
 def test_equals_the_mean_of_20_instants_by_lunarsky(step_s, filled, lmax):
     o, beams, sky = observation(step_s, filled), lb.monopole_beams(25.0, lmax), steep_sky(lmax)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import close
 from reference_linear import assert_draws_follow, z_of
 
 import lusee_bayes as lb
@@ -72,14 +73,9 @@ def term(drift, d, hours, flags, width=None) -> lb.TimeBandedCovariance:
     return drift.covariance(jnp.asarray(d), hours, DataLayout.from_flags(flags), width)
 
 
-def close(got, expected, relative):
-    expected = np.asarray(expected)
-    np.testing.assert_allclose(got, expected, rtol=0, atol=relative * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("make_flags", [complete, gappy])
-@pytest.mark.parametrize("sigma", [0.3, 1e-3])
-@pytest.mark.parametrize("n_antennas", [2, 4])
+@pytest.mark.parametrize(
+    ("n_antennas", "sigma", "make_flags"), [(2, 0.3, complete), (2, 1e-3, gappy), (4, 0.3, gappy)]
+)
 def test_every_entry_is_the_papers(n_antennas, sigma, make_flags):
     flags = make_flags(n_antennas)
     d = visibilities(n_antennas)
@@ -97,8 +93,7 @@ def gain_histories(rng, n, n_antennas, sigma, correlation=10.0):
     return rng.normal(size=(n, n_antennas, N_TIMES)) @ root.T
 
 
-@pytest.mark.parametrize(("n_antennas", "sigma"), [(2, 0.3), (4, 0.1)])
-def test_mean_and_covariance_of_simulated_histories(n_antennas, sigma):
+def test_mean_and_covariance_of_simulated_histories():
     """Entry by entry, 1e5 histories in chunks.
 
     The sample mean of e scatters by its standard deviation over sqrt(n), the sample mean of the
@@ -106,7 +101,7 @@ def test_mean_and_covariance_of_simulated_histories(n_antennas, sigma):
     from the same draws: gains make e a second-order polynomial of normals, so Wick's theorem for
     Gaussian e would not do.
     """
-    n, chunk = 100_000, 20_000
+    n_antennas, sigma, n, chunk = 3, 0.3, 100_000, 20_000
     rng = np.random.default_rng(20270115)
     d = visibilities(n_antennas)
     flags = gappy(n_antennas)
@@ -136,10 +131,9 @@ def test_mean_and_covariance_of_simulated_histories(n_antennas, sigma):
     auto = np.array([i == j for i, j in names])
     shift = (sigma**2 * np.abs(d).ravel()[keep] / scale)[auto]
     assert (shift / np.sqrt(np.diag(second)[auto] / n)).min() > 8
-    if sigma >= 0.3:
-        quadratic = np.where(auto, 2.0, 1.0) * sigma**2
-        scatter = np.sqrt((np.diag(fourth) - np.diag(second) ** 2) / n)
-        assert (quadratic / scatter).max() > 1.5 * z_of(off.size)
+    quadratic = np.where(auto, 2.0, 1.0) * sigma**2
+    scatter = np.sqrt((np.diag(fourth) - np.diag(second) ** 2) / n)
+    assert (quadratic / scatter).max() > 1.5 * z_of(off.size)
 
 
 def test_with_gains_is_the_product_of_both_antennas():
@@ -219,21 +213,6 @@ def test_what_the_band_leaves_out_changes_nothing():
     # a band that is cut at one correlation time is not the same
     cut = lb.DiagonalCovariance(jnp.asarray(variance)) + term(drift, d, hours, flags, 1)
     assert np.abs(np.asarray(cut.dense()) - full).max() > 0.01 * full.max()
-
-
-def test_scaling_with_sigma_and_the_signal():
-    """sigma^2 L + sigma^4 Q: two values of sigma predict a third; twice the signal, 4 times N."""
-    d, flags = visibilities(3), complete(3)
-
-    def dense(sigma, factor=1.0):
-        return np.asarray(term(GainDrift(sigma), factor * d, HOURS, flags).dense())
-
-    a, b = dense(0.1) / 0.1**2, dense(0.2) / 0.2**2
-    quadratic = (b - a) / (0.2**2 - 0.1**2)
-    linear = a - 0.1**2 * quadratic
-    close(dense(0.3), 0.3**2 * linear + 0.3**4 * quadratic, 1e-14)
-    assert np.abs(quadratic).max() > 0.1 * np.abs(linear).max()
-    close(dense(0.2, 2.0), 4 * dense(0.2), 1e-15)
 
 
 def test_derivatives_of_the_log_determinant():
