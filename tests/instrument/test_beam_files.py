@@ -8,6 +8,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 import xarray as xr
+from assertions import off, refused
 from astropy.io import fits
 from astropy.time import Time
 from fits_files import write_images
@@ -56,10 +57,6 @@ def visibilities(luseepy, frequency, **options) -> np.ndarray:
     beams = beam.beams(frequency, LMAX, **options)
     seen = lb.CouplingMatrix.build(beams, pointing) @ sky[frequency]
     return np.asarray(seen).reshape(16, -1)
-
-
-def off(got, expected) -> float:
-    return np.abs(got - expected).max() / np.abs(expected).max()
 
 
 @pytest.mark.parametrize("frequency", [10.0, 25.0])
@@ -278,17 +275,12 @@ def test_files_that_cannot_be_used(tmp_path, options, message):
         read_beam(write(tmp_path / "beam.fits", **options))
 
 
-def test_missing_and_truncated_files(tmp_path):
+def test_missing_and_other_files(tmp_path):
     with pytest.raises(lb.InputError, match=r"no beam file at .*check beam\.file"):
         read_beam(tmp_path / "none.fits")
-    path = write(tmp_path / "beam.fits")
-    path.write_bytes(path.read_bytes()[:200_000])
-    with pytest.raises(lb.InputError, match="cut short"):
-        read_beam(path)
+    path = tmp_path / "beam.fits"
     path.write_text("no FITS at all")
-    with pytest.raises(
-        lb.InputError, match="cannot be read as a scalar beam .*: it is no FITS file$"
-    ):
+    with refused("cannot be read as a scalar beam .*: it is no FITS file$"):
         read_beam(path)
 
 

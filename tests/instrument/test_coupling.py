@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import close
+from assertions import close, refused
 from numpyro import handlers
 from reference import arm_response, hemisphere, steep_sky, vectors, visibilities
 from scipy.stats import norm, truncnorm
@@ -234,22 +234,12 @@ def test_differentiable_in_the_beams():
     np.testing.assert_allclose(slope, f(direction), rtol=1e-10)
 
 
-def test_bad_input_is_refused(coupling):
+def test_bad_input_is_refused():
     pointing = lb.Pointing.of(two_runs(), LMAX)
-    with pytest.raises(
-        lb.InputError, match=r"the beam coefficients has shape \(16, 36\), expected"
-    ):
+    with refused(r"the beam coefficients has shape \(16, 36\), expected"):
         CouplingMatrix.build(random_beams(0, lmax=5), pointing)
     with pytest.raises(lb.InputError, match="the data layout has 4 products x 7 times"):
         CouplingMatrix.build(random_beams(0), pointing, DataLayout(4, 7))
-    with pytest.raises(lb.InputError, match=r"the sky has shape \(80,\), expected \(81,\)"):
-        coupling @ jnp.zeros(80)
-    with pytest.raises(lb.InputError, match=r"the data has shape \(3,\)"):
-        coupling.transpose_mv(jnp.zeros(3))
-    with pytest.raises(
-        lb.InputError, match="the sky must be a float64 array, got an array of float"
-    ):
-        coupling @ jnp.zeros(81, dtype=jnp.float32)
 
 
 @pytest.mark.parametrize(

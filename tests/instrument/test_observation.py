@@ -16,7 +16,7 @@ from astropy.coordinates import (
 )
 from astropy.time import Time
 from lunarsky import MCMF, LunarTopo, MoonLocation
-from reference import galactic_directions, vectors
+from reference import galactic_directions, is_dark, vectors
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.observation import BODIES, MOON_RADIUS_KM, body_direction
@@ -94,15 +94,7 @@ def test_sun_altitude_agrees_with_lunarsky():
 def test_night_only_keeps_the_samples_with_the_sun_down():
     everything = lb.Observation.from_runs([lb.Run(1.0), lb.Run(1.0)])
     mixed = lb.Observation.from_runs([lb.Run(1.0), lb.Run(1.0, night_only=True)])
-    site = MoonLocation.from_selenodetic(lon=everything.lon_deg, lat=everything.lat_deg)
-    sun, moon = (
-        get_body_barycentric(b, everything.times, ephemeris="builtin") for b in ("sun", "moon")
-    )
-    vector = (sun - moon).xyz.to_value(u.km)
-    icrs = ICRS(CartesianRepresentation(vector / np.linalg.norm(vector, axis=0)))
-    mcmf = icrs.transform_to(MCMF(obstime=everything.times)).cartesian.xyz.value
-    up = np.array([x.to_value(u.m) for x in (site.x, site.y, site.z)])
-    dark = up @ mcmf < 0
+    dark = is_dark(everything.times, everything.lon_deg, everything.lat_deg)
     keep = (everything.run == 0) | dark
     np.testing.assert_array_equal(mixed.times.jd, everything.times[keep].jd)
     np.testing.assert_array_equal(mixed.run, everything.run[keep])

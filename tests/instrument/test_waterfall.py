@@ -10,6 +10,7 @@ import astropy.units as u
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import refused
 from astropy.io import fits
 from astropy.time import Time, TimeDelta
 from fits_files import write_images
@@ -298,7 +299,6 @@ def test_simulate_writes_it_and_map_reads_it(tmp_path):
         (["-o", "w.fits", "--set", "observation.window=mean"], "no room for windows"),
         (["-o", "data.nc", "--frequencies", "10,20"], "netCDF files hold one frequency"),
         (["-o", "w.fits", "--frequencies", "20,10"], "expected growing MHz"),
-        (["-o", "w.fits", "--frequencies", "5:50:7"], "expected growing MHz"),
         (["-o", "w.fits", "--frequencies", "ten"], "expected growing MHz"),
         (["-o", "w.fits", "--frequencies", "5:50:0"], "expected growing MHz"),
         (["-o", "w.fits", "--frequencies", "40:60:10"], "frequency_mhz"),
@@ -324,9 +324,7 @@ def test_ranges_of_frequencies():
 def test_another_site_and_other_ports(tmp_path):
     path = write(tmp_path / "w.fits", header=HEADER | {"LUN_LAT_DEG": -20.0, "LUN_LONG_DEG": 10.0})
     scenario = lb.load_scenario("fiducial", ["frequency_mhz=10", "lmax=4"])
-    with pytest.raises(
-        lb.InputError, match="--set observation.lon_deg=10 --set observation.lat_deg="
-    ):
+    with refused("--set observation.lon_deg=10 --set observation.lat_deg="):
         set_up(scenario, lb.read_data(path, scenario))
     # 182.258 degrees East is 177.742 West
     path = write(tmp_path / "west.fits", header=HEADER | {"LUN_LONG_DEG": -177.742})
@@ -335,9 +333,7 @@ def test_another_site_and_other_ports(tmp_path):
 
 def test_products_that_the_beams_cannot_supply(tmp_path):
     waterfall = lb.read_waterfall(write(tmp_path / "w.fits"))
-    with pytest.raises(
-        lb.InputError, match="has the product 02R, but the beams are those of 2 ports"
-    ):
+    with refused("has the product 02R, but the beams are those of 2 ports"):
         waterfall.at(10.0, n_ports=2)
     few = lb.read_waterfall(write(tmp_path / "few.fits", pairs=[[0, 0], [0, 1], [1, 1]]))
     data = few.at(10.0, n_ports=2)
@@ -393,6 +389,7 @@ twice = np.array([[2461000.0, 0.5], [2461000.0, 0.5], [2461000.0, 0.6]])
         ({"header": {"BUNIT": "K"}}, r"BUNIT is 'K'; known: V\^2/Hz"),
         ({"header": {"TMOON_K": None}}, "has no TMOON_K"),
         ({"header": {"TIMESYS": "LOCAL"}}, "TIMESYS is 'LOCAL'"),
+        ({"header": {"TIMEUNIT": "s"}}, "TIMEUNIT is 's'"),
         ({"images": {"time": np.arange(5.0)}}, r"time has shape \(5,\), expected time x 2"),
         ({"images": {"time": backwards, "data": np.ones((3, 2, 2))}}, "times must grow"),
         ({"images": {"time": twice, "data": np.ones((3, 2, 2))}}, "times must grow"),
