@@ -218,35 +218,6 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
     np.testing.assert_allclose(emitted, 2.0 * left, rtol=0, atol=1e-4 * np.abs(left).max())
 
 
-def test_between_frequencies_of_luseepys_file(luseepy, test_data):
-    """10.4 MHz, from the file's own numbers by luseepy's sum; the exact rule differs by less than
-    twice what the rectangle rule costs."""
-    beam, _, _, _ = luseepy
-    with fits.open(test_data / "luseepy" / "synthetic_monopole_beam.fits") as hdus:
-        images = {hdu.name: np.array(hdu.data, dtype=float) for hdu in hdus}
-    low = list(images["freq"]).index(10.0)
-    theta, phi = np.radians(np.arange(91.0)), np.radians(2.0 * np.arange(180))
-    taper = 1.0 - (np.arctan((theta - np.pi / 2) / 0.03) / np.pi + 0.5) ** 2
-    solid_angle = np.sin(theta) * np.radians(1.0) * np.radians(2.0) / (4 * np.pi) * taper**2
-    points = [a.ravel() for a in np.meshgrid(theta, phi, indexing="ij")]
-    harmonics = real_harmonics(*points, 3) * np.repeat(solid_angle, 180)[:, None]
-    expected = 0.0
-    for k, weight in ((low, 0.6), (low + 1, 0.4)):
-        arm = [
-            (images[f"{name}_real"] + 1j * images[f"{name}_imag"])[k, :, :-1]
-            for name in ("Etheta", "EPhi")
-        ]
-        # ports 0 and 1: the second one a quarter turn on
-        cross = sum(e * np.roll(e, 45, axis=1).conj() for e in arm).ravel()
-        expected = expected + weight * np.array([cross.real, cross.imag]) @ harmonics
-    expected = expected * (0.6 * images["gain_conv"][low] + 0.4 * images["gain_conv"][low + 1])
-    got = beam.beams(10.4, 3, grid=beam.luseepy_grid).modes[1:3]
-    assert off(got, expected) < 1e-12
-    # a spline through the fields is another thing: 1e-5 of the peak in steps of 1 MHz
-    splined = replace(beam, interpolation="spline").beams(10.4, 3, grid=beam.luseepy_grid)
-    assert off(splined.modes[1:3], expected) > 1e-6
-
-
 def point_pattern(theta, phi, f):
     """:func:`pattern` in single directions."""
     e_theta = np.cos(theta) * np.cos(phi - 0.3) + 0.2 * np.sin(2 * theta)

@@ -157,27 +157,6 @@ def test_flagged_samples_are_left_out(coupling):
     np.testing.assert_allclose(rows, full, rtol=0, atol=1e-12)
 
 
-def test_a_second_run_is_an_observation_of_its_own(coupling):
-    o = two_runs()
-    a = steep_sky(LMAX)
-    both = np.asarray(coupling @ a).reshape(16, -1)
-    for run in (0, 1):
-        keep = o.run == run
-        alone = o.select(keep)
-        # each has its own mean pole, so only the neglected third order of the series differs
-        got = np.asarray(CouplingMatrix.observe(random_beams(1), alone) @ a).reshape(16, -1)
-        np.testing.assert_allclose(got, both[:, keep], rtol=0, atol=2e-6 * np.abs(both).max())
-
-
-def test_a_smaller_lmax_is_a_slice(coupling):
-    low = 5
-    beams = lb.ProductBeams(random_beams(1).modes[:, : n_modes(low)], 25.0)
-    pointing = lb.Pointing.of(two_runs(), low, order=coupling.pointing.order)
-    small = CouplingMatrix.build(beams, pointing)
-    full = np.asarray(coupling.dense())
-    np.testing.assert_allclose(small.dense(), full[:, : n_modes(low)], rtol=0, atol=1e-12)
-
-
 def test_a_uniform_sky_of_one_kelvin_gives_autos_of_one_kelvin():
     o = lb.Observation.from_runs([lb.Run(0.1, 20.0)])
     c = CouplingMatrix.observe(lb.monopole_beams(10.0, LMAX), o)

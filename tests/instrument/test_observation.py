@@ -103,15 +103,6 @@ def test_night_only_keeps_the_samples_with_the_sun_down():
     assert 140 < nights < 180
 
 
-def test_select():
-    o = lb.Observation.from_runs([lb.Run(0.1), lb.Run(0.1, 30.0)])
-    keep = np.arange(o.n_times) % 3 == 0
-    some = o.select(keep)
-    np.testing.assert_array_equal(some.times.jd, o.times.jd[keep])
-    np.testing.assert_array_equal(some.run, o.run[keep])
-    np.testing.assert_array_equal(some.mcmf_from_galactic(), o.mcmf_from_galactic()[keep])
-
-
 @pytest.mark.parametrize(
     ("start", "at"),
     [

@@ -182,24 +182,6 @@ def write(path, *, without=(), change=None, frequencies=(10.0, 20.0, 40.0)):
     return write_images(path, {k: v for k, v in flat.items() if k not in without}, {"VERSION": 3})
 
 
-def test_volts_of_short_dipoles(tmp_path):
-    """V^2 = 4 k T R with R = eta0 / (4 lambda^2) int |h|^2, and M by hand; T = 1 K everywhere."""
-    response = read_beam(write(tmp_path / "response.fits"))
-    f, wavelength = 20.0, c / 20e6
-    _, _, arms = short_dipoles(np.zeros(1), np.zeros(1), 1.5)
-    open_ = Boltzmann * VACUUM / wavelength**2 * 1.09 * 4 * np.pi / 3 * arms.T @ arms
-    za, zl = response.impedance[1], JFETReceiver().load(f)
-    m = zl @ np.linalg.inv(za + zl)
-    np.testing.assert_allclose(response.circuit(f).loading, m, rtol=1e-12)
-    expected = m @ open_ @ m.conj().T
-    beams = volts(response, f, response.beams(f, 2).modes)
-    got = np.asarray(to_matrix(beams))[..., 0] * np.sqrt(4 * np.pi)
-    close(got, expected, 1e-6)
-    # half sky, half Moon
-    got = volts(response, f, response.background(f, 1.0)[:, None])
-    close(to_matrix(got)[..., 0], expected, 1e-6)
-
-
 def varied(images):
     """Effective lengths that are not the same at all frequencies."""
     if "H_theta" in images:

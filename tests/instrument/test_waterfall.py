@@ -110,14 +110,6 @@ def test_any_subset_and_order_of_products(tmp_path):
     assert np.isnan(grid[place["11R"]]).all()
 
 
-def test_gaps_are_missing_samples_and_counted(tmp_path):
-    data = 100.0 + np.zeros((12, 16, 2))
-    data[3, :, 0], data[5:7, 7, 0] = np.nan, np.nan
-    waterfall = lb.read_waterfall(write(tmp_path / "w.fits", data))
-    assert (waterfall.at(10.0).n_missing, waterfall.at(20.0).n_missing) == (18, 0)
-    assert "18 samples missing" in describe(tmp_path / "w.fits")
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -245,18 +237,6 @@ def test_what_is_written_is_read_back_bit_by_bit(tmp_path):
     assert np.abs((times - one.observation.times).to_value(u.s)).max() < 1e-6
     with fits.open(path) as hdus:
         np.testing.assert_array_equal(hdus["ZIm_2"].data, [-40.0, -30.0])
-
-
-def test_luseepys_own_file_is_written_back(tmp_path, test_data):
-    original = test_data / "luseepy" / "waterfall_exact_engine.fits"
-    waterfall = lb.read_waterfall(original)
-    path = lb.write_waterfall(
-        tmp_path / "w.fits", [waterfall.at(f) for f in waterfall.frequencies_mhz]
-    )
-    ours, _, places = as_luseepy_reads(path)
-    with fits.open(original) as hdus:
-        np.testing.assert_array_equal(ours, hdus["data"].data)
-        np.testing.assert_array_equal(list(places), hdus["combinations"].data)
 
 
 @pytest.mark.parametrize(

@@ -148,16 +148,9 @@ def test_contract_of_sums(first, second, small_blocks):
     check_covariance(cov_a + cov_b, dense_a + dense_b, slopes=True)
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "diagonal",
-        *(
-            pytest.param(k, marks=[pytest.mark.long, pytest.mark.essential])
-            for k in ("banded", "blocks", "dense")
-        ),
-    ],
-)
+@pytest.mark.long
+@pytest.mark.essential
+@pytest.mark.parametrize("kind", ["banded", "blocks", "dense"])
 def test_contract_of_low_rank_updates(kind, small_blocks):
     cov, dense = _terms(FLAGS)[kind]
     directions, outer = _directions(len(dense), seed=12)
