@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from astropy.io import fits
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import IMAGE_DTYPES
-from lusee_bayes.core.layouts import Attribute, Content, Layout, Unread
+from lusee_bayes.core.layouts import Attribute, Content, Layout, Unloaded, Unread
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, SAME_S, Clock
 from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Opener, Session, session_of
 from lusee_bayes.instrument.times import scale_of
@@ -100,7 +101,10 @@ def session_of_fits(path: Path, hdus: fits.HDUList, opener: Opener) -> Session:
     names = [hdu.name for hdu in hdus]
     if "SPECTRA" not in names:
         raise no_spectra(path, "image SPECTRA", names[1:])
-    arrays: dict[str, Unread | _Cube] = {"spectra/data": _Cube(hdus["SPECTRA"])}
+    cube = hdus["SPECTRA"]
+    dtype = np.dtype(IMAGE_DTYPES[cube.header["BITPIX"]])
+    unread = Unloaded(tuple(cube.shape), dtype, partial(getattr, cube, "data"))
+    arrays: dict[str, Unread] = {"spectra/data": unread}
     for table, place in TABLES.items():
         if table not in names:
             continue
@@ -115,14 +119,6 @@ def session_of_fits(path: Path, hdus: fits.HDUList, opener: Opener) -> Session:
         if word in hdus[hdu].header
     }
     return _checked_session(path, "FITS", arrays, values, opener)
-
-
-class _Cube:
-    """The spectra of a FITS file, not yet read."""
-
-    def __init__(self, hdu: fits.ImageHDU):
-        self.shape = tuple(hdu.shape)
-        self.dtype = np.dtype(IMAGE_DTYPES[hdu.header["BITPIX"]])
 
 
 def _interpolated(path: Path, file: h5py.File) -> dict[str, Unread]:

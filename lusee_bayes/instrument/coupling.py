@@ -250,17 +250,10 @@ class DenseCoupling(Coupling):
         inside a JAX transformation.
     """
 
-    matrix: Float[Array, "data unknowns"]
+    matrix: Float[Array, "data unknowns"] = eqx.field(converter=jnp.asarray)
 
-    def __init__(
-        self,
-        matrix: Float[Array, "data unknowns"],
-        *,
-        response: Float[Array, " data"] | None = None,
-    ):
-        require_array("the coupling matrix", matrix, (None, None))
-        self.matrix = jnp.asarray(matrix)
-        self.response = response
+    def __check_init__(self):
+        require_array("the coupling matrix", self.matrix, (None, None))
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -32,7 +32,7 @@ from lusee_bayes.core.formats import is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.harmonics import from_healpy, lmax_of, map_to_modes, n_modes, to_healpy
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.reading import read_arrays, reading
+from lusee_bayes.core.reading import naming, read_arrays, reading
 
 
 class SkyFile(ABC):
@@ -102,10 +102,8 @@ def modes_of_map(
     path: str | Path, pixels: Float[np.ndarray, " pixels"], lmax: int
 ) -> Float[np.ndarray, " modes"]:
     """Coefficients of a file's map; an InputError names the file."""
-    try:
+    with naming(path):
         return map_to_modes(pixels, lmax)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 ULSA_DATASET = "smooth_absorb"
@@ -390,17 +388,17 @@ def _read_alm_fits(path: Path) -> np.ndarray:
         units = {f"{one.name.lower()}.units": one.unit for one in table.columns}
         found = TABLE.checked(path, columns, units).arrays
     index, real, imag = (found[name] for name in COLUMNS)
-    # what does not fit into memory, or is written twice, fills no lmax either
-    if index.max() > LARGEST_LMAX**2 or len(set(index.tolist())) < len(index):
-        raise InputError(
-            f"{path}: index must be ell^2 + ell + m + 1, each once, ell <= {LARGEST_LMAX}"
-        )
     ell = np.floor(np.sqrt(index - 1.0) + 1e-9).astype(int)
     m = index - 1 - ell**2 - ell
+    # what does not fit into memory, or is written twice, fills no lmax either
+    once = index.max() <= LARGEST_LMAX**2 and len(set(index.tolist())) == len(index)
+    if not once or (m < 0).any() or (m > ell).any():
+        raise InputError(
+            f"{path}: index must be ell^2 + ell + m + 1, each once, with 0 <= m <= ell <= "
+            f"{LARGEST_LMAX}"
+        )
     lmax = int(ell.max())
     alm = np.full(healpy.Alm.getsize(lmax), np.nan + 0j)
-    if (m < 0).any() or (m > ell).any():
-        raise InputError(f"{path}: index must be ell^2 + ell + m + 1 with 0 <= m <= ell")
     alm[healpy.Alm.getidx(lmax, ell, m)] = real + 1j * imag
     if np.isnan(alm).any():
         raise InputError(

@@ -544,21 +544,17 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
         said["products"] = ",".join(labels(beams.n_ports))
     with replacing(path) as partial:
         if path.suffix.lower() in (".fits", ".fit"):
-            _write_fits(partial, arrays, said)
+            header = fits.Header([(key.upper(), value) for key, value in said.items()])
+            hdus = [fits.PrimaryHDU(header=header)]
+            hdus += [
+                fits.ImageHDU(np.ascontiguousarray(a), name=name) for name, a in arrays.items()
+            ]
+            fits.HDUList(hdus).writeto(partial)
         else:
             declared = layout(fields=fields, grid=grid).variables
             variables = {name: (declared[name].dims, one) for name, one in arrays.items()}
             xr.Dataset(variables, attrs=said).to_netcdf(partial, engine="h5netcdf")
     return path
-
-
-def _write_fits(path: Path, arrays: dict[str, np.ndarray], said: dict[str, object]) -> None:
-    hdus = fits.HDUList([fits.PrimaryHDU()])
-    for key, value in said.items():
-        hdus[0].header[key.upper()] = value
-    for name, array in arrays.items():
-        hdus.append(fits.ImageHDU(np.ascontiguousarray(array), name=name))
-    hdus.writeto(path)
 
 
 def _in_order(beams: np.ndarray, products: str) -> np.ndarray:
