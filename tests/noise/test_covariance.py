@@ -272,7 +272,7 @@ _dense = eqx.filter_jit(lambda cov: cov.dense())
 
 def test_sums_of_three_do_not_depend_on_order():
     terms = list(_terms(FLAGS).values())
-    for triple in [(0, 1, 2), (0, 1, 3), (0, 3, 4), (1, 3, 4), (2, 3, 4)]:
+    for triple in [(0, 1, 2), (1, 3, 4)]:
         expected = sum(terms[i][1] for i in triple)
         for a, b, c in permutations([terms[i][0] for i in triple]):
             close(_dense(a + b + c), expected)
@@ -383,12 +383,11 @@ def test_indefinite_terms_are_named_with_their_lowest_eigenvalue():
             use()
 
 
-@pytest.mark.parametrize("update", [False, True])
-def test_indefinite_bands_are_named_with_their_lowest_eigenvalue(update):
+def test_indefinite_bands_are_named_with_their_lowest_eigenvalue():
     # times 0 and 1 correlated by 1.25: eigenvalues 1 +- 1.25; the last time stands alone
     band = jnp.zeros((3, 2, 4, 4)).at[:, 0].set(jnp.eye(4)).at[1, 1].set(1.25 * jnp.eye(4))
     cov = TimeBandedCovariance(band, DataLayout(4, 3), "the gain term")
-    cov = LowRankUpdate(cov, LowRankCovariance(1e-3 * jnp.ones((12, 1)))) if update else cov
+    cov = LowRankUpdate(cov, LowRankCovariance(1e-3 * jnp.ones((12, 1))))
     for use in (cov.factor, cov.log_det, lambda: cov.solve(jnp.ones(12))):
         with refused(r"the gain term is not positive definite: .* eigenvalue is -0\.25 "):
             use()

@@ -149,7 +149,7 @@ def test_with_gains_is_the_product_of_both_antennas():
 # --- the sampler ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("correlation", [0.7, 10.0, 300.0])
+@pytest.mark.parametrize("correlation", [0.7, 300.0])
 def test_the_samplers_covariance_is_c_g_exactly(monkeypatch, correlation):
     """g is linear in the white noise: with unit vectors for it, the sampler shows its root."""
     monkeypatch.setattr(jax.random, "normal", lambda key, shape, dtype: jnp.eye(shape[1]))
