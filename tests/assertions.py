@@ -18,6 +18,11 @@ def close(got: object, expected: object, relative: float) -> None:
     np.testing.assert_allclose(got, expected, rtol=0, atol=relative * largest)
 
 
+def off(got: object, expected: object) -> float:
+    """The largest difference, as a part of the largest expected entry."""
+    return np.abs(got - expected).max() / np.abs(expected).max()
+
+
 def within(got: object, expected: object, atol: object) -> None:
     """Assert that arrays agree to so much, whatever their size."""
     np.testing.assert_allclose(got, expected, rtol=0, atol=atol)

@@ -8,8 +8,13 @@ phi from East towards North; packed real modes at ell^2 + ell + m; time conventi
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import ICRS, Galactic
-from lunarsky import LunarTopo, MoonLocation
+from astropy.coordinates import (
+    ICRS,
+    CartesianRepresentation,
+    Galactic,
+    get_body_barycentric,
+)
+from lunarsky import MCMF, LunarTopo, MoonLocation
 from scipy.special import sph_harm_y
 
 SPEED_OF_LIGHT = 299792458.0
@@ -66,6 +71,16 @@ def galactic_directions(theta, phi, time, lon_deg, lat_deg):
     )
     there = here.transform_to(ICRS()).transform_to(Galactic())
     return np.pi / 2 - there.b.rad, there.l.rad
+
+
+def is_dark(times, lon_deg, lat_deg):
+    """Whether the Sun is down at each time, as lunarsky has the site and the Moon."""
+    site = MoonLocation.from_selenodetic(lon=lon_deg, lat=lat_deg)
+    sun, moon = (get_body_barycentric(body, times, ephemeris="builtin") for body in ("sun", "moon"))
+    vector = (sun - moon).xyz.to_value(u.km)
+    icrs = ICRS(CartesianRepresentation(vector / np.linalg.norm(vector, axis=0)))
+    mcmf = icrs.transform_to(MCMF(obstime=times)).cartesian.xyz.value
+    return np.array([x.to_value(u.m) for x in (site.x, site.y, site.z)]) @ mcmf < 0
 
 
 def visibilities(response, grid, sky, time, *, lon_deg, lat_deg, turntable_deg=0.0):

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -157,11 +158,9 @@ def _telemetry_terms(
             f"the telemetry lacks {', '.join(lacking)}, by which the gain table predicts gains; "
             "ingest the session with its telemetry, interpolated to the spectra"
         )
-    fpga = telemetry["THERM_FPGA"]
-    adc = telemetry["SPE_ADC0_T" if port < 2 else "SPE_ADC1_T"]
-    v18, v12, i18 = (telemetry[name] for name in ("SPE_1VAD8_V", "VMON_1V2D", "SPE_1VAD8_C"))
-    ones = np.ones_like(fpga)
-    return np.stack([ones, fpga, adc, v18, v12, i18, fpga**2, adc**2, fpga * adc], axis=1)
+    known = {"1": np.ones_like(telemetry[TELEMETRY[0]]), **telemetry}
+    terms = [prod(known[name] for name in term.split("*")) for term in _terms(port)]
+    return np.stack(terms, axis=1)
 
 
 # first and last frequency of curves, and how many
@@ -338,12 +337,13 @@ def write_gain_table(path: str | Path, table: GainModel) -> Path:
 def _read_folder(folder: Path, model: str) -> GainModel:
     if model not in MODELS:
         raise InputError(f"unknown model of gains '{model}'; {nearest(model, MODELS)}")
-    arrays: dict[str, list[list[np.ndarray]]] = {"freqs": [], "mean": [], "eigvecs": []}
-    for level in LETTERS:
-        for name, rows in arrays.items():
-            rows.append(
-                [_gain_array(folder / f"{level}{port}_{name}.npy") for port in range(PORTS)]
-            )
+    arrays = {
+        name: [
+            [_gain_array(folder / f"{level}{port}_{name}.npy") for port in range(PORTS)]
+            for level in LETTERS
+        ]
+        for name in ("freqs", "mean", "eigvecs")
+    }
     vectors = [[v[:, :N_COMPONENTS].T for v in row] for row in arrays["eigvecs"]]
     shapes = {v.shape for row in arrays["mean"] for v in row}
     if len(shapes) > 1:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,10 @@ from astropy.io import fits
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import IMAGE_DTYPES
-from lusee_bayes.core.layouts import Attribute, Content, Layout, Unread
+from lusee_bayes.core.layouts import Attribute, Content, Layout, Unloaded, Unread
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, SAME_S, Clock
-from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Read, Session, session_of
+from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Opener, Session, session_of
 from lusee_bayes.instrument.times import scale_of
-
-Opener = Callable[[], AbstractContextManager[Read]]
 
 INTERPOLATED = "spectra_interpolated_telemetry"
 # what luseepy makes of the scale of a mission clock that nobody has established
@@ -52,6 +50,24 @@ WORDS = {
 }
 
 
+def said_in(file: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what an open file of HDF5 says, by names as in :data:`.SAID`."""
+    return {
+        f"{name}.{key}": value
+        for name in ("constants", "session_invariants", "spectra/data")
+        if name in file
+        for key, value in file[name].attrs.items()
+    }
+
+
+def no_spectra(path: Path, lacking: str, there: Iterable[str]) -> InputError:
+    """Return the error of a file without spectra, with what is there."""
+    return InputError(
+        f"{path} has no {lacking}: the session holds no spectra (it has "
+        f"{', '.join(there) or 'nothing'})"
+    )
+
+
 def session_of_hdf5(path: Path, file: h5py.File, opener: Opener) -> Session:
     """Make a session of an open file.
 
@@ -68,10 +84,7 @@ def session_of_hdf5(path: Path, file: h5py.File, opener: Opener) -> Session:
         If something is missing or not as it should be.
     """
     if "spectra" not in file or "data" not in file["spectra"]:
-        raise InputError(
-            f"{path} has no spectra/data: the session holds no spectra (it has "
-            f"{', '.join(file) or 'nothing'})"
-        )
+        raise no_spectra(path, "spectra/data", file)
     arrays: dict[str, Unread] = {
         f"{group}/{name}": item
         for group in ("spectra", META)
@@ -79,25 +92,19 @@ def session_of_hdf5(path: Path, file: h5py.File, opener: Opener) -> Session:
         for name, item in file[group].items()
         if isinstance(item, h5py.Dataset)
     }
-    values = {
-        f"{name}.{key}": value
-        for name in ("constants", "session_invariants", "spectra/data")
-        if name in file
-        for key, value in file[name].attrs.items()
-    }
     arrays |= _interpolated(path, file)
-    return _checked_session(path, "HDF5", arrays, values, opener)
+    return _checked_session(path, "HDF5", arrays, said_in(file), opener)
 
 
 def session_of_fits(path: Path, hdus: fits.HDUList, opener: Opener) -> Session:
     """Make a session of an open file, as :func:`session_of_hdf5`."""
     names = [hdu.name for hdu in hdus]
     if "SPECTRA" not in names:
-        raise InputError(
-            f"{path} has no image SPECTRA: the session holds no spectra (it has "
-            f"{', '.join(names[1:]) or 'nothing'})"
-        )
-    arrays: dict[str, Unread | _Cube] = {"spectra/data": _Cube(hdus["SPECTRA"])}
+        raise no_spectra(path, "image SPECTRA", names[1:])
+    cube = hdus["SPECTRA"]
+    dtype = np.dtype(IMAGE_DTYPES[cube.header["BITPIX"]])
+    unread = Unloaded(tuple(cube.shape), dtype, partial(getattr, cube, "data"))
+    arrays: dict[str, Unread] = {"spectra/data": unread}
     for table, place in TABLES.items():
         if table not in names:
             continue
@@ -112,14 +119,6 @@ def session_of_fits(path: Path, hdus: fits.HDUList, opener: Opener) -> Session:
         if word in hdus[hdu].header
     }
     return _checked_session(path, "FITS", arrays, values, opener)
-
-
-class _Cube:
-    """The spectra of a FITS file, not yet read."""
-
-    def __init__(self, hdu: fits.ImageHDU):
-        self.shape = tuple(hdu.shape)
-        self.dtype = np.dtype(IMAGE_DTYPES[hdu.header["BITPIX"]])
 
 
 def _interpolated(path: Path, file: h5py.File) -> dict[str, Unread]:

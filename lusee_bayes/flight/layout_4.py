@@ -7,10 +7,7 @@ names of layout 3.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -20,7 +17,8 @@ from jaxtyping import Float
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Layout, Unread
 from lusee_bayes.flight.clock import Clock
-from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Read, Session, session_of
+from lusee_bayes.flight.layout_3 import no_spectra, said_in
+from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Opener, Session, session_of
 from lusee_bayes.instrument.times import scale_of, unannounced_leap_seconds
 
 LAYOUT_4 = Layout("a session of lusee.ingest, layout 4", ROWS, SAID)
@@ -43,9 +41,7 @@ UNUSED = {
 TICKS = 65536
 
 
-def session_of_4(
-    path: Path, file: h5py.File, opener: Callable[[], AbstractContextManager[Read]]
-) -> Session:
+def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
     """Make a session of a file of layout 4.
 
     Parameters
@@ -63,15 +59,7 @@ def session_of_4(
     """
     cube = _dataset(file, "spectra/data")
     if cube is None:
-        raise InputError(
-            f"{path} has no spectra/data: the session holds no spectra (it has "
-            f"{', '.join(file) or 'nothing'})"
-        )
-    values = {
-        f"{name}.{key}": value
-        for name in ("constants", "session_invariants", "spectra/data")
-        for key, value in _attributes(file, name).items()
-    }
+        raise no_spectra(path, "spectra/data", file)
     arrays = {"spectra/data": cube, **_metadata(path, file, cube.shape[0] if cube.shape else 0)}
     if (raw_s := _dataset(file, "spectra/raw_seconds")) is not None:
         arrays["spectra/raw_times"] = raw_s
@@ -79,23 +67,13 @@ def session_of_4(
     clock = _clock_by_reference(path, file)
     if clock is not None and raw_s is not None:
         arrays |= _telemetry_at_rows(path, file, clock, np.asarray(raw_s))
-    found = LAYOUT_4.checked(path, arrays, values)
-    return session_of(path, 4, "HDF5", found, arrays, clock, opener, _unused(file))
-
-
-def _unused(file: h5py.File) -> dict[str, int]:
-    """How many rows the families have that maps do not use."""
-    return {
-        name: int(np.ravel(file[path].attrs.get("count", 0))[0])
-        for path, name in UNUSED.items()
-        if path in file
+    found = LAYOUT_4.checked(path, arrays, said_in(file))
+    unused = {
+        name: int(np.ravel(file[group].attrs.get("count", 0))[0])
+        for group, name in UNUSED.items()
+        if group in file
     }
-
-
-def _attributes(file: h5py.File, path: str) -> dict[str, Any]:
-    """What a group or an array says of itself; nothing where there is none."""
-    item = file.get(path)
-    return {} if item is None else dict(item.attrs)
+    return session_of(path, 4, "HDF5", found, arrays, clock, opener, unused)
 
 
 def _dataset(file: h5py.File, path: str) -> Unread | None:
@@ -153,7 +131,7 @@ def _require_valid(path: Path, valid: Unread | None) -> None:
 
 
 def _clock_by_reference(path: Path, file: h5py.File) -> Clock | None:
-    said = _attributes(file, "clock_reference")
+    said = file["clock_reference"].attrs if "clock_reference" in file else {}
     if not bool(said.get("available")):
         return None
     scale = scale_of(f"{path}: time_scale", str(said["time_scale"]))

@@ -27,8 +27,13 @@ from lusee_bayes.instrument.averaging import binned
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import DataLayout, labels, runs_of
-from lusee_bayes.instrument.times import JD_SCALES, Windows, utc_of_jd
-from lusee_bayes.instrument.visibilities import Calibration, Visibilities
+from lusee_bayes.instrument.times import Windows, utc_of_jd
+from lusee_bayes.instrument.visibilities import (
+    PLACE_AND_TIME,
+    Calibration,
+    Visibilities,
+    observation_of,
+)
 
 # why a spectrum is not used in a band; the first is that it is
 REASONS = (
@@ -427,10 +432,7 @@ LAYOUT = Layout(
         "line_share": Variable(("frequency", "spectrum"), low=0.0, high=1.0),
     },
     {
-        "lon_deg": Attribute(low=-360.0, high=360.0),
-        "lat_deg": Attribute(low=-90.0, high=90.0),
-        **JD_SCALES,
-        "step_s": Attribute(low=0.0),
+        **PLACE_AND_TIME,
         "bandwidth_mhz": Attribute(low=0.0),
         "average_s": Attribute(low=0.0, optional=True),
         "gain_std": Attribute(low=0.0, optional=True),
@@ -534,9 +536,7 @@ def read_reduced(path: str | Path) -> Reduced:
             windows = Windows.whole(
                 here["window_start_s"], here["window_end_s"], here.get("live_s")
             )
-        site, angles = (said["lon_deg"], said["lat_deg"]), tuple(here["turntable_deg"].tolist())
-        runs = here["run"], angles, said["step_s"]
-        observation = Observation(*site, utc_of_jd(found), *runs, windows=windows)
+        observation = observation_of(found, utc_of_jd(found), windows)
     if here["bin_of"].max() >= found.sizes["bin"]:
         raise InputError(f"{path}: bin_of goes beyond the {found.sizes['bin']} bins")
     return Reduced(

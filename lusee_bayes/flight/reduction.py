@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.reading import naming
 from lusee_bayes.flight.bands import ChannelBand
 from lusee_bayes.flight.flags import (
     COMB_LIMIT,
@@ -289,10 +290,8 @@ def _slab(
         # the mean of the comb's channels is subtracted, unless bit 4 says that it is not
         notch = session.notch[here]
         notched = ((notch & 0b111) > 0) & ((notch & 0b10000) == 0)
-    try:
+    with naming(session.path):
         strengths = state.strengths(telemetry, len(counts))
-    except InputError as error:
-        raise InputError(f"{session.path}: {error}") from error
     frames = session.frames[here]
     lines = state.lines(counts, frames, notched)
     return partial(_calibrate, state, counts, frames, strengths, lines, session.saturated[here])
@@ -433,7 +432,11 @@ def _means(
 
 
 def _said_of(session: Session, recipe: Recipe) -> Mapping[str, Any]:
-    clock = recipe.clock or session.clock
+    clock, whose = recipe.clock or session.clock, "session"
+    if session.clock is None:
+        whose = "clock file"
+    elif recipe.clock is not None and recipe.clock.stated is not None:
+        whose = CORRECTED
     return {
         "file": str(session.path),
         "kind": session.kind,
@@ -445,18 +448,10 @@ def _said_of(session: Session, recipe: Recipe) -> Mapping[str, Any]:
         "window_s": float(session.window_s.max()),
         "saturated": int(session.saturated.sum()),
         "errors": int((session.errors != 0).sum()),
-        "clock": _whose(session, recipe),
+        "clock": whose,
         "clock_file": None if recipe.clock is None else Path(recipe.clock.source).name,
         "scale": None if clock is None else clock.scale,
         "rate": 1.0 if clock is None else clock.rate,
         "first_s": float(session.raw_s[0]),
         "last_s": float(session.raw_s[-1]),
     }
-
-
-def _whose(session: Session, recipe: Recipe) -> str:
-    """Who says which UTC a session's clock stands for."""
-    if session.clock is None:
-        return "clock file"
-    corrected = recipe.clock is not None and recipe.clock.stated is not None
-    return CORRECTED if corrected else "session"

@@ -99,6 +99,7 @@ def channel_mhz(origin: BinOrigin) -> Float[np.ndarray, " channels"]:
 TELEMETRY = ("THERM_FPGA", "SPE_ADC0_T", "SPE_ADC1_T", "SPE_1VAD8_V", "VMON_1V2D", "SPE_1VAD8_C")
 # counts of spectra [first:last] of all products and channels
 Read = Callable[[int, int], Float32[np.ndarray, "rows products channels"]]
+Opener = Callable[[], AbstractContextManager[Read]]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -162,7 +163,7 @@ class Session(Described):
     lon_deg: float
     lat_deg: float
     software: str
-    opener: Callable[[], AbstractContextManager[Read]]
+    opener: Opener
     unused: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -286,7 +287,7 @@ def session_of(
     found: Content,
     arrays: Mapping[str, Unread],
     clock: Clock | None,
-    opener: Callable[[], AbstractContextManager[Read]],
+    opener: Opener,
     unused: Mapping[str, int] | None = None,
 ) -> Session:
     """Make a session of what a file holds.

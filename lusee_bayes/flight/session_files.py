@@ -83,11 +83,11 @@ def read_session(path: str | Path) -> Session:
 
 def _version_of(path: Path, version: Any) -> int:
     """The version of a layout. InputError if it is none that this package reads."""
-    number = None if version is None else int(version)
-    if number is None:
+    if version is None:
         raise InputError(
             f"{path} has no layout_version: it is no session of luseepy's lusee.ingest"
         )
+    number = int(version)
     if number < 3:
         raise InputError(
             f"{path} is of layout {number}, in which bit slices are not restored; ingest the "

@@ -73,9 +73,14 @@ class Coupling(Described, eqx.Module):
         """Whether A^T N^-1 A can be summed over time without A (``linear.normal_matrix``)."""
         return False
 
-    @abstractmethod
     def dense(self) -> Float[Array, "data unknowns"]:
-        """A as a matrix."""
+        """A as a matrix, with the response."""
+        matrix = self._matrix()
+        return matrix if self.response is None else matrix * self.response[:, None]
+
+    @abstractmethod
+    def _matrix(self) -> Float[Array, "data unknowns"]:
+        """A as a matrix, as all of the following without the response."""
 
     @abstractmethod
     def plus(self, amplitude: Float[Array, ""], direction: Coupling) -> Coupling:
@@ -128,7 +133,8 @@ class Coupling(Described, eqx.Module):
         """
         require_float64("the sky", sky)
         require_shape("the sky", sky, (self.shape[1],))
-        return self._forward(sky)
+        data = self._forward(sky)
+        return data if self.response is None else data * self.response
 
     def transpose_mv(self, data: Float[Array, " data"]) -> Float[Array, " unknowns"]:
         """Compute A^T d.
@@ -150,7 +156,7 @@ class Coupling(Described, eqx.Module):
         """
         require_float64("the data", data)
         require_shape("the data", data, (self.shape[0],))
-        return self._backward(data)
+        return self._backward(data if self.response is None else data * self.response)
 
     def with_response(self, factors: Float[Array, " data"]) -> Coupling:
         """Multiply every row by a factor, on top of those it has.
@@ -243,24 +249,17 @@ class DenseCoupling(Coupling):
         inside a JAX transformation.
     """
 
-    matrix: Float[Array, "data unknowns"]
+    matrix: Float[Array, "data unknowns"] = eqx.field(converter=jnp.asarray)
 
-    def __init__(
-        self,
-        matrix: Float[Array, "data unknowns"],
-        *,
-        response: Float[Array, " data"] | None = None,
-    ):
-        require_array("the coupling matrix", matrix, (None, None))
-        self.matrix = jnp.asarray(matrix)
-        self.response = response
+    def __check_init__(self):
+        require_array("the coupling matrix", self.matrix, (None, None))
 
     @property
     def shape(self) -> tuple[int, int]:
         return self.matrix.shape
 
-    def dense(self):
-        return self.matrix if self.response is None else self.matrix * self.response[:, None]
+    def _matrix(self):
+        return self.matrix
 
     def plus(self, amplitude, direction):
         require_shape("the direction", direction, self.shape)
@@ -269,11 +268,10 @@ class DenseCoupling(Coupling):
         return DenseCoupling(self.matrix + amplitude * direction.dense(), response=self.response)
 
     def _forward(self, sky):
-        data = self.matrix @ sky
-        return data if self.response is None else data * self.response
+        return self.matrix @ sky
 
     def _backward(self, data):
-        return self.matrix.T @ (data if self.response is None else data * self.response)
+        return self.matrix.T @ data
 
 
 def as_coupling(coupling: Coupling | Array) -> Coupling:
@@ -407,8 +405,8 @@ class CouplingMatrix(Coupling):
         if direction.response is not None:
             raise InputError("the direction must have no response of its own")
         if not isinstance(direction, CouplingMatrix):
-            plain = replace(self, response=None).dense()
-            return DenseCoupling(plain, response=self.response).plus(amplitude, direction)
+            dense = DenseCoupling(self._matrix(), response=self.response)
+            return dense.plus(amplitude, direction)
         self.layout.require_same(direction.layout)
         return replace(
             self,
@@ -453,11 +451,10 @@ class CouplingMatrix(Coupling):
         return namespace(*blocks).concatenate(blocks)[np.argsort(np.concatenate(places))]
 
     @compiled
-    def dense(self) -> Float[Array, "data modes"]:
-        """A as a matrix (96 MB for 5232 x 2304)."""
+    def _matrix(self) -> Float[Array, "data modes"]:
+        """96 MB for 5232 x 2304."""
         blocks = [self._block(run, span) for run, span in self.pointing.runs()]
-        rows = self.layout.gather(namespace(*blocks).concatenate(blocks, axis=1))
-        return rows if self.response is None else rows * self.response[:, None]
+        return self.layout.gather(namespace(*blocks).concatenate(blocks, axis=1))
 
     @compiled
     def _forward(self, sky: Float[Array, " modes"]) -> Float[Array, " data"]:
@@ -476,14 +473,12 @@ class CouplingMatrix(Coupling):
             over_time = cosine[span] @ x_and_y[..., 0] + sine[span] @ x_and_y[..., 1]
             over_time = over_time.reshape(-1, n_products, n_functions)
             grids.append((over_time * functions[span][:, None]).sum(-1).T)
-        data = self.layout.gather(xp.concatenate(grids, axis=1))
-        return data if self.response is None else data * self.response
+        return self.layout.gather(xp.concatenate(grids, axis=1))
 
     @compiled
     def _backward(self, data: Float[Array, " data"]) -> Float[Array, " modes"]:
         """The transpose of :func:`_forward`, step by step."""
         n = self.lmax + 1
-        data = data if self.response is None else data * self.response
         grid = self.layout.scatter(data)
         cosine, sine = _phases(self.pointing, self.lmax)
         functions = self.pointing.functions

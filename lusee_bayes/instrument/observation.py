@@ -233,15 +233,12 @@ class Observation(Described):
         )
         if not any(cuts.night_only):
             return observation
-        return observation.select(cuts.by_night(observation._is_dark(throughout)))
-
-    def _is_dark(self, throughout: bool) -> Bool[np.ndarray, " times"]:
-        dark = self.sun_altitude_deg() < 0.0
-        if throughout and self.windows is not None:
-            for offset_s in self.windows.bounds_s.T:
-                times = later(self.times, offset_s)
-                dark &= replace(self, times=times, windows=None).sun_altitude_deg() < 0.0
-        return dark
+        dark = observation.sun_altitude_deg() < 0.0
+        if throughout and windows is not None:
+            for offset_s in windows.bounds_s.T:
+                at_end = replace(observation, times=later(times, offset_s), windows=None)
+                dark &= at_end.sun_altitude_deg() < 0.0
+        return observation.select(cuts.by_night(dark))
 
     def select(self, keep: Bool[np.ndarray, " times"]) -> Observation:
         """Return the observation with only the samples where ``keep`` is True.

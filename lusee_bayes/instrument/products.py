@@ -85,16 +85,12 @@ def to_matrix(
 ) -> Complex[Array, "antennas antennas *rest"]:
     """Return the Hermitian matrix V_ij of real products; inverse of :func:`to_real`."""
     xp, n = namespace(products), round(np.sqrt(products.shape[0]))
-    position = {p: k for k, p in enumerate(all_products(n))}
+    at = {label: products[k] for k, label in enumerate(labels(n))}
     rows = []
-    for i in range(n):
-        for j in range(n):
-            real = products[position[Product(min(i, j), max(i, j), "R")]]
-            if i == j:
-                imag = xp.zeros_like(real)
-            else:
-                imag = products[position[Product(min(i, j), max(i, j), "I")]]
-            rows.append(as_complex(real, imag if i < j else -imag))
+    for i, j in np.ndindex(n, n):
+        pair = f"{min(i, j)}{max(i, j)}"
+        imag = xp.zeros_like(at[f"{pair}R"]) if i == j else at[f"{pair}I"]
+        rows.append(as_complex(at[f"{pair}R"], imag if i < j else -imag))
     return xp.stack(rows).reshape(n, n, *products.shape[1:])
 
 

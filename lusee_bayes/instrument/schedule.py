@@ -232,7 +232,7 @@ def cut_runs(runs: Sequence[Run], start: str, step_s: float) -> Cuts:
     if not runs:
         raise InputError("an observation needs at least one run, got none")
     t0 = utc_from_text("start", start)
-    elapsed, starts, numbers = 0.0, [], []
+    elapsed, stretches = 0.0, []
     for number, run in enumerate(runs):
         require_positive(f"the length in cycles of run {number}", run.cycles)
         length = run.cycles * CYCLE_DAYS * 86400.0
@@ -242,22 +242,27 @@ def cut_runs(runs: Sequence[Run], start: str, step_s: float) -> Cuts:
                 f"run {number} of {run.cycles} cycles holds no sample of {step_s} s; "
                 "lengthen it or shorten step_s"
             )
-        starts.append(elapsed + step_s * np.arange(n))
-        numbers.append(np.full(n, number))
+        steps = np.full(n, float(step_s))
+        stretches.append((elapsed + step_s * np.arange(n), steps, steps))
         elapsed += length
-    stretch = np.concatenate(numbers)
-    steps = np.full(len(stretch), float(step_s))
-    return Cuts(
-        t0,
-        np.concatenate(starts),
-        steps,
-        steps,
-        stretch,
-        stretch,
-        tuple(run.turntable_deg for run in runs),
-        tuple(run.night_only for run in runs),
-        tuple(f"run {number}" for number in range(len(runs))),
-    )
+    names = tuple(f"run {number}" for number in range(len(runs)))
+    angles = tuple(run.turntable_deg for run in runs)
+    return _joined(t0, stretches, np.arange(len(runs)), angles, runs, names)
+
+
+def _joined(
+    t0: Time,
+    stretches: list[tuple[np.ndarray, ...]],
+    run: Int[np.ndarray, " stretches"],
+    turntable_deg: tuple[float, ...],
+    asked: Sequence[Run | Interval],
+    names: tuple[str, ...],
+) -> Cuts:
+    """Starts, lengths and live times of all stretches, one after the other."""
+    number = np.repeat(np.arange(len(stretches)), [len(starts) for starts, _, _ in stretches])
+    seconds = (np.concatenate(one) for one in zip(*stretches, strict=True))
+    nights = tuple(one.night_only for one in asked)
+    return Cuts(t0, *seconds, number, run[number], turntable_deg, nights, names)
 
 
 def cut_intervals(intervals: Sequence[Interval], step_s: float) -> Cuts:
@@ -271,29 +276,16 @@ def cut_intervals(intervals: Sequence[Interval], step_s: float) -> Cuts:
     require_positive("step_s", step_s)
     require_sequence(intervals)
     t0 = intervals[0].start_time
-    starts, lengths, live, numbers = [], [], [], []
-    for number, interval in enumerate(intervals):
-        n = interval.n_samples(step_s)
-        begins = step_s * np.arange(n)
+    stretches = []
+    for interval in intervals:
+        begins = step_s * np.arange(interval.n_samples(step_s))
         length = np.diff(begins, append=interval.length_s)
-        starts.append(seconds_from(t0, interval.start_time) + begins)
-        lengths.append(length)
-        live.append(interval.duty_cycle * length)
-        numbers.append(np.full(n, number))
+        start = seconds_from(t0, interval.start_time) + begins
+        stretches.append((start, length, interval.duty_cycle * length))
     given = np.array([interval.turntable_deg for interval in intervals])
     turned = np.append(True, np.diff(given) != 0.0)
-    stretch = np.concatenate(numbers)
-    return Cuts(
-        t0,
-        np.concatenate(starts),
-        np.concatenate(lengths),
-        np.concatenate(live),
-        stretch,
-        (np.cumsum(turned) - 1)[stretch],
-        tuple(given[turned].tolist()),
-        tuple(interval.night_only for interval in intervals),
-        _names(intervals),
-    )
+    run, angles = np.cumsum(turned) - 1, tuple(given[turned].tolist())
+    return _joined(t0, stretches, run, angles, intervals, _names(intervals))
 
 
 def _names(intervals: Sequence[Interval]) -> tuple[str, ...]:

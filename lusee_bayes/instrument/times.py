@@ -33,6 +33,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from lusee_bayes.core.checks import Described, require_finite
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.layouts import Attribute, Content
+from lusee_bayes.core.reading import naming
 
 EPHEMERIS_YEARS = (1900, 2050)
 # scales of time that files may state
@@ -500,10 +501,8 @@ def utc_bounds(bounds: Any, n_times: int) -> Time:
             f"bounds have shape {bounds.shape}, expected ({n_times}, 2): start and end of every "
             "sample"
         )
-    try:
+    with naming("bounds, taken row by row"):
         return utc_times(bounds).reshape(n_times, 2)
-    except InputError as error:
-        raise InputError(f"bounds, taken row by row: {error}") from error
 
 
 def _rounding(step_s: float) -> float:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from astropy.time import Time
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import Array
@@ -201,11 +201,6 @@ class Calibration:
             require_shape("gain_port", self.gain_port, (n,))
             require_shape("gain_slope", self.gain_slope, (n, times))
             require_finite("gain_slope", self.gain_slope)
-
-    def select(self, keep: Bool[np.ndarray, " times"]) -> Calibration:
-        """Return that of the times where ``keep`` is True."""
-        slope = None if self.gain_slope is None else self.gain_slope[:, keep]
-        return Calibration(self.n_averaged[keep], self.gain_names, self.gain_port, slope, self.lost)
 
 
 LOADS = ("load_ohm_real", "load_ohm_imag")
@@ -474,6 +469,13 @@ class Visibilities(Described):
 
 
 # what a file of visibilities holds
+# what files say of an observation, beside the arrays jd1, jd2, run and turntable_deg
+PLACE_AND_TIME = {
+    "lon_deg": Attribute(low=-360.0, high=360.0),
+    "lat_deg": Attribute(low=-90.0, high=90.0),
+    "step_s": Attribute(low=0.0),
+    **JD_SCALES,
+}
 LAYOUT = Layout(
     "visibilities",
     {
@@ -497,13 +499,17 @@ LAYOUT = Layout(
     },
     {
         "frequency_mhz": Attribute(low=0.0, unit="MHz"),
-        "lon_deg": Attribute(low=-360.0, high=360.0),
-        "lat_deg": Attribute(low=-90.0, high=90.0),
-        "step_s": Attribute(low=0.0),
+        **PLACE_AND_TIME,
         "window": Attribute("text", choices=("mean", "instant"), optional=True),
-        **JD_SCALES,
     },
 )
+
+
+def observation_of(found: Content, times: Time, windows: Windows | None) -> Observation:
+    """Return the observation of a file that has :data:`PLACE_AND_TIME`; InputError if none."""
+    here, said = found.arrays, found.values
+    runs = here["run"], tuple(here["turntable_deg"].tolist()), said["step_s"]
+    return Observation(said["lon_deg"], said["lat_deg"], times, *runs, windows=windows)
 
 
 def read_visibilities(path: str | Path) -> Visibilities:
@@ -543,14 +549,11 @@ def read_visibilities(path: str | Path) -> Visibilities:
         layout = DataLayout.from_flags(flags)
         utc = utc_of_jd(found)
         times, windows, says_window = read_windows(found, utc)
-        said, angles = found.values, tuple(here["turntable_deg"].tolist())
-        runs, site = (here["run"], angles, said["step_s"]), (said["lon_deg"], said["lat_deg"])
-        observation = Observation(*site, times, *runs, windows=windows)
         return Visibilities(
             layout.gather(values),
             layout,
-            observation,
-            said["frequency_mhz"],
+            observation_of(found, times, windows),
+            found.values["frequency_mhz"],
             here.get("truth"),
             receiver_of(path, here, "load_frequency_mhz", *LOADS),
             says_window,

@@ -153,10 +153,8 @@ class Waterfall:
                 f"{self.path} has the product {all_products()[first].label}, but the beams are "
                 f"those of {n_ports} ports; give beam.rotations_deg an angle for every port"
             )
-        try:
+        with naming(f"{self.path} at {frequency_mhz:g} MHz"):
             layout = DataLayout.from_flags(~present[within])
-        except InputError as error:
-            raise InputError(f"{self.path} at {frequency_mhz:g} MHz: {error}") from error
         data = layout.gather(np.where(present, values, 0.0)[within])
         return Visibilities(
             data,

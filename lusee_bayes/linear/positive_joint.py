@@ -240,7 +240,7 @@ def find_joint_mode(
                 skies, laws, here.exponents, posterior, energy, float(moved), rounds
             )
         here = _descended(skies, channels, prior, here, there)
-        laws, last = laws.with_parameters(laws.parameters + change), change
+        laws, last = replace(laws, parameters=laws.parameters + change), change
     raise InputError(
         f"the positive skies did not settle in {MAX_ROUNDS} rounds: the last moved by {moved:.2g} "
         "standard deviations; the data are far from anything that the templates allow: use "

@@ -252,10 +252,6 @@ class FieldLaws:
         parameters = np.column_stack([np.log(levels), np.full(len(levels), TILT)])
         return cls(parameters, means, parameters)
 
-    def with_parameters(self, parameters: Float[np.ndarray, "laws 2"]) -> FieldLaws:
-        """The same with other parameters."""
-        return replace(self, parameters=parameters)
-
     def log_density(self) -> float:
         """ln p of the parameters, but for a constant."""
         away = (self.parameters - self.expected) / [LOG_WIDTH, TILT_WIDTH]
@@ -300,7 +296,7 @@ class FieldLaws:
                 curvature = 2.0 * (s * np.maximum(scaled, left[ells])) @ s.T + np.diag(narrow)
                 step = step + np.linalg.solve(curvature, gradient)
             parameters[k] = self.parameters[k] + np.clip(step, -REACH, REACH)
-        return self.with_parameters(parameters)
+        return replace(self, parameters=parameters)
 
 
 # steps of Newton's method, of which each closes in on the root; longest change of a parameter

@@ -54,6 +54,8 @@ class Prior(Described, eqx.Module):
 
     invertible: ClassVar[bool] = True
     independent: ClassVar[bool] = False
+    # kinds that have one make it a field
+    mean: ClassVar[None] = None
 
     def description(self) -> tuple[str, ...]:
         return (f"{self.size} unknowns of {self.rank} independent normals",)
@@ -132,7 +134,7 @@ class Prior(Described, eqx.Module):
     @property
     def white_mean(self) -> Float[Array, " white"] | None:
         """Mean of u; None for zero."""
-        return None
+        return None if self.mean is None else self.whiten(self.mean)
 
     def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
         """Draw skies from the prior.
@@ -235,10 +237,6 @@ class DensePrior(Prior):
     @property
     def size(self) -> int:
         return self.root.shape[0]
-
-    @property
-    def white_mean(self) -> Float[Array, " white"] | None:
-        return None if self.mean is None else self.whiten(self.mean)
 
     def colour(self, u):
         return times_lower(u.reshape(-1, self.size), self.root, transpose=True).reshape(u.shape)
@@ -430,10 +428,6 @@ class HarmonicPrior(DiagonalPrior):
             f"independent coefficients about {about}, lmax = {self.spectrum.shape[0] - 1}",
             f"{self.size} real coefficients, Galactic; C_ell {extent(self.spectrum, 'K^2')}",
         )
-
-    @property
-    def white_mean(self) -> Float[Array, " white"] | None:
-        return None if self.mean is None else self.whiten(self.mean)
 
     @property
     def widths(self) -> Float[Array, " modes"]:

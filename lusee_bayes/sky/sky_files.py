@@ -13,7 +13,6 @@ FREQ_START, FREQ_END and FREQ_STEP in MHz. The file does not say its frame and o
 
 from __future__ import annotations
 
-import math
 import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -33,7 +32,7 @@ from lusee_bayes.core.formats import is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.harmonics import from_healpy, lmax_of, map_to_modes, n_modes, to_healpy
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.reading import read_arrays, reading
+from lusee_bayes.core.reading import naming, read_arrays, reading
 
 
 class SkyFile(ABC):
@@ -103,10 +102,8 @@ def modes_of_map(
     path: str | Path, pixels: Float[np.ndarray, " pixels"], lmax: int
 ) -> Float[np.ndarray, " modes"]:
     """Coefficients of a file's map; an InputError names the file."""
-    try:
+    with naming(path):
         return map_to_modes(pixels, lmax)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 ULSA_DATASET = "smooth_absorb"
@@ -155,8 +152,7 @@ class SkyMap(SkyFile):
         path = user_path(path)
         hdf5 = h5py.is_hdf5(path)
         pixels = _read_hdf5(path, dataset or ULSA_DATASET) if hdf5 else _read_map(path)
-        if not _nside(pixels.size):
-            raise InputError(f"{path}: {pixels.size} values are not a HEALPix map of 12 NSIDE^2")
+        _require_healpix(path, pixels.size)
         unseen = pixels == UNSEEN
         if unseen.any():
             raise InputError(
@@ -171,15 +167,14 @@ class SkyMap(SkyFile):
     def summary(self) -> tuple[str, ...]:
         pixels = self.pixels
         return (
-            f"HEALPix sky map, NSIDE {_nside(pixels.size)}, RING, Galactic",
+            f"HEALPix sky map, NSIDE {healpy.npix2nside(pixels.size)}, RING, Galactic",
             f"mean {pixels.mean():.6g} K, from {pixels.min():.4g} to {pixels.max():.4g} K",
         )
 
 
-def _nside(n_pixels: int) -> int:
-    """NSIDE of 12 NSIDE^2 pixels; 0 if there is none."""
-    nside = math.isqrt(n_pixels // 12)
-    return nside if 12 * nside**2 == n_pixels else 0
+def _require_healpix(path: str | Path, n_pixels: int) -> None:
+    if not n_pixels or not healpy.isnpixok(n_pixels):
+        raise InputError(f"{path}: {n_pixels} values are not a HEALPix map of 12 NSIDE^2")
 
 
 def _layout(name: str) -> Layout:
@@ -393,17 +388,17 @@ def _read_alm_fits(path: Path) -> np.ndarray:
         units = {f"{one.name.lower()}.units": one.unit for one in table.columns}
         found = TABLE.checked(path, columns, units).arrays
     index, real, imag = (found[name] for name in COLUMNS)
-    # what does not fit into memory, or is written twice, fills no lmax either
-    if index.max() > LARGEST_LMAX**2 or len(set(index.tolist())) < len(index):
-        raise InputError(
-            f"{path}: index must be ell^2 + ell + m + 1, each once, ell <= {LARGEST_LMAX}"
-        )
     ell = np.floor(np.sqrt(index - 1.0) + 1e-9).astype(int)
     m = index - 1 - ell**2 - ell
+    # what does not fit into memory, or is written twice, fills no lmax either
+    once = index.max() <= LARGEST_LMAX**2 and len(set(index.tolist())) == len(index)
+    if not once or (m < 0).any() or (m > ell).any():
+        raise InputError(
+            f"{path}: index must be ell^2 + ell + m + 1, each once, with 0 <= m <= ell <= "
+            f"{LARGEST_LMAX}"
+        )
     lmax = int(ell.max())
     alm = np.full(healpy.Alm.getsize(lmax), np.nan + 0j)
-    if (m < 0).any() or (m > ell).any():
-        raise InputError(f"{path}: index must be ell^2 + ell + m + 1 with 0 <= m <= ell")
     alm[healpy.Alm.getidx(lmax, ell, m)] = real + 1j * imag
     if np.isnan(alm).any():
         raise InputError(
@@ -472,10 +467,7 @@ class SkyCube(SkyFile):
                 f"{path}: the image has shape {pixels.shape}, expected {count} maps for {start:g} "
                 f"to {end:g} MHz in steps of {step:g}"
             )
-        if not healpy.isnpixok(pixels.shape[1]):
-            raise InputError(
-                f"{path}: {pixels.shape[1]} values are not a HEALPix map of 12 NSIDE^2"
-            )
+        _require_healpix(path, pixels.shape[1])
         return cls(str(path), start + step * np.arange(count), pixels)
 
     def map_at(self, frequency_mhz: float) -> Float[np.ndarray, " pixels"]:

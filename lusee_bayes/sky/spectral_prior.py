@@ -24,9 +24,7 @@ from lusee_bayes.core.checks import (
     extent,
     listed,
     require_array,
-    require_float64,
     require_positive,
-    require_shape,
 )
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import per_mode, power_spectrum
@@ -133,11 +131,9 @@ class SpectralPrior(Described, eqx.Module):
             require_array(name, values, shape)
         require_positive("the components' C_ell", self.spectra)
         if self.residual is not None:
-            require_float64("the residual spectra", self.residual)
-            require_shape("the residual spectra", self.residual, (channels, self.spectra.shape[1]))
-            require_positive(
-                "the residual spectra", self.residual, "leave them out if there is no residual"
-            )
+            name, hint = "the residual spectra", "leave them out if there is no residual"
+            require_array(name, self.residual, (channels, self.spectra.shape[1]))
+            require_positive(name, self.residual, hint)
 
     @classmethod
     def components(

@@ -7,21 +7,26 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from lusee_bayes.sky.galaxy import MAXIMUM_MHZ, Slabs, background, brightness, galaxy_map
 from lusee_bayes.sky.sky_source import GalaxySource
 
 
+def _towards(theta: np.ndarray, phi: np.ndarray) -> tuple[Slabs, tuple[np.ndarray, np.ndarray]]:
+    """Lines of sight, the same at all frequencies, and the side and line of each direction."""
+    return _slabs(np.stack([0.5 * np.pi - np.asarray(theta), phi]).astype(np.float64).tobytes())
+
+
 @lru_cache(maxsize=1)
-def _slabs(points: bytes) -> tuple[Slabs, Int[np.ndarray, " points"]]:
-    """Lines of sight, the same at all frequencies, and the line of each latitude and longitude."""
+def _slabs(points: bytes) -> tuple[Slabs, tuple[np.ndarray, np.ndarray]]:
     latitude, longitude = np.frombuffer(points).reshape(2, -1)
     # lines of sight above and below the plane share what is symmetric: each once for both
     both, of_point = np.unique(
         np.stack([np.abs(latitude).round(12), longitude]), axis=1, return_inverse=True
     )
-    return Slabs.towards(np.degrees(both[1]), np.degrees(both[0])), of_point.ravel()
+    places = (latitude < 0).astype(int), of_point.ravel()
+    return Slabs.towards(np.degrees(both[1]), np.degrees(both[0])), places
 
 
 def galactic_share(
@@ -36,12 +41,10 @@ def galactic_share(
     theta, phi : (points,) array
         Galactic, in radians; theta from the north pole.
     """
-    points = np.stack([0.5 * np.pi - np.asarray(theta), phi]).astype(np.float64)
-    slabs, of_point = _slabs(points.tobytes())
+    slabs, places = _towards(theta, phi)
     synchrotron, depth = slabs.synchrotron(MAXIMUM_MHZ)
     whole = brightness(synchrotron, depth, MAXIMUM_MHZ)
-    share = 1.0 - background(MAXIMUM_MHZ) * np.exp(-depth) / whole
-    return share[(points[0] < 0).astype(int), of_point]
+    return (1.0 - background(MAXIMUM_MHZ) * np.exp(-depth) / whole)[places]
 
 
 class Template(ABC):
@@ -78,10 +81,8 @@ class EmbeddedTemplate(Template):
     frequency_mhz: float
 
     def at(self, theta, phi):
-        points = np.stack([0.5 * np.pi - np.asarray(theta), phi]).astype(np.float64)
-        slabs, of_point = _slabs(points.tobytes())
-        sides = brightness(*slabs.synchrotron(self.frequency_mhz), self.frequency_mhz)
-        return sides[(points[0] < 0).astype(int), of_point]
+        slabs, places = _towards(theta, phi)
+        return brightness(*slabs.synchrotron(self.frequency_mhz), self.frequency_mhz)[places]
 
     def pixels(self, nside: int) -> Float[np.ndarray, " pixels"]:
         """Compute it at the centres of HEALPix RING pixels, in K."""

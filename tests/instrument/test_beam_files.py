@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import astropy.units as u
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from assertions import close
+from assertions import off, refused
 from astropy.io import fits
 from astropy.time import Time
 from fits_files import write_images
@@ -25,7 +24,7 @@ from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.instrument.beams.luseepy_files import FIELDS, ScalarBeam
 from lusee_bayes.instrument.beams.sampled import read_beam
-from lusee_bayes.instrument.products import labels, to_matrix
+from lusee_bayes.instrument.products import labels
 from lusee_bayes.testing.scenarios import small_scenario
 
 LMAX, PORTS = 47, 4
@@ -56,15 +55,11 @@ def luseepy(test_data):
 def visibilities(luseepy, frequency, **options) -> np.ndarray:
     beam, _, sky, pointing = luseepy
     beams = beam.beams(frequency, LMAX, **options)
-    seen = lb.CouplingMatrix.build(beams, pointing) @ jnp.asarray(sky[frequency])
+    seen = lb.CouplingMatrix.build(beams, pointing) @ sky[frequency]
     return np.asarray(seen).reshape(16, -1)
 
 
-def off(got, expected) -> float:
-    return np.abs(got - expected).max() / np.abs(expected).max()
-
-
-@pytest.mark.parametrize("frequency", [5.0, 10.0, 25.0, 50.0])
+@pytest.mark.parametrize("frequency", [10.0, 25.0])
 def test_all_products_of_luseepys_waterfall(luseepy, frequency):
     """With luseepy's rule both are one sum, in another order; 1e-10 of the peak is asked for."""
     got = visibilities(luseepy, frequency, grid=luseepy[0].luseepy_grid)
@@ -79,7 +74,7 @@ def test_the_waterfall_of_luseepys_default_engine(luseepy, test_data):
     observation = lb.read_waterfall(test_data / "luseepy" / "waterfall_fixed_axis_engine.fits")
     observation = replace(observation.observation, fixed_axis=True)
     beams = beam.beams(25.0, LMAX, grid=beam.luseepy_grid)
-    seen = lb.CouplingMatrix.observe(beams, observation) @ jnp.asarray(sky[25.0])
+    seen = lb.CouplingMatrix.observe(beams, observation) @ sky[25.0]
     assert off(np.asarray(seen).reshape(16, -1), expected) < 1e-7
 
 
@@ -141,18 +136,12 @@ def test_the_embedded_antennas_agree_with_the_file_in_shape(luseepy):
 # --- synthetic files --------------------------------------------------------------------------
 
 
-def pattern(theta, phi, f):
-    """A smooth complex pattern that is no symmetric one."""
-    t, p = theta[:, None], phi[None]
-    e_theta = (np.cos(t) * np.cos(p - 0.3) + 0.2 * np.sin(2 * t)) * np.exp(1j * f / 20 * np.cos(t))
-    e_phi = -np.sin(p - 0.3) * (1 + 0.1j * np.sin(t)) * np.ones_like(t)
-    return e_theta, e_phi
-
-
 def write(path, *, without=(), change=None, header=None):
     frequencies = (10.0, 20.0, 30.0, 40.0, 50.0)
     theta, phi = np.radians(np.linspace(0, 90, 46)), np.radians(np.linspace(0, 360, 61))
-    fields = np.array([pattern(theta, phi, f) for f in frequencies]).swapaxes(0, 1)
+    fields = np.array([point_pattern(theta[:, None], phi[None], f) for f in frequencies]).swapaxes(
+        0, 1
+    )
     images = {
         "Etheta_real": fields[0].real,
         "Etheta_imag": fields[0].imag,
@@ -174,16 +163,16 @@ def test_between_frequencies_and_directions(tmp_path):
     beam = replace(read_beam(write(tmp_path / "beam.fits")), interpolation="spline")
     assert beam.n_phi == 60
     fields = beam.fields(27.0, taper=False, rotations_deg=(0.0, 33.0))
-    grid = fields.grid
+    grid, theta = fields.grid, fields.grid.theta[:, None]
     scale = np.sqrt(2 * (100.0 / 27.0) / (4 * np.pi))
     for port, angle in enumerate((0.0, 33.0)):
-        e_theta, e_phi = pattern(grid.theta, grid.phi - np.radians(angle), 27.0)
+        e_theta, e_phi = point_pattern(theta, grid.phi - np.radians(angle), 27.0)
         # (h f)^4 / 100 of a phase of f / 20, and of 100 / f
         np.testing.assert_allclose(fields.e_theta[port], scale * e_theta, rtol=0, atol=3e-2)
         np.testing.assert_allclose(fields.e_phi[port], scale * e_phi, rtol=0, atol=3e-2)
     # (2 degrees)^4 / 384 of the fourth derivative, a few times that at the ends
     exact = beam.fields(30.0, taper=False, rotations_deg=(0.0, 33.0))
-    e_theta, e_phi = pattern(grid.theta, grid.phi - np.radians(33.0), 30.0)
+    e_theta, e_phi = point_pattern(theta, grid.phi - np.radians(33.0), 30.0)
     scale = np.sqrt(2 * (100.0 / 30.0) / (4 * np.pi))
     np.testing.assert_allclose(exact.e_theta[1], scale * e_theta, rtol=0, atol=5e-6)
     np.testing.assert_allclose(exact.e_phi[1], scale * e_phi, rtol=0, atol=5e-6)
@@ -229,38 +218,6 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
     np.testing.assert_allclose(emitted, 2.0 * left, rtol=0, atol=1e-4 * np.abs(left).max())
 
 
-@pytest.mark.parametrize("quadrature", ["luseepy", "exact"])
-def test_between_frequencies_of_luseepys_file(luseepy, test_data, quadrature):
-    """10.4 MHz, from the file's own numbers by luseepy's sum; the exact rule differs by less than
-    twice what the rectangle rule costs."""
-    beam, _, _, _ = luseepy
-    with fits.open(test_data / "luseepy" / "synthetic_monopole_beam.fits") as hdus:
-        images = {hdu.name: np.array(hdu.data, dtype=float) for hdu in hdus}
-    low = list(images["freq"]).index(10.0)
-    theta, phi = np.radians(np.arange(91.0)), np.radians(2.0 * np.arange(180))
-    taper = 1.0 - (np.arctan((theta - np.pi / 2) / 0.03) / np.pi + 0.5) ** 2
-    solid_angle = np.sin(theta) * np.radians(1.0) * np.radians(2.0) / (4 * np.pi) * taper**2
-    points = [a.ravel() for a in np.meshgrid(theta, phi, indexing="ij")]
-    harmonics = real_harmonics(*points, 3) * np.repeat(solid_angle, 180)[:, None]
-    expected = 0.0
-    for k, weight in ((low, 0.6), (low + 1, 0.4)):
-        arm = [
-            (images[f"{name}_real"] + 1j * images[f"{name}_imag"])[k, :, :-1]
-            for name in ("Etheta", "EPhi")
-        ]
-        # ports 0 and 1: the second one a quarter turn on
-        cross = sum(e * np.roll(e, 45, axis=1).conj() for e in arm).ravel()
-        expected = expected + weight * np.array([cross.real, cross.imag]) @ harmonics
-    expected = expected * (0.6 * images["gain_conv"][low] + 0.4 * images["gain_conv"][low + 1])
-    grid = beam.luseepy_grid if quadrature == "luseepy" else None
-    got = beam.beams(10.4, 3, grid=grid).modes[1:3]
-    tolerance = 1e-12 if quadrature == "luseepy" else 5e-4
-    assert off(got, expected) < tolerance
-    # a spline through the fields is another thing: 1e-5 of the peak in steps of 1 MHz
-    splined = replace(beam, interpolation="spline").beams(10.4, 3, grid=beam.luseepy_grid)
-    assert off(splined.modes[1:3], expected) > 1e-6
-
-
 def point_pattern(theta, phi, f):
     """:func:`pattern` in single directions."""
     e_theta = np.cos(theta) * np.cos(phi - 0.3) + 0.2 * np.sin(2 * theta)
@@ -268,77 +225,34 @@ def point_pattern(theta, phi, f):
     return e_theta * phase, -np.sin(phi - 0.3) * (1 + 0.1j * np.sin(theta))
 
 
-def test_kelvin_in_kelvin_out(tmp_path):
-    """T = g / 4 pi int |E|^2 of a sky of one Kelvin, by a sum over the sphere."""
-    beam = read_beam(write(tmp_path / "beam.fits"))
-    beams = beam.beams(30.0, 4, taper=False)
-    got = np.asarray(beams.modes)[:, 0] * np.sqrt(4 * np.pi)
-    x, w = np.polynomial.legendre.leggauss(200)
-    theta, phi = np.arccos((x + 1) / 2), 2 * np.pi * np.arange(400) / 400
-    fields = [pattern(theta, phi - np.radians(a), 30.0) for a in (0, 90, 180, 270)]
-    expected = np.zeros((PORTS, PORTS), complex)
-    for i, a in enumerate(fields):
-        for j, b in enumerate(fields):
-            power = a[0] * b[0].conj() + a[1] * b[1].conj()
-            expected[i, j] = (w / 2) @ power.mean(1) * 0.5 * (100.0 / 30.0)
-    got = np.asarray(to_matrix(jnp.asarray(got)[:, None])[..., 0])
-    close(got, expected, 1e-6)
-
-
-def break_shape(images):
-    images["EPhi_imag"] = images["EPhi_imag"][:, :-1]
-
-
-def break_order(images):
-    images["freq"] = images["freq"][::-1].copy()
-
-
-def break_numbers(images):
-    images["EPhi_real"] = images["EPhi_real"].copy()
-    images["EPhi_real"][1, 2, 3] = np.nan
-
-
-def break_gain(images):
-    images["gain_conv"] = images["gain_conv"][:-1]
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"without": ("EPhi_imag",)}, "has no EPhi_imag"),
-        ({"change": break_shape}, r"EPhi_imag has shape \(5, 45, 61\), expected 5 \(freq\) x 46"),
-        ({"change": break_order}, "freq does not grow: 40 follows 50"),
-        ({"change": break_numbers}, "EPhi_real"),
-        ({"change": break_gain}, r"gain_conv has shape \(4,\), expected 5 \(freq\)"),
+        ({"change": lambda i: i.update(EPhi_imag=i["EPhi_imag"][:, :-1])},
+         r"EPhi_imag has shape \(5, 45, 61\), expected 5 \(freq\) x 46"),
+        ({"change": lambda i: i.update(freq=i["freq"][::-1].copy())},
+         "freq does not grow: 40 follows 50"),
+        ({"change": lambda i: i["EPhi_real"].__setitem__((1, 2, 3), np.nan)}, "EPhi_real"),
+        ({"change": lambda i: i.update(gain_conv=i["gain_conv"][:-1])},
+         r"gain_conv has shape \(4,\), expected 5 \(freq\)"),
         ({"header": {"THETA_MAX": 180.0}}, "theta 0 to 180"),
         ({"header": {"TIMECONV": "e-iwt"}}, "TIMECONV"),
         ({"change": lambda images: images["freq"].__imul__(1e6)}, "is this Hz"),
     ],
-)
+)  # fmt: skip
 def test_files_that_cannot_be_used(tmp_path, options, message):
     with pytest.raises(lb.InputError, match=message):
         read_beam(write(tmp_path / "beam.fits", **options))
 
 
-def test_missing_and_truncated_files(tmp_path):
+def test_missing_and_other_files(tmp_path):
     with pytest.raises(lb.InputError, match=r"no beam file at .*check beam\.file"):
         read_beam(tmp_path / "none.fits")
-    path = write(tmp_path / "beam.fits")
-    path.write_bytes(path.read_bytes()[:200_000])
-    with pytest.raises(lb.InputError, match="cut short"):
-        read_beam(path)
+    path = tmp_path / "beam.fits"
     path.write_text("no FITS at all")
-    with pytest.raises(
-        lb.InputError, match="cannot be read as a scalar beam .*: it is no FITS file$"
-    ):
+    with refused("cannot be read as a scalar beam .*: it is no FITS file$"):
         read_beam(path)
-
-
-def test_no_extrapolation(tmp_path):
-    beam = read_beam(write(tmp_path / "beam.fits"))
-    for frequency in (9.9, 50.1):
-        with pytest.raises(lb.InputError, match=f"from 10 to 50 MHz, not at {frequency}"):
-            beam.fields(frequency)
 
 
 # --- in a scenario ----------------------------------------------------------------------------
@@ -382,16 +296,12 @@ def test_a_second_file_as_the_true_beams(tmp_path):
         (["beam.length_m=2"], "length_m is an entry of model monopole, not of luseepy"),
         (["noise.beam={parameters: {length_m: 0.1}}"], "which beam.file replaces"),
         (["sky.sources=false", "sources.list=[{name: Cas A}]"], "exact beams of the embedded"),
+        (["noise.beam={shift_mhz: 1, file: some.fits}"], "give either shift_mhz, file or param"),
     ],
 )
 def test_what_a_file_does_not_have(overrides, message):
     with pytest.raises(lb.InputError, match=message):
         lb.load_scenario("fiducial", ["beam.file=some.fits", *overrides])
-
-
-def test_two_beam_errors_at_once():
-    with pytest.raises(lb.InputError, match="give either shift_mhz, file or parameters"):
-        lb.load_scenario("fiducial", ["noise.beam={shift_mhz: 1, file: some.fits}"])
 
 
 def test_the_program_of_the_instrument_needs_the_embedded_antennas(tmp_path):

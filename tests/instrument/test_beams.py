@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from assertions import close
 from numpy.polynomial import Polynomial
 from numpy.polynomial.legendre import Legendre
 from reference import SPEED_OF_LIGHT, hemisphere, real_harmonics, unit_vectors
-from scipy.special import eval_legendre, factorial
+from scipy.special import factorial
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mode_numbers, n_modes, polar_functions, synthesis_matrix
@@ -49,7 +48,7 @@ def short_dipole(axis):
         [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)], axis=-1
     )
     e_phi = np.stack([-np.sin(phi), np.cos(phi), np.zeros_like(phi)], axis=-1)
-    return AntennaFields(*(jnp.asarray((e @ axis)[None] + 0j) for e in (e_theta, e_phi)), GRID)
+    return AntennaFields(*(np.asarray((e @ axis)[None] + 0j) for e in (e_theta, e_phi)), GRID)
 
 
 def random_fields(seed, n_antennas, grid):
@@ -60,43 +59,17 @@ def random_fields(seed, n_antennas, grid):
 
     def one():
         weights = rng.standard_normal((2, n_antennas, len(basis)))
-        return jnp.asarray(np.einsum("ab,btp->atp", weights[0] + 1j * weights[1], basis))
+        return np.asarray(np.einsum("ab,btp->atp", weights[0] + 1j * weights[1], basis))
 
     return AntennaFields(one(), one(), grid)
 
 
 def test_the_grid_integrates_over_the_hemisphere():
     x, _, z = unit_vectors(GRID)
-    fields = jnp.asarray(np.stack([np.ones_like(x), z, x * x, x]))
+    fields = np.asarray(np.stack([np.ones_like(x), z, x * x, x]))
     expected = [2 * np.pi, np.pi, 2 * np.pi / 3, 0.0]
     np.testing.assert_allclose(GRID.integrate(fields), expected, rtol=0, atol=1e-13)
     assert (np.diff(GRID.theta) > 0).all()
-
-
-def test_uniform_hemisphere():
-    one = jnp.ones((len(GRID.theta), GRID.n_phi))
-    got = np.asarray(GRID.modes(one, LMAX))
-    expected = np.zeros(n_modes(LMAX))
-    for ell in range(LMAX + 1):
-        # int_0^1 P_l = (P_{l-1}(0) - P_{l+1}(0)) / (2 l + 1)
-        half = 1.0 if ell == 0 else (eval_legendre(ell - 1, 0.0) - eval_legendre(ell + 1, 0.0)) / (
-            2 * ell + 1
-        )  # fmt: skip
-        expected[ell * (ell + 1)] = 2 * np.pi * np.sqrt((2 * ell + 1) / (4 * np.pi)) * half
-    # polynomials within the rule's degree: only rounding is left
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
-
-
-def test_short_vertical_dipole():
-    fields = short_dipole([0, 0, 1])
-    got = np.asarray(product_beams(fields, 10.0, LMAX, normalise=False).modes)[0]
-    power = Polynomial([1.0, 0.0, -1.0]) / 2  # sin^2 theta / 2
-    expected = np.zeros(n_modes(LMAX))
-    for ell in range(LMAX + 1):
-        norm = 2 * np.pi * np.sqrt((2 * ell + 1) / (4 * np.pi))
-        expected[ell * (ell + 1)] = norm * over_half(power * legendre(ell))
-    # the oracle's monomials of degree 18 cancel to 1e-11
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize(("axis", "sign"), [([1, 0, 0], -1.0), ([0, 1, 0], 1.0)])
@@ -122,7 +95,7 @@ def test_only_the_sky_above_the_horizon_answers():
     theta, phi = (a.ravel() for a in np.meshgrid(GRID.theta, GRID.phi, indexing="ij"))
     above = (synthesis_matrix(theta, phi, LMAX) @ sky).reshape(len(GRID.theta), -1)
     patterns = to_real(stokes_beam(random_fields(0, 2, GRID)))
-    expected = GRID.integrate(patterns * jnp.asarray(above)[None])
+    expected = GRID.integrate(patterns * np.asarray(above)[None])
     scale = np.abs(expected).max()
     np.testing.assert_allclose(np.asarray(beams.modes) @ sky, expected, rtol=0, atol=1e-12 * scale)
     # and by an independent rule with scipy's harmonics, above the horizon alone
@@ -156,9 +129,9 @@ def test_power_is_positive():
     b = np.moveaxis(np.asarray(stokes_beam(fields)), (0, 1), (2, 3))
     assert np.linalg.eigvalsh(b).min() > -1e-12 * np.abs(b).max()
     # a sky of positive temperature: T_sky = 1 + 0.9 z is one
-    sky = jnp.zeros(n_modes(LMAX)).at[0].set(np.sqrt(4 * np.pi))
-    sky = sky.at[2].set(0.9 * np.sqrt(4 * np.pi / 3))
-    v = to_matrix(product_beams(fields, 10.0, LMAX).modes @ sky)
+    sky = np.zeros(n_modes(LMAX))
+    sky[[0, 2]] = np.sqrt(4 * np.pi), 0.9 * np.sqrt(4 * np.pi / 3)
+    v = to_matrix(product_beams(fields, 10.0, LMAX).modes @ sky[:, None])[..., 0]
     assert np.linalg.eigvalsh(np.asarray(v)).min() > 0.0
 
 
@@ -175,7 +148,7 @@ def test_displaced_copies_are_an_interferometer():
     temperature = real_harmonics(theta, phi, 6) @ sky
     n = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
     power = (1 - n[0] ** 2) / 2
-    got = np.asarray(to_matrix(jnp.asarray(np.asarray(beams.modes)[:, : n_modes(6)] @ sky)))
+    got = to_matrix(beams.modes[:, : n_modes(6)] @ sky[:, None])[..., 0]
     for i in range(3):
         for j in range(3):
             fringe = np.exp(1j * k * (positions[i] - positions[j]) @ n)
@@ -200,27 +173,19 @@ def test_normalised_autos_average_to_one():
     np.testing.assert_allclose(q, np.asarray(q_raw) / mean, rtol=1e-12)
 
 
-def test_a_smaller_lmax_is_a_slice():
-    fields = random_fields(8, 2, GRID)
-    large, small = (product_beams(fields, 10.0, lmax).modes for lmax in (LMAX, 5))
-    np.testing.assert_allclose(large[:, : n_modes(5)], small, rtol=0, atol=1e-14)
-    assert product_beams(fields, 10.0, 5).labels == ("00R", "01R", "01I", "11R")
-    assert product_beams(fields, 10.0, 5).lmax == 5
-
-
 def test_modes_keep_leading_axes_and_refuse_a_coarse_azimuth():
     patterns = to_real(stokes_beam(random_fields(9, 2, GRID)))
     both = GRID.modes(patterns.reshape(2, 2, *patterns.shape[1:]), 4)
     np.testing.assert_allclose(both[1, 0], GRID.modes(patterns[2], 4), rtol=0, atol=1e-14)
     coarse = HemisphereGrid.gauss_legendre(10, 8)
     with pytest.raises(InputError, match="8 azimuths cannot resolve lmax = 4"):
-        coarse.modes(jnp.ones((10, 8)), 4)
+        coarse.modes(np.ones((10, 8)), 4)
 
 
 def test_fields_are_checked():
     good = short_dipole([0, 0, 1])
     with pytest.raises(InputError, match="e_theta must be a complex128 array, got complex64"):
-        AntennaFields(good.e_theta.astype(jnp.complex64), good.e_phi, GRID)
+        AntennaFields(good.e_theta.astype(np.complex64), good.e_phi, GRID)
     with pytest.raises(InputError, match=r"e_theta has shape \(1, 127, 128\), expected"):
         AntennaFields(good.e_theta[:, 1:], good.e_phi[:, 1:], GRID)
 
@@ -229,9 +194,9 @@ def test_unknown_stokes_and_products_are_refused():
     with pytest.raises(InputError, match="unknown Stokes parameter 'W'; known: I, Q, U, V"):
         stokes_beam(short_dipole([0, 0, 1]), "W")
     with pytest.raises(InputError, match="3 products do not come from any number of antennas"):
-        ProductBeams(jnp.zeros((3, 4)), 10.0)
+        ProductBeams(np.zeros((3, 4)), 10.0)
     with pytest.raises(InputError, match="5 coefficients do not fill any lmax"):
-        ProductBeams(jnp.zeros((4, 5)), 10.0)
+        ProductBeams(np.zeros((4, 5)), 10.0)
 
 
 # --- luseepy's quadrature rules, against closed forms ---------------------------------------------
@@ -274,8 +239,8 @@ def test_a_band_limited_pattern_above_the_horizon_is_integrated_as_it_is_given()
         expected = (ell[same] == ell[k]) / (2 * np.pi)
         np.testing.assert_allclose(both, expected, rtol=0, atol=1e-13)
     # and the integral over the whole sphere of 1 is 4 pi: two halves
-    ones = jnp.ones((n, 16))
-    assert float(grid.integrate(ones)) == pytest.approx(2 * np.pi, rel=1e-13)
+    ones = np.ones((1, n, 16))
+    assert float(grid.integrate(ones)[0]) == pytest.approx(2 * np.pi, rel=1e-13)
 
 
 def test_the_rectangle_rule():
@@ -284,6 +249,6 @@ def test_the_rectangle_rule():
     n = 91
     grid = rectangle_rule(np.linspace(0.0, np.pi / 2, n), 180)
     step = np.pi / 180
-    assert float(grid.integrate(jnp.ones((n, 180)))) == pytest.approx(
+    assert float(grid.integrate(np.ones((1, n, 180)))[0]) == pytest.approx(
         2 * np.pi * (1.0 + step / 2 - step**2 / 12), rel=1e-9
     )

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import close
+from assertions import close, refused
 from numpyro import handlers
 from reference import arm_response, hemisphere, steep_sky, vectors, visibilities
 from scipy.stats import norm, truncnorm
@@ -16,7 +16,7 @@ from scipy.stats import norm, truncnorm
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import Rotation, n_modes, turn_about_z
 from lusee_bayes.instrument.coupling import BeamOperator, CouplingMatrix, DenseCoupling, as_coupling
-from lusee_bayes.instrument.products import DataLayout, auto_indices, labels, to_matrix
+from lusee_bayes.instrument.products import DataLayout, auto_indices, labels
 from lusee_bayes.systematics.instrument_unknowns import BeamError, InstrumentParameters
 from lusee_bayes.testing.contracts import check_coupling
 
@@ -26,7 +26,7 @@ SITE = {"lon_deg": 182.258, "lat_deg": -23.814}
 
 def random_beams(seed, lmax=LMAX, n_products=16):
     modes = np.random.default_rng(seed).standard_normal((n_products, n_modes(lmax)))
-    return lb.ProductBeams(jnp.asarray(modes), 25.0)
+    return lb.ProductBeams(modes, 25.0)
 
 
 def two_runs():
@@ -78,7 +78,7 @@ def flagged_coupling():
     """Two runs of random beams with three samples in ten missing."""
     o = two_runs()
     layout = DataLayout.from_flags(np.random.default_rng(6).random((16, o.n_times)) < 0.3)
-    return CouplingMatrix.build(random_beams(5, 4), lb.Pointing.of(o, 4), layout)
+    return CouplingMatrix.build(random_beams(5, 2), lb.Pointing.of(o, 2), layout)
 
 
 def by_rows(coupling):
@@ -157,51 +157,6 @@ def test_flagged_samples_are_left_out(coupling):
     np.testing.assert_allclose(rows, full, rtol=0, atol=1e-12)
 
 
-@pytest.mark.long
-@pytest.mark.essential
-def test_a_quarter_turn_of_the_turntable_permutes_the_products():
-    lmax = 12
-    beams, sky = lb.monopole_beams(25.0, lmax), steep_sky(lmax)
-    straight, turned = (
-        CouplingMatrix.observe(beams, lb.Observation.from_runs([lb.Run(0.1, angle)])) @ sky
-        for angle in (0.0, 90.0)
-    )
-    v, w = (np.asarray(to_matrix(x.reshape(16, -1))) for x in (straight, turned))
-    # the North arm (0) now points West, where 3 was; East (1) points North, where 0 was; ...
-    was = (np.arange(4) - 1) % 4
-    scale = np.abs(v).max()
-    np.testing.assert_allclose(w, v[was][:, was], rtol=0, atol=1e-12 * scale)
-    assert np.abs(w - v).max() > 1e-2 * scale
-
-
-def test_a_second_run_is_an_observation_of_its_own(coupling):
-    o = two_runs()
-    a = steep_sky(LMAX)
-    both = np.asarray(coupling @ a).reshape(16, -1)
-    for run in (0, 1):
-        keep = o.run == run
-        alone = o.select(keep)
-        # each has its own mean pole, so only the neglected third order of the series differs
-        got = np.asarray(CouplingMatrix.observe(random_beams(1), alone) @ a).reshape(16, -1)
-        np.testing.assert_allclose(got, both[:, keep], rtol=0, atol=2e-6 * np.abs(both).max())
-
-
-def test_a_smaller_lmax_is_a_slice(coupling):
-    low = 5
-    beams = lb.ProductBeams(random_beams(1).modes[:, : n_modes(low)], 25.0)
-    pointing = lb.Pointing.of(two_runs(), low, order=coupling.pointing.order)
-    small = CouplingMatrix.build(beams, pointing)
-    full = np.asarray(coupling.dense())
-    np.testing.assert_allclose(small.dense(), full[:, : n_modes(low)], rtol=0, atol=1e-12)
-
-
-def test_linearity(coupling):
-    a, b = steep_sky(LMAX, 1), steep_sky(LMAX, 2)
-    both = coupling @ (2.0 * a - 3.0 * b)
-    apart = 2.0 * (coupling @ a) - 3.0 * (coupling @ b)
-    np.testing.assert_allclose(both, apart, rtol=0, atol=1e-12 * np.abs(both).max())
-
-
 def test_a_uniform_sky_of_one_kelvin_gives_autos_of_one_kelvin():
     o = lb.Observation.from_runs([lb.Run(0.1, 20.0)])
     c = CouplingMatrix.observe(lb.monopole_beams(10.0, LMAX), o)
@@ -258,22 +213,12 @@ def test_differentiable_in_the_beams():
     np.testing.assert_allclose(slope, f(direction), rtol=1e-10)
 
 
-def test_bad_input_is_refused(coupling):
+def test_bad_input_is_refused():
     pointing = lb.Pointing.of(two_runs(), LMAX)
-    with pytest.raises(
-        lb.InputError, match=r"the beam coefficients has shape \(16, 36\), expected"
-    ):
+    with refused(r"the beam coefficients has shape \(16, 36\), expected"):
         CouplingMatrix.build(random_beams(0, lmax=5), pointing)
     with pytest.raises(lb.InputError, match="the data layout has 4 products x 7 times"):
         CouplingMatrix.build(random_beams(0), pointing, DataLayout(4, 7))
-    with pytest.raises(lb.InputError, match=r"the sky has shape \(80,\), expected \(81,\)"):
-        coupling @ jnp.zeros(80)
-    with pytest.raises(lb.InputError, match=r"the data has shape \(3,\)"):
-        coupling.transpose_mv(jnp.zeros(3))
-    with pytest.raises(
-        lb.InputError, match="the sky must be a float64 array, got an array of float"
-    ):
-        coupling @ jnp.zeros(81, dtype=jnp.float32)
 
 
 @pytest.mark.parametrize(
@@ -432,17 +377,3 @@ def test_a_direction_has_no_gains_and_the_same_samples(instrument, base, pointin
     complete = lb.CouplingMatrix.build(instrument.beams(), pointing)
     with pytest.raises(lb.InputError, match="hold different samples"):
         base.coupling.plus(jnp.ones(()), complete)
-
-
-def test_a_response_multiplies_the_rows(base):
-    factors = 1.0 + 0.1 * jax.random.normal(jax.random.key(1), (base.n_data,))
-    twice = base.coupling.with_response(factors).with_response(2.0 * jnp.ones(base.n_data))
-    sky = base.prior.sample(jax.random.key(2))
-    expected = 2.0 * np.asarray(factors) * np.asarray(base.coupling @ sky)
-    np.testing.assert_allclose(twice @ sky, expected, rtol=1e-13)
-    rows = 2.0 * np.asarray(factors)[:, None] * np.asarray(base.coupling.dense())
-    # an entry is a sum of terms of the size of the largest
-    np.testing.assert_allclose(twice.dense(), rows, rtol=1e-13, atol=1e-15 * np.abs(rows).max())
-    np.testing.assert_allclose(
-        twice.transpose_mv(jnp.asarray(expected)), rows.T @ expected, rtol=1e-9
-    )

@@ -60,21 +60,6 @@ def test_fields_agree_with_a_sum_along_the_arms(frequency, options):
                 np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * scale)
 
 
-def test_a_short_arm_in_free_space_is_a_short_dipole():
-    frequency, length = 1.0, 1e-3
-    m = Monopoles(NO_GROUND, length_m=length)
-    fields = m.fields(frequency, GRID)
-    moment = np.pi * frequency * 1e6 / SPEED_OF_LIGHT * length**2  # int sin k(L - s) ds
-    theta, phi = np.meshgrid(GRID.theta, GRID.phi, indexing="ij")
-    for port, arm in enumerate(arms(75.0)):
-        e_theta = (arm[0] * np.cos(phi) + arm[1] * np.sin(phi)) * np.cos(theta)
-        e_theta -= arm[2] * np.sin(theta)
-        e_phi = arm[1] * np.cos(phi) - arm[0] * np.sin(phi)
-        # the phase along the arm, k L = 2e-5
-        np.testing.assert_allclose(fields.e_theta[port] / moment, e_theta, rtol=0, atol=2e-5)
-        np.testing.assert_allclose(fields.e_phi[port] / moment, e_phi, rtol=0, atol=2e-5)
-
-
 def test_a_vertical_arm_over_a_conductor_has_its_image():
     frequency, height = 30.0, 1.5
     m = Monopoles(CONDUCTOR, length_m=1e-4, zenith_angle_deg=0.0, height_m=height)
@@ -188,14 +173,6 @@ def test_uniform_ground_obeys_fresnel(eps, loss, atol):
     if loss > 1.0:
         within(s, -1.0, 1e-7)
         within(p, 1.0, 2e-7)
-
-
-def test_no_vertical_reflection_at_brewsters_angle():
-    eps = 3.0
-    brewster = np.cos(np.arctan(np.sqrt(eps)))
-    s, p = uniform(eps, 0.0).reflection(np.array([brewster]), 30.0)
-    assert abs(p[0]) < 1e-15
-    assert s[0].real == pytest.approx((1 - eps) / (1 + eps), abs=1e-14)
 
 
 def test_grazing_incidence_reflects_everything_with_reversed_sign():

@@ -8,17 +8,15 @@ import numpy as np
 import pytest
 from assertions import within
 from astropy.coordinates import (
-    GCRS,
     ICRS,
     CartesianRepresentation,
     Galactic,
     SkyCoord,
     get_body_barycentric,
-    get_sun,
 )
 from astropy.time import Time
 from lunarsky import MCMF, LunarTopo, MoonLocation
-from reference import galactic_directions, vectors
+from reference import galactic_directions, is_dark, vectors
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.observation import BODIES, MOON_RADIUS_KM, body_direction
@@ -81,16 +79,7 @@ def test_the_rotations_are_rotations_and_the_moon_turns():
     assert np.degrees(np.arctan2(step[0, 1], step[0, 0])) == pytest.approx(1.098, abs=0.01)
 
 
-def test_zenith():
-    o = lb.Observation.from_runs([lb.Run(0.3)])
-    for k in (0, 50):
-        zero = np.zeros(1)
-        colatitude, longitude = galactic_directions(zero, zero, o.times[k], o.lon_deg, o.lat_deg)
-        expected = vectors(colatitude, longitude)[0]
-        np.testing.assert_allclose(o.zenith_galactic()[k], expected, rtol=0, atol=1e-10)
-
-
-def test_sun_altitude_agrees_with_lunarsky_and_with_the_sun_seen_from_the_earth():
+def test_sun_altitude_agrees_with_lunarsky():
     o = lb.Observation.from_runs([lb.Run(1.0)], step_s=40000.0)
     got = o.sun_altitude_deg()
     site = MoonLocation.from_selenodetic(lon=o.lon_deg, lat=o.lat_deg)
@@ -100,42 +89,18 @@ def test_sun_altitude_agrees_with_lunarsky_and_with_the_sun_seen_from_the_earth(
     by_frame = [direction[k].transform_to(LunarTopo(obstime=o.times[k], location=site)).alt.deg
                 for k in range(o.n_times)]  # fmt: skip
     np.testing.assert_allclose(got, by_frame, rtol=0, atol=1e-7)
-    # the Earth lies 0.147 degrees of solar parallax away, aberration adds 0.006
-    seen = get_sun(o.times).cartesian.xyz.value
-    assert isinstance(get_sun(o.times).frame, GCRS)
-    galactic = ICRS(CartesianRepresentation(seen)).transform_to(Galactic()).cartesian.xyz.value
-    galactic = galactic / np.linalg.norm(galactic, axis=0)
-    from_earth = np.degrees(np.arcsin(np.sum(o.zenith_galactic() * galactic.T, axis=1)))
-    np.testing.assert_allclose(got, from_earth, rtol=0, atol=0.16)
 
 
 def test_night_only_keeps_the_samples_with_the_sun_down():
     everything = lb.Observation.from_runs([lb.Run(1.0), lb.Run(1.0)])
     mixed = lb.Observation.from_runs([lb.Run(1.0), lb.Run(1.0, night_only=True)])
-    site = MoonLocation.from_selenodetic(lon=everything.lon_deg, lat=everything.lat_deg)
-    sun, moon = (
-        get_body_barycentric(b, everything.times, ephemeris="builtin") for b in ("sun", "moon")
-    )
-    vector = (sun - moon).xyz.to_value(u.km)
-    icrs = ICRS(CartesianRepresentation(vector / np.linalg.norm(vector, axis=0)))
-    mcmf = icrs.transform_to(MCMF(obstime=everything.times)).cartesian.xyz.value
-    up = np.array([x.to_value(u.m) for x in (site.x, site.y, site.z)])
-    dark = up @ mcmf < 0
+    dark = is_dark(everything.times, everything.lon_deg, everything.lat_deg)
     keep = (everything.run == 0) | dark
     np.testing.assert_array_equal(mixed.times.jd, everything.times[keep].jd)
     np.testing.assert_array_equal(mixed.run, everything.run[keep])
     # half of a synodic month is 14.77 days: 177 samples of two hours
     nights = np.sum(mixed.run == 1)
     assert 140 < nights < 180
-
-
-def test_select():
-    o = lb.Observation.from_runs([lb.Run(0.1), lb.Run(0.1, 30.0)])
-    keep = np.arange(o.n_times) % 3 == 0
-    some = o.select(keep)
-    np.testing.assert_array_equal(some.times.jd, o.times.jd[keep])
-    np.testing.assert_array_equal(some.run, o.run[keep])
-    np.testing.assert_array_equal(some.mcmf_from_galactic(), o.mcmf_from_galactic()[keep])
 
 
 @pytest.mark.parametrize(
@@ -257,7 +222,7 @@ def by_erfa_and_lunartopo(planet, time, lon_deg, lat_deg):
             late = middle
     north, east, up = seen(late)  # azimuth counts from North towards East
     distance = np.linalg.norm([east, north, up])
-    return np.array([east, north, up]) / distance, distance / AU_KM
+    return np.array([east, north, up]) / distance
 
 
 @pytest.mark.parametrize(
@@ -269,7 +234,7 @@ def test_directions_agree_with_erfa_and_lunartopo(body, planet):
     to_topo = observation.topocentric_from_mcmf() @ observation.mcmf_from_galactic()
     got = np.einsum("tij,tj->ti", to_topo, body_direction(body, observation))
     for k in range(2):
-        expected, _ = by_erfa_and_lunartopo(planet, observation.times[k], **site)
+        expected = by_erfa_and_lunartopo(planet, observation.times[k], **site)
         # the same series by another way: rounding of rotations, and 1e-4 s of light time
         assert angle(got[k], expected) < 1e-3 * ARCSECOND
 
@@ -289,40 +254,6 @@ def test_jupiter_is_where_the_almanac_had_it():
     assert there.ra.deg == pytest.approx(110.8, abs=1.0)
     assert there.dec.deg == pytest.approx(22.0, abs=0.5)
     assert angle(gal, -body_direction("Sun", observation))[0] < np.radians(1.5)
-
-
-def test_two_landers_see_the_earth_against_different_stars():
-    # both on the great circle at right angles to the Earth's direction near 0 E, 0 N: the poles
-    north = dates("2027-01-15T00:00:00", lat_deg=90.0, lon_deg=0.0)
-    south = dates("2027-01-15T00:00:00", lat_deg=-90.0, lon_deg=0.0)
-    site = {"lon_deg": 0.0, "lat_deg": 0.0}
-    _, distance = by_erfa_and_lunartopo(3, north.times[0], **site)
-    centre_km = distance * AU_KM
-    assert 350000 < centre_km < 407000
-    a, b = body_direction("Earth", north), body_direction("Earth", south)
-    parallax = angle(a, b)[0]
-    # 2 x 1737.4 / distance = 0.52 degrees; the libration, 7 degrees, shortens the base by < 1 %
-    assert parallax == pytest.approx(2 * 1737.4 / centre_km, rel=1e-2)
-    # the northern lander sees the Earth displaced towards the south
-    assert np.sum((a - b) * north.zenith_galactic()) < -0.99 * parallax
-    # and the Sun hardly at all
-    sun = angle(body_direction("Sun", north), body_direction("Sun", south))[0]
-    assert 4.0 * ARCSECOND < sun < 5.0 * ARCSECOND
-
-
-def test_light_time():
-    # it moves a planet by its own motion: Jupiter, 13 km/s over 35 to 50 minutes, 5-9"
-    later = dates("2027-01-15T00:00:00")
-    with unannounced_leap_seconds():
-        tdb = later.times.tdb
-        heliocentric, barycentric = (x["p"] for x in erfa.epv00(tdb.jd1, tdb.jd2))
-        moon = barycentric + erfa.moon98(tdb.jd1, tdb.jd2)["p"]
-        at_once = barycentric - heliocentric + erfa.plan94(tdb.jd1, tdb.jd2, 5)["p"] - moon
-    galactic = (
-        ICRS(CartesianRepresentation(at_once[0])).transform_to(Galactic()).cartesian.xyz.value
-    )
-    moved = angle(galactic / np.linalg.norm(galactic), body_direction("Jupiter", later)[0])
-    assert 5.0 * ARCSECOND < moved < 10.0 * ARCSECOND
 
 
 def test_every_body_is_known_in_any_case():

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import refused
 from reference import steep_sky
 from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation as SpatialRotation
@@ -54,15 +55,6 @@ def test_split_of_a_turn_about_z_has_no_tilt():
     np.testing.assert_array_equal(tilt, 0.0)
 
 
-def test_split_reproduces_the_moon():
-    moon = lb.Observation.from_runs([lb.Run(1.0)]).mcmf_from_galactic()
-    frame = mean_pole_frame(moon)
-    # lunarsky's matrices are orthogonal to 1e-15; the sample times add nothing
-    np.testing.assert_allclose(rebuilt(*split(moon @ frame.T)) @ frame, moon, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(frame @ frame.T, np.eye(3), rtol=0, atol=1e-14)
-    assert np.linalg.det(frame) == pytest.approx(1.0, abs=1e-14)
-
-
 @pytest.mark.parametrize(("cycles", "wander"), [(1, 0.044), (3, 0.083)])
 def test_the_axis_wanders_as_far_as_the_moons_pole_does(cycles, wander):
     o = lb.Observation.from_runs([lb.Run(1.0)] * cycles)
@@ -96,9 +88,7 @@ def test_sufficient_order_is_the_lowest_that_bounds_the_series(size, lmax):
 
 
 def test_a_negative_order_is_refused():
-    with pytest.raises(
-        lb.InputError, match="order of the tilt expansion must be 0, 1, ..., got -1"
-    ):
+    with refused("order of the tilt expansion must be 0, 1, ..., got -1"):
         Pointing.of(lb.Observation.from_runs([lb.Run(0.1)]), 3, order=-1)
 
 
@@ -197,9 +187,9 @@ def test_inside_a_compiled_function_as_exactly_shifted(names):
 
 
 def test_offsets_are_differentiable():
-    o, beams = two_runs(), lb.monopole_beams(25.0, 4)
-    nominal = lb.Pointing.of(o, 4)
-    a = jnp.asarray(steep_sky(4))
+    o, beams = two_runs(), lb.monopole_beams(25.0, 2)
+    nominal = lb.Pointing.of(o, 2)
+    a = jnp.asarray(steep_sky(2))
     names = list(VALUES)
 
     def total(values):

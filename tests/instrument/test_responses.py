@@ -9,7 +9,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import close, within
+from assertions import close, off, within
 from astropy.io import fits
 from fits_files import write_images, write_response
 from reference import hemisphere, real_harmonics
@@ -19,10 +19,10 @@ import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.instrument.beams.luseepy_files import CONVENTIONS
 from lusee_bayes.instrument.beams.monopoles import (
     CapacitorReceiver,
     JFETReceiver,
-    loading_matrix,
     read_receiver,
 )
 from lusee_bayes.instrument.beams.sampled import read_beam
@@ -72,7 +72,7 @@ def simulated(luseepy, test_data, frequency, times, *, fixed_axis=False) -> np.n
     modes = from_healpy(sky["alm"][list(sky["freq"]).index(frequency)])
     observation = replace(lb.read_waterfall(path).observation.select(times), fixed_axis=fixed_axis)
     beams = response.beams(frequency, LMAX, grid=response.luseepy_grid)
-    seen = np.asarray(lb.CouplingMatrix.observe(beams, observation) @ jnp.asarray(modes))
+    seen = np.asarray(lb.CouplingMatrix.observe(beams, observation) @ modes)
     moon = response.background(frequency, MOON)
     return volts(response, frequency, seen.reshape(16, -1) + moon[:, None])
 
@@ -82,10 +82,6 @@ def volts(response, frequency, kelvin) -> np.ndarray:
     root, matrix = np.sqrt(response.per_kelvin(frequency)), np.asarray(to_matrix(kelvin))
     scale = (root[:, None] * root[None]).reshape(4, 4, *(1,) * (matrix.ndim - 2))
     return np.asarray(to_real(matrix * scale))
-
-
-def off(got, expected) -> float:
-    return np.abs(got - expected).max() / np.abs(expected).max()
 
 
 @pytest.mark.long
@@ -130,12 +126,6 @@ def test_other_conventions_are_noticed(luseepy, test_data):
     assert off(right, expected) < 3e-8
     for case in wrong:
         assert off(case, expected) > 1e-4
-
-
-def test_the_background_grows_with_the_ground(luseepy):
-    response = luseepy[0]
-    moon = np.asarray(response.background(25.0, MOON)) / np.asarray(response.background(25.0, 1.0))
-    np.testing.assert_allclose(moon, MOON, rtol=1e-12)
 
 
 def test_sky_and_moon_of_one_temperature_are_an_enclosure(luseepy):
@@ -190,24 +180,6 @@ def write(path, *, without=(), change=None, frequencies=(10.0, 20.0, 40.0)):
     if change is not None:
         change(flat)
     return write_images(path, {k: v for k, v in flat.items() if k not in without}, {"VERSION": 3})
-
-
-def test_volts_of_short_dipoles(tmp_path):
-    """V^2 = 4 k T R with R = eta0 / (4 lambda^2) int |h|^2, and M by hand; T = 1 K everywhere."""
-    response = read_beam(write(tmp_path / "response.fits"))
-    f, wavelength = 20.0, c / 20e6
-    _, _, arms = short_dipoles(np.zeros(1), np.zeros(1), 1.5)
-    open_ = Boltzmann * VACUUM / wavelength**2 * 1.09 * 4 * np.pi / 3 * arms.T @ arms
-    za, zl = response.impedance[1], JFETReceiver().load(f)
-    m = zl @ np.linalg.inv(za + zl)
-    np.testing.assert_allclose(response.circuit(f).loading, m, rtol=1e-12)
-    expected = m @ open_ @ m.conj().T
-    beams = volts(response, f, response.beams(f, 2).modes)
-    got = np.asarray(to_matrix(beams))[..., 0] * np.sqrt(4 * np.pi)
-    close(got, expected, 1e-6)
-    # half sky, half Moon
-    got = volts(response, f, response.background(f, 1.0)[:, None])
-    close(to_matrix(got)[..., 0], expected, 1e-6)
 
 
 def varied(images):
@@ -314,8 +286,8 @@ def test_losses_emit_at_the_antennas_temperature(tmp_path):
 
 def test_open_ports_and_turns(tmp_path):
     response = read_beam(write(tmp_path / "response.fits"))
-    np.testing.assert_array_equal(loading_matrix(response.impedance[0], None), np.eye(4))
     open_ = replace(response, receiver=None)
+    np.testing.assert_array_equal(open_.circuit(20.0).loading, np.eye(4))
     # a quarter turn makes East North: each port takes the place of the next
     plain, turned = (
         np.asarray(to_matrix(volts(open_, 20.0, open_.beams(20.0, 5, turn_deg=turn).modes)))
@@ -346,12 +318,6 @@ def test_open_ports_and_turns(tmp_path):
 def test_files_that_cannot_be_used(tmp_path, options, message):
     with pytest.raises(lb.InputError, match=message):
         read_beam(write(tmp_path / "response.fits", **options))
-
-
-def test_no_extrapolation(tmp_path):
-    response = read_beam(write(tmp_path / "response.fits"))
-    with pytest.raises(lb.InputError, match="from 10 to 40 MHz, not at 50"):
-        response.beams(50.0, 4)
 
 
 # --- in scenarios -------------------------------------------------------------------------------
@@ -452,14 +418,7 @@ def test_the_map_from_luseepys_four_ports(luseepy, tmp_path, test_data):
 @pytest.mark.parametrize(
     "words",
     [
-        {"TIMECONV": "e-jwt"},
-        {"COORDSYS": "celestial"},
-        {"THETADEF": "elevation"},
-        {"PHIDEF": "azimuth-from-north"},
-        {"OMEGADEF": "propagation-direction"},
-        {"POLBASIS": "ludwig-3"},
-        {"PORTS": "0132"},
-        {"CANONICAL": "E[V/m],peak"},
+        *({key: "another"} for key in CONVENTIONS),
         {"INPUT_KIND": "loaded"},
         {"FIELD_KIND": "rE"},
         {"FIELD_UNIT": "V/m"},
@@ -577,26 +536,6 @@ def test_open_ports_have_no_loads_to_write(luseepy, tmp_path):
         circuit = replace(response, receiver=None).circuit(5.0)
         lb.write_four_port(tmp_path / "w.fits", [channel], [circuit])
     assert not list(tmp_path.iterdir())
-
-
-def test_there_is_no_room_for_windows(luseepy, tmp_path):
-    response, original, _ = luseepy
-    channel = lb.read_waterfall(original).at(5.0)
-    with pytest.raises(lb.InputError, match="luseepy's waterfalls have no room for windows"):
-        lb.write_four_port(tmp_path / "w.fits", [channel.stamped("start")], [response.circuit(5.0)])
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("image", "word", "value"),
-    [(0, "BUNIT", "K"), (0, "TIMEUNIT", "s"), (0, "TIMESYS", "local"), ("ZL_real", "BUNIT", "S")],
-)
-def test_words_that_contradict_the_layout_are_refused(luseepy, tmp_path, image, word, value):
-    with fits.open(luseepy[1]) as hdus:
-        hdus[image].header[word] = value
-        hdus.writeto(tmp_path / "w.fits")
-    with pytest.raises(lb.InputError, match=f"{word}|unit"):
-        lb.read_waterfall(tmp_path / "w.fits")
 
 
 @pytest.mark.essential

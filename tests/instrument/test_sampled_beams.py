@@ -78,19 +78,6 @@ def embedded(kind, frequency_mhz=FREQUENCY):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_embedded_beam_sampled_gives_the_same_visibilities(kind):
-    made = sampled_beams(FREQUENCY, **embedded(kind))
-    assert made.n_ports == 4
-    observation = lb.Observation.from_runs([lb.Run(0.05, turntable_deg=20.0)])
-    sky = lb.galaxy_sky(FREQUENCY, LMAX)
-    ours, own = (
-        np.asarray(lb.CouplingMatrix.observe(beams, observation) @ sky.modes)
-        for beams in (made.beams(FREQUENCY, LMAX), lb.monopole_beams(FREQUENCY, LMAX))
-    )
-    assert np.abs(ours - own).max() < SPLINES * np.abs(own).max()
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_short_dipoles_have_their_closed_form(kind):
     """Dipoles u at places r: B_ij = (u.v - (u.n)(v.n)) / 2 exp(i k n.(r_i - r_j)), no angles."""
     rng = np.random.default_rng(2)

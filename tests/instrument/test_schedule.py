@@ -3,10 +3,9 @@ from datetime import datetime, timedelta
 import astropy.units as u
 import numpy as np
 import pytest
-from assertions import within
-from astropy.coordinates import ICRS, CartesianRepresentation, get_body_barycentric
+from assertions import refused, within
 from astropy.time import Time
-from lunarsky import MCMF, MoonLocation
+from reference import is_dark
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.schedule import CYCLE_DAYS, Interval, Run, read_schedule
@@ -87,15 +86,6 @@ def test_intervals_are_cut_as_by_a_loop(seed, step_s):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_no_time_is_lost_or_found(seed):
-    intervals = schedule(seed, n=8)
-    o = lb.Observation.from_schedule(intervals, step_s=777.0)
-    total = sum(one.duty_cycle * one.length_s for one in intervals)
-    # rounding of a few hundred numbers of 1e3 seconds
-    assert o.live_s.sum() == pytest.approx(total, abs=1e-8)
-
-
 def test_instants_begin_before_the_end():
     intervals = [
         Interval("2027-01-15T00:00:00", "2027-01-15T04:00:00"),  # two steps: the end is no sample
@@ -107,9 +97,7 @@ def test_instants_begin_before_the_end():
     assert o.windows is None
     assert (o.live_s == 7200.0).all()
     half = [Interval("2027-01-15", "2027-01-16", duty_cycle=0.5)]
-    with pytest.raises(
-        lb.InputError, match=r"no duty cycle; take windows \(observation.window=mean\)"
-    ):
+    with refused(r"no duty cycle; take windows \(observation.window=mean\)"):
         lb.Observation.from_schedule(half, window="instant")
 
 
@@ -147,16 +135,6 @@ def test_runs_are_a_schedule(window, step_s):
     np.testing.assert_allclose(got.live_s, expected.live_s, rtol=0, atol=1e-8)
     if window == "mean":
         within(got.windows.bounds_s, expected.windows.bounds_s, 1e-8)  # fmt: skip
-
-
-def is_dark(times, lon_deg, lat_deg):
-    """As lunarsky has the site and the Moon."""
-    site = MoonLocation.from_selenodetic(lon=lon_deg, lat=lat_deg)
-    sun, moon = (get_body_barycentric(body, times, ephemeris="builtin") for body in ("sun", "moon"))
-    vector = (sun - moon).xyz.to_value(u.km)
-    icrs = ICRS(CartesianRepresentation(vector / np.linalg.norm(vector, axis=0)))
-    mcmf = icrs.transform_to(MCMF(obstime=times)).cartesian.xyz.value
-    return np.array([x.to_value(u.m) for x in (site.x, site.y, site.z)]) @ mcmf < 0
 
 
 def test_windows_at_night_are_dark_from_end_to_end():
@@ -211,7 +189,6 @@ HEADER = "start,end,turntable_deg,duty_cycle,night_only\n"
         ("start,end\n", "schedule.csv has the columns start, end; a schedule has .*turntable_deg"),
         ("start,end,turntable_deg,duty\n", "has the columns .*duty; a schedule has"),
         ("start,end,end,turntable_deg\n", "has the columns start, end, end.1, turntable_deg; a"),
-        (f"{HEADER}2027-01-01\n", "row 1: turntable_deg is '', not a number"),
         (f"{HEADER}2027-01-01,2027-01-02,0,1,false,5\n", "rows have more entries than the header"),
         (f"{HEADER}\nsoon,2027-01-02,0,1,false\n", "row 1: start 'soon' is not a date; write it"),
         (f"{HEADER}2027-01-01,61050.8,0,1,false\n", "row 1: end '61050.8' is not a date; write"),
@@ -233,7 +210,6 @@ HEADER = "start,end,turntable_deg,duty_cycle,night_only\n"
         (f"{HEADER}2027-01-01,2027-01-02,0,1.5,false\n", "row 1: duty_cycle is 1.5; give the fra"),
         (f"{HEADER}2027-01-01,2027-01-02,0,0,false\n", "row 1: duty_cycle is 0; give the fraction"),
         (f"{HEADER}2027-01-01,2027-01-02,0,half,\n", "row 1: duty_cycle is 'half', not a number"),
-        (f"{HEADER}2027-01-01,2027-01-02,north,1,\n", "row 1: turntable_deg is 'north', not a num"),
         (f"{HEADER}2027-01-01,2027-01-02,,1,\n", "row 1: turntable_deg is '', not a number"),
         (f"{HEADER}2027-01-01,2027-01-02,inf,1,\n", "row 1: turntable_deg is inf; give an angle"),
         (f"{HEADER}2027-01-01,2027-01-02,0,1,1\n", "row 1: night_only is '1'; write true or false"),
@@ -247,9 +223,7 @@ def test_bad_tables_are_refused(write, text, message):
 def test_an_interval_without_a_night_is_refused(write):
     # the Sun is up for two weeks from 1 February 2027 at this site
     text = f"{HEADER}2027-01-16,2027-01-17,0,1,true\n2027-02-05,2027-02-07,0,1,true\n"
-    with pytest.raises(
-        lb.InputError, match=r"schedule.csv, row 2 holds no lunar night; lengthen it"
-    ):
+    with refused(r"schedule.csv, row 2 holds no lunar night; lengthen it"):
         lb.Observation.from_schedule(read_schedule(write(text)))
     unnamed = [Interval("2027-02-05", "2027-02-07", night_only=True)]
     with pytest.raises(lb.InputError, match="interval 0 holds no lunar night"):
@@ -262,7 +236,6 @@ def test_an_interval_without_a_night_is_refused(write):
         ([], {}, "a schedule needs at least one interval, got none"),
         ([("2027-01-02", "2027-01-03"), ("2027-01-01", "2027-01-02")], {}, "interval 1: the inter"),
         ([("2027-01-02", "2027-01-03")], {"step_s": 0.0}, "step_s must be positive, got 0.0"),
-        ([("2027-01-02", "2027-01-03")], {"lat_deg": 95.0}, "lat_deg must lie in -90..90"),
         ([("2027-01-02", "2027-01-03")], {"fixed_axis": True}, "use observation.window=instant"),
     ],
 )
@@ -309,11 +282,9 @@ def test_a_command_table_of_opsim(write):
     ("text", "message"),
     [
         ("", "comtable.yml is no command table of OpSim: expected numbered entries"),
-        ("- 1\n", "comtable.yml is no command table of OpSim"),
         ("1: [\n", "comtable.yml is not valid YAML"),
         ("1: {start: 61050.8}\n", "entry 1: a command table of OpSim has a start .* and a mode"),
         ("1: science\n", "entry 1: a command table of OpSim has a start"),
-        ("1: {start: [1], mode: science}\n", "entry 1: a command table of OpSim has a start"),
         ("1:\n  start: noon\n  mode: science\n", "entry 1: a command table of OpSim has a start"),
         ("1: {start: nan, mode: science}\n", "entry 1: sample times run outside the ephemeris"),
         ("1: {start: 2461050.8, mode: science}\n", "entry 1: sample times run outside the ephemer"),

@@ -170,19 +170,6 @@ def test_the_sense_of_v_is_luseepys():
         np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-14)
 
 
-@pytest.mark.long
-def test_autos_and_circular_waves():
-    theta, phi = np.arccos(np.linspace(0.05, 1.0, 15)), np.linspace(0.0, 6.0, 15)
-    autos = [labels().index(name) for name in ("00R", "11R", "22R", "33R")]
-    # a straight arm in free space is linear in every direction
-    free = towards(FREQUENCY, vectors(theta, phi), SHORT, stokes="V")
-    assert np.abs(free[autos]).max() < 1e-15
-    # the lossy, layered ground makes it elliptical, by no more than all of it
-    total, circular = (towards(FREQUENCY, vectors(theta, phi), stokes=s)[autos] for s in "IV")
-    assert (np.abs(circular) <= total).all()
-    assert np.abs(circular).max() > 0.01 * total.max()
-
-
 # --- at every sample
 
 
@@ -265,16 +252,6 @@ def test_a_smoothed_source_agrees_with_the_coupling_matrix():
         assert np.abs(integral(wrong) - expected).max() > 0.1 * scale
 
 
-def test_zero_exactly_while_the_source_is_down():
-    o = observation()
-    galactic = np.array([0.6, 0.0, 0.8])
-    response = np.asarray(source_response(o, galactic, FREQUENCY, stokes_v=0.3))
-    up = o.zenith_galactic() @ galactic > 0
-    assert 10 < up.sum() < o.n_times - 10
-    np.testing.assert_array_equal((response != 0).any(axis=0), up)
-    assert (response[0, up] > 0).all()
-
-
 def test_a_moving_source_is_a_fixed_one_at_every_sample():
     o = observation()
     path = vectors(np.linspace(0.5, 2.5, o.n_times), np.linspace(0.0, 5.0, o.n_times))
@@ -314,11 +291,6 @@ def test_the_circularly_polarised_part_enters_by_the_v_beam():
 def test_bad_directions_are_refused(arguments, message):
     with pytest.raises(lb.InputError, match=message):
         beams_towards(*arguments)
-
-
-def test_unknown_stokes_parameters_are_refused():
-    with pytest.raises(lb.InputError, match="unknown Stokes parameter 'v'"):
-        beams_towards(25.0, ZENITH, stokes="v")
 
 
 @pytest.mark.parametrize(

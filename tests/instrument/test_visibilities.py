@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-import xarray as xr
 from assertions import close, refused
 from astropy.time import Time
 
@@ -47,26 +46,6 @@ def test_round_trip_is_exact(data, tmp_path):
     np.testing.assert_array_equal(
         again.observation.mcmf_from_galactic(), data.observation.mcmf_from_galactic()
     )
-
-
-def test_missing_samples_are_nan_in_the_grid_and_absent_from_d(data):
-    grid = data.grid()
-    assert np.isnan(grid).sum() == data.n_missing > 0
-    np.testing.assert_array_equal(grid[~np.isnan(grid)], data.data)
-
-
-def test_a_failed_write_leaves_the_old_file(data, tmp_path, monkeypatch):
-    path = data.write(tmp_path / "data.nc")
-    before = path.read_bytes()
-
-    def fail(*_, **__):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(xr.Dataset, "to_netcdf", fail)
-    with pytest.raises(OSError, match="disk full"):
-        data.write(path)
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["data.nc"]
 
 
 def altered(change):
@@ -369,12 +348,6 @@ def test_labels_are_those_of_luseepy():
     assert list(labels()) == LUSEEPY
     assert all_products()[4] == Product(0, 2, "I")
     assert [LUSEEPY[k] for k in auto_indices()] == ["00R", "11R", "22R", "33R"]
-
-
-@pytest.mark.parametrize("n", [1, 2, 3, 4])
-def test_every_real_number_of_a_hermitian_matrix_appears_once(n):
-    assert len(set(labels(n))) == len(labels(n)) == n * n
-    assert all(p.i <= p.j and (p.part == "R" or p.i < p.j) for p in all_products(n))
 
 
 def test_each_product_is_the_entry_its_label_names():

@@ -10,6 +10,7 @@ import astropy.units as u
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import refused
 from astropy.io import fits
 from astropy.time import Time, TimeDelta
 from fits_files import write_images
@@ -107,21 +108,6 @@ def test_any_subset_and_order_of_products(tmp_path):
     np.testing.assert_array_equal(grid[place["13I"]], -200.0 - time)
     np.testing.assert_array_equal(grid[place["00R"]], 300.0 + time)
     assert np.isnan(grid[place["11R"]]).all()
-
-
-def test_gaps_are_missing_samples_and_counted(tmp_path):
-    data = 100.0 + np.zeros((12, 16, 2))
-    data[3, :, 0], data[5:7, 7, 0] = np.nan, np.nan
-    waterfall = lb.read_waterfall(write(tmp_path / "w.fits", data))
-    assert (waterfall.at(10.0).n_missing, waterfall.at(20.0).n_missing) == (18, 0)
-    assert "18 samples missing" in describe(tmp_path / "w.fits")
-
-
-@pytest.mark.parametrize(("unit", "factor"), [("mK", 1e-3), ("K", 1.0), ("kK", 1e3)])
-def test_temperatures_in_other_units_are_converted(tmp_path, unit, factor):
-    given = [lb.read_waterfall(write(tmp_path / "k.fits"))]
-    given.append(lb.read_waterfall(write(tmp_path / "u.fits", header=HEADER | {"BUNIT": unit})))
-    np.testing.assert_allclose(given[1].grid, factor * given[0].grid, rtol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -253,18 +239,6 @@ def test_what_is_written_is_read_back_bit_by_bit(tmp_path):
         np.testing.assert_array_equal(hdus["ZIm_2"].data, [-40.0, -30.0])
 
 
-def test_luseepys_own_file_is_written_back(tmp_path, test_data):
-    original = test_data / "luseepy" / "waterfall_exact_engine.fits"
-    waterfall = lb.read_waterfall(original)
-    path = lb.write_waterfall(
-        tmp_path / "w.fits", [waterfall.at(f) for f in waterfall.frequencies_mhz]
-    )
-    ours, _, places = as_luseepy_reads(path)
-    with fits.open(original) as hdus:
-        np.testing.assert_array_equal(ours, hdus["data"].data)
-        np.testing.assert_array_equal(list(places), hdus["combinations"].data)
-
-
 @pytest.mark.parametrize(
     ("runs", "message"),
     [
@@ -305,7 +279,6 @@ def test_simulate_writes_it_and_map_reads_it(tmp_path):
         (["-o", "w.fits", "--set", "observation.window=mean"], "no room for windows"),
         (["-o", "data.nc", "--frequencies", "10,20"], "netCDF files hold one frequency"),
         (["-o", "w.fits", "--frequencies", "20,10"], "expected growing MHz"),
-        (["-o", "w.fits", "--frequencies", "5:50:7"], "expected growing MHz"),
         (["-o", "w.fits", "--frequencies", "ten"], "expected growing MHz"),
         (["-o", "w.fits", "--frequencies", "5:50:0"], "expected growing MHz"),
         (["-o", "w.fits", "--frequencies", "40:60:10"], "frequency_mhz"),
@@ -331,9 +304,7 @@ def test_ranges_of_frequencies():
 def test_another_site_and_other_ports(tmp_path):
     path = write(tmp_path / "w.fits", header=HEADER | {"LUN_LAT_DEG": -20.0, "LUN_LONG_DEG": 10.0})
     scenario = lb.load_scenario("fiducial", ["frequency_mhz=10", "lmax=4"])
-    with pytest.raises(
-        lb.InputError, match="--set observation.lon_deg=10 --set observation.lat_deg="
-    ):
+    with refused("--set observation.lon_deg=10 --set observation.lat_deg="):
         set_up(scenario, lb.read_data(path, scenario))
     # 182.258 degrees East is 177.742 West
     path = write(tmp_path / "west.fits", header=HEADER | {"LUN_LONG_DEG": -177.742})
@@ -342,9 +313,7 @@ def test_another_site_and_other_ports(tmp_path):
 
 def test_products_that_the_beams_cannot_supply(tmp_path):
     waterfall = lb.read_waterfall(write(tmp_path / "w.fits"))
-    with pytest.raises(
-        lb.InputError, match="has the product 02R, but the beams are those of 2 ports"
-    ):
+    with refused("has the product 02R, but the beams are those of 2 ports"):
         waterfall.at(10.0, n_ports=2)
     few = lb.read_waterfall(write(tmp_path / "few.fits", pairs=[[0, 0], [0, 1], [1, 1]]))
     data = few.at(10.0, n_ports=2)
@@ -400,6 +369,7 @@ twice = np.array([[2461000.0, 0.5], [2461000.0, 0.5], [2461000.0, 0.6]])
         ({"header": {"BUNIT": "K"}}, r"BUNIT is 'K'; known: V\^2/Hz"),
         ({"header": {"TMOON_K": None}}, "has no TMOON_K"),
         ({"header": {"TIMESYS": "LOCAL"}}, "TIMESYS is 'LOCAL'"),
+        ({"header": {"TIMEUNIT": "s"}}, "TIMEUNIT is 's'"),
         ({"images": {"time": np.arange(5.0)}}, r"time has shape \(5,\), expected time x 2"),
         ({"images": {"time": backwards, "data": np.ones((3, 2, 2))}}, "times must grow"),
         ({"images": {"time": twice, "data": np.ones((3, 2, 2))}}, "times must grow"),

@@ -140,18 +140,6 @@ def test_values_windows_and_live_times_are_those_of_loops(case, to_s):
     np.testing.assert_array_equal(found.truth, data.truth)
 
 
-@pytest.mark.parametrize("to_s", [STEP, 2.5 * STEP, 7 * STEP, 1e6])
-def test_live_time_times_value_is_conserved(to_s):
-    data = data_of(observed())
-    after = averaged(data, to_s)
-
-    def integral(data):
-        return data.grid() @ data.observation.live_s
-
-    np.testing.assert_allclose(integral(after), integral(data), rtol=1e-12)
-    assert product_live_s(after) == pytest.approx(product_live_s(data), rel=1e-12)
-
-
 @pytest.mark.parametrize("to_s", [1.5 * STEP, 2.5 * STEP, 3.25 * STEP])
 def test_no_bin_is_longer_than_asked_for(to_s):
     """Samples that do not fit: bins of whole samples, none across a run, all of them there."""
@@ -293,7 +281,7 @@ def sigma_of(v, o):
 
 
 @pytest.mark.parametrize("lmax", [12, pytest.param(47, marks=pytest.mark.long)])
-@pytest.mark.parametrize("filled", [False, True])
+@pytest.mark.parametrize("filled", [pytest.param(False, marks=pytest.mark.long), True])
 @pytest.mark.parametrize("step_s", [10.0, 600.0, 7200.0, 43200.0])
 def test_equals_the_mean_of_200_instants(step_s, filled, lmax):
     o, beams, sky = observation(step_s, filled), lb.monopole_beams(25.0, lmax), steep_sky(lmax)
@@ -332,7 +320,7 @@ def antenna_frame(o, time):
 
 @pytest.mark.parametrize(
     ("step_s", "filled", "lmax"),
-    [(7200.0, False, 20), pytest.param(43200.0, True, 47, marks=pytest.mark.long)],
+    [(7200.0, False, 12), pytest.param(43200.0, True, 47, marks=pytest.mark.long)],
 )
 def test_equals_the_mean_of_20_instants_by_lunarsky(step_s, filled, lmax):
     o, beams, sky = observation(step_s, filled), lb.monopole_beams(25.0, lmax), steep_sky(lmax)
@@ -372,32 +360,28 @@ def test_nodes_suffice(angle):
     assert w @ np.cos(angle * x) / 2 == pytest.approx(np.sinc(angle / np.pi), abs=2e-15 + 1e-14)
 
 
-def test_windows_that_cannot_be():
-    one = np.array([1.0])
-    with pytest.raises(
-        lb.InputError, match="sample 0 ends -1 s from its time, not after its start"
-    ):
-        Windows.whole(one, -one)
-    with pytest.raises(lb.InputError, match="sample 0 was live for 3 s of a window of 2 s"):
-        Windows.whole(-one, one, 3 * one)
-    with pytest.raises(lb.InputError, match="sample 0 has a live time of 0 s"):
-        Windows.whole(-one, one, 0 * one)
-    with pytest.raises(lb.InputError, match="sample 0 has a piece that begins at 0.5 s, before"):
-        Windows(np.array([0, 0]), np.array([0.0, 0.5]), np.array([1.0, 2.0]), np.ones(2))
-    with pytest.raises(lb.InputError, match="must count the samples 0, 1"):
-        Windows(np.array([0, 2]), np.zeros(2), np.ones(2), np.ones(2))
-    none = np.zeros(0)
-    with pytest.raises(lb.InputError, match="same length, with at least one piece"):
-        Windows(none.astype(int), none, none, none)
+@pytest.mark.parametrize(
+    ("sample", "start", "end", "live", "words"),
+    [
+        ([0], [1.0], [-1.0], [1.0], "sample 0 ends -1 s from its time, not after its start"),
+        ([0], [-1.0], [1.0], [3.0], "sample 0 was live for 3 s of a window of 2 s"),
+        ([0], [-1.0], [1.0], [0.0], "sample 0 has a live time of 0 s"),
+        ([0, 0], [0.0, 0.5], [1.0, 2.0], [1.0, 1.0], "a piece that begins at 0.5 s, before"),
+        ([0, 2], [0.0, 0.0], [1.0, 1.0], [1.0, 1.0], "must count the samples 0, 1"),
+        ([], [], [], [], "same length, with at least one piece"),
+    ],
+)
+def test_windows_that_cannot_be(sample, start, end, live, words):
+    with refused(words):
+        Windows(np.array(sample, dtype=int), *(np.array(x) for x in (start, end, live)))
+
+
+def test_windows_that_samples_cannot_have():
     o = lb.Observation.from_runs([lb.Run(0.05)], window="mean")
     n = np.ones(o.n_times)
-    with pytest.raises(
-        lb.InputError, match="the window of sample 0 lasts 8000 s, longer than the st"
-    ):
+    with refused("the window of sample 0 lasts 8000 s, longer than the st"):
         replace(o, windows=Windows.whole(-4000 * n, 4000 * n))
-    with pytest.raises(
-        lb.InputError, match=r"samples 0 and 1 \(2027-01-15T01:00:00\) overlap by 600"
-    ):
+    with refused(r"samples 0 and 1 \(2027-01-15T01:00:00\) overlap by 600"):
         replace(o, windows=Windows.whole(-3600 * n, 3600 * n + 600 * (o.hours == 0)), step_s=8e3)
     with pytest.raises(lb.InputError, match="windows of 3 samples for 16 times"):
         replace(o, windows=Windows.whole(-n[:3], n[:3]))
@@ -450,13 +434,8 @@ def data():
     observation = lb.Observation.from_runs(
         [lb.Run(0.01), lb.Run(0.01, turntable_deg=30.0)], window="mean"
     )
-    n = observation.n_times
-    rng = np.random.default_rng(5)
-    edges = np.sort(rng.uniform(-3600.0, 3600.0, (n, 4)), axis=1)
-    start, end = edges[:, ::2].ravel(), edges[:, 1::2].ravel()
-    live = (end - start) * rng.uniform(0.3, 1.0, 2 * n)
-    windows = Windows(np.repeat(np.arange(n), 2), start, end, live)
-    observation = replace(observation, windows=windows)
+    n, rng = observation.n_times, np.random.default_rng(5)
+    observation = replace(observation, windows=partly_filled(n, 7200.0))
     layout = DataLayout.from_flags(rng.random((16, n)) < 0.1)
     return lb.Visibilities(rng.normal(size=layout.size), layout, observation, 25.0)
 
@@ -559,7 +538,7 @@ def test_info_says_windows_and_live_share(data, tmp_path):
     path = made(timestamp="end", live_s=[900.0] * 4).write(tmp_path / "data.nc")
     assert "times are middles of windows of 3600 s, live for 25.0% of them" in describe(path)
     text = describe(data.write(tmp_path / "pieces.nc"))
-    assert f"in {2 * data.observation.n_times} pieces" in text
+    assert f"in {len(data.observation.windows.sample)} pieces" in text
 
 
 def lose(*names):

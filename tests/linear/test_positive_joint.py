@@ -1,6 +1,6 @@
 """Positive joint skies: mode and Gaussian against scipy and one big model of all channels."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -91,7 +91,7 @@ def rough(skies, level=0.3):
         level * np.where(np.arange(len(parameters)) < len(laws.means), 1, 0.3)
     )
     parameters[:, 1] = -1.0
-    return laws.with_parameters(parameters)
+    return replace(laws, parameters=parameters)
 
 
 def test_the_mode_of_one_channel_is_that_of_a_direct_minimisation():
@@ -208,7 +208,7 @@ def test_learned_laws_maximise_the_evidence():
     found = find_joint_mode(skies, FieldLaws.of(skies), channels, learn=True).laws
 
     def evidence(parameters):
-        there = found.with_parameters(parameters)
+        there = replace(found, parameters=parameters)
         mode = find_joint_mode(skies, there, channels)
         return float(mode.posterior.log_evidence) + there.log_density()
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import close, refused
 from reference_linear import assert_draws_follow, z_of
 
 import lusee_bayes as lb
@@ -72,14 +73,9 @@ def term(drift, d, hours, flags, width=None) -> lb.TimeBandedCovariance:
     return drift.covariance(jnp.asarray(d), hours, DataLayout.from_flags(flags), width)
 
 
-def close(got, expected, relative):
-    expected = np.asarray(expected)
-    np.testing.assert_allclose(got, expected, rtol=0, atol=relative * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("make_flags", [complete, gappy])
-@pytest.mark.parametrize("sigma", [0.3, 1e-3])
-@pytest.mark.parametrize("n_antennas", [2, 4])
+@pytest.mark.parametrize(
+    ("n_antennas", "sigma", "make_flags"), [(2, 0.3, complete), (2, 1e-3, gappy), (4, 0.3, gappy)]
+)
 def test_every_entry_is_the_papers(n_antennas, sigma, make_flags):
     flags = make_flags(n_antennas)
     d = visibilities(n_antennas)
@@ -97,8 +93,7 @@ def gain_histories(rng, n, n_antennas, sigma, correlation=10.0):
     return rng.normal(size=(n, n_antennas, N_TIMES)) @ root.T
 
 
-@pytest.mark.parametrize(("n_antennas", "sigma"), [(2, 0.3), (4, 0.1)])
-def test_mean_and_covariance_of_simulated_histories(n_antennas, sigma):
+def test_mean_and_covariance_of_simulated_histories():
     """Entry by entry, 1e5 histories in chunks.
 
     The sample mean of e scatters by its standard deviation over sqrt(n), the sample mean of the
@@ -106,7 +101,7 @@ def test_mean_and_covariance_of_simulated_histories(n_antennas, sigma):
     from the same draws: gains make e a second-order polynomial of normals, so Wick's theorem for
     Gaussian e would not do.
     """
-    n, chunk = 100_000, 20_000
+    n_antennas, sigma, n, chunk = 3, 0.3, 100_000, 20_000
     rng = np.random.default_rng(20270115)
     d = visibilities(n_antennas)
     flags = gappy(n_antennas)
@@ -136,10 +131,9 @@ def test_mean_and_covariance_of_simulated_histories(n_antennas, sigma):
     auto = np.array([i == j for i, j in names])
     shift = (sigma**2 * np.abs(d).ravel()[keep] / scale)[auto]
     assert (shift / np.sqrt(np.diag(second)[auto] / n)).min() > 8
-    if sigma >= 0.3:
-        quadratic = np.where(auto, 2.0, 1.0) * sigma**2
-        scatter = np.sqrt((np.diag(fourth) - np.diag(second) ** 2) / n)
-        assert (quadratic / scatter).max() > 1.5 * z_of(off.size)
+    quadratic = np.where(auto, 2.0, 1.0) * sigma**2
+    scatter = np.sqrt((np.diag(fourth) - np.diag(second) ** 2) / n)
+    assert (quadratic / scatter).max() > 1.5 * z_of(off.size)
 
 
 def test_with_gains_is_the_product_of_both_antennas():
@@ -155,7 +149,7 @@ def test_with_gains_is_the_product_of_both_antennas():
 # --- the sampler ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("correlation", [0.7, 10.0, 300.0])
+@pytest.mark.parametrize("correlation", [0.7, 300.0])
 def test_the_samplers_covariance_is_c_g_exactly(monkeypatch, correlation):
     """g is linear in the white noise: with unit vectors for it, the sampler shows its root."""
     monkeypatch.setattr(jax.random, "normal", lambda key, shape, dtype: jnp.eye(shape[1]))
@@ -221,21 +215,6 @@ def test_what_the_band_leaves_out_changes_nothing():
     assert np.abs(np.asarray(cut.dense()) - full).max() > 0.01 * full.max()
 
 
-def test_scaling_with_sigma_and_the_signal():
-    """sigma^2 L + sigma^4 Q: two values of sigma predict a third; twice the signal, 4 times N."""
-    d, flags = visibilities(3), complete(3)
-
-    def dense(sigma, factor=1.0):
-        return np.asarray(term(GainDrift(sigma), factor * d, HOURS, flags).dense())
-
-    a, b = dense(0.1) / 0.1**2, dense(0.2) / 0.2**2
-    quadratic = (b - a) / (0.2**2 - 0.1**2)
-    linear = a - 0.1**2 * quadratic
-    close(dense(0.3), 0.3**2 * linear + 0.3**4 * quadratic, 1e-14)
-    assert np.abs(quadratic).max() > 0.1 * np.abs(linear).max()
-    close(dense(0.2, 2.0), 4 * dense(0.2), 1e-15)
-
-
 def test_derivatives_of_the_log_determinant():
     d, layout = visibilities(2), DataLayout.from_flags(gappy(2))
     radiometer = lb.DiagonalCovariance(jnp.asarray(layout.gather(jnp.asarray(d**2)) * 1e-4))
@@ -262,18 +241,14 @@ def test_derivatives_of_the_log_determinant():
 def test_bad_parameters_are_refused(bad):
     with pytest.raises(lb.InputError, match="the gain drift's sigma must be positive, got"):
         GainDrift(bad)
-    with pytest.raises(
-        lb.InputError, match="the gain drift's correlation time in hours must be positive, got"
-    ):
+    with refused("the gain drift's correlation time in hours must be positive, got"):
         GainDrift(0.01, bad)
 
 
 def test_bad_visibilities_are_refused():
     drift, layout = GainDrift(0.01), DataLayout(4, N_TIMES)
     d = jnp.asarray(visibilities(2))
-    with pytest.raises(
-        lb.InputError, match=r"the visibilities has shape \(4, 5\), expected \(4, 6\)"
-    ):
+    with refused(r"the visibilities has shape \(4, 5\), expected \(4, 6\)"):
         drift.covariance(d[:, :5], HOURS[:5], layout)
     with pytest.raises(lb.InputError, match=r"the visibilities holds NaN .* first at \(2, 1\)"):
         drift.covariance(d.at[2, 1].set(jnp.nan), HOURS, layout)
@@ -282,8 +257,5 @@ def test_bad_visibilities_are_refused():
 def test_the_term_alone_is_not_a_noise():
     """It is singular: the Re and Im of a product drift together."""
     gain = term(GainDrift(0.01), visibilities(2), HOURS, complete(2))
-    with pytest.raises(
-        lb.InputError,
-        match="the gain-drift covariance is not positive definite.*add the radiometer",
-    ):
+    with refused("the gain-drift covariance is not positive definite.*add the radiometer"):
         gain.factor()

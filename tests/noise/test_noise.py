@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import refused
 from reference_linear import z_of
 
 import lusee_bayes as lb
@@ -138,22 +139,10 @@ def test_defaults_are_the_fiducial_experiment():
     np.testing.assert_allclose(got.diagonal()[:N_TIMES], expected, rtol=1e-14)
 
 
-@pytest.mark.parametrize("form", ["paper", "exact"])
-def test_flagged_samples_are_left_out(form):
-    flags = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
-    flags[3, 1] = flags[:, 2] = True
-    keep = ~flags.ravel()
-    expected = np.asarray(noise(form).dense())[np.ix_(keep, keep)]
-    got = noise(form, DataLayout.from_flags(flags)).dense()
-    np.testing.assert_allclose(got, expected, rtol=1e-15)
-
-
 @pytest.mark.parametrize("name", ["bandwidth_hz", "step_s", "factor", "duty_cycle"])
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), float("inf")])
 def test_parameters_must_be_positive(name, bad):
-    with pytest.raises(
-        lb.InputError, match=rf"the radiometer's {name} must be positive, got {bad}"
-    ):
+    with refused(rf"the radiometer's {name} must be positive, got {bad}"):
         noise(**{name: bad})
 
 
@@ -168,9 +157,7 @@ def test_unknown_form_names_the_nearest():
 
 
 def test_bad_visibilities_are_refused():
-    with pytest.raises(
-        lb.InputError, match=r"antenna temperature .* must be positive.*\(1, 2\).*sky"
-    ):
+    with refused(r"antenna temperature .* must be positive.*\(1, 2\).*sky"):
         radiometer_noise(VISIBILITIES.at[7, 2].set(-1.0), LAYOUT)
     with pytest.raises(lb.InputError, match=r"the visibilities holds NaN .*\(5, 0\)"):
         radiometer_noise(VISIBILITIES.at[5, 0].set(jnp.nan), LAYOUT)

@@ -49,22 +49,38 @@ def modes():
     return modes
 
 
+def write_fits(path, pixels, unit="K", **keywords):
+    keywords = {"coord": "G"} | keywords
+    healpy.write_map(path, pixels, dtype=np.float64, column_units=unit, **keywords)
+
+
+def write_hdf5(path, **arrays):
+    with h5py.File(path, "w") as file:
+        file.update(arrays)
+
+
+def write_cube(path, maps, start=1, end=None, step=1):
+    """The cards of ULSA_32_ddi_smooth.fits: integers, two of them beyond eight letters."""
+    hdu = fits.PrimaryHDU(maps)
+    hdu.header["HIERARCH FREQ_START"] = start
+    hdu.header["FREQ_END"] = start + step * (len(maps) - 1) if end is None else end
+    hdu.header["HIERARCH FREQ_STEP"] = step
+    hdu.header["TYPE"] = "ulsa"
+    hdu.writeto(path)
+    return path
+
+
 def fits_map(path, modes):
-    pixels = modes_to_map(modes, NSIDE)
-    healpy.write_map(path, pixels, dtype=np.float64, column_units="K", coord="G")
+    write_fits(path, modes_to_map(modes, NSIDE))
 
 
 def hdf5_map(path, modes):
-    with h5py.File(path, "w") as file:
-        file["other"] = modes_to_map(modes, NSIDE)
+    write_hdf5(path, other=modes_to_map(modes, NSIDE))
 
 
 def cube(path, modes):
     """The same sky at 24, 25 and 26 MHz."""
-    hdu = fits.PrimaryHDU(np.tile(modes_to_map(modes, NSIDE), (3, 1)))
-    for key, value in (("FREQ_START", 24), ("FREQ_END", 26), ("FREQ_STEP", 1)):
-        hdu.header[f"HIERARCH {key}"] = value
-    hdu.writeto(path)
+    write_cube(path, np.tile(modes_to_map(modes, NSIDE), (3, 1)), start=24)
 
 
 def fits_alms(path, modes):
@@ -224,16 +240,6 @@ def test_sources_are_added_to_the_galaxy():
     )
 
 
-def write_fits(path, pixels, unit="K", **keywords):
-    keywords = {"coord": "G"} | keywords
-    healpy.write_map(path, pixels, dtype=np.float64, column_units=unit, **keywords)
-
-
-def write_hdf5(path, **arrays):
-    with h5py.File(path, "w") as file:
-        file.update(arrays)
-
-
 def with_one(pixels, value):
     return np.where(np.arange(pixels.size) == 7, value, pixels)
 
@@ -266,18 +272,6 @@ def test_millikelvin_are_converted_and_lmax_has_to_fit(tmp_path, pixels):
 
 
 CUBE_NSIDE = 8
-
-
-def write_cube(path, maps, start=1, end=None, step=1):
-    """The cards of ULSA_32_ddi_smooth.fits: integers, two of them beyond eight letters."""
-    hdu = fits.PrimaryHDU(maps)
-    hdu.header["HIERARCH FREQ_START"] = start
-    hdu.header["FREQ_END"] = start + step * (len(maps) - 1) if end is None else end
-    hdu.header["HIERARCH FREQ_STEP"] = step
-    hdu.header["NSIDE"] = CUBE_NSIDE
-    hdu.header["TYPE"] = "ulsa"
-    hdu.writeto(path)
-    return path
 
 
 @pytest.fixture

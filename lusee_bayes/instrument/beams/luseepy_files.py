@@ -331,9 +331,7 @@ class PortResponse(LuseepyBeam):
         """Return U_aa, the V^2/Hz that an enclosure of 1 K makes at each receiver's input."""
         return self.circuit(frequency_mhz).per_kelvin.diagonal().real
 
-    def fields(
-        self, frequency_mhz: float, *, grid: HemisphereGrid | None = None, turn_deg: float = 0.0
-    ) -> AntennaFields:
+    def fields(self, frequency_mhz: float, **how: Any) -> AntennaFields:
         """Return the fields of the ports; their products are beams in K per K and sr.
 
         Between the frequencies of the file this is so with splines only. With linear interpolation
@@ -357,15 +355,15 @@ class PortResponse(LuseepyBeam):
         InputError
             Outside the frequencies of the file.
         """
-        opened = self._open(self._at(frequency_mhz, self.h_theta, self.h_phi), grid, turn_deg)
+        opened = self._open(self._at(frequency_mhz, self.h_theta, self.h_phi), **how)
         mixing = self._mixing(frequency_mhz) / (SPEED_OF_LIGHT / (1e6 * frequency_mhz))
         parts = (np.tensordot(mixing, part, axes=1) for part in (opened.e_theta, opened.e_phi))
         return AntennaFields(*parts, opened.grid)
 
-    def _linear(self, frequency_mhz, lmax, *, grid=None, turn_deg=0.0):
+    def _linear(self, frequency_mhz, lmax, **how):
         opened = np.zeros((N_ANTENNAS**2, (lmax + 1) ** 2))
         for k, weight in self._neighbours(frequency_mhz):
-            fields = self._open([self.h_theta[k], self.h_phi[k]], grid, turn_deg)
+            fields = self._open([self.h_theta[k], self.h_phi[k]], **how)
             wavelength = SPEED_OF_LIGHT / (1e6 * self.frequencies_mhz[k])
             opened += weight / wavelength**2 * product_modes(fields, lmax, normalise=False)
         mixing = self._mixing(frequency_mhz)
@@ -404,7 +402,7 @@ class PortResponse(LuseepyBeam):
         return scale[:, None] * self.circuit(frequency_mhz).loading
 
     def _open(
-        self, parts: list[np.ndarray], grid: HemisphereGrid | None, turn_deg: float
+        self, parts: list[np.ndarray], *, grid: HemisphereGrid | None = None, turn_deg: float = 0.0
     ) -> AntennaFields:
         """The effective lengths of one frequency on a grid, of ports that are open."""
         grid = self._grid(grid)
@@ -508,14 +506,7 @@ class ScalarBeam(LuseepyBeam):
         """The directions of the file with luseepy's rule: sin(theta) dtheta dphi."""
         return rectangle_rule(self.theta, self.n_phi)
 
-    def fields(
-        self,
-        frequency_mhz: float,
-        *,
-        grid: HemisphereGrid | None = None,
-        taper: bool = True,
-        rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
-    ) -> AntennaFields:
+    def fields(self, frequency_mhz: float, **how: Any) -> AntennaFields:
         """Return the fields of the arms; their products are beams in K per K.
 
         Between the frequencies of the file this is so with splines only. With linear interpolation
@@ -543,19 +534,15 @@ class ScalarBeam(LuseepyBeam):
             Outside the frequencies of the file.
         """
         *parts, gain = self._at(frequency_mhz, self.e_theta, self.e_phi, self.gain)
-        return self._put_up(parts, float(gain), grid, taper, rotations_deg)
+        return self._put_up(parts, float(gain), **how)
 
     def _linear(self, frequency_mhz, lmax, **how):
         (gain,) = self._at(frequency_mhz, self.gain)
-        return sum(
-            weight
-            * product_modes(
-                self._put_up([self.e_theta[k], self.e_phi[k]], float(gain), **how),
-                lmax,
-                normalise=False,
-            )
-            for k, weight in self._neighbours(frequency_mhz)
-        )
+        modes = 0
+        for k, weight in self._neighbours(frequency_mhz):
+            fields = self._put_up([self.e_theta[k], self.e_phi[k]], float(gain), **how)
+            modes = modes + weight * product_modes(fields, lmax, normalise=False)
+        return modes
 
     def impedance_at(self, frequency_mhz: float) -> complex | None:
         """Return the arm's impedance in Ohm, or None. InputError outside the file's frequencies."""
@@ -599,6 +586,7 @@ class ScalarBeam(LuseepyBeam):
         self,
         parts: list[np.ndarray],
         gain: float,
+        *,
         grid: HemisphereGrid | None = None,
         taper: bool = True,
         rotations_deg: tuple[float, ...] = ROTATIONS_DEG,

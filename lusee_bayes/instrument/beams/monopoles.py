@@ -537,8 +537,11 @@ class Circuit:
 
     @property
     def loading(self) -> Complex[np.ndarray, "ports ports"]:
-        """M; the identity for open ports."""
-        return loading_matrix(self.antenna_ohm, self.load_ohm)
+        """M = ZL (ZA + ZL)^-1; the identity for open ports."""
+        load_ohm = self.load_ohm
+        if load_ohm is None:
+            return np.eye(len(self.antenna_ohm), dtype=complex)
+        return np.linalg.solve((self.antenna_ohm + load_ohm).T, load_ohm.T).T
 
     @property
     def per_kelvin(self) -> Complex[np.ndarray, "ports ports"]:
@@ -550,16 +553,6 @@ class Circuit:
     ) -> Complex[np.ndarray, "ports ports"]:
         """Return the V^2/Hz at the receivers of resistances times their temperatures in K."""
         return 4.0 * Boltzmann * self.loading @ kelvin_ohm @ self.loading.conj().T
-
-
-def loading_matrix(
-    antenna_ohm: Complex[np.ndarray, "ports ports"],
-    load_ohm: Complex[np.ndarray, "ports ports"] | None,
-) -> Complex[np.ndarray, "ports ports"]:
-    """Return M = ZL (ZA + ZL)^-1; the identity for open ports (``load_ohm`` None)."""
-    if load_ohm is None:
-        return np.eye(len(antenna_ohm), dtype=complex)
-    return np.linalg.solve((antenna_ohm + load_ohm).T, load_ohm.T).T
 
 
 # rotations keep |n| = 1 to rounding; a vector that is further from it is a mistake

@@ -44,7 +44,7 @@ from lusee_bayes.core.formats import (
     read_fits,
     read_netcdf,
 )
-from lusee_bayes.core.layouts import Attribute, Layout, Variable, require_mhz
+from lusee_bayes.core.layouts import Attribute, Content, Layout, Variable, require_mhz
 from lusee_bayes.core.lazy import healpy, pyuvdata
 from lusee_bayes.core.reading import naming, reading, require_file
 from lusee_bayes.instrument.beams.fields import (
@@ -196,10 +196,7 @@ class Directions:
         and phi have no value at the zenith.
         """
         if self.theta is not None:
-            return (
-                self.scalars_on(e_theta, grid, turn_deg),
-                self.scalars_on(e_phi, grid, turn_deg),
-            )
+            return tuple(self.scalars_on(one, grid, turn_deg) for one in (e_theta, e_phi))
         theta, phi = healpy.pix2ang(self.nside, np.arange(e_theta.shape[-1]))
         along = [a * e_theta + b * e_phi for a, b in zip(*_axes(theta, phi), strict=True)]
         own_phi = grid.phi - np.radians(turn_deg)
@@ -471,16 +468,6 @@ def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
     )
 
 
-def is_sampled_file(path: str | Path) -> bool:
-    """Whether there is a file of this layout at a path."""
-    path = user_path(path)
-    if not path.is_file():
-        return False
-    if is_fits(path):
-        return bool({FIELDS[0], POWER} & set(image_names(path)))
-    return formats.format_of(path) == formats.BEAMS
-
-
 def read_sampled_beams(path: str | Path) -> SampledBeams:
     """Read a file that :func:`write_sampled_beams` has written, or one of the same layout.
 
@@ -499,15 +486,14 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
     """
     path = user_path(path)
     in_fits = path.is_file() and is_fits(path)
-    if in_fits:
-        there = frozenset(image_names(path))
-    else:
-        there = read_netcdf(path, formats.BEAMS, Layout(WHAT), HINT).there
-    declared = layout(fields=POWER not in there, grid="theta_deg" in there, upper=in_fits)
-    if in_fits:
-        found = read_fits(path, declared, HINT)
-    else:
-        found = read_netcdf(path, formats.BEAMS, declared, HINT)
+
+    def read(declared: Layout) -> Content:
+        if in_fits:
+            return read_fits(path, declared, HINT)
+        return read_netcdf(path, formats.BEAMS, declared, HINT)
+
+    there = read(Layout(WHAT)).there
+    found = read(layout(fields=POWER not in there, grid="theta_deg" in there, upper=in_fits))
     arrays, said = found.arrays, {key.lower(): value for key, value in found.values.items()}
     given: dict[str, np.ndarray] = {}
     if POWER in arrays:
@@ -558,21 +544,17 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
         said["products"] = ",".join(labels(beams.n_ports))
     with replacing(path) as partial:
         if path.suffix.lower() in (".fits", ".fit"):
-            _write_fits(partial, arrays, said)
+            header = fits.Header([(key.upper(), value) for key, value in said.items()])
+            hdus = [fits.PrimaryHDU(header=header)]
+            hdus += [
+                fits.ImageHDU(np.ascontiguousarray(a), name=name) for name, a in arrays.items()
+            ]
+            fits.HDUList(hdus).writeto(partial)
         else:
             declared = layout(fields=fields, grid=grid).variables
             variables = {name: (declared[name].dims, one) for name, one in arrays.items()}
             xr.Dataset(variables, attrs=said).to_netcdf(partial, engine="h5netcdf")
     return path
-
-
-def _write_fits(path: Path, arrays: dict[str, np.ndarray], said: dict[str, object]) -> None:
-    hdus = fits.HDUList([fits.PrimaryHDU()])
-    for key, value in said.items():
-        hdus[0].header[key.upper()] = value
-    for name, array in arrays.items():
-        hdus.append(fits.ImageHDU(np.ascontiguousarray(array), name=name))
-    hdus.writeto(path)
 
 
 def _in_order(beams: np.ndarray, products: str) -> np.ndarray:
@@ -619,12 +601,6 @@ class SampledFileBeams(BeamSource):
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         turn_deg, normalise = self.turntable_offset_deg, self.normalise
         return self.sampled.beams(frequency_mhz, lmax, turn_deg=turn_deg, normalise=normalise)
-
-
-def is_uvbeam_file(path: str | Path) -> bool:
-    """Whether there is a beam FITS file of pyuvdata at a path."""
-    path = user_path(path)
-    return path.is_file() and has_words(path, UVBEAM_WORDS)
 
 
 def read_uvbeam(path: str | Path) -> SampledBeams:
@@ -746,11 +722,12 @@ def beam_kind(path: str | Path) -> str:
         path = require_file(path, "beam file")
     except InputError:
         return "luseepy"
-    if is_sampled_file(path) or is_uvbeam_file(path):
+    in_fits = is_fits(path)
+    names = set(image_names(path)) if in_fits else set()
+    own = names & {FIELDS[0], POWER} if in_fits else formats.format_of(path) == formats.BEAMS
+    if own or has_words(path, UVBEAM_WORDS):
         return "sampled"
-    if is_fits(path) and "h_theta_real" in image_names(path):
-        return "response"
-    return "luseepy"
+    return "response" if "h_theta_real" in names else "luseepy"
 
 
 def read_sampled(path: str | Path) -> SampledBeams:
@@ -761,7 +738,8 @@ def read_sampled(path: str | Path) -> SampledBeams:
     InputError
         As :func:`read_sampled_beams` and :func:`read_uvbeam`.
     """
-    return read_uvbeam(path) if is_uvbeam_file(path) else read_sampled_beams(path)
+    path = require_file(path, "beam file", "check beam.file")
+    return read_uvbeam(path) if has_words(path, UVBEAM_WORDS) else read_sampled_beams(path)
 
 
 READERS = {"sampled": read_sampled, "response": read_response, "luseepy": read_scalar_beam}
