@@ -47,7 +47,7 @@ def main() -> None:
         rows.append((name, first, steady / per, peak_memory_gb()))
 
     section, source = scenario.observation, scenario.beam.source()
-    measure("rotations (lunarsky)", lambda: section.observation().mcmf_from_galactic())
+    measure("rotations (lunarsky)", lambda: section.observation().mcmf_from_galactic)
     observation = section.observation()
     measure("pointing", lambda: lb.Pointing.of(observation, scenario.lmax))
     pointing = lb.Pointing.of(observation, scenario.lmax)

@@ -10,7 +10,6 @@ notebook.
 from __future__ import annotations
 
 from abc import abstractmethod
-from html import escape
 from typing import Any
 
 import jax
@@ -213,11 +212,6 @@ class Described:
     def __repr__(self) -> str:
         first, *rest = self.description()
         return "\n  ".join([f"{type(self).__name__}: {first}", *rest])
-
-    def _repr_html_(self) -> str:
-        first, *rest = self.description()
-        lines = "".join(f"<br>{escape(line)}" for line in rest)
-        return f"<div><b>{escape(type(self).__name__)}</b>: {escape(first)}{lines}</div>"
 
 
 def number(value: Any, form: str = ".6g") -> str:

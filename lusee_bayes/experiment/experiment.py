@@ -261,18 +261,14 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     """
     setup, data, log_normal = experiment.setup, experiment.data, experiment.scenario.log_normal
 
-    def free(key: str, made: Callable[[], Any]) -> Callable[[], Any]:
-        def make():
-            piece = made()
-            term = next(term for term in TERMS if term.key == key)
-            if any(t == "marginalised" for t, _ in term.build(setup, Around())):
-                raise InputError(
-                    "the program samples what the scenario marginalises, so that it would count "
-                    f"twice; set {key}.treatment=sampled"
-                )
-            return piece
-
-        return make
+    def free(key: str, piece: Any) -> Any:
+        term = next(term for term in TERMS if term.key == key)
+        if any(t == "marginalised" for t, _ in term.build(setup, Around())):
+            raise InputError(
+                "the program samples what the scenario marginalises, so that it would count "
+                f"twice; set {key}.treatment=sampled"
+            )
+        return piece
 
     @cache
     def around() -> Around:
@@ -285,9 +281,9 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     return {
         "gaussian": lambda: to_sample()[0],
         "systematics": lambda: to_sample()[1],
-        "gain_drifts": free("noise.gain", lambda: gain_drifts(setup, around())),
-        "instrument": free("noise.beam", lambda: embedded_instrument(setup)),
-        "sources": free("sources", lambda: point_sources(setup)),
+        "gain_drifts": lambda: free("noise.gain", gain_drifts(setup, around())),
+        "instrument": lambda: free("noise.beam", embedded_instrument(setup)),
+        "sources": lambda: free("sources", point_sources(setup)),
         "log_normal": lambda: on_device(log_normal.prior(setup.sky.frequency_mhz, setup.sky.lmax)),
         "layout": lambda: data.layout,
     }

@@ -112,13 +112,10 @@ class FlightSimulation:
         return synthesis.ChannelSpectra.of(self.frequencies_mhz, channel_mhz(self.origin))
 
     @cached_property
-    def _hours(self) -> Float[np.ndarray, " rows"]:
-        return self.observation.hours
-
-    @cached_property
     def sessions(self) -> tuple[slice, ...]:
         """Which spectra each session has."""
-        number = np.floor((self._hours - self._hours[0]) / self.section.session_h + 1e-9)
+        hours = self.observation.hours
+        number = np.floor((hours - hours[0]) / self.section.session_h + 1e-9)
         starts = np.flatnonzero(np.diff(number, prepend=-1.0))
         ends = np.append(starts[1:], len(number))
         return tuple(slice(int(a), int(b)) for a, b in zip(starts, ends, strict=True))
@@ -212,7 +209,7 @@ class FlightSimulation:
         return synthesis.Counting(self.gains, levels, self.section.navgf, self.origin, sign)
 
     def _telemetry(self, rows: slice) -> Mapping[str, Float[np.ndarray, " _"]]:
-        hours = self._hours[rows]
+        hours = self.observation.hours[rows]
         return {
             name: mean + amplitude * np.sin(2.0 * np.pi * hours / period_h)
             for name, (mean, amplitude, period_h) in TELEMETRY.items()

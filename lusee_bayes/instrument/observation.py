@@ -302,19 +302,16 @@ class Observation(Described):
         instants = replace(self, times=times, run=self.run[sample], windows=None)
         return instants, sample, weight
 
-    @property
+    @cached_property
     def hours(self) -> Float[np.ndarray, " times"]:
         """Hours since the first sample."""
         with unannounced_leap_seconds():
             tdb = self.times.tdb
         return (tdb - tdb[0]).to_value(u.hour)
 
-    def mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
-        """Return the rotations that take Galactic unit vectors to MCMF ones at every time."""
-        return self._mcmf_from_galactic
-
     @cached_property
-    def _mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
+    def mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
+        """The rotations that take Galactic unit vectors to MCMF ones at every time."""
         if self.fixed_axis:
             angle = 2.0 * np.pi * self.hours / LUSEEPY_MONTH_HOURS
             about_z = SpatialRotation.from_rotvec(np.outer(-angle, [0.0, 0.0, 1.0])).as_matrix()
@@ -343,7 +340,7 @@ class Observation(Described):
 
     def zenith_galactic(self) -> Float[np.ndarray, "times 3"]:
         """Return the Galactic unit vector of the zenith at every time."""
-        return self.topocentric_from_mcmf()[2] @ self.mcmf_from_galactic()
+        return self.topocentric_from_mcmf()[2] @ self.mcmf_from_galactic
 
     def sun_altitude_deg(self) -> Float[np.ndarray, " times"]:
         """Return the geometric altitude of the Sun's centre above the horizon in degrees."""

@@ -120,7 +120,7 @@ class Pointing(eqx.Module):
             longest = (observation.windows.end_s - observation.windows.start_s).max()
             angle = lmax * FASTEST_TURN * float(longest) / 2.0
         instants, sample, weight = observation.at_nodes(sufficient_nodes(angle))
-        mcmf = instants.mcmf_from_galactic()
+        mcmf = instants.mcmf_from_galactic
         if pole_frame is None:
             pole_frame = mean_pole_frame(mcmf)
         azimuth, tilt = split(mcmf @ pole_frame.T)

@@ -43,7 +43,7 @@ def antenna_directions(
     """
     require_array("galactic", galactic, (3,) if galactic.ndim == 1 else (observation.n_times, 3))
     vectors = np.broadcast_to(galactic, (observation.n_times, 3))
-    mcmf = np.einsum("tij,tj->ti", observation.mcmf_from_galactic(), vectors)
+    mcmf = np.einsum("tij,tj->ti", observation.mcmf_from_galactic, vectors)
     topocentric_from_mcmf = observation.topocentric_from_mcmf()
     leaning = observation.lander_from_mcmf() @ topocentric_from_mcmf.T
     east, north, up = leaning @ (mcmf @ topocentric_from_mcmf.T).T

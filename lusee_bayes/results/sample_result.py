@@ -61,12 +61,9 @@ class SampleResult:
         return others | mode.sky_quantities(self.skies, pixels=LANDMARKS, ells=ells, modes=modes)
 
     @cached_property
-    def _summary(self) -> pd.DataFrame:
-        return mode.summary(self.quantities())
-
-    def summary_table(self) -> pd.DataFrame:
+    def summary(self) -> pd.DataFrame:
         """ArviZ's summary of :meth:`quantities`."""
-        return self._summary
+        return mode.summary(self.quantities())
 
     @cached_property
     def maps(self) -> dict[str, np.ndarray]:
@@ -75,7 +72,7 @@ class SampleResult:
 
     def headline(self) -> str:
         """The few figures that matter, in one line."""
-        table, figures = self.summary_table(), self.figures()
+        table, figures = self.summary, self.figures()
         parts = [
             f"{figures['chains']} x {figures['draws']} draws of {figures['program']}",
             f"R-hat at most {table['r_hat'].max():.4f}",
@@ -88,7 +85,7 @@ class SampleResult:
 
     def lines(self) -> list[str]:
         """What a terminal shows."""
-        table = self.summary_table().rename_axis("quantity").reset_index()
+        table = self.summary.rename_axis("quantity").reset_index()
         reasons = warnings_of({name: table[name].to_numpy() for name in table}, self.figures())
         return [self.headline(), *reasons, *self.experiment.doubts]
 

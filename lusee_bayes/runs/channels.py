@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -338,11 +339,8 @@ def tie_receivers(scenario: Scenario, channels: Sequence[Scenario], files: Chann
     return tie(np.stack(means), np.stack(covariances), ties, normals)
 
 
-def write_tied_sky(
-    number: int,
-    channels: Sequence[Scenario],
-    tied: Tied,
-    files: ChannelFiles,
+def _write_tied_sky(
+    channels: Sequence[Scenario], tied: Tied, files: ChannelFiles, number: int
 ) -> None:
     """Write the result of one channel, unless it is there."""
     channel = channels[number]
@@ -447,15 +445,12 @@ def cube_result(
     if not mapped:
         raise InputError(f"no channel can be mapped: {_reasons(unmapped)}")
     components, tie_log_evidence = None, 0.0
+    numbers, names = range(len(mapped)), [names_of((channel,)) for channel in mapped]
     if tied:
         receivers = tie_receivers(scenario, mapped, files)
         tie_log_evidence = receivers.log_evidence
-
-        def write_tied(number: int) -> None:
-            write_tied_sky(number, mapped, receivers, files)
-
-        skies = Tasks(write_tied, range(len(mapped)), [names_of((c,)) for c in mapped])
-        engine.each(skies, stages, "smooth receivers")
+        write = partial(_write_tied_sky, mapped, receivers, files)
+        engine.each(Tasks(write, numbers, names), stages, "smooth receivers")
     if scenario.joint:
         left = _without(unmapped, scenario)
         # coverage is compared with draws
@@ -463,13 +458,8 @@ def cube_result(
         n_solved = max(n_draws, N_DRAWS) if known else n_draws
         components = solve_components(left, files, n_solved, engine, stages)
         # for workers of other processes
-        shared = on_host(components)
-
-        def write_sky(number: int) -> None:
-            _write_joint_sky(number, mapped, shared, scenario, files, n_draws)
-
-        skies = Tasks(write_sky, range(len(mapped)), [names_of((c,)) for c in mapped])
-        engine.each(skies, stages, "joint skies")
+        write = partial(_write_joint_sky, mapped, on_host(components), scenario, files, n_draws)
+        engine.each(Tasks(write, numbers, names), stages, "joint skies")
     found = tuple(files.read(c, "result") for c in mapped)
     tied_evidence = {"tie_log_evidence": tie_log_evidence}
     return CubeResult(scenario, found, components, stages.seconds, unmapped, **tied_evidence)
@@ -494,12 +484,12 @@ def _reasons(unmapped: dict[float, str]) -> str:
 
 
 def _write_joint_sky(
-    number: int,
     channels: tuple[Scenario, ...],
     components: Components,
     scenario: Scenario,
     files: ChannelFiles,
     n_draws: int,
+    number: int,
 ) -> None:
     channel, key = channels[number], draw_key(scenario)
     if files.has(channel, "result"):

@@ -446,4 +446,4 @@ def run_average(
 
 
 def _bits(scenario: Scenario, data: Visibilities) -> float:
-    return float(expected_posterior(set_up(scenario, data)).information_bits())
+    return float(expected_posterior(set_up(scenario, data))[1].information_bits())

@@ -178,11 +178,7 @@ class Output:
 
 def text_file(name: str, text: Callable[[Any], str]) -> Output:
     """A file of text, UTF-8."""
-    return Output(lambda result, folder: _write_text(folder / name, text(result)))
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+    return Output(lambda result, folder: (folder / name).write_text(text(result), "utf-8"))
 
 
 def json_file(name: str, figures: Callable[[Any], Mapping[str, Any]]) -> Output:
@@ -296,7 +292,7 @@ class RunFolder:
                     provenance.write(stage)
                 if kind.name in PAGES:
                     page = PAGES[kind.name](stage, folder.resolve().name)
-                    _write_text(stage / REPORT, page)
+                    (stage / REPORT).write_text(page, encoding="utf-8")
             files = sorted(path.relative_to(stage) for path in stage.rglob("*") if path.is_file())
         return RunOutcome(result, folder, [folder / name for name in files])
 

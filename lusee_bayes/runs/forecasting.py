@@ -12,7 +12,8 @@ import hashlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -85,15 +86,11 @@ def without_ports(setup: Setup, lost: Sequence[int]) -> Setup:
     return replace(setup, instrument=instrument, coupling=coupling)
 
 
-def expected_posterior(setup: Setup) -> Posterior:
-    """The posterior of a setup, of which all but the mean is known without data.
+def expected_posterior(setup: Setup) -> tuple[LinearGaussian, Posterior]:
+    """The model of a setup, and its posterior, of which all but the mean is known without data.
 
     N is the model's, with marginalised systematics and noise levels from the modelled sky.
     """
-    return _expected(setup)[1]
-
-
-def _expected(setup: Setup) -> tuple[LinearGaussian, Posterior]:
     model = full_model(setup)
     # the covariance is that of any data; these are the shortest to write
     return model, model.condition(np.zeros(model.n_data))
@@ -125,7 +122,7 @@ def forecast(variation: Variation) -> Forecast:
         setup = set_up(variation.scenario)
         if variation.lost:
             setup = without_ports(setup, variation.lost)
-        model, posterior = _expected(setup)
+        model, posterior = expected_posterior(setup)
         return Forecast(
             variation=variation,
             days=float(setup.observation.live_s.sum()) / 86400.0,
@@ -242,31 +239,20 @@ def with_duty_cycle(scenario: Scenario, duty_cycle: float) -> Scenario:
     return scenario.with_section("noise", radiometer=radiometer)
 
 
-@dataclass(frozen=True)
-class ForecastFiles:
-    """Unfinished work of a plan: a JSON file for each forecast that is made.
-
-    Attributes
-    ----------
-    folder : Path
-    """
-
-    folder: Path
-
-    def forecast(self, variation: Variation) -> Forecast:
-        """Read the forecast of a variation, or make it and write it, whole or not at all."""
-        path = self.folder / f"{_digest(variation)}.json"
-        if path.is_file():
-            kept = json.loads(path.read_text(encoding="utf-8"))
-            kept["snr_squared"] = np.array(kept["snr_squared"], dtype=np.float64)
-            return Forecast(variation=variation, **kept)
-        made = forecast(variation)
-        names = (field.name for field in fields(Forecast) if field.name != "variation")
-        kept = {name: getattr(made, name) for name in names}
-        kept["snr_squared"] = np.asarray(made.snr_squared).tolist()
-        with replacing(path) as partial:
-            partial.write_text(json.dumps(kept), encoding="utf-8")
-        return made
+def kept_forecast(folder: Path, variation: Variation) -> Forecast:
+    """Read the forecast of a variation from its JSON file in a folder, or make and write it."""
+    path = folder / f"{_digest(variation)}.json"
+    if path.is_file():
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        kept["snr_squared"] = np.array(kept["snr_squared"], dtype=np.float64)
+        return Forecast(variation=variation, **kept)
+    made = forecast(variation)
+    names = (field.name for field in fields(Forecast) if field.name != "variation")
+    kept = {name: getattr(made, name) for name in names}
+    kept["snr_squared"] = np.asarray(made.snr_squared).tolist()
+    with replacing(path) as scratch:
+        scratch.write_text(json.dumps(kept), encoding="utf-8")
+    return made
 
 
 def _digest(variation: Variation) -> str:
@@ -276,15 +262,15 @@ def _digest(variation: Variation) -> str:
 
 
 def forecasts_of(
-    variations: Sequence[Variation], files: ForecastFiles, engine: Engine, stages: Stages
+    variations: Sequence[Variation], folder: Path, engine: Engine, stages: Stages
 ) -> list[Forecast]:
     """Make a forecast of every variation; what is there twice is computed once.
 
     Parameters
     ----------
     variations : sequence of Variation
-    files : ForecastFiles
-        What an interrupted plan has made is taken from them.
+    folder : Path
+        Of unfinished work: what an interrupted plan has made is taken from it.
     engine : Engine
     stages : Stages
         Told how many there are, and after the first about how long the others take.
@@ -308,12 +294,14 @@ def forecasts_of(
     first, *others = different.values()
     start = time.perf_counter()
     with stages("first forecast"):
-        found = [files.forecast(first)]
+        found = [kept_forecast(folder, first)]
     if others:
         longest = len(others) * (time.perf_counter() - start)
         stages.say(f"  the other {len(others)} take about {duration(longest)}, or less")
         names = [f"{other.source}, {other.name}" for other in others]
-        found += engine.each(Tasks(files.forecast, others, names), stages, "planning")
+        found += engine.each(
+            Tasks(partial(kept_forecast, folder), others, names), stages, "planning"
+        )
     known = {_digest(one.variation): one for one in found}
     return [
         replace(known[_digest(there)], variation=here)

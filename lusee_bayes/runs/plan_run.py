@@ -13,7 +13,7 @@ from lusee_bayes.report.figures.plans import forecasts
 from lusee_bayes.results.forecast import Forecast, Variation, forecast_rows
 from lusee_bayes.runs.cost import posterior_cost, require_fits
 from lusee_bayes.runs.folder import RunKind, RunOutcome, inputs_of, origin_of, rows_file, run_folder
-from lusee_bayes.runs.forecasting import ForecastFiles, forecasts_of
+from lusee_bayes.runs.forecasting import forecasts_of
 
 UNFINISHED = "unfinished-forecasts"
 
@@ -57,8 +57,8 @@ def run_plan(
     inputs = [path for v in variations for path in inputs_of(v.scenario)]
     with run_folder(folder, PLAN, origin, replace=replace, inputs=inputs) as run:
         engine.work_in(run.path)
-        files = ForecastFiles((run.path / UNFINISHED).resolve())
-        return run.write(forecasts_of(variations, files, engine, stages), stages)
+        made = (run.path / UNFINISHED).resolve()
+        return run.write(forecasts_of(variations, made, engine, stages), stages)
 
 
 # what the folder of a plan holds; a new file is one line here

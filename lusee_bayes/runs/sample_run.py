@@ -315,7 +315,7 @@ def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Pat
 SAMPLE_OUTPUTS = (
     netcdf_file(SAMPLES, lambda run: run.tree),
     Output(lambda run, folder: write_maps(folder, run.maps, run.experiment.scenario)),
-    text_file("summary.csv", lambda run: run.summary_table().to_csv(index_label="quantity")),
+    text_file("summary.csv", lambda run: run.summary.to_csv(index_label="quantity")),
     text_file("scenario.yaml", lambda run: run.experiment.scenario.to_yaml()),
     json_file("sampling.json", lambda run: run.figures()),
 )

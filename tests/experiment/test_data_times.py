@@ -312,7 +312,7 @@ def map_of(scenario, data, observation):
     setup = set_up(scenario, replace(data, observation=observation))
     model = full_model(setup)
     covariance = np.asarray(model.condition(np.zeros(model.n_data)).covariance())
-    bits = float(expected_posterior(setup).information_bits())
+    bits = float(expected_posterior(setup)[1].information_bits())
     return Map(model, covariance, bits)
 
 

@@ -130,7 +130,7 @@ def test_dense_rows_are_each_times_own_rotation(coupling):
     dense = np.asarray(coupling.dense()).reshape(16, o.n_times, -1)
     a = steep_sky(LMAX, monopole=1.0)
     beams = random_beams(1).modes
-    topocentric = o.topocentric_from_mcmf() @ o.mcmf_from_galactic()
+    topocentric = o.topocentric_from_mcmf() @ o.mcmf_from_galactic
     for k in (0, 5, o.n_times - 1):
         seen = Rotation.from_matrix(topocentric[k], LMAX)(a)
         turned = turn_about_z(beams, np.radians(o.turntable_deg[o.run[k]]))

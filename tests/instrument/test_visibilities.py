@@ -44,7 +44,7 @@ def test_round_trip_is_exact(data, tmp_path):
     assert again.frequency_mhz == 25.0
     # orientations, the only use of the times, are the same to the last bit
     np.testing.assert_array_equal(
-        again.observation.mcmf_from_galactic(), data.observation.mcmf_from_galactic()
+        again.observation.mcmf_from_galactic, data.observation.mcmf_from_galactic
     )
 
 

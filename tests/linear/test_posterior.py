@@ -268,7 +268,7 @@ def test_the_sky_that_never_rises_is_a_cap_round_the_north_pole():
     # pixels on the rim: 2 pi sin(radius) / pixel size of them, half a pixel each at worst
     rim = 2 * np.pi * np.sin(radius) * healpy.nside2resol(nside) / (4 * np.pi) / 2
     assert abs(hidden.mean() - expected) < rim
-    pole = observation.mcmf_from_galactic()[:, 2].mean(axis=0)
+    pole = observation.mcmf_from_galactic[:, 2].mean(axis=0)
     distance = np.arccos(np.array(healpy.pix2vec(nside, np.flatnonzero(hidden))).T @ pole)
     assert distance.max() < radius + 0.002  # the axis wanders by 0.0008 rad
 

@@ -23,7 +23,6 @@ from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.results.forecast import Variation, forecast_rows
 from lusee_bayes.runs import forecasting
 from lusee_bayes.runs.forecasting import (
-    ForecastFiles,
     default_variations,
     expected_snr_squared,
     forecast,
@@ -215,7 +214,7 @@ def test_what_is_there_twice_is_computed_once(monkeypatch, tmp_path):
         lambda variation: computed.append(variation) or replace(first, variation=variation),
     )
     again, broken = replace(whole, name="again"), replace(whole, lost=(1,))
-    given = [whole, again, broken], ForecastFiles(tmp_path), ThisProcess(), Stages()
+    given = [whole, again, broken], tmp_path, ThisProcess(), Stages()
     made = forecasts_of(*given)
     rows = forecast_rows(made)
     assert computed == [whole, broken]
