@@ -210,8 +210,7 @@ class Described:
         """Return a few lines: first what the object is, then what it holds."""
 
     def __repr__(self) -> str:
-        first, *rest = self.description()
-        return "\n  ".join([f"{type(self).__name__}: {first}", *rest])
+        return f"{type(self).__name__}: " + "\n  ".join(self.description())
 
 
 def number(value: Any, form: str = ".6g") -> str:

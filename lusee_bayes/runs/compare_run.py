@@ -63,12 +63,15 @@ def run_compare(
         return run.write(read_runs(folders), stages)
 
 
-PAGE = "comparison.html"
+def _write_page(runs: list[FinishedRun], folder: Path) -> None:
+    (folder / "comparison.html").write_text(comparison_page(runs, folder), encoding="utf-8")
+
+
 # what the folder of a comparison holds; a new file is one line here
 COMPARISON = RunKind(
     "compare",
     outputs=(
-        Output(lambda runs, to: (to / PAGE).write_text(comparison_page(runs, to), "utf-8")),
+        Output(_write_page),
         rows_file("comparison.csv", comparison_rows),
     ),
     figures={"maps": maps_of_runs, "curves": curves_of_runs},

@@ -178,7 +178,7 @@ class Output:
 
 def text_file(name: str, text: Callable[[Any], str]) -> Output:
     """A file of text, UTF-8."""
-    return Output(lambda result, folder: (folder / name).write_text(text(result), "utf-8"))
+    return Output(lambda result, folder: (folder / name).write_text(text(result), encoding="utf-8"))
 
 
 def json_file(name: str, figures: Callable[[Any], Mapping[str, Any]]) -> Output:
