@@ -161,6 +161,8 @@ def test_the_default_path_with_drifts(sigma, test_data):
     assert 1.0 - 4.0 * np.sqrt(2.0 / known) < total / known < 1.0 + 4.0 * np.sqrt(2.0 / known)
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_a_prior_that_does_not_settle_with_n_is_said_to(monkeypatch):
     """Rounds that may never end are cut short, and the map says by how much it still moves."""
     monkeypatch.setattr("lusee_bayes.experiment.rounds.PRIOR_SETTLED", 0.0)

@@ -177,6 +177,7 @@ def test_products_that_are_absent_are_absent(tmp_path):
     assert relative_error(reduced, truth)[present].max() < 1e-6
 
 
+@pytest.mark.long
 def test_the_same_seed_makes_the_same_disturbances_and_noise(tmp_path):
     one, first = simulated(tmp_path / "a", DISTURBED, rows=20)
     two, second = simulated(tmp_path / "b", DISTURBED, rows=20)
@@ -216,6 +217,7 @@ def test_a_tone_that_no_bin_holds_is_refused():
         drawn(1003)
 
 
+@pytest.mark.long
 def test_gains_are_off_as_they_are_said_to_be(tmp_path):
     """By the table the values are those of gains that are off by what the truth says."""
     off = "flight.gain_std=0.02", "flight.component_std=[0.01, 0.02]", "noise.gain_table={}"

@@ -113,6 +113,7 @@ def test_ignored_the_report_points_at_it(known_sky):
     assert days["last_day"].max() <= 28
 
 
+@pytest.mark.long
 def test_where_nothing_is_off_the_report_is_silent():
     none = "true_values: {clock_s: 0, turntable_0_deg: 0, turntable_1_deg: 0}"
     nothing = f"noise.pointing={{clock_s: 60, turntable_deg: 0.3, {none}, treatment: ignored}}"
@@ -215,6 +216,7 @@ def test_offsets_that_can_stand_for_one_another_settle(size):
     assert (np.abs(off) < 4 * np.sqrt(np.diagonal(covariance))).all()
 
 
+@pytest.mark.long
 def test_sources_and_gains_are_those_of_the_offsets():
     """Where offsets are known, the model is that of data without any, taken as the offsets say."""
     extra = [
@@ -245,6 +247,7 @@ def test_sources_and_gains_are_those_of_the_offsets():
     np.testing.assert_allclose(systematic, wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
 
 
+@pytest.mark.long
 def test_what_is_left_to_sample_is_about_the_offsets():
     """Gains are sampled, a turntable is marginalised: what is left of the model fits."""
     far = "noise.pointing={turntable_deg: 1, true_values: {turntable_deg: 2.0}}"

@@ -71,6 +71,7 @@ def test_gains_that_are_ignored_are_not_in_the_model_nor_in_the_signal():
 # --- what the gain term is built around -------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_posteriors_own_prediction_has_settled():
     e, found = (f(GAIN, "noise.gain.visibilities=posterior") for f in (experiment, inferred))
     setup, data, posterior = e.setup, e.data, found.posterior

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.errors import InputError
 
-FEW, MANY = 60, 3_000 * SCALE
+FEW, MANY = 30, 3_000 * SCALE
 SMALL = ("--set", "lmax=2", "--set", "observation.runs.0.cycles=0.02", "-q")
 
 

@@ -34,7 +34,7 @@ from lusee_bayes.runs.data_run import run_simulate_flight
 from lusee_bayes.sky.sky_files import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
-FEW, MANY = 6, 150 * SCALE
+FEW, MANY = 2, 150 * SCALE
 
 
 def read_sky(path: Path) -> object:

@@ -24,7 +24,7 @@ from lusee_bayes.results.finished_runs import read_runs
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.testing.scenarios import small_scenario
 
-FEW, MANY = 3, 60 * SCALE
+FEW, MANY = 2, 60 * SCALE
 
 
 @pytest.fixture(scope="session")

@@ -16,9 +16,7 @@ from lusee_bayes.experiment.keys import scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.runs.cost import posterior_cost, require_fits
 
-few_and_many = pytest.mark.parametrize(
-    "n", [100, pytest.param(500 * SCALE, marks=pytest.mark.long)]
-)
+few_and_many = pytest.mark.parametrize("n", [50, pytest.param(500 * SCALE, marks=pytest.mark.long)])
 
 NUMBERS = st.one_of(
     st.integers(), st.floats(), st.integers(-3, 60), st.floats(0.0, 50.0),

@@ -65,7 +65,9 @@ def solved(n_data: int, form: str, *, turned: bool) -> Posterior:
 SIZES = [(40, "map"), (40, "root"), (40, "structured"), (12, "data"), (12, "structured")]
 
 
-@pytest.mark.parametrize(("n_data", "form"), [(40, "map"), (40, "structured"), (12, "data")])
+@pytest.mark.parametrize(
+    ("n_data", "form"), [(40, "map"), pytest.param(12, "data", marks=pytest.mark.long)]
+)
 def test_a_turned_problem_has_the_turned_posterior(n_data, form):
     found, expected = (solved(n_data, form, turned=turned) for turned in (True, False))
     covariance = TURN @ np.asarray(expected.covariance()) @ TURN.T

@@ -142,6 +142,7 @@ def test_the_direct_solution_is_the_textbooks(case, place, monkeypatch):
         assert np.abs(z @ z.T / 4000 - np.eye(N_MODES)).max() < z_of(81) * np.sqrt(2 / 4000)
 
 
+@pytest.mark.long
 def test_chi2_of_data_drawn_from_the_joint_prior():
     """d^T K^-1 d, which is twice the fall of ln p(d), follows chi^2 with N_data."""
     prior = PRIORS["components"]()

@@ -177,6 +177,7 @@ def test_other_channels_do_tell(dense, expected):
     assert (np.abs(alone.mean - expected.mean) / expected.std)[part(1)].max() > 0.05
 
 
+@pytest.mark.long
 def test_a_resumed_run_is_the_same(scenario, folder, cube, tmp_path, monkeypatch):
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     (tmp_path / "channels" / "22.result.nc").unlink()

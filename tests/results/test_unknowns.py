@@ -173,6 +173,7 @@ def known(setup: Setup) -> Setup:
     return replace(setup, scenario=scenario, background=background)
 
 
+@pytest.mark.long
 def test_receivers_and_ground_that_are_not_known_cost_the_monopole_alone(response_file):
     """Of 20 data sets no mode with ell >= 1 moves by 0.1 standard deviations."""
     first = set_up(four_ports(response_file, RECEIVER, GROUND))

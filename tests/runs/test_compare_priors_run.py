@@ -73,6 +73,7 @@ def test_it_is_what_separate_maps_find(finished):
 
 
 @pytest.mark.parametrize("name", ["isotropic-sky", "local_scales"])
+@pytest.mark.long
 def test_data_of_a_prior_prefer_it(name, tmp_path):
     """A sky drawn from a prior; its mean is the model's, since antennas are warm."""
     scenario = small_scenario(**SIZES)
