@@ -140,7 +140,6 @@ def test_a_task_whose_worker_dies_is_done_again_elsewhere(engine, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_a_task_that_takes_too_much_memory_is_named(tmp_path):
     def hold(k):
         if k == 1:

@@ -266,7 +266,6 @@ def test_links_lead_somewhere(path):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_both_faces_of_the_guides_systematic_have_one_evidence():
     ((_, code),) = FENCES.findall((DOCS / "systematics.md").read_text())
     made = {}

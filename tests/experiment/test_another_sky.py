@@ -220,7 +220,6 @@ def test_all_wrong_data_make_a_map_and_most_causes_are_named():
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_absent_samples_do_not_matter():
     def make(scenario, sky, seed):
         data = wrong_data.WRONG[0].make(scenario, sky, seed)

@@ -156,7 +156,6 @@ def test_disturbances_are_found_and_little_else(tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_bursts_of_an_hour_are_found_and_little_else(tmp_path):
     """One is at the end of a span, where nothing holds the curve down."""
     bursts = "flight.simulated={burst_every_h: 2.0, burst_s: 3600, absent_share: 0.01}"
@@ -303,7 +302,6 @@ def test_what_the_comb_spoils_and_nothing_else_is_left_out(mapped, truth):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_the_map_is_that_of_the_same_data_in_kelvin(flight, truth, mapped):
     """Data that are made by hand, a sum for each product, and know nothing of sessions."""
     _, found = mapped

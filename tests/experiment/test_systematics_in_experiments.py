@@ -94,7 +94,6 @@ def test_the_posteriors_own_prediction_has_settled():
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_beam_parameters_are_directions_of_one_sigma():
     setup, model = experiment(PARAMETERS).setup, inferred(PARAMETERS).model
     assert isinstance(model.noise, LowRankUpdate)

@@ -139,9 +139,10 @@ def test_contract(kind, layout, small_blocks):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 @pytest.mark.parametrize("second", KINDS)
-@pytest.mark.parametrize("first", KINDS)
+@pytest.mark.parametrize(
+    "first", [pytest.param(k, marks=pytest.mark.essential) if k == "blocks" else k for k in KINDS]
+)
 def test_contract_of_sums(first, second, small_blocks):
     terms = _terms(FLAGS)
     (cov_a, dense_a), (cov_b, dense_b) = terms[first], terms[second]

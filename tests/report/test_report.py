@@ -179,7 +179,6 @@ def test_a_corrupted_product_is_pointed_at(tmp_path, factor):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_a_page_without_groups(tmp_path, monkeypatch):
     """Noise that couples times, and an A that would be too large to judge its data one by one."""
     monkeypatch.setattr(residuals_module, "DENSE_BYTES", 0.0)

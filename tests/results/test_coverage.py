@@ -125,7 +125,6 @@ def test_the_scatter_is_that_of_simulated_skies(ensemble):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_skies_of_the_prior_are_covered_within_the_printed_errors(tmp_path):
     """Shares of four skies, the mean of their distances from the level in printed errors: 0 within
     1 / sqrt(4). With error bars that are 1.3 times too wide they are far from it."""

@@ -33,7 +33,6 @@ def cube_of(response_file, *overrides, frequencies="[15, 20]"):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch):
     others = {name: lambda _: Figure() for name in CUBE_FIGURES}
     drawn = {**others, "unknowns": map_run.CUBE.figures["unknowns"]}

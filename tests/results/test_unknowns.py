@@ -118,7 +118,6 @@ def test_the_common_gain_is_told_where_it_keeps_its_prior(experiment, common, to
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_unknowns_of_a_map_onto_another_are_said_to_be_of_the_new_data(response_file, tmp_path):
     """As numbers: those of these data mapped alone."""
     first = four_ports(response_file, GROUND, "output.updatable=true")

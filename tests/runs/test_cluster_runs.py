@@ -155,7 +155,6 @@ def goes_on(cluster: Cluster, folder: Path, *more):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_a_cluster_gives_the_same_numbers_though_a_worker_is_killed(cluster, alone, tmp_path):
     process = cluster.command(*MAP, "-o", tmp_path / "a")
     when_some_are_there(process, tmp_path / "a")

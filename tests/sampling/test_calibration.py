@@ -264,7 +264,6 @@ def test_too_few_data_sets_are_refused():
 
 
 @pytest.mark.long
-@pytest.mark.essential
 @EVERY_NOISE
 def test_the_sky_is_calibrated(noise):
     ranks = calibrate_sky(model(noise), model(noise), seed=1)

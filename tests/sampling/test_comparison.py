@@ -169,7 +169,6 @@ def test_how_many_draws_count(name, least):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_the_mode_and_the_curvature_in_two_dimensions():
     it = evidence("prior_amplitude").laplace
     names = [name for name, _ in it.whitening.sites]

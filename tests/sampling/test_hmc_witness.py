@@ -31,7 +31,7 @@ NOISES = {
 # a chain or two of each structure of N is run every time, the others by make long
 EVERY_NOISE = pytest.mark.parametrize(
     "noise",
-    ["exact", *(pytest.param(n, marks=pytest.mark.long) for n in ("gain", "paper", "beam"))],
+    [*(pytest.param(n, marks=pytest.mark.essential) for n in ("exact", "gain")), "paper", "beam"],
 )
 LMAX, N_MODES, DRAWS, TIME = 6, 49, 2000, 2
 
@@ -133,7 +133,6 @@ class UnevenPrior(lb.HarmonicPrior):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 @EVERY_NOISE
 def test_hmc_finds_the_analytic_posterior(noise):
     w = witness(noise)
@@ -173,7 +172,6 @@ TOO_NARROW, TOO_WIDE = "covariance, largest", "covariance, smallest"
 
 
 @pytest.mark.long
-@pytest.mark.essential
 @EVERY_NOISE
 def test_what_the_wrong_posteriors_are_made_with_is_right(noise):
     """Dense matrices, a prior with weights of one, a quarter of the draws.
@@ -190,7 +188,6 @@ def test_what_the_wrong_posteriors_are_made_with_is_right(noise):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 @EVERY_NOISE
 def test_a_prior_variance_halved_for_some_modes_fails(noise):
     w = witness(noise)
@@ -200,7 +197,6 @@ def test_a_prior_variance_halved_for_some_modes_fails(noise):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 @EVERY_NOISE
 @pytest.mark.parametrize(("factor", "end"), [(2.0, TOO_WIDE), (0.5, TOO_NARROW)])
 def test_a_posterior_or_a_noise_off_by_sqrt_2_fails(noise, factor, end):
@@ -213,7 +209,6 @@ def test_a_posterior_or_a_noise_off_by_sqrt_2_fails(noise, factor, end):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 @EVERY_NOISE
 def test_a_posterior_without_one_time_sample_fails(noise):
     """The rows of one time of six are gone from d, A and N: variances are too large.
@@ -228,7 +223,6 @@ def test_a_posterior_without_one_time_sample_fails(noise):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 @EVERY_NOISE
 def test_noise_left_out_at_one_time_fails(noise):
     """A thousandth of the noise at one time, its correlations in step: too sure of that time."""

@@ -173,7 +173,6 @@ def by_quadrature(gaussian, data, noise, logs):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_a_sky_in_white_coordinates_beside_a_site_in_none(gaussian, data, level_grid):
     """Against quadrature over the level: p(level | d), and the sky's mean and second moments."""
     whitening = lb.Whitening.of(gaussian.condition(data))
@@ -376,7 +375,6 @@ def in_numpyros_types():
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_chains_within_a_program_follow_each_data_sets_posterior(gaussian):
     """64 data sets at once. In each one's white coordinates the draws' means are independent."""
     n_sets, sampler = 64, Sampler(warmup=100, draws=30, algorithm="hmc")

@@ -161,7 +161,6 @@ def test_the_density_is_the_priors_times_the_evidence(case):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_nuts_follows_the_grid(grid, sites):
     assert_follow(grid, np.log(sites["amplitude"]), sites["tilt"])
 

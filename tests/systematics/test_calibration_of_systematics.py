@@ -253,7 +253,6 @@ def drawn(first: Setup, seed: int) -> tuple[Setup, lb.Experiment]:
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_simulation_based_calibration(response_file):
     first = set_up(four_ports(response_file, *UNKNOWN))
     # known to a fifth, so that no sky is without a signal

@@ -358,7 +358,6 @@ def test_rounds_find_the_mode_and_the_first_order_does_not(experiment):
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_many_modes_do_not_pass_for_a_gain():
     """20 skies of 121 modes: the common gain that is found is zero on average.
 

@@ -193,7 +193,6 @@ def test_drifts_too_strong_for_the_coordinates_have_none():
 
 
 @pytest.mark.long
-@pytest.mark.essential
 def test_the_instruments_program():
     """Beams of antennas built so, the evidence in decimal arithmetic, and the priors by scipy."""
     e = small_experiment(lmax=4)
