@@ -2,17 +2,19 @@
 
 import gc
 import os
+from importlib.metadata import version
 from pathlib import Path
 
 # tests spend their time compiling small programs that run once: without LLVM's optimisations that
 # takes a third less. The numbers are those of the same operations. What computes for long gains by
 # them: LUSEE_BAYES_TEST_XLA_LEVEL=3
-os.environ["XLA_FLAGS"] = " ".join(
-    [
-        os.environ.get("XLA_FLAGS", ""),
-        f"--xla_backend_optimization_level={os.environ.get('LUSEE_BAYES_TEST_XLA_LEVEL', '0')}",
-    ]
-).strip()
+LEVEL = os.environ.get("LUSEE_BAYES_TEST_XLA_LEVEL", "0")
+flags = [os.environ.get("XLA_FLAGS", ""), f"--xla_backend_optimization_level={LEVEL}"]
+# nor with fusions that are written kernel by kernel, nor in 32 parts: that takes half. Only where
+# these flags are known to exist: XLA ends the process for any other
+if LEVEL == "0" and version("jaxlib").startswith("0.9."):
+    flags += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
+os.environ["XLA_FLAGS"] = " ".join(flags).strip()
 # of healpy, whose threads wait for each other where other processes want the processors, too: a map
 # of NSIDE 8 then takes 25 us with one of them, and 900 us with two
 os.environ.setdefault("OMP_NUM_THREADS", "1")
