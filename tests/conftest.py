@@ -21,7 +21,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # as the package says it, for what imports JAX before
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-from jaxtyping import install_import_hook
+from jaxtyping import install_import_hook  # noqa: E402
 
 # before the package is imported anywhere: every annotated shape and dtype is checked at run time
 install_import_hook("lusee_bayes", "beartype.beartype")
