@@ -16,7 +16,7 @@ from jaxtyping import Float
 from matplotlib import colormaps
 
 from lusee_bayes.core.formats import opened
-from lusee_bayes.core.harmonics import lmax_of, mode_numbers, n_modes
+from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import coordinates, healpy
 from lusee_bayes.report import html
@@ -106,8 +106,7 @@ def _point_spread(diagnostics: xr.Dataset) -> dict[str, object]:
     """The resolution matrix in units of the prior, as point_spread.js reads it."""
     lmax = min(LARGEST_ELL, lmax_of(diagnostics.sizes["mode"]))
     n = n_modes(lmax)
-    ell, _ = mode_numbers(lmax)
-    steps = diagnostics["resolution_step"].values[: ell[-1] + 1, : ell[-1] + 1]
+    steps = diagnostics["resolution_step"].values[: lmax + 1, : lmax + 1]
     known = diagnostics["resolution"].values[:n, :n].astype(np.int8)
     symmetric = bool((known == known.T).all())
     entries = known[np.triu_indices(n)] if symmetric else known

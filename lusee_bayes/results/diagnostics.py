@@ -11,10 +11,11 @@ import xarray as xr
 from jaxtyping import Float, Int8
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.arrays import DataVector, Grid, ModesMatrix, on_host
+from lusee_bayes.core.arrays import DataVector, Grid, Modes, ModesMatrix, on_host
 from lusee_bayes.core.harmonics import (
     azimuth_functions,
     lmax_of,
+    mean_over_m,
     mode_numbers,
     modes_to_map,
     polar_functions,
@@ -69,7 +70,7 @@ def diagnostics(
     prior = on_host(inference.model.prior)
     usual = 0.0 if prior.white_mean is None else prior.colour(prior.white_mean)
     deviation = channel.mean - usual
-    known, steps = packed_resolution(covariance, prior)
+    known, steps, widths = packed_resolution(covariance, prior)
     monopole = 1.0 / np.sqrt(4.0 * np.pi)
     with_monopole = 2.0 * modes_to_map(covariance[0], nside) - monopole * covariance[0, 0]
     left = channel.pixel_std**2 - monopole * with_monopole
@@ -101,7 +102,7 @@ def diagnostics(
         "region_prior_fraction": ("region", region_share),
         "resolution": (("mode", "mode_2"), known),
         "resolution_step": (("ell", "ell_2"), steps),
-        "prior_std": ("mode", channel.prior_std, kelvin),
+        "prior_std": ("mode", widths, kelvin),
         "data": (("product", "time"), data.grid(), kelvin),
         "predicted": (("product", "time"), on_grid(found.predicted), kelvin),
         "z": (("product", "time"), on_grid(found.z), {"units": "standard deviations"}),
@@ -124,18 +125,18 @@ def diagnostics(
 
 
 def _chi2(name: str, part: ChiSquare) -> dict[str, float]:
-    found = {"chi2": part.chi2, "chi2_expected": part.degrees, "p": part.p}
-    return {f"{name}_{key}": value for key, value in found.items()}
+    return {f"{name}_chi2": part.chi2, f"{name}_chi2_expected": part.degrees, f"{name}_p": part.p}
 
 
 def packed_resolution(
     covariance: ModesMatrix, prior: Prior
-) -> tuple[Int8[np.ndarray, "modes modes"], Float[np.ndarray, "ells ells"]]:
+) -> tuple[Int8[np.ndarray, "modes modes"], Float[np.ndarray, "ells ells"], Modes]:
     """Pack what the data know of the modes, for point-spread functions of any direction.
 
-    The resolution matrix is R = 1 - C S^-1 = D K D^-1, with D the prior's standard deviations. K,
-    which is symmetric where S is diagonal, is kept with a byte for each entry, in steps of its pair
-    of multipoles.
+    The resolution matrix is R = 1 - C S^-1 = D K D^-1, with D the prior's standard deviations; of
+    modes that are correlated, those of whole multipoles, since one mode may be 60 times as wide as
+    another. K, which is symmetric where S is diagonal, is kept with a byte for each entry, in steps
+    of its pair of multipoles.
 
     Parameters
     ----------
@@ -150,8 +151,12 @@ def packed_resolution(
         In steps; zero for modes without prior variance.
     (ells, ells) array
         The steps.
+    (modes,) array
+        D, in K.
     """
-    width = np.sqrt(prior.variance())
+    variance = np.asarray(prior.variance())
+    ell, _ = mode_numbers(lmax_of(len(variance)))
+    width = np.sqrt(variance if prior.independent else mean_over_m(variance)[ell])
     power = width > 0
     # row by row, D^-1 C S^-1 D
     left = prior.whiten_columns(prior.whiten(covariance))
@@ -159,12 +164,11 @@ def packed_resolution(
     white = np.diag(power.astype(np.float64)) - left
     if prior.independent:  # but for rounding
         white = (white + white.T) / 2.0
-    ell, _ = mode_numbers(lmax_of(len(width)))
     starts = np.flatnonzero(np.diff(ell, prepend=-1))
     largest = np.maximum.reduceat(np.abs(white), starts, axis=0)
     largest = np.maximum.reduceat(largest, starts, axis=1)
     steps = np.where(largest > 0, largest, 1.0) / LARGEST_STEP
-    return np.rint(white / steps[np.ix_(ell, ell)]).astype(np.int8), steps
+    return np.rint(white / steps[np.ix_(ell, ell)]).astype(np.int8), steps, width
 
 
 def region_nside(nside: int) -> int:

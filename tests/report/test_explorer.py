@@ -96,15 +96,11 @@ def test_pixels_and_equatorial_coordinates(page, small_map, tmp_path):
 
 
 @needs_node
-# of local scales one mode of an ell may be 60 times as wide as another, and their step is the same
 @pytest.mark.parametrize(
-    ("which", "most"),
-    [
-        ("small_map", 0.02),
-        pytest.param("correlated", 0.4, marks=[pytest.mark.long, pytest.mark.essential]),
-    ],
+    "which",
+    ["small_map", pytest.param("correlated", marks=[pytest.mark.long, pytest.mark.essential])],
 )
-def test_point_spread_functions_are_those_of_the_posterior(which, most, request, tmp_path):
+def test_point_spread_functions_are_those_of_the_posterior(which, request, tmp_path):
     """Against y^T R from the posterior; bytes are wrong by half a step at most, at random."""
     run = request.getfixturevalue(which)
     commands = f"told.kernels = {json.dumps(POINTS)}.map((p) => explorer.kernel(...p));"
@@ -120,7 +116,7 @@ def test_point_spread_functions_are_those_of_the_posterior(which, most, request,
     variance = (y * width) ** 2 @ (step**2 / 12) @ ((there / width) ** 2).T
     # entries of the two triangles are the same number: errors may add, sqrt(2) at most
     assert (np.abs(kernels - expected) < 6 * np.sqrt(2 * variance) + 1e-6 * expected.max()).all()
-    assert np.abs(kernels - expected).max() < most * np.abs(expected).max()
+    assert np.abs(kernels - expected).max() < 0.03 * np.abs(expected).max()
 
 
 @needs_node

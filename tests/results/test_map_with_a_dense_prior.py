@@ -64,7 +64,8 @@ def test_the_channel_is_that_of_matrices(mapped):
 
 
 def test_its_resolution_is_packed(mapped):
-    page, width = mapped.diagnostics, mapped.channel.prior_std
+    page = mapped.diagnostics
+    width = page["prior_std"].values
     ell, _ = mode_numbers(LMAX)
     steps = page["resolution_step"].values[np.ix_(ell, ell)]
     scale = width[:, None] / width[None]
