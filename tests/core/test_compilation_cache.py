@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from lusee_bayes.core.arrays import SWITCH
 
 # one program, compiled anew or found; says which
@@ -48,6 +50,7 @@ def test_what_one_process_compiles_the_next_one_finds(tmp_path):
     assert run(tmp_path, "TF_CPP") == ("0\n", "")
 
 
+@pytest.mark.long
 def test_it_can_be_switched_off_and_do_without(tmp_path):
     assert run("off")[0] == "0\n"
     # a place that cannot be written to: programs are compiled anew, and nothing is said

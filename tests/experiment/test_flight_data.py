@@ -94,6 +94,7 @@ def test_times_and_windows_are_those_of_the_observation(tmp_path):
     assert truth["frames"] == 2**20
 
 
+@pytest.mark.long
 def test_receiver_noise_is_that_of_the_frames_and_channels(tmp_path):
     reduced, truth = simulated(tmp_path, rows=150, step_s=42.0)
     whole = 0.0
@@ -121,6 +122,8 @@ DISTURBED = (
 )
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_disturbances_are_found_and_little_else(tmp_path):
     reduced, truth = simulated(tmp_path, DISTURBED, "seed=4", rows=500, step_s=42.0, average_s=7200)
     saturated, tone, comb = truth["saturated"], truth["tone"], truth["comb"]

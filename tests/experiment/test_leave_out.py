@@ -93,7 +93,7 @@ def test_noise_that_is_larger_than_said_is_not_the_datas_fault(experiment, every
     assert found.remark.startswith(TOO_MANY)
 
 
-@pytest.mark.parametrize("strength", [2.0, 1e3])
+@pytest.mark.parametrize("strength", [2.0, pytest.param(1e3, marks=pytest.mark.long)])
 def test_a_bad_product_is_found_alone(experiment, strength):
     """It spoils what is predicted of all times; a time of its own that is bad is found, too."""
     data = spoilt(experiment, experiment.data.layout.product == 6, strength)

@@ -186,6 +186,7 @@ def test_inside_a_compiled_function_as_exactly_shifted(names):
     assert moved > 0.5
 
 
+@pytest.mark.long
 def test_offsets_are_differentiable():
     o, beams = two_runs(), lb.monopole_beams(25.0, 2)
     nominal = lb.Pointing.of(o, 2)

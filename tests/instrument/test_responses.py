@@ -539,6 +539,7 @@ def test_open_ports_have_no_loads_to_write(luseepy, tmp_path):
 
 
 @pytest.mark.essential
+@pytest.mark.long
 def test_simulated_and_mapped_between_the_responses_frequencies(luseepy, tmp_path):
     """14.5 MHz / 3, a Moon of many digits, other receivers, which nothing but the data say."""
     response, *_ = luseepy

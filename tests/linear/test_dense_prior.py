@@ -131,6 +131,7 @@ def test_a_beam_error_holds_the_correlated_sky():
     np.testing.assert_allclose(found, direction @ moment @ direction.T, rtol=1e-10)
 
 
+@pytest.mark.long
 def test_updates():
     model, data = problem(40, turned=True)
     noise = lb.DiagonalCovariance(jnp.linspace(0.5, 2.0, 40))

@@ -28,6 +28,7 @@ def information_of(family, seed=3):
     return model.inform(coupling @ sky + NOISE * rng.standard_normal(N_DATA))[0]
 
 
+@pytest.mark.long
 def test_the_evidence_agrees_with_draws_of_the_hyperprior():
     """The mean of p(d | theta) over theta ~ p(theta), which no maximum enters."""
     family = IsotropicFamily.around(2e4, LMAX)

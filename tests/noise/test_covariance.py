@@ -131,7 +131,13 @@ LAYOUTS = {"complete": np.zeros_like(FLAGS), "flagged": FLAGS}
 CASES = [*((kind, "flagged") for kind in KINDS), ("blocks", "complete")]
 
 
-@pytest.mark.parametrize(("kind", "layout"), CASES)
+@pytest.mark.parametrize(
+    ("kind", "layout"),
+    [
+        pytest.param(*case, marks=pytest.mark.long) if case == ("banded", "flagged") else case
+        for case in CASES
+    ],
+)
 def test_contract(kind, layout, small_blocks):
     flagged = layout == "flagged"
     eager = flagged and kind != "banded"

@@ -119,6 +119,8 @@ def part(k: int, sky: bool = True) -> slice:
     return slice(start, start + N_MODES) if sky else slice(start + N_MODES, start + 21)
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_skies_and_evidence_are_those_of_one_normal_equation(cube, dense, expected):
     for k, channel in enumerate(cube.channels):
         own = part(k)
@@ -132,6 +134,8 @@ def test_skies_and_evidence_are_those_of_one_normal_equation(cube, dense, expect
     assert abs(cube.log_evidence - alone) > 0.1
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_chi2_is_about_what_the_others_tell_of_the_receivers(cube, dense, expected):
     """N of a channel given the others' data: with the covariance that they leave to its five."""
     for k, channel in enumerate(cube.channels):
@@ -146,6 +150,8 @@ def test_chi2_is_about_what_the_others_tell_of_the_receivers(cube, dense, expect
         assert channel.chi2_expected == pytest.approx(degrees, rel=ROUNDING)
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_receivers_and_ground_are_those_of_one_normal_equation(cube, expected):
     for k, channel in enumerate(cube.channels):
         table, own = channel.unknowns.table, part(k, sky=False)
@@ -157,6 +163,8 @@ def test_receivers_and_ground_are_those_of_one_normal_equation(cube, expected):
     assert any("smooth over 0.4 octaves" in line for line in cube.lines())
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_draws_are_of_all_channels_together(cube, expected):
     """Covariances of white draws scatter by 1 / sqrt(n), their squares by sqrt(2 / n)."""
     every = np.r_[part(0), part(1), part(2)]
@@ -170,6 +178,8 @@ def test_draws_are_of_all_channels_together(cube, expected):
     assert np.abs(np.diag(off)).max() < 5 * np.sqrt(2 / N_DRAWS)
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_other_channels_do_tell(dense, expected):
     """So that the tests above would see each channel's own posterior."""
     alone = dense.solve((1,))
@@ -190,6 +200,7 @@ def test_a_resumed_run_is_the_same(scenario, folder, cube, tmp_path, monkeypatch
         assert here.coverage == there.coverage != ()
 
 
+@pytest.mark.long
 def test_simulated_receivers_have_the_covariance(response_file):
     """Over seeds, ports and pairs of frequencies: products of normals scatter by 1 to sqrt 2."""
     scenario = cube_of(response_file, RECEIVER)

@@ -89,6 +89,7 @@ def test_independent_channels_are_maps_of_each_frequency(independent):
     assert not (independent / "channels").exists()
 
 
+@pytest.mark.long
 def test_runs_take_names_strings_and_data_in_memory(tmp_path, monkeypatch, numbers_alone):
     """A cube of sets in memory is that of the same data simulated; ~ is the user's folder."""
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -201,7 +202,11 @@ def gap(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("joint", [[], ["joint=true", "spectral.components=[power_law]"]], ids=len)
+@pytest.mark.parametrize(
+    "joint",
+    [pytest.param([], marks=pytest.mark.long), ["joint=true", "spectral.components=[power_law]"]],
+    ids=len,
+)
 def test_a_channel_that_cannot_be_mapped_leaves_the_others_as_they_are(
     gap, joint, tmp_path, numbers_alone, monkeypatch, capsys
 ):

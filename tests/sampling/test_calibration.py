@@ -215,6 +215,7 @@ def test_the_conjugate_posterior_is_calibrated():
             assert abs(share - level) < 4 * ranks.coverage_error(level), (name, level)
 
 
+@pytest.mark.long
 def test_every_data_set_is_another_and_batches_do_not_matter():
     few, many = (conjugate(simulations=120, batch=b) for b in (25, 120))
     np.testing.assert_array_equal(few.ranks, many.ranks)
@@ -314,7 +315,8 @@ def test_fewer_data_than_modes_with_an_offset():
     assert not calibrate_sky(random_model(True), random_model(False)).passed
 
 
-@pytest.mark.parametrize("factor", [2.0, pytest.param(0.5, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("factor", [2.0, 0.5])
 @EVERY_NOISE
 def test_a_noise_off_by_sqrt_2_is_noticed(noise, factor):
     truth = model(noise)

@@ -120,7 +120,7 @@ def test_the_gradient_vanishes_at_the_mode():
 # --- straight coordinates ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("learned", [False, True])
+@pytest.mark.parametrize("learned", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_straight_coordinates_are_one_to_one_with_the_determinant_they_say(learned):
     power_law = np.array([np.log(0.03), TILTED]) if learned else None
     covariance = np.array([[0.04, 0.01], [0.01, 0.09]]) if learned else None

@@ -97,7 +97,9 @@ def test_false_alarms_are_as_rare_as_stated(form, turns):
     assert sum(map(bool, alarms)) < 6, [a for a in alarms if a]
 
 
-@pytest.mark.parametrize("turns", ["independent", "like NUTS"])
+@pytest.mark.parametrize(
+    "turns", [pytest.param("independent", marks=pytest.mark.long), "like NUTS"]
+)
 def test_scores_of_means_and_variances_are_standard_normal(turns):
     """30 runs of 16 uncorrelated modes: a scale of the scores that is off by a sixth is seen."""
     mean, scale = np.linspace(-1, 1, MODES), 10.0 ** np.linspace(-2, 2, MODES)

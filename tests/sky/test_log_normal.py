@@ -69,6 +69,7 @@ def test_modes_are_integrals_of_the_template_times_exp(sky, white):
         np.testing.assert_allclose(row, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
 
 
+@pytest.mark.long
 def test_jax_computes_the_same(sky, white):
     found = on_device(sky).modes(jnp.asarray(white))
     np.testing.assert_allclose(found, sky.modes(white), rtol=0, atol=1e-11 * float(found.max()))
