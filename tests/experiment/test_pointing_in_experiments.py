@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpyro import handlers
+from scipy import stats
 
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
@@ -195,6 +196,37 @@ def test_sampled_sites_move_a_as_the_exact_shift_does(name):
     )
     left = 4 * 1e-3 * done if name == "clock_s" else 1e-6 * done
     assert got == pytest.approx(wanted, abs=left + 1e-4)
+
+
+@pytest.mark.long
+def test_simulation_based_calibration():
+    """100 data sets with clock, turntable, lean and sky drawn from their priors."""
+    pointing = "noise.pointing={clock_s: 60, turntable_deg: 0.1, tilt_east_deg: 0.1, %s}"
+    first = set_up(scenario_of(pointing % "tilt_north_deg: 0.1", lmax=6, step_s=43200.0))
+    # known to 1 %, where the clock is told to some 40 s
+    prior = HarmonicPrior(1e-4 * np.asarray(first.prior.spectrum), mean=first.sky.modes)
+    z, ranks = [], []
+    for seed in range(100):
+        draw = np.asarray(prior.colour(np.random.default_rng(seed).standard_normal(prior.size)))
+        sky = replace(first.sky, modes=first.sky.modes + draw)
+        scenario = first.scenario.model_copy(update={"seed": seed})
+        setup = replace(first.under(sky), scenario=scenario, prior=prior)
+        experiment = Experiment(setup, simulate(setup))
+        found = infer(experiment)
+        mean, covariance = offset_posterior(found)
+        truth = true_values(setup)
+        std = np.sqrt(np.diagonal(covariance))
+        z.append([(mean[name] - truth[name]) / s for name, s in zip(mean, std, strict=True)])
+        pull = (found.posterior.mean - sky.modes) / found.posterior.std()
+        ranks.append(np.asarray(pull)[[0, 2, 6, 20]])
+    pulls = np.concatenate([z, ranks], axis=1)
+    assert pulls.shape == (100, 8)
+    for column in pulls.T:
+        assert stats.kstest(column, "norm").pvalue > 1e-3 / 8
+    # and all of their squares: 99.9 % of chi^2
+    low, high = stats.chi2(100).interval(1 - 1e-3 / 8)
+    assert ((pulls**2).sum(0) > low).all()
+    assert ((pulls**2).sum(0) < high).all()
 
 
 @pytest.mark.parametrize(
