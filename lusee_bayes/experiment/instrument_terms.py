@@ -6,9 +6,9 @@ and pointing that are off; drifts of the antennas' gains; and errors of the gain
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from dataclasses import replace
-from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
@@ -273,7 +273,7 @@ GAIN_DRAW, SCALE_DRAW = 2, 6
 
 
 # NumPyro's handlers are those of all threads, in which channels and cases are simulated
-_HANDLERS = Lock()
+_HANDLERS = threading.Lock()
 
 
 class GainTerm(Term):
