@@ -167,13 +167,13 @@ class SkyMap(SkyFile):
     def summary(self) -> tuple[str, ...]:
         pixels = self.pixels
         return (
-            f"HEALPix sky map, NSIDE {healpy.npix2nside(pixels.size)}, RING, Galactic",
+            f"HEALPix sky map, NSIDE {round((pixels.size / 12) ** 0.5)}, RING, Galactic",
             f"mean {pixels.mean():.6g} K, from {pixels.min():.4g} to {pixels.max():.4g} K",
         )
 
 
 def _require_healpix(path: str | Path, n_pixels: int) -> None:
-    if not n_pixels or not healpy.isnpixok(n_pixels):
+    if not n_pixels or n_pixels != 12 * round((n_pixels / 12) ** 0.5) ** 2:
         raise InputError(f"{path}: {n_pixels} values are not a HEALPix map of 12 NSIDE^2")
 
 

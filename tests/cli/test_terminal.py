@@ -182,7 +182,7 @@ def test_help_waits_for_no_library(arguments):
     [
         ("posterior.nc", {"jax", "healpy", "matplotlib", "scipy"}),
         ("diagnostics.nc", {"jax", "healpy", "matplotlib", "scipy"}),
-        ("mean.fits", {"numpyro", "xarray", "lunarsky", "scipy.stats"}),
+        ("mean.fits", {"numpyro", "xarray", "lunarsky", "scipy.stats", "healpy", "matplotlib"}),
     ],
 )
 def test_info_waits_for_no_more_than_its_file(name, spared, small_map):
