@@ -6,12 +6,14 @@ draws.
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import jax
@@ -60,6 +62,24 @@ def run_command(line: str) -> None:
 def no_figures(monkeypatch):
     """Drawing takes a third of the time, and other tests check it."""
     monkeypatch.setattr(Figure, "savefig", lambda self, target, **_: Path(target).touch())
+
+
+def test_what_pages_and_notebooks_import_is_there():
+    texts = [path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *PAGES[1:]]]
+    blocks = [code for text in texts for kind, code in FENCES.findall(text) if kind == "python"]
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        cells = nbformat.read(path, as_version=4).cells
+        blocks += [c.source for c in cells if c.cell_type == "code" and "%" not in c.source]
+    imports = [
+        node
+        for block in blocks
+        for node in ast.walk(ast.parse(block))
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("lusee_bayes")
+    ]
+    assert imports
+    for node in imports:
+        module = import_module(node.module)
+        assert not [name.name for name in node.names if not hasattr(module, name.name)], node.module
 
 
 @pytest.mark.long
