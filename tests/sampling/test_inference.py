@@ -421,7 +421,7 @@ DEVICES_SCRIPT = """
     out = Path(sys.argv[1])
     gaussian = t.small_model()
     data = gaussian.sample(jax.random.key(5))[1]
-    whitening = t.Whitening.of(gaussian.condition(data))
+    whitening = t.lb.Whitening.of(gaussian.condition(data))
 
     for stop_at in (60, None):
         seen = set()
