@@ -65,7 +65,7 @@ def test_samples_have_the_moments_of_weighted_draws(tmp_path):
     scenario = small_scenario(NO_SOURCES, lmax=LMAX, cycles=0.1)
     sampler, program = Sampler(chains=2, warmup=100, draws=500, seed=1), load_program("log_normal")
     run = lb.run_sample(scenario, tmp_path / "samples", program=program, sampler=sampler)
-    (sampled,) = run.results
+    (sampled,) = run.result
     # tails of A where the sky hardly tells it are steep: one of a thousand may fail
     assert sampled.figures()["divergences"] <= 5
     table = sampled.summary
