@@ -27,14 +27,14 @@ from rich.table import Table
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
+from lusee_bayes.experiment.draws import deviations
 from lusee_bayes.experiment.experiment import under_sky
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.judge.coverage import Counts
 from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, ORANGE, colour_bar, mollweide
 from lusee_bayes.results.channel import ChannelResult
-from lusee_bayes.results.draws import deviations
-from lusee_bayes.results.map_result import map_result
+from lusee_bayes.runs.map_run import map_result
 from lusee_bayes.sky.sky_source import FileSource, GalaxySource, SkySource
 
 # each takes a seed

@@ -25,7 +25,7 @@ from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.judge.measures import ell_cross, signal_to_noise
 from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar, mollweide, shown
 from lusee_bayes.report.figures.maps import sky_maps
-from lusee_bayes.results.map_result import map_result
+from lusee_bayes.runs.map_run import map_result
 from lusee_bayes.sampling.datatree import read_datatree
 from lusee_bayes.sampling.mode import summary
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galaxy_map

@@ -16,8 +16,10 @@ from jaxtyping import Float, Shaped
 from lusee_bayes.core.arrays import Array, Ells, Modes, ModesMatrix, Pixels
 from lusee_bayes.core.checks import Described, extent
 from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, power_spectrum
+from lusee_bayes.experiment.draws import deviations, doubts, posterior_draws
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport
 from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.judge.coverage import Counts, Coverage, latitudes
 from lusee_bayes.judge.measures import (
@@ -30,8 +32,6 @@ from lusee_bayes.judge.measures import (
 from lusee_bayes.judge.plausibility import about_information
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import pixel_std
-from lusee_bayes.results.draws import deviations, doubts, posterior_draws
-from lusee_bayes.results.unknowns import Unknowns, UnknownsReport
 
 
 @dataclass(frozen=True)

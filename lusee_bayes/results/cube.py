@@ -19,6 +19,7 @@ from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import about_run
 from lusee_bayes.core.reading import rows_of
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.unknowns import UnknownsReport
 from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.judge.chi2 import RULE, ChiSquare, Fit
 from lusee_bayes.judge.cube_fit import ChannelFits
@@ -26,7 +27,6 @@ from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.map_files import about
 from lusee_bayes.results.map_result import joint_prior_sentence
-from lusee_bayes.results.unknowns import UnknownsReport
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 

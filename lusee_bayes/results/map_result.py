@@ -5,102 +5,30 @@ Beside the map are the fluxes of point sources, and where its prior comes from.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
 from textwrap import wrap
 from typing import Any
 
-import jax
-import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.checks import Described
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.progress import Stages, about_run
-from lusee_bayes.experiment.diagnosis import Diagnosis, diagnose
-from lusee_bayes.experiment.experiment import Experiment, explained, infer
+from lusee_bayes.core.progress import about_run
+from lusee_bayes.experiment.diagnosis import Diagnosis
+from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.instrument_terms import beam_rms_difference
-from lusee_bayes.experiment.model import true_values
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.flight.reduced import Reduced
-from lusee_bayes.judge.chi2 import LEVELS, RULE
-from lusee_bayes.judge.measures import effective_resolution_deg
-from lusee_bayes.judge.residuals import residuals
-from lusee_bayes.linear.amplitudes import template_amplitudes
-from lusee_bayes.linear.linear_gaussian import composed, deviation_model
-from lusee_bayes.results.channel import ChannelResult, channel_of_posterior
-from lusee_bayes.results.diagnostics import diagnostics
-from lusee_bayes.results.saved import JUDGED
-from lusee_bayes.results.unknowns import (
+from lusee_bayes.experiment.unknowns import (
     PointingReport,
     UnknownsReport,
-    pointing_report,
-    unknowns_report,
+    flux_lines,
 )
-from lusee_bayes.results.updatable import Updatable, read_updatable
-from lusee_bayes.sky.galaxy import kelvin_steradian
-from lusee_bayes.systematics.sky_unknowns import PointSources
-
-
-def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
-    """Posterior of every source's flux in Jy and in K sr, with its prior and, if known, its truth.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        With sources that are not ignored.
-    inference : Inference
-        Of these data alone.
-
-    Returns
-    -------
-    DataFrame
-        A row for each source, or block of it. ``above_horizon``: whether it is ever up; if not,
-        its flux is known from the prior only.
-    """
-    setup, data = experiment.setup, experiment.data
-    sources = next(s for s in inference.systematics if isinstance(s, PointSources))
-    amplitudes = template_amplitudes(
-        inference.model, inference.posterior, data.data, sources.templates()
-    )
-    prior_std = np.asarray(sources.std())
-    mean = np.asarray(sources.mean()) + prior_std * amplitudes.mean
-    std = prior_std * amplitudes.std
-    jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
-    truth = true_values(setup) if data.truth is not None else {}
-    listed = [(s, block) for s in sources.sources for block in range(s.n_blocks)]
-    table = pd.DataFrame(
-        {
-            "source": [source.name for source, _ in listed],
-            "block": [block for _, block in listed],
-            "above_horizon": [bool(up) for s in sources.sources for up in s.seen()],
-            "flux_jy": mean * jansky,
-            "std_jy": std * jansky,
-            "flux_k_sr": mean,
-            "std_k_sr": std,
-            "prior_jy": [float(source.mean) * jansky for source, _ in listed],
-            "prior_std_jy": [float(source.std) * jansky for source, _ in listed],
-        }
-    )
-    if data.truth is None:
-        return table
-    true = [np.broadcast_to(truth.get(s.site, np.nan), s.n_blocks) for s in sources.sources]
-    return table.assign(true_jy=np.concatenate(true) * jansky)
-
-
-def flux_lines(fluxes: pd.DataFrame) -> list[str]:
-    """One line for every source, or block of it."""
-    lines = []
-    for row in fluxes.to_dict("records"):
-        name = row["source"] if row["block"] == 0 else f"{row['source']} ({row['block']})"
-        text = f"{name}: {row['flux_jy']:.4g} +- {row['std_jy']:.2g} Jy"
-        if not row["above_horizon"]:
-            text += ", the prior's: it is never above the horizon"
-        lines.append(text)
-    return lines
+from lusee_bayes.flight.reduced import Reduced
+from lusee_bayes.judge.chi2 import RULE
+from lusee_bayes.judge.measures import effective_resolution_deg
+from lusee_bayes.results.channel import ChannelResult
+from lusee_bayes.results.saved import JUDGED
 
 
 def prior_sentence(experiment: Experiment) -> str:
@@ -131,9 +59,6 @@ def joint_prior_sentence(scenario: Scenario) -> str:
             f"{', '.join(section.fields)}, their C_ell learned from these data; {kept}."
         )
     return f"Prior spectral.model={section.model}, C_ell of the scenario's own skies; {kept}."
-
-
-DOES_NOT_FIT = LEVELS[-1]
 
 
 @dataclass(frozen=True, repr=False)
@@ -267,96 +192,3 @@ class MapResult(Described):
 
 def _figures(channel: ChannelResult, *names: str) -> dict[str, Any]:
     return {name: getattr(channel, name) for name in names}
-
-
-def map_result(
-    experiment: Experiment,
-    *,
-    onto: str | Path | None = None,
-    diagnosed: bool = False,
-    stages: Stages | None = None,
-) -> MapResult:
-    """Condition an experiment's model on its data, and work out the uncertainties.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    onto : path, optional
-        Folder of an updatable run, to whose data these are added.
-    diagnosed : bool
-        Try the usual mistakes even if the data fit.
-    stages : Stages, optional
-        Told what is being done.
-
-    Raises
-    ------
-    InputError
-        For data that the earlier run holds already, and as :func:`infer`.
-    """
-    stages = stages or Stages()
-    scenario, data = experiment.scenario, experiment.data
-    earlier = None if onto is None else read_updatable(onto, scenario)
-    digests = (data.digest(),)
-    with stages("posterior"), explained(experiment):
-        found = judged = alone = infer(experiment)
-        if earlier is not None:
-            found, judged = _updated(earlier, found, experiment)
-            digests = (*earlier.digests, *digests)
-        elif scenario.output.updatable:
-            posterior = found.model.condition(data.data, form="root")
-            found = judged = replace(found, posterior=posterior)
-        jax.block_until_ready(found.posterior.white_mean)
-    with stages("standard deviations"):
-        covariance = on_host(found.posterior).covariance()
-        channel = channel_of_posterior(
-            experiment, found, covariance, n_draws=scenario.output.draws, judged=judged
-        )
-    fluxes = None
-    if experiment.setup.responses and scenario.sources.treatment != "ignored":
-        with stages("fluxes"):
-            fluxes = flux_table(experiment, alone)
-    unknowns = unknowns_report(experiment, alone)
-    if unknowns is not None and earlier is not None:
-        unknowns = replace(unknowns, onto=True)
-    with stages("diagnostics"):
-        left = residuals(judged.model, judged.posterior, data, channel.chi2_model)
-        page = diagnostics(experiment, found, left, channel, covariance)
-    pointing, diagnosis = None, None
-    if diagnosed or page.attrs["level"] == DOES_NOT_FIT:
-        with stages("usual mistakes"):
-            diagnosis = diagnose(experiment, alone, left)
-    if scenario.noise.pointing is not None or page.attrs["level"] == DOES_NOT_FIT:
-        with stages("clock and pointing"):
-            own = covariance if earlier is None else on_host(alone.posterior).covariance()
-            pointing = pointing_report(experiment, alone, own)
-    return MapResult(
-        experiment,
-        found,
-        channel,
-        page,
-        fluxes,
-        pointing,
-        unknowns,
-        digests,
-        diagnosis,
-        stages.seconds,
-    )
-
-
-def _updated(
-    earlier: Updatable, alone: Inference, experiment: Experiment
-) -> tuple[Inference, Inference]:
-    """The posterior given earlier data and these, and the model of these given the earlier ones."""
-    data = experiment.data
-    if data.digest() in earlier.digests:
-        raise InputError(
-            "these data are behind the earlier posterior already; used again, they would count "
-            "twice"
-        )
-    deviations = deviation_model(earlier.posterior, alone.model)
-    deviation = deviations.condition(data.data, form="root")
-    posterior = composed(earlier.posterior, deviation)
-    return (
-        replace(alone, posterior=posterior),
-        Inference(deviations, alone.systematics, deviation, alone.rounds, alone.around),
-    )

@@ -12,19 +12,15 @@ from functools import reduce
 from operator import getitem
 from typing import Any
 
-from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.progress import about_run
-from lusee_bayes.experiment.experiment import Experiment, infer
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.judge.residuals import HeldOut, held_out
+from lusee_bayes.judge.residuals import HeldOut
 from lusee_bayes.judge.split import Split
 from lusee_bayes.results.channel import (
     ChannelResult,
-    channel_of_posterior,
     errors_by_latitude,
     snr_at_some_ell,
 )
-from lusee_bayes.results.map_result import prior_sentence
 
 # a difference of two evidences of which each is good to one or two
 CLEAR = 3.0
@@ -61,24 +57,6 @@ class UnderPrior:
     n_parameters: int
     held_out: tuple[HeldOut, ...]
     split: Split
-
-    @classmethod
-    def of(cls, name: str, experiment: Experiment, log_evidence: float) -> UnderPrior:
-        """Map the data, and leave out groups of them."""
-        inference = infer(experiment)
-        model, posterior = inference.model, inference.posterior
-        covariance = on_host(posterior).covariance()
-        channel = channel_of_posterior(experiment, inference, covariance)
-        learned = experiment.learned
-        return cls(
-            name,
-            prior_sentence(experiment),
-            channel,
-            log_evidence,
-            0 if learned is None else len(learned.parameters),
-            held_out(model, posterior, experiment.data),
-            Split.of(posterior, channel.chi2_model, model.n_data),
-        )
 
     def as_json(self) -> dict[str, object]:
         """Its entry of priors.json; null where the sky is not known."""

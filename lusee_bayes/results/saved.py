@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
+from lusee_bayes.experiment.unknowns import UNKNOWN_COLUMNS
 from lusee_bayes.judge.chi2 import LEVELS
 from lusee_bayes.judge.levels import NAMES
 
@@ -220,15 +221,8 @@ POINTING = _table(
     value="number",
     **dict.fromkeys(("std", "prior_std", "beyond_first_order"), "size"),
 )
-# columns in their order in a report
-_UNKNOWN = {
-    "unknown": "text",
-    "unit": "text",
-    "value": "number",
-    "std": "size",
-    "prior": "number",
-    "prior_std": "size",
-}
+_KINDS = ("text", "text", "number", "size", "number", "size")
+_UNKNOWN = dict(zip(UNKNOWN_COLUMNS, _KINDS, strict=True))
 UNKNOWNS = _table("receivers, ground and gain table", "unknown", **_UNKNOWN)
 CHANNEL_UNKNOWNS = _table(
     "receivers, ground and gain table of several frequencies",

@@ -31,11 +31,11 @@ from lusee_bayes.experiment.data_files import Data, digest_of
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.joint import ComponentSums, summed_information
 from lusee_bayes.results.channel import Observed
-from lusee_bayes.results.unknowns import Unknowns
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 CHANNELS = "channels"

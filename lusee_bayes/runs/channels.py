@@ -33,6 +33,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data, anchored, read_data
+from lusee_bayes.experiment.draws import deviations, draw_key, posterior_draws
 from lusee_bayes.experiment.experiment import build, explained, inform, with_truth
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.sky_terms import is_receiver
@@ -49,7 +50,6 @@ from lusee_bayes.linear.positive_joint import (
 )
 from lusee_bayes.results.channel import ChannelResult, channel_of_information
 from lusee_bayes.results.cube import Components, CubeResult
-from lusee_bayes.results.draws import deviations, draw_key, posterior_draws
 from lusee_bayes.runs.channel_files import (
     ChannelFiles,
     ChannelInformation,

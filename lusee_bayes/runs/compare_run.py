@@ -6,18 +6,23 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data
-from lusee_bayes.experiment.experiment import Experiment, observed
+from lusee_bayes.experiment.experiment import Experiment, infer, observed
 from lusee_bayes.experiment.rounds import about_sky, learned_prior, named_priors
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.judge.residuals import held_out
+from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.information import Information
 from lusee_bayes.report.comparison_page import comparison_page
 from lusee_bayes.report.figures.maps import curves_of_runs, maps_of_runs
 from lusee_bayes.report.figures.plans import priors
+from lusee_bayes.results.channel import channel_of_posterior
 from lusee_bayes.results.finished_runs import FinishedRun, Provenance, comparison_rows, read_runs
+from lusee_bayes.results.map_result import prior_sentence
 from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import (
@@ -145,14 +150,25 @@ def run_compare_priors(
 
 
 def _under(name: str, setup: Setup, experiment: Experiment, information: Information) -> UnderPrior:
-    """What the data say under one prior, or a family of them."""
+    """Map the data under one prior, or a family of them, and leave out groups of them."""
     if setup.family is None:
-        evidence = float(information.posterior(setup.prior).log_evidence)
-        return UnderPrior.of(name, replace(experiment, setup=setup), evidence)
-    learned = learned_prior(setup, setup.family, information)
-    setup = replace(setup, prior=learned.prior)
+        learned, evidence = None, float(information.posterior(setup.prior).log_evidence)
+    else:
+        learned = learned_prior(setup, setup.family, information)
+        setup, evidence = replace(setup, prior=learned.prior), learned.log_evidence
     mapped = replace(experiment, setup=setup, learned=learned)
-    return UnderPrior.of(name, mapped, learned.log_evidence)
+    inference = infer(mapped)
+    model, posterior = inference.model, inference.posterior
+    channel = channel_of_posterior(mapped, inference, on_host(posterior).covariance())
+    return UnderPrior(
+        name,
+        prior_sentence(mapped),
+        channel,
+        evidence,
+        0 if learned is None else len(learned.parameters),
+        held_out(model, posterior, mapped.data),
+        Split.of(posterior, channel.chi2_model, model.n_data),
+    )
 
 
 # what the folder of a comparison of priors holds; a new file is one line here

@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import replace as replace_fields
 from pathlib import Path
 
+import jax
 import numpy as np
 
+from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.engine import Engine
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import rows_of
 from lusee_bayes.experiment.data_files import (
@@ -16,20 +19,29 @@ from lusee_bayes.experiment.data_files import (
     read_data,
     reduced_of,
 )
-from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.experiment.diagnosis import diagnose
+from lusee_bayes.experiment.experiment import Experiment, explained, infer
 from lusee_bayes.experiment.flight_data import visibilities_of
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
+from lusee_bayes.experiment.unknowns import flux_table, pointing_report, unknowns_report
 from lusee_bayes.flight.reduced import Reduced, write_reduced
+from lusee_bayes.judge.chi2 import LEVELS
+from lusee_bayes.judge.residuals import residuals
+from lusee_bayes.linear.linear_gaussian import composed, deviation_model
 from lusee_bayes.report.figures import judgement, maps
+from lusee_bayes.results.channel import channel_of_posterior
 from lusee_bayes.results.cube import CubeResult
 from lusee_bayes.results.diagnostics_file import write_diagnostics
 from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.map_files import cards, posterior_dataset, write_cubes, write_maps
-from lusee_bayes.results.map_result import MapResult, map_result
+from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.results.saved import REDUCED
+from lusee_bayes.results.updatable import Updatable, read_updatable
 from lusee_bayes.runs.channel_files import CHANNELS
 from lusee_bayes.runs.channels import cube_result
 from lusee_bayes.runs.cost import measured_experiment, posterior_cost, require_fits
+from lusee_bayes.runs.diagnostics import diagnostics
 from lusee_bayes.runs.folder import (
     SCENARIO,
     Output,
@@ -44,6 +56,8 @@ from lusee_bayes.runs.folder import (
     table_file,
 )
 from lusee_bayes.sky.sky_files import write_alms
+
+DOES_NOT_FIT = LEVELS[-1]
 
 
 def run_map(
@@ -122,6 +136,99 @@ def run_map(
             reduced = reduced and _as_used(reduced, experiment)
         made = replace_fields(made, reduced=reduced)
         return run.write(made, stages, provenance)
+
+
+def map_result(
+    experiment: Experiment,
+    *,
+    onto: str | Path | None = None,
+    diagnosed: bool = False,
+    stages: Stages | None = None,
+) -> MapResult:
+    """Condition an experiment's model on its data, and work out the uncertainties.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    onto : path, optional
+        Folder of an updatable run, to whose data these are added.
+    diagnosed : bool
+        Try the usual mistakes even if the data fit.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        For data that the earlier run holds already, and as :func:`infer`.
+    """
+    stages = stages or Stages()
+    scenario, data = experiment.scenario, experiment.data
+    earlier = None if onto is None else read_updatable(onto, scenario)
+    digests = (data.digest(),)
+    with stages("posterior"), explained(experiment):
+        found = judged = alone = infer(experiment)
+        if earlier is not None:
+            found, judged = _updated(earlier, found, experiment)
+            digests = (*earlier.digests, *digests)
+        elif scenario.output.updatable:
+            posterior = found.model.condition(data.data, form="root")
+            found = judged = replace_fields(found, posterior=posterior)
+        jax.block_until_ready(found.posterior.white_mean)
+    with stages("standard deviations"):
+        covariance = on_host(found.posterior).covariance()
+        channel = channel_of_posterior(
+            experiment, found, covariance, n_draws=scenario.output.draws, judged=judged
+        )
+    fluxes = None
+    if experiment.setup.responses and scenario.sources.treatment != "ignored":
+        with stages("fluxes"):
+            fluxes = flux_table(experiment, alone)
+    unknowns = unknowns_report(experiment, alone)
+    if unknowns is not None and earlier is not None:
+        unknowns = replace_fields(unknowns, onto=True)
+    with stages("diagnostics"):
+        left = residuals(judged.model, judged.posterior, data, channel.chi2_model)
+        page = diagnostics(experiment, found, left, channel, covariance)
+    pointing, diagnosis = None, None
+    if diagnosed or page.attrs["level"] == DOES_NOT_FIT:
+        with stages("usual mistakes"):
+            diagnosis = diagnose(experiment, alone, left)
+    if scenario.noise.pointing is not None or page.attrs["level"] == DOES_NOT_FIT:
+        with stages("clock and pointing"):
+            own = covariance if earlier is None else on_host(alone.posterior).covariance()
+            pointing = pointing_report(experiment, alone, own)
+    return MapResult(
+        experiment,
+        found,
+        channel,
+        page,
+        fluxes,
+        pointing,
+        unknowns,
+        digests,
+        diagnosis,
+        stages.seconds,
+    )
+
+
+def _updated(
+    earlier: Updatable, alone: Inference, experiment: Experiment
+) -> tuple[Inference, Inference]:
+    """The posterior given earlier data and these, and the model of these given the earlier ones."""
+    data = experiment.data
+    if data.digest() in earlier.digests:
+        raise InputError(
+            "these data are behind the earlier posterior already; used again, they would count "
+            "twice"
+        )
+    deviations = deviation_model(earlier.posterior, alone.model)
+    deviation = deviations.condition(data.data, form="root")
+    posterior = composed(earlier.posterior, deviation)
+    return (
+        replace_fields(alone, posterior=posterior),
+        Inference(deviations, alone.systematics, deviation, alone.rounds, alone.around),
+    )
 
 
 def _as_used(reduced: Reduced, experiment: Experiment) -> Reduced:

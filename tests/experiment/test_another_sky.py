@@ -23,6 +23,7 @@ from lusee_bayes.experiment.diagnosis import (
     model_mistakes,
     port_mixing,
 )
+from lusee_bayes.experiment.draws import doubts
 from lusee_bayes.experiment.experiment import build, infer
 from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.rounds import learned_prior, settled
@@ -32,7 +33,6 @@ from lusee_bayes.experiment.term import Around, gains_about, radiometer_about
 from lusee_bayes.instrument.products import DataLayout, to_matrix, to_real
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.noise.instrument_errors import GainDrift, with_gains
-from lusee_bayes.results.draws import doubts
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.sky.sky_source import Sky
 

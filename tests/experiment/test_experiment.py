@@ -21,7 +21,7 @@ from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
-from lusee_bayes.results.map_result import map_result
+from lusee_bayes.runs.map_run import map_result
 from lusee_bayes.sky.prior import read_spectrum
 from lusee_bayes.testing.scenarios import small_scenario
 

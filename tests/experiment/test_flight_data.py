@@ -16,6 +16,7 @@ from lusee_bayes.experiment.flight_data import per_kelvin_of, reduce_files
 from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.unknowns import unknowns_report
 from lusee_bayes.flight.gain_model import synthetic_gains
 from lusee_bayes.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED
 from lusee_bayes.flight.session import CHANNEL_MHZ
@@ -24,7 +25,6 @@ from lusee_bayes.flight.synthesis import Disturbances
 from lusee_bayes.instrument.products import all_products, auto_indices, labels
 from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.noise.radiometer import exact_blocks
-from lusee_bayes.results.unknowns import unknowns_report
 from lusee_bayes.runs.data_run import run_simulate_flight
 from lusee_bayes.testing.contracts import assert_refused
 

@@ -19,7 +19,7 @@ import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.solver import FORMS
-from lusee_bayes.results.map_result import map_result
+from lusee_bayes.runs.map_run import map_result
 
 LMAX, N_MODES, N_DRAWS, SEED = 8, 81, 4000, 20270115
 SPECTRUM = 1e8 * (1.0 + np.arange(LMAX + 1.0)) ** -2.5  # K^2; the monopole is 20000 K below

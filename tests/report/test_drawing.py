@@ -18,7 +18,7 @@ from lusee_bayes.report.figures.drawing import (
     unprojected,
     view,
 )
-from lusee_bayes.results.draws import warnings_of
+from lusee_bayes.results.sample_result import warnings_of
 
 
 def test_points_lie_where_matplotlib_puts_them():

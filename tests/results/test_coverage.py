@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
+from lusee_bayes.experiment.draws import deviations
 from lusee_bayes.experiment.experiment import build, under_sky
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.judge.coverage import Counts, Coverage
 from lusee_bayes.judge.levels import LEVELS
-from lusee_bayes.results.draws import deviations
-from lusee_bayes.results.map_result import map_result
 from lusee_bayes.runs.channel_files import from_dataset, to_dataset
+from lusee_bayes.runs.map_run import map_result
 from lusee_bayes.sky.sky_files import write_alms
 from lusee_bayes.sky.sky_source import FileSource, GalaxySource
 from lusee_bayes.testing.scenarios import small_scenario

@@ -14,9 +14,9 @@ from reference_linear import white_posterior
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import per_mode
 from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.experiment.unknowns import unknowns_report
 from lusee_bayes.report.cube_page import FIGURES as CUBE_FIGURES
 from lusee_bayes.report.cube_page import cube_page
-from lusee_bayes.results.unknowns import unknowns_report
 from lusee_bayes.runs import map_run
 from lusee_bayes.runs.channels import cube_result
 

@@ -13,8 +13,8 @@ from commands import run
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.rounds import NAMED
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.results.map_result import map_result
 from lusee_bayes.runs.compare_run import run_compare_priors
+from lusee_bayes.runs.map_run import map_result
 from lusee_bayes.sky.sky_files import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 

@@ -20,9 +20,9 @@ from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import full_model, simulate, true_values
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.setup import Setup, set_up
+from lusee_bayes.experiment.unknowns import GAIN, SKY, unknowns_report
 from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.linear.amplitudes import template_amplitudes
-from lusee_bayes.results.unknowns import GAIN, SKY, unknowns_report
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sampling.validation import FALSE_ALARM, N_DRAWS, Ranks, calibrate

@@ -36,7 +36,7 @@ from lusee_bayes.experiment.setup import Setup, mean_flux, source_responses
 from lusee_bayes.experiment.sky_sections import SourceSection
 from lusee_bayes.experiment.sky_terms import point_sources
 from lusee_bayes.experiment.term import Around
-from lusee_bayes.results.map_result import flux_table
+from lusee_bayes.experiment.unknowns import flux_table
 from lusee_bayes.sampling.programs import latent_sites
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.systematics.sky_unknowns import Source, SpectrumBands

@@ -14,9 +14,9 @@ from reference_linear import white_posterior
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import radiometer, simulate, true_values
 from lusee_bayes.experiment.setup import Setup, ground_per_kelvin, set_up
+from lusee_bayes.experiment.unknowns import NullDirection, unknowns_report
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.report.map_page import map_page
-from lusee_bayes.results.unknowns import NullDirection, unknowns_report
 
 RECEIVER, GROUND = "noise.receiver={power_k: 2000}", "noise.regolith={std_k: 30}"
 TABLE = "noise.gain_table={std: 0.01}"

@@ -1,4 +1,4 @@
-"""What the data tell of the instrument: receivers, ground, gain table, clock and pointing.
+"""What the data tell besides the sky: receivers, ground, gain table, pointing, point sources.
 
 A uniform sky, warmer ground and noisier receivers look much alike. Of their joint posterior, each
 in units of its prior's standard deviation, the *null direction* is the one with the largest
@@ -29,9 +29,15 @@ from lusee_bayes.experiment.rounds import Inference, offset_posterior
 from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
 from lusee_bayes.judge.residuals import HOURS_A_DAY
-from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, amplitudes_of_sky
-from lusee_bayes.results.saved import UNKNOWNS
+from lusee_bayes.linear.amplitudes import (
+    Amplitudes,
+    AmplitudesOfSky,
+    amplitudes_of_sky,
+    template_amplitudes,
+)
+from lusee_bayes.sky.galaxy import kelvin_steradian
 from lusee_bayes.systematics.gain_table import GainTable
+from lusee_bayes.systematics.sky_unknowns import PointSources
 from lusee_bayes.systematics.systematic import LinearUnknowns
 
 # a null direction is worth a sentence where it keeps more than that of the prior's variance, and a
@@ -91,6 +97,8 @@ class NullDirection:
         )
 
 
+# of a table of unknowns, in their order in a report; "true" stands behind them where it is known
+UNKNOWN_COLUMNS = ("unknown", "unit", "value", "std", "prior", "prior_std")
 # what these are called beside receivers and ground
 SKY, GAIN = "uniform sky", "common gain"
 # an unknown that keeps more of its prior's standard deviation is not told by the data
@@ -236,7 +244,7 @@ class Unknowns:
         if GAIN in self.names:
             gain = self.parts[self.names.index(GAIN)]
             common = float(np.sqrt(gain @ told.covariance @ gain))
-        columns = [*UNKNOWNS.variables, *(["true"] if "true" in rows else [])]
+        columns = [*UNKNOWN_COLUMNS, *(["true"] if "true" in rows else [])]
         return UnknownsReport(rows[columns], null, common)
 
     def _null_direction(self, told: Amplitudes, variance: float) -> NullDirection:
@@ -417,3 +425,61 @@ def _preferred(
     )
     table = pd.DataFrame(rows)
     return table.assign(value=told.amplitude, std=told.std, chi2_gain=told.gain)
+
+
+def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
+    """Posterior of every source's flux in Jy and in K sr, with its prior and, if known, its truth.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        With sources that are not ignored.
+    inference : Inference
+        Of these data alone.
+
+    Returns
+    -------
+    DataFrame
+        A row for each source, or block of it. ``above_horizon``: whether it is ever up; if not,
+        its flux is known from the prior only.
+    """
+    setup, data = experiment.setup, experiment.data
+    sources = next(s for s in inference.systematics if isinstance(s, PointSources))
+    amplitudes = template_amplitudes(
+        inference.model, inference.posterior, data.data, sources.templates()
+    )
+    prior_std = np.asarray(sources.std())
+    mean = np.asarray(sources.mean()) + prior_std * amplitudes.mean
+    std = prior_std * amplitudes.std
+    jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
+    truth = true_values(setup) if data.truth is not None else {}
+    listed = [(s, block) for s in sources.sources for block in range(s.n_blocks)]
+    table = pd.DataFrame(
+        {
+            "source": [source.name for source, _ in listed],
+            "block": [block for _, block in listed],
+            "above_horizon": [bool(up) for s in sources.sources for up in s.seen()],
+            "flux_jy": mean * jansky,
+            "std_jy": std * jansky,
+            "flux_k_sr": mean,
+            "std_k_sr": std,
+            "prior_jy": [float(source.mean) * jansky for source, _ in listed],
+            "prior_std_jy": [float(source.std) * jansky for source, _ in listed],
+        }
+    )
+    if data.truth is None:
+        return table
+    true = [np.broadcast_to(truth.get(s.site, np.nan), s.n_blocks) for s in sources.sources]
+    return table.assign(true_jy=np.concatenate(true) * jansky)
+
+
+def flux_lines(fluxes: pd.DataFrame) -> list[str]:
+    """One line for every source, or block of it."""
+    lines = []
+    for row in fluxes.to_dict("records"):
+        name = row["source"] if row["block"] == 0 else f"{row['source']} ({row['block']})"
+        text = f"{name}: {row['flux_jy']:.4g} +- {row['std_jy']:.2g} Jy"
+        if not row["above_horizon"]:
+            text += ", the prior's: it is never above the horizon"
+        lines.append(text)
+    return lines

@@ -21,6 +21,7 @@ from lusee_bayes.core.harmonics import (
     polar_functions,
 )
 from lusee_bayes.core.lazy import healpy
+from lusee_bayes.experiment.draws import posterior_draws
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.judge.chi2 import ChiSquare
@@ -29,7 +30,6 @@ from lusee_bayes.judge.residuals import Residuals
 from lusee_bayes.linear.posterior import prior_pixel_std
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.diagnostics_file import group_variables
-from lusee_bayes.results.draws import posterior_draws
 from lusee_bayes.sky.prior import Prior
 
 REGION_NSIDE = 8
