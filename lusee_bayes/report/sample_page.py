@@ -8,8 +8,8 @@ import numpy as np
 
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import entries, read_json, read_table
+from lusee_bayes.judge.convergence import CRITERIA, FAR, FEW, warnings_of
 from lusee_bayes.report import html
-from lusee_bayes.results.sample_result import CRITERIA, FAR, FEW, warnings_of
 from lusee_bayes.results.saved import CHECK, SAMPLING, SUMMARY_TABLE, VALIDATION
 
 # name, text for those who do not see it, caption

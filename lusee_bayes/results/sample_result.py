@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,6 +12,7 @@ import xarray as xr
 from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.judge.convergence import warnings_of
 from lusee_bayes.sampling import mode
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.systematics.systematic import SKY
@@ -106,52 +105,3 @@ class SampleResult:
             "gradients_per_second": self.gradients_per_second,
             **about_run(self.seconds),
         }
-
-
-# R-hat and effective sizes a chain that are enough (Vehtari et al. 2021); an R-hat far from it, and
-# the share of diverged draws that is
-AGREE, PER_CHAIN, FAR, FEW = 1.01, 100, 1.05, 0.01
-CRITERIA = (
-    f"Wanted: R-hat of at most {AGREE:g}, effective sizes of {PER_CHAIN} for each chain, no "
-    f"divergences. Bad: R-hat above {FAR:g}, or more than {FEW:.0%} of the draws diverged."
-)
-
-
-def warnings_of(table: Mapping[str, np.ndarray], sampling: Mapping[str, Any]) -> list[str]:
-    """Why draws are not to be trusted yet, and what to do; empty if there is no reason.
-
-    Parameters
-    ----------
-    table : mapping
-        Columns of summary.csv: quantity, r_hat, ess_bulk, ess_tail.
-    sampling : mapping
-        sampling.json.
-    """
-    found = []
-    names, r_hat = table["quantity"], np.nan_to_num(table["r_hat"], nan=-np.inf, posinf=np.inf)
-    above = int((r_hat > AGREE).sum())
-    if above:
-        furthest = int(np.argmax(r_hat))
-        found.append(
-            f"Not converged: R-hat is above {AGREE:g} for {above} of {len(names)} quantities, most "
-            f"for {names[furthest]} ({r_hat[furthest]:.3f}). Raise --draws."
-        )
-    least = PER_CHAIN * sampling["chains"]
-    for column, what in (("ess_bulk", "bulk"), ("ess_tail", "tail")):
-        if column not in table:
-            continue
-        size = np.nan_to_num(table[column], nan=np.inf)
-        few = int((size < least).sum())
-        if few:
-            worst = int(np.argmin(size))
-            found.append(
-                f"The {what} effective size is below {least} for {few} of {len(names)} quantities, "
-                f"least for {names[worst]} ({size[worst]:.0f}): raise --draws."
-            )
-    if sampling["divergences"]:
-        found.append(
-            f"{sampling['divergences']} trajectories diverged: the steps are too long where the "
-            "posterior is narrow. Raise --warmup; if that does not help, write the program in "
-            "coordinates in which its posterior is wide."
-        )
-    return found

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
-from lusee_bayes.experiment.unknowns import UNKNOWN_COLUMNS
 from lusee_bayes.judge.chi2 import LEVELS
 from lusee_bayes.judge.levels import NAMES
 
@@ -221,8 +220,15 @@ POINTING = _table(
     value="number",
     **dict.fromkeys(("std", "prior_std", "beyond_first_order"), "size"),
 )
-_KINDS = ("text", "text", "number", "size", "number", "size")
-_UNKNOWN = dict(zip(UNKNOWN_COLUMNS, _KINDS, strict=True))
+# columns in their order in a report
+_UNKNOWN = {
+    "unknown": "text",
+    "unit": "text",
+    "value": "number",
+    "std": "size",
+    "prior": "number",
+    "prior_std": "size",
+}
 UNKNOWNS = _table("receivers, ground and gain table", "unknown", **_UNKNOWN)
 CHANNEL_UNKNOWNS = _table(
     "receivers, ground and gain table of several frequencies",

@@ -198,18 +198,8 @@ def map_result(
         with stages("clock and pointing"):
             own = covariance if earlier is None else on_host(alone.posterior).covariance()
             pointing = pointing_report(experiment, alone, own)
-    return MapResult(
-        experiment,
-        found,
-        channel,
-        page,
-        fluxes,
-        pointing,
-        unknowns,
-        digests,
-        diagnosis,
-        stages.seconds,
-    )
+    told = (fluxes, pointing, unknowns, digests, diagnosis)
+    return MapResult(experiment, found, channel, page, *told, stages.seconds)
 
 
 def _updated(

@@ -8,6 +8,7 @@ import pytest
 from matplotlib.projections.geo import MollweideAxes
 
 from lusee_bayes.core.harmonics import map_to_modes, modes_to_map
+from lusee_bayes.judge.convergence import warnings_of
 from lusee_bayes.report.figures.drawing import (
     LEFT_AT_LMAX,
     WIDTH,
@@ -18,7 +19,6 @@ from lusee_bayes.report.figures.drawing import (
     unprojected,
     view,
 )
-from lusee_bayes.results.sample_result import warnings_of
 
 
 def test_points_lie_where_matplotlib_puts_them():
