@@ -175,7 +175,9 @@ def test_precise_data_of_one_day_are_judged_by_product(monkeypatch):
     )
     model, data = simulated("noise.radiometer.factor=1e-6", "observation.runs=[{cycles: 0.03}]")
     found = judged(model, data)
-    assert found.level() == "consistent" and np.isfinite(found.z).all()
+    assert found.level() == "consistent"
+    # N(0, 1) or narrower: one of 1e5 data is beyond 5
+    assert np.abs(found.z).max() < 5
     (day,) = found.days
     assert day.n == data.layout.size and np.isnan(day.others_p)
     assert len(found.compared()) == 16
