@@ -337,3 +337,21 @@ def opened(path: str | Path, what: str = "FITS", hint: str = "") -> Iterator[fit
             raise InputError(f"{path} cannot be read as {what}: it is no FITS file") from error
         with hdus:
             yield hdus
+
+
+def is_session(path: str | Path) -> bool:
+    """Return whether a file says that it is a session of the spectrometer.
+
+    Raises
+    ------
+    InputError
+        If there is no file, or it is damaged.
+    """
+    path = require_file(path, "data")
+    if is_fits(path):
+        return has_words(path, ["LAYOUTV"])
+    with reading(path, "a session in HDF5"):
+        if not h5py.is_hdf5(path):
+            return False
+        with h5py.File(path) as file:
+            return "layout_version" in file.attrs

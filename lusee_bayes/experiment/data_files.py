@@ -11,13 +11,12 @@ import numpy as np
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import user_path
-from lusee_bayes.core.formats import format_of, image_names, is_fits
+from lusee_bayes.core.formats import format_of, image_names, is_fits, is_session
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.experiment.flight_data import reduce_files, visibilities_of
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.flight.reduced import Reduced, read_reduced
-from lusee_bayes.flight.session_files import is_session
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.times import Timestamp

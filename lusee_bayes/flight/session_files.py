@@ -20,7 +20,7 @@ from jaxtyping import Float, Float32, Int, Shaped
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import has_words, is_fits, opened, require_readable_hdf5
+from lusee_bayes.core.formats import is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.reading import reading, require_file
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
 from lusee_bayes.flight.layout_3 import INTERPOLATED, UNKNOWN, session_of_fits, session_of_hdf5
@@ -29,24 +29,6 @@ from lusee_bayes.flight.session import LEVELS, META, N_CHANNELS, N_PRODUCTS, POR
 
 HDF5, FITS = (f"a session of lusee.ingest in {kind}" for kind in ("HDF5", "FITS"))
 NEWEST = 4
-
-
-def is_session(path: str | Path) -> bool:
-    """Return whether a file says that it is a session.
-
-    Raises
-    ------
-    InputError
-        If there is no file, or it is damaged.
-    """
-    path = require_file(path, "data")
-    if is_fits(path):
-        return has_words(path, ["LAYOUTV"])
-    with reading(path, HDF5):
-        if not h5py.is_hdf5(path):
-            return False
-        with h5py.File(path) as file:
-            return "layout_version" in file.attrs
 
 
 def read_session(path: str | Path) -> Session:

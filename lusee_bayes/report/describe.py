@@ -29,10 +29,6 @@ def _has_image(*names: str) -> Callable[[Path], bool]:
     return lambda path: is_fits(path) and bool(set(names) & set(image_names(path)))
 
 
-def _is_session(path: Path) -> bool:
-    return bool(resolve_name("lusee_bayes.flight.session_files:is_session")(path))
-
-
 # other files: how each kind is recognised; what is none of them is a sky
 KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
     (_has_image("h_theta_real"), "describe_data:describe_response"),
@@ -40,7 +36,7 @@ KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
     (_has_image("e_theta_real", "product_beam"), "describe_data:describe_sampled_beams"),
     (lambda path: has_words(path, formats.UVBEAM_WORDS), "describe_data:describe_sampled_beams"),
     (_has_image("combinations", "products"), "describe_data:describe_waterfall"),
-    (_is_session, "describe_data:describe_session"),
+    (formats.is_session, "describe_data:describe_session"),
     (lambda path: True, "describe_sky:describe_sky"),
 )
 

@@ -337,7 +337,7 @@ def test_simulated_chains_turn_as_far_as_the_real_ones(c):
 
 
 def test_normal_scores_of_variances_far_out():
-    """Where chi^2 has no tail any more: the root of its deviance, to Wilson and Hilferty's sixth."""
+    """Where chi^2 has no tail any more: the root of its deviance, to a sixth of it."""
     ratio, dof = np.array([0.01, 0.05, 5.0, 50.0]), 500.0
     deviance = np.sqrt(dof * (ratio - 1.0 - np.log(ratio)))
     far = validation._chi2_z(ratio, np.full(4, dof))
