@@ -29,13 +29,13 @@ from layout_4 import (
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.formats import is_session
 from lusee_bayes.flight.clock import Clock
 from lusee_bayes.flight.session import FLIGHT_PRODUCTS, OF_FLIGHT, TELEMETRY
 from lusee_bayes.flight.session_files import (
     SessionRows,
     cache_for,
     guessed_chunks,
-    is_session,
     read_session,
     write_session,
 )
