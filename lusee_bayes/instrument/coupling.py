@@ -47,7 +47,6 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
 
-
 # times whose data A^T d takes at once: it bounds the memory
 MOST_TIMES = 8192
 

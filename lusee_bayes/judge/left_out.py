@@ -44,7 +44,6 @@ from lusee_bayes.core.engine import in_threads, once
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import (
     cholesky,
-    inverse_from_cholesky,
     invert_factorised,
     solve_lower,
     spanning_rows,
@@ -76,6 +75,7 @@ Weights = Float[np.ndarray, "blocks places *places"]
 Roots = Float[np.ndarray, "blocks used *used"]
 Rows = Float[np.ndarray, "rows rank"]
 SkyRows = Float[np.ndarray, "rows sky"]
+Answer = tuple[float, float, float]
 
 
 class Missed(NamedTuple):
@@ -111,9 +111,6 @@ class Missed(NamedTuple):
 
 
 NOT_TOLD = (np.nan, np.nan, np.nan)
-
-
-KINDS = ("product", "day", "turntable angle")
 
 
 class DataGroup(NamedTuple):
@@ -152,7 +149,7 @@ def groups_of(data: Visibilities) -> list[DataGroup]:
     product = np.arange(len(present))[:, None]
     found = [("product", label, product == k) for k, label in enumerate(data.labels)]
     found += [("day", f"{k}", (day == k)[None]) for k in np.unique(day)]
-    found += [("turntable angle", f"{x:g}", (angle == x)[None]) for x in np.unique(angle)]
+    found += [("angle", f"{x:g}", (angle == x)[None]) for x in np.unique(angle)]
     groups = [DataGroup(*one, np.broadcast_to(flags, present.shape)) for *one, flags in found]
     return [group for group in groups if (group.data & present).any()]
 
@@ -205,9 +202,6 @@ class LeftOut:
         If the model cannot be factorised.
     """
 
-    present: GridFlags
-    u: Grid
-
     def __init__(
         self,
         model: LinearGaussian,
@@ -218,11 +212,10 @@ class LeftOut:
         gone: GridFlags | None = None,
     ):
         self._model, self._data, self._layout = on_host(model), np.asarray(data), layout
+        self._set_noise()
         self.present = np.asarray(layout.present)
         if gone is not None:
             self.present = self.present & ~gone
-        self._set_noise()
-        if gone is not None:
             self._weights = self._weights - taken(self._weights, self._on_cells(gone))
         self._lower = self._factorised(None if gone is not None else on_host(posterior))
         self._u = self._weighted_residuals()
@@ -291,7 +284,7 @@ class LeftOut:
         blocks, places = (np.flatnonzero(cells.any(axis)) for axis in (1, 0))
         where = np.ix_(blocks, places)
         root = roots(self._weights[blocks], cells[blocks])
-        b = whitened(root, np.where(cells[where], self._u[where], 0.0)[..., None])
+        b = whiten_group(root, np.where(cells[where], self._u[where], 0.0)[..., None])
         chosen = Chosen(cells, blocks, places, cells[where], root, b)
         small = self._small(chosen)
         answer = self._taken_out(chosen) if small is None else self._among_data(chosen, *small)
@@ -299,8 +292,7 @@ class LeftOut:
             return Missed(n, *NOT_TOLD)
         diagonal = root if root.ndim == 2 else np.diagonal(root, axis1=1, axis2=2)
         chi2, directions, log_det = answer
-        log_det += 2.0 * float(np.log(diagonal).sum())
-        return Missed(n, chi2, directions, log_det)
+        return Missed(n, chi2, directions, log_det + 2.0 * float(np.log(diagonal).sum()))
 
     def each(self, groups: Sequence[GridFlags]) -> list[Missed]:
         """Leave out each of several groups, in threads."""
@@ -312,8 +304,8 @@ class LeftOut:
         if self._kept is not None:
             less = np.einsum("tkm,tkm->tk", self._kept[0], self._kept[0])
         else:
-            n = len(self._u) if self._shared is not None else NEAR
-            parts = [np.arange(len(self._u))[k : k + n] for k in range(0, len(self._u), n)]
+            times = np.arange(len(self._u))
+            parts = np.array_split(times, -(-len(times) // NEAR))
             less = np.concatenate(in_threads(self._lost_by_prediction, parts))
         weights = self._weights
         own = weights if weights.ndim == 2 else np.diagonal(weights, axis1=1, axis2=2)
@@ -324,17 +316,16 @@ class LeftOut:
 
     def _set_noise(self) -> None:
         """D and T by block: of every time, or one of all data where N couples times."""
-        noise, base, templates = self._model.noise, self._model.noise, None
-        if isinstance(noise, LowRankUpdate):
-            base, templates = noise.base, np.asarray(noise.update.root)
-        self._cells, weights = self._layout, base.time_weights(self._layout)
+        noise, self._cells = self._model.noise, self._layout
+        base, self._templates = noise, np.zeros((noise.size, 0))
+        if isinstance(noise, LowRankUpdate) and is_within_times(noise):
+            base, self._templates = noise.base, np.asarray(noise.update.root)
+        weights = base.time_weights(self._layout)
         self._summable = weights is not None and self._model.coupling.has_time_structure
         if weights is None:
-            self._cells, templates = DataLayout(noise.size, 1), None
-            root = cholesky(np.asarray(noise.dense()))
-            weights = inverse_from_cholesky(root)[..., None]
+            self._cells = DataLayout(noise.size, 1)
+            weights = np.linalg.inv(np.asarray(noise.dense()))[..., None]
         self._weights = np.moveaxis(np.asarray(weights), -1, 0)
-        self._templates = np.zeros((noise.size, 0)) if templates is None else templates
         self._t, self._n_templates = self._by_cell(self._templates), self._templates.shape[1]
 
     def _factorised(self, posterior: Posterior | None) -> Square:
@@ -389,11 +380,11 @@ class LeftOut:
     def _gram(self, weights: Weights) -> Square:
         """F^T W F."""
         if not self._summable:
-            rows, rank = self._rows(None), self._n_templates + self._model.prior.rank
+            rows = self._rows(None)
             some = weights.any(axis=-1) if weights.ndim == 3 else weights != 0.0
-            return rows[some].T @ weigh(weights, rows)[some].reshape(-1, rank)
-        n, coupling = self._n_templates, self._model.coupling
-        sky = self._model.prior.sandwich(summed(coupling, np.moveaxis(weights, 0, -1)))
+            return rows[some].T @ weigh(weights, rows)[some]
+        n, model = self._n_templates, self._model
+        sky = model.prior.sandwich(summed(model.coupling, np.moveaxis(weights, 0, -1)))
         if not n:
             return sky
         across = self._pull(weigh(weights, self._t))
@@ -405,11 +396,9 @@ class LeftOut:
         if blocks is None:
             sky = prior.colour_columns(coupling.dense())
             return self._by_cell(np.concatenate([self._templates, sky], axis=1))
-        n_products = self._layout.n_products
-        product, time = np.tile(np.arange(n_products), len(blocks)), np.repeat(blocks, n_products)
-        sky = prior.colour_columns(coupling.rows(product, time)).reshape(
-            len(blocks), n_products, -1
-        )
+        shape = len(blocks), self._layout.n_products
+        product, time = np.indices(shape)[1].ravel(), np.repeat(blocks, shape[1])
+        sky = prior.colour_columns(coupling.rows(product, time)).reshape(*shape, -1)
         return np.concatenate([self._t[blocks], sky], axis=2)
 
     def _halves(self, rows: Float[np.ndarray, "*cells rank"]) -> tuple[np.ndarray, np.ndarray]:
@@ -454,17 +443,15 @@ class LeftOut:
         if self._kept is not None:
             if np.count_nonzero(some) > rank:
                 return None
-            halves = [x[np.ix_(blocks, places)] for x in self._kept]
-            for half in halves:
-                half[~some] = 0.0
-            w, with_sky = (whitened(root, x).reshape(some.size, -1) for x in halves)
+            halves = (some[..., None] * x[np.ix_(blocks, places)] for x in self._kept)
+            w, with_sky = (whiten_group(root, x).reshape(some.size, -1) for x in halves)
             return w, with_sky, b.ravel()
         independent = self._weights.ndim == 2
         whole = independent or (cells[blocks] == self._on_cells(self.present)[blocks]).all()
         if not whole or len(blocks) > rank:
             return None
         near = self._near(blocks, rank // len(places))
-        if near is None or len(places) * near.factors.shape[1] > rank:
+        if near is None or len(places) * min(near.factors.shape) > rank:
             return None
         if independent:
             c, b = (root * some).T[..., None] * near.factors, b.swapaxes(0, 1)
@@ -477,9 +464,7 @@ class LeftOut:
         w, with_sky = ((r @ x).reshape(-1, x.shape[-1]) for x in halves)
         return w, with_sky, (q.swapaxes(1, 2) @ b).ravel()
 
-    def _among_data(
-        self, chosen: Chosen, w: Rows, with_sky: SkyRows, inside: Vector
-    ) -> tuple[float, float, float]:
+    def _among_data(self, chosen: Chosen, w: Rows, with_sky: SkyRows, inside: Vector) -> Answer:
         """chi^2_s, directions and ln|1 - W W^T|."""
         lower = cholesky(np.eye(len(w)) - w @ w.T, overwrite=True)
         solved = solve_lower(lower, np.column_stack([inside, with_sky]), transpose=False)
@@ -504,11 +489,11 @@ class LeftOut:
         invert_factorised(lower)
         return float(np.diagonal(lower)[self._n_templates :].sum())
 
-    def _taken_out(self, chosen: Chosen) -> tuple[float, float, float]:
+    def _taken_out(self, chosen: Chosen) -> Answer:
         """chi^2_s, directions and ln|Q_s| - ln|Q|."""
         mean = np.zeros((*chosen.cells.shape, 1))
         where = np.ix_(chosen.blocks, chosen.places)
-        mean[where] = whitened(chosen.root, chosen.b, transpose=True)
+        mean[where] = whiten_group(chosen.root, chosen.b, transpose=True)
         h = self._pull(weigh(self._weights, mean))
         gram = self._gram(taken(self._weights, chosen.cells))
         lower = cholesky(np.subtract(self._normal, gram, out=gram), overwrite=True)
@@ -538,7 +523,7 @@ def roots(weights: Weights, chosen: CellFlags) -> Roots:
     return np.linalg.cholesky(np.where(both, within[..., used], np.eye(len(used))))
 
 
-def whitened(root: Roots, x: np.ndarray, *, transpose: bool = False) -> np.ndarray:
+def whiten_group(root: Roots, x: np.ndarray, *, transpose: bool = False) -> np.ndarray:
     """c^-1 x, or c^-T x."""
     if root.ndim == 2:
         return x / root[..., None]
@@ -552,7 +537,7 @@ def taken(weights: Weights, chosen: CellFlags) -> Weights:
     lost, blocks = np.zeros_like(weights), np.flatnonzero(chosen.any(axis=1))
     some, within = chosen[blocks], weights[blocks]
     used = np.flatnonzero(some.any(axis=0))
-    e = whitened(roots(within, some), np.where(some[:, used, None], within[:, used], 0.0))
+    e = whiten_group(roots(within, some), np.where(some[:, used, None], within[:, used], 0.0))
     # the rows of the group to the last bit
     whole = some[:, :, None] | some[:, None]
     lost[blocks] = np.where(whole, within, e.swapaxes(1, 2) @ e)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,6 +11,7 @@ import xarray as xr
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import read_dataset
+from lusee_bayes.judge.residuals import Group
 from lusee_bayes.results.saved import DIAGNOSTICS
 
 
@@ -26,7 +26,7 @@ def write_diagnostics(dataset: xr.Dataset, path: Path) -> None:
 def read_diagnostics(path: str | Path) -> xr.Dataset:
     """What :func:`write_diagnostics` wrote. InputError for anything else."""
     found = read_dataset(path, formats.DIAGNOSTICS, DIAGNOSTICS, "lusee-bayes map writes one")
-    empty = group_variables({})
+    empty = group_variables(())
     if "group" not in found.sizes:
         return found.assign(empty)
     # files hold no empty arrays, so that all are absent, or none
@@ -42,10 +42,9 @@ GROUP = {"kind": np.str_, "name": np.str_, "n": np.int64} | dict.fromkeys(
 )
 
 
-def group_variables(kinds: Mapping[str, Sequence[Any]]) -> dict[str, tuple[str, np.ndarray]]:
-    """One row for every group (``linear.residuals.Group``) that was left out, by its kind."""
-    groups = [{"kind": kind, **vars(group)} for kind, found in kinds.items() for group in found]
+def group_variables(groups: Sequence[Group]) -> dict[str, tuple[str, np.ndarray]]:
+    """One row for every group that was left out."""
     return {
-        f"group_{name}": ("group", np.array([group[name] for group in groups], dtype=dtype))
+        f"group_{name}": ("group", np.array([getattr(g, name) for g in groups], dtype=dtype))
         for name, dtype in GROUP.items()
     }

@@ -9,14 +9,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
-from lusee_bayes.judge.chi2 import LEVELS
+from lusee_bayes.judge.chi2 import KINDS, LEVELS
 from lusee_bayes.judge.levels import NAMES
 
 NUMBER, COUNT, TEXT = Attribute(), Attribute("integer", low=0.0), Attribute("text")
 SIZE, SHARE, FLAG = Attribute(low=0.0), Attribute(low=0.0, high=1.0), Attribute("boolean")
 OPTIONAL, OPTIONAL_TEXT = Attribute(optional=True), Attribute("text", optional=True)
 OPTIONAL_ELL = Attribute("integer", optional=True)
-KINDS = ("product", "day", "angle")
 LEVEL = Attribute("text", choices=LEVELS)
 HINT = "give the folder of a finished run"
 # of flight data: the spectra behind a map
@@ -98,7 +97,7 @@ DIAGNOSTICS = Layout(
         "hours": _on("time"),
         **{name: _on("product", "time", finite=False) for name in ("data", "predicted", "z")},
         # none where groups were not judged
-        "group_kind": _on("group", kind="text", choices=KINDS, optional=True),
+        "group_kind": _on("group", kind="text", choices=tuple(KINDS), optional=True),
         "group_name": _on("group", kind="text", optional=True),
         "group_n": _on("group", kind="integer", low=0.0, optional=True),
         "group_degrees": _on("group", low=0.0, optional=True),
@@ -172,7 +171,7 @@ PRIOR = _figures(
 )
 HELD_OUT = _figures(
     "groups of data that were left out",
-    kind=Attribute("text", choices=KINDS),
+    kind=Attribute("text", choices=tuple(KINDS)),
     **dict.fromkeys(("groups", "n"), COUNT),
     **dict.fromkeys(("chi2", "log_density"), NUMBER),
 )

@@ -106,7 +106,7 @@ def diagnostics(
         "data": (("product", "time"), data.grid(), kelvin),
         "predicted": (("product", "time"), on_grid(found.predicted), kelvin),
         "z": (("product", "time"), on_grid(found.z), {"units": "standard deviations"}),
-        **group_variables({"product": found.products, "day": found.days, "angle": found.angles}),
+        **group_variables(found.groups),
     }
     return xr.Dataset(
         variables,
@@ -117,8 +117,8 @@ def diagnostics(
             "verdict": fit.text,
             **_chi2("instrument", found.split.instrument),
             **_chi2("prior", found.split.prior),
-            "extremes": [f"{kind} {group.name}" for kind, group in found.extremes()] or "none",
-            "suspects": [f"{kind} {group.name}" for kind, group in found.suspects()] or "none",
+            "extremes": list(map(str, found.extremes())) or "none",
+            "suspects": list(map(str, found.suspects())) or "none",
             "frequency_mhz": scenario.frequency_mhz,
         },
     )
