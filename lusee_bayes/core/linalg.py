@@ -335,7 +335,9 @@ def spanning_rows(
             return None
         k = int(squares.argmax())
         unit = rest[k] / np.sqrt(squares[k])
-        along.append(np.where(kind == kind[k], rest @ unit, 0.0))
+        # not by BLAS, whose threads would wait for each other every time
+        products = np.einsum("rc,c->r", rest, unit)
+        along.append(np.where(kind == kind[k], products, 0.0))
         picked.append(k)
         rest -= along[-1][:, None] * unit
     coordinates = np.stack(along, axis=1)

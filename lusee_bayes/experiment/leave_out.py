@@ -192,7 +192,7 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
     else:
         model, wide = on_host(model_about(setup, Around(data))[0]), None
         prior = model.prior.widened(WIDER)
-    left_out = LeftOut(replace(model, prior=prior), data.data, data.layout, posterior=wide)
+    left_out = LeftOut(replace(model, prior=prior), data, posterior=wide)
     return GroupsCompared.of(left_out, data)
 
 

@@ -135,11 +135,10 @@ class Counts:
         truth, draws = self.values[..., 0], self.values[..., 1:]
         n, allowed = len(LEVELS), np.quantile(draws[:, -1], ALLOWED, axis=1)
         columns = (x.tolist() for x in (truth, draws.std(2), truth[:, n + 1], allowed))
+        parts = zip(self.names, self.sizes, *columns, strict=True)
         return tuple(
             Coverage(name, size, tuple(held[:n]), tuple(spread[:n]), held[n], spread[n], *largest)
-            for name, size, held, spread, *largest in zip(
-                self.names, self.sizes, *columns, strict=True
-            )
+            for name, size, held, spread, *largest in parts
         )
 
 

@@ -93,13 +93,11 @@ class ChannelFits:
         signs = min(1.0, 2.0 * float(bdtr(min(above, n - above), n, 0.5)))
         total = ChiSquare(float(self.chi2.sum()), float(self.degrees.sum()))
         furthest = ChiSquare(float(self.chi2[least]), float(self.degrees[least]))
-        frequency = f"{self.frequencies_mhz[least]:g} MHz"
+        where = f"{self.frequencies_mhz[least]:g} MHz, {furthest.found()}"
         return [
             JointTest("sum over all channels", total.p, 1, total.found()),
             JointTest("channels above the median", signs, 1, f"{above} of {n}"),
-            JointTest(
-                "channel furthest out", float(p[least]), n, f"{frequency}, {furthest.found()}"
-            ),
+            JointTest("channel furthest out", float(p[least]), n, where),
             JointTest("prior", self.rest.p, 1, self.rest.found(), of_prior=True),
         ]
 

@@ -39,7 +39,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from lusee_bayes.core.arrays import DataVector, Grid, GridFlags, Square, Vector, on_host
+from lusee_bayes.core.arrays import Grid, GridFlags, Square, Vector, on_host
 from lusee_bayes.core.engine import in_threads, once
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import (
@@ -51,6 +51,7 @@ from lusee_bayes.core.linalg import (
 )
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.judge.split import log_det_of
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.normal_matrix import is_within_times, summed
 from lusee_bayes.linear.posterior import Posterior
@@ -180,10 +181,8 @@ class LeftOut:
     ----------
     model : LinearGaussian
         Of any kind. Without structure in time A is formed, and where N couples times N^-1, too.
-    data : (data,) array
+    data : Visibilities
         In K.
-    layout : DataLayout
-        The product and the time of every datum.
     posterior : Posterior, optional
         Of this model, given any data: saves factorising it.
     gone : (products, times) array of bool, optional
@@ -205,15 +204,14 @@ class LeftOut:
     def __init__(
         self,
         model: LinearGaussian,
-        data: DataVector,
-        layout: DataLayout,
+        data: Visibilities,
         *,
         posterior: Posterior | None = None,
         gone: GridFlags | None = None,
     ):
-        self._model, self._data, self._layout = on_host(model), np.asarray(data), layout
+        self._model, self._data, self._layout = on_host(model), data, on_host(data.layout)
         self._set_noise()
-        self.present = np.asarray(layout.present)
+        self.present = np.asarray(self._layout.present)
         if gone is not None:
             self.present = self.present & ~gone
             self._weights = self._weights - taken(self._weights, self._on_cells(gone))
@@ -228,8 +226,7 @@ class LeftOut:
             if self._weights.ndim == 2:
                 self._shared = shared
             else:
-                halves = (np.tensordot(shared.factors, x, axes=(1, 1)) for x in shared[:2])
-                self._kept = tuple(weigh(self._weights, x) for x in halves)
+                self._kept = self._expanded(shared)
 
     @classmethod
     def of(
@@ -253,7 +250,7 @@ class LeftOut:
         summable = model.coupling.has_time_structure and is_within_times(model.noise)
         if not summable and 8 * model.n_data * model.prior.size > DENSE_BYTES:
             return None
-        return cls(model, data.data, data.layout, posterior=posterior)
+        return cls(model, data, posterior=posterior)
 
     def without(self, gone: GridFlags) -> LeftOut:
         """Take out data for good; nothing else of the model changes.
@@ -262,7 +259,7 @@ class LeftOut:
         ----------
         gone : (products, times) array of bool
         """
-        return LeftOut(self._model, self._data, self._layout, gone=gone | ~self.present)
+        return LeftOut(self._model, self._data, gone=gone | ~self.present)
 
     def missed(self, group: GridFlags) -> Missed:
         """Leave out a group.
@@ -287,12 +284,10 @@ class LeftOut:
         b = whiten_group(root, np.where(cells[where], self._u[where], 0.0)[..., None])
         chosen = Chosen(cells, blocks, places, cells[where], root, b)
         small = self._small(chosen)
+        # all NaN where Q_s, or 1 - W W^T, has no root
         answer = self._taken_out(chosen) if small is None else self._among_data(chosen, *small)
-        if np.isnan(answer[-1]):
-            return Missed(n, *NOT_TOLD)
-        diagonal = root if root.ndim == 2 else np.diagonal(root, axis1=1, axis2=2)
         chi2, directions, log_det = answer
-        return Missed(n, chi2, directions, log_det + 2.0 * float(np.log(diagonal).sum()))
+        return Missed(n, chi2, directions, log_det + 2.0 * float(np.log(diagonal_of(root)).sum()))
 
     def each(self, groups: Sequence[GridFlags]) -> list[Missed]:
         """Leave out each of several groups, in threads."""
@@ -304,11 +299,9 @@ class LeftOut:
         if self._kept is not None:
             less = np.einsum("tkm,tkm->tk", self._kept[0], self._kept[0])
         else:
-            times = np.arange(len(self._u))
-            parts = np.array_split(times, -(-len(times) // NEAR))
+            parts = pieces(np.arange(len(self._u)), NEAR)
             less = np.concatenate(in_threads(self._lost_by_prediction, parts))
-        weights = self._weights
-        own = weights if weights.ndim == 2 else np.diagonal(weights, axis1=1, axis2=2)
+        own = diagonal_of(self._weights)
         own = np.where(own > less, own - less, np.nan)
         return self._layout.scatter(self._cells.gather(own.T))
 
@@ -352,7 +345,7 @@ class LeftOut:
     def _weighted_residuals(self) -> Cells:
         """u = D (d - E[d] - F z), with z = Q^-1 F^T D (d - E[d])."""
         model, z = self._model, np.zeros(len(self._lower))
-        rest = self._data if model.offset is None else self._data - model.offset
+        rest = np.asarray(self._data.data) - (0.0 if model.offset is None else model.offset)
         if model.prior.white_mean is not None:
             rest = rest - model.coupling @ model.prior.colour(model.prior.white_mean)
         n, weighted = self._n_templates, weigh(self._weights, self._by_cell(rest[:, None]))
@@ -420,9 +413,21 @@ class LeftOut:
         few = spanning_rows(np.concatenate(features, axis=1), run, most or len(times))
         if few is None:
             return None
-        parts = np.array_split(times[few[0]], -(-len(few[0]) // CHUNK))
+        parts = pieces(times[few[0]], CHUNK)
         halves = in_threads(lambda part: self._halves(self._rows(part).swapaxes(0, 1)), parts)
         return Near(*(np.concatenate(x, axis=1) for x in zip(*halves, strict=True)), few[1])
+
+    def _expanded(self, near: Near) -> tuple[np.ndarray, np.ndarray]:
+        """Y L^-T and the columns of the sky of Y Q^-1 at all times."""
+        kept = tuple(np.empty((*self._u.shape, few.shape[-1])) for few in near[:2])
+
+        def fill(times: Int[np.ndarray, " n"]) -> None:
+            for whole, few in zip(kept, near[:2], strict=True):
+                rows = (near.factors[times] @ few).swapaxes(0, 1)
+                whole[times] = weigh(self._weights[times], rows)
+
+        in_threads(fill, pieces(np.arange(len(self._u)), CHUNK))
+        return kept
 
     def _lost_by_prediction(self, times: Int[np.ndarray, " n"]) -> Cells:
         """The diagonal of Y Q^-1 Y^T at these times."""
@@ -503,9 +508,14 @@ class LeftOut:
         return float((chosen.b**2).sum() + (h**2).sum()), directions, log_det
 
 
-def log_det_of(root: Square) -> float:
-    """ln|M| of a matrix with this Cholesky factor."""
-    return 2.0 * float(np.log(np.diagonal(root)).sum())
+def pieces(times: Int[np.ndarray, " n"], most: int) -> list[np.ndarray]:
+    """So many times, or fewer, each."""
+    return np.array_split(times, -(-len(times) // most))
+
+
+def diagonal_of(blocks: np.ndarray) -> Cells:
+    """The diagonals of blocks, which may be all of them."""
+    return blocks if blocks.ndim == 2 else np.diagonal(blocks, axis1=1, axis2=2)
 
 
 def weigh(weights: Weights, x: Float[np.ndarray, "blocks places k"]) -> np.ndarray:

@@ -106,7 +106,7 @@ def test_it_is_what_matrices_say(size, kind, shared, monkeypatch):
     if not shared:
         monkeypatch.setattr(left_out, "SHARED", 0)
     model, data, *expected = observed(size, kind)
-    check(LeftOut(model, data.data, data.layout), data, *expected, every_kind(data))
+    check(LeftOut(model, data), data, *expected, every_kind(data))
 
 
 @pytest.mark.parametrize("kind", WITHIN_TIMES)
@@ -114,7 +114,7 @@ def test_many_times_a_day(kind, monkeypatch):
     monkeypatch.setattr(left_out, "SHARED", 0)
     monkeypatch.setattr(left_out, "NEAR", 30)
     model, data, *expected = observed("often", kind)
-    check(LeftOut(model, data.data, data.layout), data, *expected, every_kind(data))
+    check(LeftOut(model, data), data, *expected, every_kind(data))
 
 
 @pytest.mark.parametrize("kind", ["diagonal", "blocks and templates"])
@@ -123,20 +123,20 @@ def test_missing_data(kind, shared, monkeypatch):
     if not shared:
         monkeypatch.setattr(left_out, "SHARED", 0)
     model, data, *expected = observed("few", kind, gaps=True)
-    check(LeftOut(model, data.data, data.layout), data, *expected, every_kind(data))
+    check(LeftOut(model, data), data, *expected, every_kind(data))
 
 
 @pytest.mark.parametrize("kind", ["diagonal", "blocks and templates"])
 def test_a_matrix_without_structure_in_time(kind):
     model, data, *expected = observed("many", kind)
     model = replace(model, coupling=lb.DenseCoupling(model.coupling.dense()))
-    check(LeftOut(model, data.data, data.layout), data, *expected, every_kind(data))
+    check(LeftOut(model, data), data, *expected, every_kind(data))
 
 
 def test_what_the_posterior_saves_changes_nothing():
     model, data, *expected = observed("few", "blocks and templates")
     posterior = model.condition(data.data)
-    found = LeftOut(model, data.data, data.layout, posterior=posterior)
+    found = LeftOut(model, data, posterior=posterior)
     check(found, data, *expected, every_kind(data))
 
 
@@ -144,12 +144,12 @@ def test_means_over_windows():
     """Other functions of time than those of instants."""
     model, data, *expected = observed("many", "diagonal", "observation.window=mean")
     assert data.observation.windows is not None
-    check(LeftOut(model, data.data, data.layout), data, *expected, every_kind(data))
+    check(LeftOut(model, data), data, *expected, every_kind(data))
 
 
 def test_all_data_have_nothing_to_be_compared_with():
     model, data, *_ = observed("few", "diagonal")
-    found = LeftOut(model, data.data, data.layout)
+    found = LeftOut(model, data)
     missed = found.missed(found.present)
     assert missed.n == data.layout.size and np.isnan(missed.chi2)
 
@@ -160,7 +160,7 @@ def test_what_is_taken_out_leaves_the_model_of_the_rest(kind):
     model, data, inverse, sky, u = observed("few", kind)
     gone = np.zeros((data.layout.n_products, data.layout.n_times), dtype=bool)
     gone[:, 4] = gone[6, 9] = True
-    left = LeftOut(model, data.data, data.layout).without(gone)
+    left = LeftOut(model, data).without(gone)
     gone[2] = True
     left = left.without(gone)
     keep = ~gone[data.layout.product, data.layout.time]
