@@ -66,8 +66,8 @@ REFINEMENTS = 2
 # runs of no more times have one F_few for all groups; in others, own entries of K^-1 have one for
 # so many times
 SHARED, NEAR = 1000, 144
-# times whose rows are computed at once
-CHUNK = 64
+# times whose rows are computed at once, and data that are a small group in any case
+CHUNK, QUICK = 64, 500
 
 # arrays by block of D (times, or one block of all data) and place in it (products, or data)
 Cells = Float[np.ndarray, "blocks places"]
@@ -444,7 +444,8 @@ class LeftOut:
 
     def _small(self, chosen: Chosen) -> tuple[Rows, SkyRows, Vector] | None:
         """q^T W, q^T W L^-1, and q^T c^-1 u_s; None for a large group."""
-        (cells, blocks, places, some, root, b), rank = chosen, len(self._lower)
+        cells, blocks, places, some, root, b = chosen
+        rank = max(len(self._lower), QUICK)
         if self._kept is not None:
             if np.count_nonzero(some) > rank:
                 return None

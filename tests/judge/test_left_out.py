@@ -35,6 +35,15 @@ WITHIN_TIMES = [kind for kind in NOISES if kind != "coupled"]
 COUPLED = pytest.param("few", "coupled", marks=[pytest.mark.long, pytest.mark.essential])
 
 
+# all groups are small, in rows that are kept; large ones, too; and as in long runs, without rows
+LIMITS = [{}, {"QUICK": 0}, {"QUICK": 0, "SHARED": 0}]
+
+
+def limited(monkeypatch, limits):
+    for name, value in limits.items():
+        monkeypatch.setattr(left_out, name, value)
+
+
 def flags_of(layout: DataLayout) -> np.ndarray:
     """A product that is missing, but for some times, a time, and single data."""
     flags = np.zeros((layout.n_products, layout.n_times), dtype=bool)
@@ -100,34 +109,31 @@ def every_kind(data):
         COUPLED,
     ],
 )
-@pytest.mark.parametrize("shared", [True, False])
-def test_it_is_what_matrices_say(size, kind, shared, monkeypatch):
-    """In short runs, which keep rows of all data, and as in long ones."""
-    if not shared:
-        monkeypatch.setattr(left_out, "SHARED", 0)
+@pytest.mark.parametrize("limits", LIMITS)
+def test_it_is_what_matrices_say(size, kind, limits, monkeypatch):
+    limited(monkeypatch, limits)
     model, data, *expected = observed(size, kind)
     check(LeftOut(model, data), data, *expected, every_kind(data))
 
 
 @pytest.mark.parametrize("kind", WITHIN_TIMES)
 def test_many_times_a_day(kind, monkeypatch):
-    monkeypatch.setattr(left_out, "SHARED", 0)
-    monkeypatch.setattr(left_out, "NEAR", 30)
+    limited(monkeypatch, {"SHARED": 0, "NEAR": 30})
     model, data, *expected = observed("often", kind)
     check(LeftOut(model, data), data, *expected, every_kind(data))
 
 
 @pytest.mark.parametrize("kind", ["diagonal", "blocks and templates"])
-@pytest.mark.parametrize("shared", [True, False])
-def test_missing_data(kind, shared, monkeypatch):
-    if not shared:
-        monkeypatch.setattr(left_out, "SHARED", 0)
+@pytest.mark.parametrize("limits", LIMITS)
+def test_missing_data(kind, limits, monkeypatch):
+    limited(monkeypatch, limits)
     model, data, *expected = observed("few", kind, gaps=True)
     check(LeftOut(model, data), data, *expected, every_kind(data))
 
 
 @pytest.mark.parametrize("kind", ["diagonal", "blocks and templates"])
-def test_a_matrix_without_structure_in_time(kind):
+def test_a_matrix_without_structure_in_time(kind, monkeypatch):
+    limited(monkeypatch, {"QUICK": 0})
     model, data, *expected = observed("many", kind)
     model = replace(model, coupling=lb.DenseCoupling(model.coupling.dense()))
     check(LeftOut(model, data), data, *expected, every_kind(data))
@@ -149,8 +155,7 @@ def test_means_over_windows():
 
 def test_all_data_have_nothing_to_be_compared_with():
     model, data, *_ = observed("few", "diagonal")
-    found = LeftOut(model, data)
-    missed = found.missed(found.present)
+    missed = LeftOut(model, data).missed(np.asarray(data.layout.present))
     assert missed.n == data.layout.size and np.isnan(missed.chi2)
 
 
@@ -201,8 +206,7 @@ def test_groups_have_data():
     """Days of 24 hours and turntable angles; none of a product that is missing."""
     _, data, *_ = observed("few", "diagonal")
     found = groups_of(data)
-    kinds = [group.kind for group in found]
-    assert [kinds.count(kind) for kind in KINDS] == [16, 2, 2]
+    assert [sum(group.kind == kind for group in found) for kind in KINDS] == [16, 2, 2]
     day = data.observation.hours // 24 == 1
     np.testing.assert_array_equal(found[17].data, np.broadcast_to(day, (16, len(day))))
     layout = DataLayout.from_flags(found[3].data)
