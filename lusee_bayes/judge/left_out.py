@@ -18,9 +18,11 @@ With N = N_0 + T T^T, F = [T, A S^(1/2)], and D = N_0^-1, whose blocks are the d
 
     K_ss = c (1 - W W^T) c^T,    directions = |(1 - W W^T)^(-1/2) W L^-1|^2 over the sky's columns.
 
-W of all data is kept where it fits into ``KEPT_BYTES``. In longer runs rows of A at times close to
-each other are combinations of those at a few of them, A_s = U A_few, and so c^T U = q r gives
-W = q (r F_few L^-T): of a day of ten-minute samples a sixth of the rows is computed.
+Rows of A at times close to each other are combinations of those at a few of them, A_s = U A_few
+(:func:`.spanning_rows`), and so c^T U = q r gives W = q (r F_few L^-T): of a day of ten-minute
+samples an eighth of the rows is computed. Runs of at most ``SHARED`` times have one F_few, which is
+kept for all groups; where D couples products, and where A has no structure in time, Y L^-T of all
+data is kept.
 
 **A large group** is taken out of Q, without rows of A where A and N have structure in time::
 
@@ -59,7 +61,7 @@ from lusee_bayes.noise.covariance import LowRankUpdate
 
 # a larger A without structure in time is not formed: 60,000 data at lmax 47
 DENSE_BYTES = 1.2e9
-# W and W L^-1 of all data are kept up to this size (a month of hours at lmax 47: 0.4 GB)
+# Y L^-T and Y Q^-1 of all data are kept up to this size (a month of hours at lmax 47: 0.4 GB)
 KEPT_BYTES = 5e8
 # steps that refine Q^-1 F^T D d, which loses what the normal equations lose
 REFINEMENTS = 2
@@ -410,7 +412,8 @@ class LeftOut:
         templates = templates / np.maximum(np.abs(templates).max(axis=0), 1e-300)
         features = [self._model.coupling.time_features(times), templates]
         run = np.searchsorted(pointing.run_starts, times, side="right")
-        few = spanning_rows(np.concatenate(features, axis=1), run, most or len(times))
+        most = len(times) if most is None else most
+        few = spanning_rows(np.concatenate(features, axis=1), run, most)
         if few is None:
             return None
         parts = pieces(times[few[0]], CHUNK)
