@@ -224,7 +224,7 @@ class LeftOut:
         if not self._summable:
             self._kept = self._halves(weigh(self._weights, self._rows(None)))
         elif len(self._u) <= SHARED and 16 * self._u.size * len(self._lower) <= KEPT_BYTES:
-            shared = self._near(np.arange(len(self._u)))
+            shared = self._near(np.arange(len(self._u)), len(self._u))
             if self._weights.ndim == 2:
                 self._shared = shared
             else:
@@ -403,7 +403,7 @@ class LeftOut:
         sky = solve_lower(self._lower, half, transpose=True)[self._n_templates :].T
         return half.T.reshape(rows.shape), sky.reshape(*rows.shape[:-1], -1)
 
-    def _near(self, times: Int[np.ndarray, " n"], most: int | None = None) -> Near | None:
+    def _near(self, times: Int[np.ndarray, " n"], most: int) -> Near | None:
         """F of all products at these times; None if it takes more than ``most`` of them."""
         if self._shared is not None:
             return self._shared._replace(factors=self._shared.factors[times])
@@ -412,7 +412,6 @@ class LeftOut:
         templates = templates / np.maximum(np.abs(templates).max(axis=0), 1e-300)
         features = [self._model.coupling.time_features(times), templates]
         run = np.searchsorted(pointing.run_starts, times, side="right")
-        most = len(times) if most is None else most
         few = spanning_rows(np.concatenate(features, axis=1), run, most)
         if few is None:
             return None
@@ -434,7 +433,7 @@ class LeftOut:
 
     def _lost_by_prediction(self, times: Int[np.ndarray, " n"]) -> Cells:
         """The diagonal of Y Q^-1 Y^T at these times."""
-        half, _, factors = self._near(times)
+        half, _, factors = self._near(times, len(times))
         weights = self._weights[times]
         if weights.ndim == 2:
             within = half @ half.swapaxes(1, 2)
