@@ -30,7 +30,7 @@ data is kept.
     chi^2_s = u_s^T D_ss^-1 u_s + h^T Q_s^-1 h,    |K_ss| = |D_ss| |Q_s| / |Q|,
     directions = tr (Q_s^-1 - Q^-1) of the sky.
 
-What is left without a group has N_0 without it, so that D loses D_:s D_ss^-1 D_s:.
+What is left without a group has N_0 without it, so that D loses ``D_:s D_ss^-1 D_s:``.
 """
 
 from __future__ import annotations
@@ -216,7 +216,7 @@ class LeftOut:
         self.present = np.asarray(self._layout.present)
         if gone is not None:
             self.present = self.present & ~gone
-            self._weights = self._weights - taken(self._weights, self._on_cells(gone))
+            self._weights = self._weights - lost_weights(self._weights, self._on_cells(gone))
         self._lower = self._factorised(None if gone is not None else on_host(posterior))
         self._u = self._weighted_residuals()
         self.u = self._layout.scatter(self._cells.gather(self._u.T))
@@ -283,7 +283,7 @@ class LeftOut:
         blocks, places = (np.flatnonzero(cells.any(axis)) for axis in (1, 0))
         where = np.ix_(blocks, places)
         root = roots(self._weights[blocks], cells[blocks])
-        b = whiten_group(root, np.where(cells[where], self._u[where], 0.0)[..., None])
+        b = solve_roots(root, np.where(cells[where], self._u[where], 0.0)[..., None])
         chosen = Chosen(cells, blocks, places, cells[where], root, b)
         small = self._small(chosen)
         # all NaN where Q_s, or 1 - W W^T, has no root
@@ -452,7 +452,7 @@ class LeftOut:
             if np.count_nonzero(some) > rank:
                 return None
             halves = (some[..., None] * x[np.ix_(blocks, places)] for x in self._kept)
-            w, with_sky = (whiten_group(root, x).reshape(some.size, -1) for x in halves)
+            w, with_sky = (solve_roots(root, x).reshape(some.size, -1) for x in halves)
             return w, with_sky, b.ravel()
         independent = self._weights.ndim == 2
         whole = independent or (cells[blocks] == self._on_cells(self.present)[blocks]).all()
@@ -501,9 +501,9 @@ class LeftOut:
         """chi^2_s, directions and ln|Q_s| - ln|Q|."""
         mean = np.zeros((*chosen.cells.shape, 1))
         where = np.ix_(chosen.blocks, chosen.places)
-        mean[where] = whiten_group(chosen.root, chosen.b, transpose=True)
+        mean[where] = solve_roots(chosen.root, chosen.b, transpose=True)
         h = self._pull(weigh(self._weights, mean))
-        gram = self._gram(taken(self._weights, chosen.cells))
+        gram = self._gram(lost_weights(self._weights, chosen.cells))
         lower = cholesky(np.subtract(self._normal, gram, out=gram), overwrite=True)
         h = solve_lower(lower, h, transpose=False)
         log_det = log_det_of(lower) - log_det_of(self._lower)
@@ -536,21 +536,21 @@ def roots(weights: Weights, chosen: CellFlags) -> Roots:
     return np.linalg.cholesky(np.where(both, within[..., used], np.eye(len(used))))
 
 
-def whiten_group(root: Roots, x: np.ndarray, *, transpose: bool = False) -> np.ndarray:
+def solve_roots(root: Roots, x: np.ndarray, *, transpose: bool = False) -> np.ndarray:
     """c^-1 x, or c^-T x."""
     if root.ndim == 2:
         return x / root[..., None]
     return np.linalg.solve(root.swapaxes(1, 2) if transpose else root, x)
 
 
-def taken(weights: Weights, chosen: CellFlags) -> Weights:
-    """What D loses without a group: D_:s D_ss^-1 D_s:, all of it in the rows of the group."""
+def lost_weights(weights: Weights, chosen: CellFlags) -> Weights:
+    """What D loses without a group, ``D_:s D_ss^-1 D_s:``, all of it in the rows of the group."""
     if weights.ndim == 2:
         return np.where(chosen, weights, 0.0)
     lost, blocks = np.zeros_like(weights), np.flatnonzero(chosen.any(axis=1))
     some, within = chosen[blocks], weights[blocks]
     used = np.flatnonzero(some.any(axis=0))
-    e = whiten_group(roots(within, some), np.where(some[:, used, None], within[:, used], 0.0))
+    e = solve_roots(roots(within, some), np.where(some[:, used, None], within[:, used], 0.0))
     # the rows of the group to the last bit
     whole = some[:, :, None] | some[:, None]
     lost[blocks] = np.where(whole, within, e.swapaxes(1, 2) @ e)
