@@ -17,8 +17,8 @@ from pydantic_core import PydanticUndefined
 
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.reading import as_yaml
+from lusee_bayes.core.section import Section
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.section import Section
 
 UNITS = {
     "mhz": "MHz",
@@ -132,10 +132,18 @@ def _keys_of(section: type[Section], prefix: str, kind: str) -> Iterator[Key]:
 
 
 def _meanings(section: type[Section]) -> dict[str, str]:
-    parsed = parse(section.__doc__ or "", style=DocstringStyle.NUMPYDOC)
+    """By name; of sections that it does not describe, what they say of themselves."""
+    found = {
+        name: parse(inner.__doc__ or "").short_description
+        for name, field in section.model_fields.items()
+        for inner in _sections(field.annotation)
+    }
+    for cls in reversed(section.__mro__):
+        parsed = parse(cls.__doc__ or "", style=DocstringStyle.NUMPYDOC)
+        found |= {p.arg_name: p.description for p in parsed.params}
     return {
-        p.arg_name: " ".join((p.description or "").split()).rstrip(".").replace("``", "`")
-        for p in parsed.params
+        name: " ".join((text or "").split()).rstrip(".").replace("``", "`")
+        for name, text in found.items()
     }
 
 

@@ -17,13 +17,13 @@ from lusee_bayes.core.formats import says
 from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.version import __version__, versions
 from lusee_bayes.experiment.experiment import build, infer
-from lusee_bayes.experiment.instrument_terms import beam_rms_difference
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.sky_sections import FileSkySection
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, stokes_beam
 from lusee_bayes.paper.claims import FREQUENCIES, Cases, cross, frequency_case
 from lusee_bayes.results.channel import channel_of_posterior
+from lusee_bayes.systematics.beam import beam_rms_difference
 
 # by name: a scenario of the package and what differs from it; those after the frequencies are not
 # among the paper's figures, but its text speaks of them or they tell why a claim does not hold

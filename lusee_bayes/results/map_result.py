@@ -16,7 +16,6 @@ from lusee_bayes.core.checks import Described
 from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.diagnosis import Diagnosis
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.instrument_terms import beam_rms_difference
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import (
@@ -29,6 +28,7 @@ from lusee_bayes.judge.chi2 import RULE
 from lusee_bayes.judge.measures import effective_resolution_deg
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.saved import JUDGED
+from lusee_bayes.systematics.beam import beam_rms_difference
 
 
 def prior_sentence(experiment: Experiment) -> str:

@@ -36,7 +36,6 @@ from lusee_bayes.experiment.data_files import Data, anchored, read_data
 from lusee_bayes.experiment.draws import deviations, draw_key, posterior_draws
 from lusee_bayes.experiment.experiment import build, explained, inform, with_truth
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.sky_terms import is_receiver
 from lusee_bayes.judge.coverage import N_DRAWS
 from lusee_bayes.linear.amplitudes import Amplitudes, Tied, information_given, tie, told_by_others
 from lusee_bayes.linear.joint import channel_sky, component_posterior, paired
@@ -60,6 +59,7 @@ from lusee_bayes.runs.channel_files import (
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.sky.positive_skies import PositiveSkies
 from lusee_bayes.sky.template import EmbeddedTemplate, galactic_share
+from lusee_bayes.systematics.receivers import is_receiver
 
 # highest ell of the fields, over that of the map
 FIELDS = 1.5

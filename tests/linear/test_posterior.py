@@ -15,7 +15,6 @@ import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import pixel_matrix, to_healpy
 from lusee_bayes.experiment.model import base_model, full_model
-from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.judge.measures import (
     correlation,
@@ -30,6 +29,7 @@ from lusee_bayes.linear import posterior as posterior_module
 from lusee_bayes.linear.linear_gaussian import LinearGaussian, deviation_model, updated
 from lusee_bayes.linear.solver import FORMS
 from lusee_bayes.results.updatable import read_updatable
+from lusee_bayes.systematics.context import Around
 
 SPECTRUM = np.array([4.0, 1.0, 0.5, 0.25])
 PER_MODE = np.repeat(SPECTRUM, [1, 3, 5, 7])

@@ -149,21 +149,3 @@ def without_other_kinds(
             names = ", ".join(name for name, kind in kinds.items() if kind in others)
             raise ValueError(f"{key} is an entry of model {names}, not of {tree['model']}")
     return kept
-
-
-class OutputSection(Section):
-    """Results that are written on request.
-
-    Attributes
-    ----------
-    draws : int
-        Number of posterior draws ``posterior.nc`` keeps.
-    covariance : bool
-        Keep the posterior covariance in ``posterior.nc``.
-    updatable : bool
-        Keep in ``posterior.nc`` what new data need to be added later.
-    """
-
-    draws: Annotated[int, Field(ge=0)] = 0
-    covariance: bool = False
-    updatable: bool = False
