@@ -37,7 +37,7 @@ from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.sky.prior import IndependentPrior
 from lusee_bayes.systematics.context import Around, Context
-from lusee_bayes.systematics.systematic import Systematic, Unknown, derivative, multiplied
+from lusee_bayes.systematics.systematic import Systematic, Unknown, multiplied
 
 # the site of the errors, in prior standard deviations
 GAIN_TABLE = "gain_table"
@@ -161,7 +161,7 @@ class GainTable(Systematic):
         # visibilities of one, so that T is dF/dz
         ones, unit = DenseCoupling(np.ones((n, 1))), np.ones(1)
         model = LinearGaussian(ones, IndependentPrior(unit), DiagonalCovariance(np.ones(n)))
-        slopes = np.asarray(derivative(self, model, unit, centre))
+        slopes = np.asarray(self.derivative(model, unit, centre))
         log_slopes = slopes / np.asarray(self.errors.factors(centre))[:, None]
         return -log_slopes.T @ np.asarray(self.freedom)
 

@@ -354,6 +354,28 @@ class Systematic(eqx.Module):
         """
         raise NotImplementedError(f"{type(self).__name__} has no effect of its values")
 
+    def derivative(
+        self, model: LinearGaussian, sky: Modes, centre: Vector
+    ) -> Float[Array, "data n"]:
+        """Compute T, the derivative of the data by the unknowns in prior std's, in K.
+
+        Parameters
+        ----------
+        model : LinearGaussian
+            With what comes before it.
+        sky : (modes,) array
+            In K.
+        centre : (n,) array
+            About which, in prior standard deviations.
+        """
+        coupling, prior, unit = model.coupling, model.prior, np.ones(1)
+        if not self.changes_coupling:  # how much of this sky there is
+            coupling, prior = DenseCoupling((coupling @ sky)[:, None]), IndependentPrior(unit)
+            sky = unit
+        noise = DiagonalCovariance(np.ones(model.n_data))
+        bare = LinearGaussian(coupling, prior, noise, model.offset)
+        return _derivative(*on_device((self, bare, sky, centre)))
+
     def expected(self, centre: Vector) -> Vector:
         """What :meth:`marginalised` takes the prior mean for, about values, in prior std's."""
         return np.zeros(len(centre))
@@ -482,7 +504,7 @@ class Expanded(Marginalised):
         means, names = systematic.means, systematic.names
         at = np.array([given.get(name, mean) for name, mean in zip(names, means, strict=True)])
         centre = (at - means) / systematic.stds
-        columns = derivative(systematic, model, sky, centre)
+        columns = systematic.derivative(model, sky, centre)
         expected = systematic.expected(centre)
         return cls(systematic, centre, columns, expected, columns @ (expected - centre))
 
@@ -498,31 +520,6 @@ class Expanded(Marginalised):
         """Take the effect at z_0, add T T^T to N and T (expected - z_0) to the mean."""
         noise = model.noise + LowRankCovariance(self.columns, self.systematic.words)
         return with_added(replace(self.seen(model), noise=noise), self.shift)
-
-
-def derivative(
-    systematic: Systematic, model: LinearGaussian, sky: Modes, centre: Vector
-) -> Float[Array, "data n"]:
-    """Compute T, the derivative of the data by a systematic's unknowns in prior std's, in K.
-
-    Parameters
-    ----------
-    systematic : Systematic
-    model : LinearGaussian
-        With what comes before it.
-    sky : (modes,) array
-        In K.
-    centre : (n,) array
-        About which, in prior standard deviations.
-    """
-    unit = np.ones(1)
-    noise, prior, coupling = DiagonalCovariance(np.ones(model.n_data)), model.prior, model.coupling
-    if not systematic.changes_coupling:
-        # how much of this sky there is
-        coupling, sky = DenseCoupling((coupling @ sky)[:, None]), unit
-        prior = IndependentPrior(unit)
-    bare = LinearGaussian(coupling, prior, noise, model.offset)
-    return _derivative(*on_device((systematic, bare, sky, centre)))
 
 
 @eqx.filter_jit
