@@ -354,14 +354,14 @@ class MovingSources(eqx.Module):
 
     def seen(self, orientation: Float[Array, "times 3 3"], layout: DataLayout) -> DataVector:
         """What they add to the data, in K; differentiable but where a source rises or sets."""
-        turned = (self.directions[..., None, :] @ orientation[self.sample])[..., 0, :]
+        turned = jnp.einsum("sti,tij->stj", self.directions, orientation[self.sample])
         shape = (layout.n_products, *turned.shape[:2])
         known = (self.frequency_mhz, turned.reshape(-1, 3), self.monopoles)
         response = beams_towards(*known).reshape(shape)
         if self.stokes_v is not None:
             circular = beams_towards(*known, stokes="V").reshape(shape)
-            response = response + self.stokes_v[:, None] * circular
-        both = (response * (self.fluxes[:, None] * self.weight)).sum(1)
+            response = response + self.stokes_v[None, :, None] * circular
+        both = jnp.einsum("kst,s,t->kt", response, self.fluxes, self.weight)
         grid = jnp.zeros((layout.n_products, layout.n_times)).at[:, self.sample].add(both)
         return layout.gather(grid)
 
