@@ -49,14 +49,13 @@ def sampled(tmp_path_factory):
     return run_sample(scenario, tmp_path_factory.mktemp("run") / "s", sampler=sampler).folder
 
 
-def explorer_data(page: str) -> dict:
-    (text,) = re.findall(r'<script type="application/json" id="explorer-data">(.*?)</script>', page)
+def viewer_data(page: str) -> dict:
+    (text,) = re.findall(r'<script type="application/json" id="viewer-data">(.*?)</script>', page)
     return json.loads(text)
 
 
-def layer(data: dict, key: str) -> np.ndarray:
-    (found,) = [one for one in data["layers"] if one["key"] == key]
-    return np.frombuffer(base64.b64decode(found["values"]), dtype="<f4")
+def layer(data: dict, name: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(data["maps"][name]["values"]), dtype="<f4")
 
 
 class Outline(HTMLParser):
@@ -107,7 +106,7 @@ def test_pages_are_whole_and_need_nothing_else(which, request):
 @pytest.mark.long
 @pytest.mark.essential
 def test_a_pixels_posterior_is_that_of_the_file(folder):
-    data = explorer_data((folder / "report.html").read_text())
+    data = viewer_data((folder / "report.html").read_text())
     with xr.open_dataset(folder / "posterior.nc", engine="h5netcdf") as file:
         mean, covariance = file["mean"].values, file["covariance"].values
     nside = data["nside"]
@@ -206,9 +205,9 @@ const shown = [...document.querySelectorAll("img, canvas, dl, p, h1, h2")];
 const found = {
   errors: window.problems, width: innerWidth, needed: document.documentElement.scrollWidth,
   cut: shown.filter((e) => beyond(e) && !e.closest(".scroll, figure")).length, pixels: []};
-if (window.explorer) for (const [l, b] of POINTS) found.pixels.push(explorer.at(l, b));
-if (window.explorer) { explorer.choose(POINTS[0][0], POINTS[0][1]);
-  found.values = document.getElementById("explorer-values").textContent; }
+if (window.viewer) for (const [l, b] of POINTS) found.pixels.push(viewer.at(l, b));
+if (window.viewer) { viewer.choose(POINTS[0][0], POINTS[0][1]);
+  found.values = document.getElementById("viewer-values").textContent; }
 const text = document.createElement("pre"); text.id = "found";
 text.textContent = JSON.stringify(found); document.body.append(text);
 </script>"""
@@ -255,7 +254,7 @@ def test_in_a_browser(which, width, request, tmp_path):
     assert found["needed"] <= width
     assert found["cut"] == 0
     if which == "folder":
-        # the page's own HEALPix is healpy's (test_explorer.py)
+        # the page's own HEALPix is healpy's (test_viewer.py)
         pixels = np.array([p["pixel"] for p in found["pixels"]])
         mean = healpy.read_map(folder / "mean.fits", dtype=np.float64)
         np.testing.assert_allclose([p["mean"] for p in found["pixels"]], mean[pixels], rtol=1e-7)

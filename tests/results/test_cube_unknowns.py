@@ -15,7 +15,6 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import per_mode
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.unknowns import unknowns_report
-from lusee_bayes.report.cube_page import FIGURES as CUBE_FIGURES
 from lusee_bayes.report.cube_page import cube_page
 from lusee_bayes.runs import map_run
 from lusee_bayes.runs.channels import cube_result
@@ -34,7 +33,7 @@ def cube_of(response_file, *overrides, frequencies="[15, 20]"):
 
 @pytest.mark.long
 def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch):
-    others = {name: lambda _: Figure() for name in CUBE_FIGURES}
+    others = {name: lambda _: Figure() for name in map_run.CUBE.figures}
     drawn = {**others, "unknowns": map_run.CUBE.figures["unknowns"]}
     monkeypatch.setattr(map_run, "CUBE", replace(map_run.CUBE, figures=drawn))
     run = lb.run_map(cube_of(response_file, RECEIVER, GROUND, TABLE), tmp_path / "cube")

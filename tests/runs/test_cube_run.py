@@ -21,7 +21,7 @@ from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.term import Around
 from lusee_bayes.judge.measures import signal_to_noise
-from lusee_bayes.report import html
+from lusee_bayes.report.rendering import sentences
 from lusee_bayes.runs import channels, map_run
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs.channels import cube_result, lmax_of_fields, positive_skies
@@ -236,7 +236,7 @@ def test_a_channel_that_cannot_be_mapped_leaves_the_others_as_they_are(
 def head_of(folder):
     """What a report says of channels that could not be mapped."""
     path = folder / "summary.json"
-    return "\n".join(html.sentences(path, json.loads(path.read_text()), "unmapped"))
+    return "\n".join(sentences(path, json.loads(path.read_text()), "unmapped"))
 
 
 def test_too_few_channels_for_a_joint_posterior_are_named(gap, tmp_path, numbers_alone):

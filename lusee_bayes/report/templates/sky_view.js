@@ -235,7 +235,9 @@ const skyView = (function () {
       for (let lon = -180; lon <= 180; lon += 30) curve(steps.map((k) => [lon, -90 + 2 * k]));
       for (let lat = -60; lat <= 60; lat += 30) curve(steps.map((k) => [-180 + 4 * k, lat]));
       const unit = (lon) => (galactic ? `${(lon + 360) % 360}°` : `${((lon + 360) % 360) / 15}h`);
-      for (let lon = -150; lon <= 150; lon += 30) this.label(unit(lon), to(lon, 0), 0, -6);
+      // half of them where they would touch
+      const apart = this.growth() / this.zoom > 1.5 ? 60 : 30;
+      for (let lon = apart - 180; lon < 180; lon += apart) this.label(unit(lon), to(lon, 0), 0, -6);
       for (let lat = -60; lat <= 60; lat += 30) {
         if (lat) this.label(`${lat}°`, to(galactic ? 90 : 0, lat), 0, -6);
       }

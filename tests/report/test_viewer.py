@@ -20,7 +20,7 @@ from reference_linear import resolution_rows
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
-from lusee_bayes.report.explorer import BUDGET, KERNEL_NSIDE, nside_of_page
+from lusee_bayes.report.viewer import BUDGET, KERNEL_NSIDE, nside_of_page
 from lusee_bayes.results.diagnostics_file import read_diagnostics
 
 NODE = shutil.which("node")
@@ -47,19 +47,19 @@ globalThis.Option = function (text, value) { this.text = text; this.value = valu
 globalThis.window = globalThis;
 globalThis.requestAnimationFrame = (f) => f();
 """
-SIZES = {"explorer-map": [400, 200], "explorer-psf": [120, 60]}
+SIZES = {"viewer-map": [400, 200], "viewer-psf": [120, 60]}
 
 
 def run_page(page: str, tmp_path, commands: str) -> dict:
     """What ``commands`` leave in ``told`` after the scripts of the page have run."""
     (data,) = re.findall(
-        r'<script type="application/json" id="explorer-data">(.*?)</script>', page, re.DOTALL
+        r'<script type="application/json" id="viewer-data">(.*?)</script>', page, re.DOTALL
     )
     scripts = re.findall(r"<script>\n(.*?)\n</script>", page, re.DOTALL)
     text = "\n".join(
         [
             STUB.replace("SIZES", json.dumps(SIZES)),
-            f"element('explorer-data').textContent = {json.dumps(data)};",
+            f"element('viewer-data').textContent = {json.dumps(data)};",
             *scripts,
             "const told = {};",
             commands,
@@ -85,7 +85,7 @@ def test_pixels_and_equatorial_coordinates(page, small_map, tmp_path):
     rng = np.random.default_rng(3)
     lon, lat = rng.uniform(0, 360, 300), np.degrees(np.arcsin(rng.uniform(-1, 1, 300)))
     points = json.dumps(np.stack([lon, lat], 1).tolist())
-    told = run_page(page, tmp_path, f"told.at = {points}.map((p) => explorer.at(...p));")["at"]
+    told = run_page(page, tmp_path, f"told.at = {points}.map((p) => viewer.at(...p));")["at"]
     nside = small_map.result.channel.nside
     expected = healpy.ang2pix(nside, lon, lat, lonlat=True)
     np.testing.assert_array_equal([one["pixel"] for one in told], expected)
@@ -103,7 +103,7 @@ def test_pixels_and_equatorial_coordinates(page, small_map, tmp_path):
 def test_point_spread_functions_are_those_of_the_posterior(which, request, tmp_path):
     """Against y^T R from the posterior; bytes are wrong by half a step at most, at random."""
     run = request.getfixturevalue(which)
-    commands = f"told.kernels = {json.dumps(POINTS)}.map((p) => explorer.kernel(...p));"
+    commands = f"told.kernels = {json.dumps(POINTS)}.map((p) => viewer.kernel(...p));"
     page = (run.folder / "report.html").read_text()
     kernels = np.array(run_page(page, tmp_path, commands)["kernels"])
     lon, lat = np.radians(POINTS).T
@@ -124,18 +124,18 @@ def test_what_a_direction_and_the_pointer_tell(page, tmp_path):
     told = run_page(
         page,
         tmp_path,
-        """explorer.choose(280, -30);
-        told.rows = elements["explorer-values"].rows.map((one) => one.textContent);
-        elements["explorer-map"].listeners.pointermove({ clientX: 200, clientY: 100, buttons: 0 });
-        told.hover = elements["explorer-hover"].textContent;
-        told.texts = elements["explorer-map"].texts;
-        told.options = elements["explorer-layer"].options.map((one) => one.value);
-        told.ticks = [explorer.ticks(1, 1000, true), explorer.ticks(-4, 4, false),
-          explorer.ticks(3700, 6300, true)];
+        """viewer.choose(280, -30);
+        told.rows = elements["viewer-values"].rows.map((one) => one.textContent);
+        elements["viewer-map"].listeners.pointermove({ clientX: 200, clientY: 100, buttons: 0 });
+        told.hover = elements["viewer-hover"].textContent;
+        told.texts = elements["viewer-map"].texts;
+        told.options = elements["viewer-layer"].options.map((one) => one.value);
+        told.ticks = [viewer.ticks(1, 1000, true), viewer.ticks(-4, 4, false),
+          viewer.ticks(3700, 6300, true)];
         const seen = (id) => elements[id].image.data.filter((x, k) => k % 4 === 3 && x).length;
-        told.seen = [seen("explorer-map"), seen("explorer-psf")];
-        elements["explorer-in"].listeners.click();
-        told.zoomed = seen("explorer-map");""",
+        told.seen = [seen("viewer-map"), seen("viewer-psf")];
+        elements["viewer-in"].listeners.click();
+        told.zoomed = seen("viewer-map");""",
     )
     assert "right ascension, declination (ICRS)" in told["rows"]
     assert told["hover"].startswith("posterior mean: ") and "RA, Dec" in told["hover"]
@@ -172,14 +172,14 @@ def test_channels_of_the_page_are_those_of_the_files(small_cube, tmp_path):
     told = run_page(
         page,
         tmp_path,
-        f"""told.at = [0, 1, 2].map((k) => {points}.map((p) => explorer.at(k, ...p)));
+        f"""told.at = [0, 1, 2].map((k) => {points}.map((p) => viewer.at(...p, k)));
         told.texts = [0, 2].map((k) => {{
-          elements["explorer-channel"].value = k;
-          elements["explorer-channel"].listeners.input();
-          return elements["explorer-frequency"].textContent;
+          elements["viewer-channel"].value = k;
+          elements["viewer-channel"].listeners.input();
+          return elements["viewer-frequency"].textContent;
         }});
-        told.options = elements["explorer-layer"].options.map((one) => one.value);
-        told.rows = elements["explorer-values"].rows.map((one) => one.textContent);""",
+        told.options = elements["viewer-layer"].options.map((one) => one.value);
+        told.rows = elements["viewer-values"].rows.map((one) => one.textContent);""",
     )
     nside = small_cube.result.scenario.map_nside
     pixels = healpy.ang2pix(nside, lon, lat, lonlat=True)
