@@ -11,7 +11,7 @@ from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.reading import entries, read_json
 from lusee_bayes.judge.chi2 import stands_out
 from lusee_bayes.judge.cube_fit import N_TESTS
-from lusee_bayes.report.rendering import render_run, rows_of, sentences
+from lusee_bayes.report.rendering import render_run, rows_if_there, sentences
 from lusee_bayes.report.sections import flight_section
 from lusee_bayes.report.viewer import Maps, viewer
 from lusee_bayes.results.saved import (
@@ -57,7 +57,7 @@ def cube_page(folder: Path, name: str) -> str:
         coverage=_coverage(path, channels),
         pulls=entries(path, summary, "pulls", PULLS) if summary.get("pulls") else [],
         tests=tests,
-        unknowns=rows_of(folder / "unknowns.csv", CHANNEL_UNKNOWNS),
+        unknowns=rows_if_there(folder / "unknowns.csv", CHANNEL_UNKNOWNS),
         untold=sentences(path, summary, "unknowns"),
         flight=flight_section(folder),
     )

@@ -11,7 +11,7 @@ import xarray as xr
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.layouts import Layout
 from lusee_bayes.core.reading import entries
-from lusee_bayes.report.rendering import render_run, rows_of, sentences
+from lusee_bayes.report.rendering import render_run, rows_if_there, sentences
 from lusee_bayes.report.sections import flight_section
 from lusee_bayes.report.viewer import resolution, viewer
 from lusee_bayes.results.diagnostics_file import GROUP
@@ -52,7 +52,7 @@ def map_page(folder: Path, name: str) -> str:
     run = FinishedRun.read(folder)
     summary, found = run.summary, run.diagnostics
     path = folder / "summary.json"
-    unknowns = rows_of(folder / "unknowns.csv", UNKNOWNS)
+    unknowns = rows_if_there(folder / "unknowns.csv", UNKNOWNS)
     return render_run(
         "map.html",
         path,
@@ -65,10 +65,10 @@ def map_page(folder: Path, name: str) -> str:
         viewer=_viewer(folder, run),
         spectra=run.spectra,
         groups=_groups(found),
-        offsets=rows_of(folder / "pointing.csv", POINTING),
+        offsets=rows_if_there(folder / "pointing.csv", POINTING),
         unknowns=unknowns,
         untold=_untold(path, summary) if unknowns else [],
-        sources=rows_of(folder / "sources.csv", SOURCES),
+        sources=rows_if_there(folder / "sources.csv", SOURCES),
         flight=flight_section(folder),
     )
 

@@ -21,7 +21,7 @@ from lusee_bayes.core.checks import counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.layouts import Layout
-from lusee_bayes.core.reading import read_table, read_text
+from lusee_bayes.core.reading import read_table, read_text, rows_of
 from lusee_bayes.core.version import __version__, printable
 from lusee_bayes.judge.chi2 import RULE, probability
 from lusee_bayes.judge.convergence import CRITERIA
@@ -69,7 +69,7 @@ def asset(name: str) -> Markup:
     return Markup(ENVIRONMENT.loader.get_source(ENVIRONMENT, name)[0])
 
 
-def number(value: Any, form: str, missing: str = "") -> str:
+def formatted(value: Any, form: str, missing: str = "") -> str:
     """Format a number.
 
     Parameters
@@ -98,7 +98,7 @@ ENVIRONMENT = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-ENVIRONMENT.filters |= {"number": number, "probability": p_value}
+ENVIRONMENT.filters |= {"number": formatted, "probability": p_value}
 ENVIRONMENT.globals |= {"asset": asset, "counted": counted, "RULE": RULE, "CRITERIA": CRITERIA}
 
 
@@ -153,16 +153,9 @@ def sentences(path: Path, found: Mapping[str, Any], name: str) -> list[str]:
     return told
 
 
-def rows_of(path: Path, layout: Layout) -> list[dict[str, Any]]:
+def rows_if_there(path: Path, layout: Layout) -> list[dict[str, Any]]:
     """The rows of a CSV table by the names of its columns; none if there is no such file.
 
     InputError as :func:`.read_table`.
     """
-    if not path.is_file():
-        return []
-    table = read_table(path, layout)
-    names = list(layout.variables)
-    return [
-        dict(zip(names, row, strict=True))
-        for row in zip(*(table[name] for name in names), strict=True)
-    ]
+    return rows_of(read_table(path, layout)) if path.is_file() else []

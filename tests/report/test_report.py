@@ -243,7 +243,7 @@ def in_browser(page: str, tmp_path, width: int, points) -> dict:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize("width", [1280, 390])
-@pytest.mark.parametrize("which", [FOLDER, SAMPLED])
+@pytest.mark.parametrize("which", [FOLDER, CUBE, SAMPLED])
 def test_in_a_browser(which, width, request, tmp_path):
     folder = request.getfixturevalue(which)
     points = np.random.default_rng(3).uniform([0, -90], [360, 90], (300, 2))

@@ -19,8 +19,10 @@ from astropy.io import fits
 from reference_linear import resolution_rows
 
 import lusee_bayes as lb
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
-from lusee_bayes.report.viewer import BUDGET, KERNEL_NSIDE, nside_of_page
+from lusee_bayes.report.rendering import render
+from lusee_bayes.report.viewer import BUDGET, KERNEL_NSIDE, nside_of_page, resolution, viewer
 from lusee_bayes.results.diagnostics_file import read_diagnostics
 
 NODE = shutil.which("node")
@@ -192,6 +194,96 @@ def test_channels_of_the_page_are_those_of_the_files(small_cube, tmp_path):
     assert told["texts"] == ["20 MHz", "30 MHz"]
     assert told["options"] == ["mean", "std", "truth", "residual", "pull"]
     assert "30 MHz" in told["rows"]
+
+
+@needs_node
+@pytest.mark.parametrize("which", ["small_map", "small_cube"])
+def test_keys_move_the_direction_and_parts_are_those_that_the_page_has(which, request, tmp_path):
+    page = (request.getfixturevalue(which).folder / "report.html").read_text()
+    many = which == "small_cube"
+    assert ('id="viewer-channel"' in page, 'id="viewer-spectrum"' in page) == (many, many)
+    assert ('id="viewer-psf"' in page) != many
+    told = run_page(
+        page,
+        tmp_path,
+        """const place = () => ["l", "b"].map((name) => Number(elements[`viewer-${name}`].value));
+        const press = (key) => {
+          elements["viewer-map"].listeners.keydown({ key, preventDefault() {} });
+          return place();
+        };
+        told.places = [place(), ...["ArrowLeft", "ArrowUp", "ArrowRight", "ArrowDown"].map(press)];
+        elements["viewer-l"].value = "30"; elements["viewer-b"].value = "-45";
+        elements["viewer-l"].listeners.change();
+        told.rows = elements["viewer-values"].rows.map((one) => one.textContent);""",
+    )
+    assert told["places"] == [[0, 0], [2, 0], [2, 2], [0, 2], [0, 0]]
+    assert "30.00°, -45.00°" in told["rows"]
+    assert ("peak of the point-spread function" in told["rows"]) != many
+
+
+@needs_node
+def test_everything_that_is_given_of_two_channels_is_shown(small_map, tmp_path):
+    """The second channel has twice the temperatures of the first, and another resolution."""
+    found = read_diagnostics(small_map.folder / "diagnostics.nc")
+    both = np.array([[1.0], [2.0]])
+    maps = {
+        name: both * healpy.read_map(small_map.folder / f"{name}.fits", dtype=np.float64)
+        for name in ("mean", "std", "truth")
+    }
+    maps["prior_fraction"] = both / 4 * np.ones(maps["mean"].shape)
+    maps["draw1"] = maps["mean"] + 1.0
+    first = resolution(found)
+    second = resolution(found.assign(resolution_step=3.0 * found["resolution_step"]))
+    names = ("mean", "std", "prior_fraction")
+    shown = viewer(
+        [10.0, 20.0],
+        maps,
+        highest_altitude=found["highest_altitude"].values,
+        regions={name: both * found[f"region_{name}"].values for name in names},
+        resolutions=[first, second],
+    )
+    told = run_page(
+        render("viewer.html", tmp_path, viewer=shown),
+        tmp_path,
+        """const rows = () => {
+          const texts = elements["viewer-values"].rows.map((one) => one.textContent);
+          return Object.fromEntries(texts.flatMap((x, k) => (k % 2 ? [] : [[x, texts[k + 1]]])));
+        };
+        told.first = rows();
+        elements["viewer-channel"].value = 1;
+        elements["viewer-channel"].listeners.input();
+        told.second = rows();
+        told.options = elements["viewer-layer"].options.map((one) => one.value);
+        told.kernels = [0, 1].map((k) => viewer.kernel(30, 40, k));""",
+    )
+    assert told["options"] == [
+        "mean", "std", "truth", "residual", "pull", "prior_fraction", "draw1"
+    ]  # fmt: skip
+    assert (told["first"]["frequency"], told["second"]["frequency"]) == ("10 MHz", "20 MHz")
+    assert told["first"]["ever above the horizon"] == told["second"]["ever above the horizon"]
+    region = "region of 7.3° around it: mean"
+    for name in ("posterior mean", "standard deviation", "truth", region):
+        values = [float(told[k][name].replace(",", "").split()[0]) for k in ("first", "second")]
+        # rounded to a kelvin, and quantised to 1/65535 of their range
+        assert values[1] == pytest.approx(2 * values[0], rel=1e-3)
+    # steps and kernels are in single precision, and add up to less than their peak
+    expected = 3.0 * np.array(told["kernels"][0])
+    np.testing.assert_allclose(told["kernels"][1], expected, atol=1e-6 * expected.max())
+
+
+def test_maps_that_do_not_go_together_are_refused():
+    mean = np.ones((2, 12))
+    for other in (np.ones((1, 12)), np.ones((2, 48))):
+        with pytest.raises(InputError, match="maps of std have the shape"):
+            viewer([10.0, 20.0], {"mean": mean, "std": other})
+    with pytest.raises(InputError, match="on a HEALPix grid"):
+        viewer([10.0], {"mean": np.ones((1, 13)), "std": np.ones((1, 13))})
+
+
+def test_a_sky_below_zero_has_a_linear_scale():
+    maps = {"mean": np.linspace(-2.0, -1.0, 24).reshape(2, 12), "std": np.ones((2, 12))}
+    for scale in viewer([10.0, 20.0], maps)["scales"]["temperature"]:
+        assert not scale["log"] and -2.0 <= scale["low"] < scale["high"] <= -1.0
 
 
 def test_pages_stay_within_their_size():
