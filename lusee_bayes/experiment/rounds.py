@@ -293,7 +293,9 @@ PRIOR_SETTLED, MAX_PRIOR_ROUNDS = 0.05, 8
 COARSE_LMAX = 24
 
 
-def with_learned_prior(setup: Setup, data: Visibilities) -> tuple[Setup, Learned, Around | None]:
+def with_learned_prior(
+    setup: Setup, data: Visibilities, earlier: Information | None = None
+) -> tuple[Setup, Learned, Around | None]:
     """Learn the prior from data.
 
     Systematics are in N as far as they are marginalised. Where N is built around what the data
@@ -305,6 +307,8 @@ def with_learned_prior(setup: Setup, data: Visibilities) -> tuple[Setup, Learned
     setup : Setup
         With a family of priors.
     data : Visibilities
+    earlier : Information, optional
+        Of earlier data, which are learned from, too.
 
     Returns
     -------
@@ -316,11 +320,13 @@ def with_learned_prior(setup: Setup, data: Visibilities) -> tuple[Setup, Learned
         What N was built around in the last round; None where that is the data alone.
     """
     if not rebuilds(setup):
-        learned = learned_prior(setup, setup.family, about_sky(setup, data))
+        information = _with_more(about_sky(setup, data), earlier)
+        learned = learned_prior(setup, setup.family, information)
         return replace(setup, prior=learned.prior), learned, None
     learned, before, found = None, None, settled(setup, data)
     for _ in range(MAX_PRIOR_ROUNDS):
-        information = full_model(setup, found.around).inform(data.data)[0]
+        own = full_model(setup, found.around).inform(data.data)[0]
+        information = _with_more(own, earlier)
         start = None if learned is None or not learned.settled else learned.parameters
         learned = learned_prior(setup, setup.family, information, start)
         setup = replace(setup, prior=learned.prior)
@@ -338,6 +344,10 @@ def about_sky(setup: Setup, data: Visibilities) -> Information:
     """
     around = settled(setup, data).around if rebuilds(setup) else Around(data)
     return full_model(setup, around).inform(data.data)[0]
+
+
+def _with_more(information: Information, earlier: Information | None) -> Information:
+    return information if earlier is None else information + earlier
 
 
 def learned_prior(

@@ -165,6 +165,30 @@ class Information(Described, eqx.Module):
         misfit = namespace(misfit).asarray(misfit)
         return replace(self, vector=self.vector - pulled, reference=sky, misfit=misfit)
 
+    def __add__(self, other: Information) -> Information:
+        """The information of the data of both, whose noise is independent.
+
+        Parameters
+        ----------
+        other : Information
+            Of other data, for the same modes.
+
+        Raises
+        ------
+        InputError
+            If it is for another number of modes.
+        """
+        require_shape("the other reference sky", other.reference, (self.n_modes,))
+        here = other.recentred(self.reference)
+        return Information(
+            self.matrix + here.matrix,
+            self.vector + here.vector,
+            self.reference,
+            self.misfit + here.misfit,
+            self.log_det + here.log_det,
+            self.n_data + here.n_data,
+        )
+
     def raised(self, factor: float) -> Information:
         """The information of the same data under N times a factor.
 
@@ -203,6 +227,38 @@ class Information(Described, eqx.Module):
             If ``sky`` has another length.
         """
         return self.recentred(sky).misfit
+
+    def fit(self, mean: Modes, covariance: ModesMatrix) -> dict[str, float]:
+        """Compute chi^2 of the residuals about a mean, and its expectation if the model holds.
+
+        Parameters
+        ----------
+        mean, covariance : (modes,) and (modes, modes) array
+            Of the posterior, which may be given other data, too, in K and K^2.
+
+        Returns
+        -------
+        dict of float
+            ``chi2``, and ``chi2_expected``: N_data - tr(M C).
+        """
+        expected = float(self.n_data - np.vdot(self.matrix, covariance))
+        return {"chi2": float(self.chi2(mean)), "chi2_expected": expected}
+
+    def log_likelihood(self, skies: Float[Array, "n modes"]) -> Float[np.ndarray, " n"]:
+        """Compute ln p(d | m) of some skies.
+
+        Parameters
+        ----------
+        skies : (n, modes) array
+            m, in K.
+
+        Returns
+        -------
+        (n,) array
+            For data in K.
+        """
+        rest = float(self.log_det + self.n_data * np.log(2.0 * np.pi))
+        return np.array([-0.5 * (float(self.chi2(sky)) + rest) for sky in skies])
 
     def posterior(self, prior: Prior) -> Posterior:
         """Compute the posterior over the sky.
