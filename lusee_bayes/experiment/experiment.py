@@ -58,6 +58,8 @@ class Experiment(Described):
         Of flight data: the times that did not fit and are left out; None for other data.
     around : Around or None
         What N was built around when the prior was learned, in rounds; None for the data alone.
+    information : Information or None
+        What the data say of the sky, where the prior was learned from it.
     """
 
     setup: Setup
@@ -66,6 +68,7 @@ class Experiment(Described):
     learned: Learned | None = None
     fitting: Fitting | None = None
     around: Around | None = None
+    information: Information | None = None
 
     def description(self) -> tuple[str, ...]:
         scenario = self.scenario
@@ -190,8 +193,10 @@ def _learned(
     if experiment.setup.family is None:
         return experiment
     with stages("prior"):
-        setup, learned, around = with_learned_prior(experiment.setup, experiment.data, earlier)
-    return replace(experiment, setup=setup, learned=learned, around=around)
+        setup, learned, around, known = with_learned_prior(
+            experiment.setup, experiment.data, earlier
+        )
+    return replace(experiment, setup=setup, learned=learned, around=around, information=known)
 
 
 def with_truth(experiment: Experiment) -> Experiment:
@@ -237,7 +242,7 @@ def infer(experiment: Experiment) -> Inference:
     InputError
         As :func:`.settled`.
     """
-    return settled(experiment.setup, experiment.data, experiment.around)
+    return settled(experiment.setup, experiment.data, experiment.around, experiment.information)
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:

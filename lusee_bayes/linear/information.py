@@ -75,6 +75,7 @@ class Information(Described, eqx.Module):
         noise: Covariance,
         offset: DataVector | None,
         data: DataVector,
+        known: Information | None = None,
     ) -> tuple[Information, Posterior]:
         """Compute the information of data, and the posterior under a prior.
 
@@ -92,6 +93,8 @@ class Information(Described, eqx.Module):
             Mean of the data without a sky, in K; None for zero.
         data : (data,) array
             d, in K.
+        known : Information, optional
+            Of the same data under the same A and N, with any reference sky.
 
         Returns
         -------
@@ -112,21 +115,25 @@ class Information(Described, eqx.Module):
                 (coupling, prior, noise, offset, data)
             )
         factor = noise.factor()
-        if has_structure(coupling, noise):
-            matrix = normal_matrix(coupling, noise)
-        else:
+        structured = has_structure(coupling, noise)
+        if not structured:
             coupling = DenseCoupling(coupling.dense())
-            matrix = gram_matrix(factor.whiten(coupling.dense()))
-        xp = namespace(matrix)
+        xp = namespace((coupling, noise, data))
         centred = xp.asarray(data) if offset is None else data - offset
-        zero, n_data = xp.zeros(prior.size), xp.asarray(float(noise.size))
-        vector, misfit = gradient_and_misfit(coupling, factor, centred, zero)
-        first = cls(matrix, vector, zero, misfit, xp.asarray(factor.log_det()), n_data)
-        _require_modes(prior, len(zero))
-        lower = _precision_root(matrix, prior)
+        first = known
+        if first is None:
+            if structured:
+                matrix = normal_matrix(coupling, noise)
+            else:
+                matrix = gram_matrix(factor.whiten(coupling.dense()))
+            zero, n_data = xp.zeros(prior.size), xp.asarray(float(noise.size))
+            vector, misfit = gradient_and_misfit(coupling, factor, centred, zero)
+            first = cls(matrix, vector, zero, misfit, xp.asarray(factor.log_det()), n_data)
+        _require_modes(prior, first.n_modes)
+        lower = _precision_root(first.matrix, prior)
         mean = prior.colour(_condition(first, prior, lower, 1)[0])
         vector, misfit = gradient_and_misfit(coupling, factor, centred, mean)
-        information = cls(matrix, vector, mean, misfit, first.log_det, n_data)
+        information = replace(first, vector=vector, reference=mean, misfit=misfit)
         return information, information._posterior(prior, lower)
 
     def description(self) -> tuple[str, ...]:

@@ -27,14 +27,14 @@ from lusee_bayes.core.harmonics import (
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.diagnosis import diagnose
-from lusee_bayes.experiment.draws import deviations, doubts, posterior_draws
+from lusee_bayes.experiment.draws import doubts, posterior_draws
 from lusee_bayes.experiment.experiment import Experiment, explained, infer
 from lusee_bayes.experiment.instrument_terms import beam_rms_difference
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport, flux_table, pointing_report
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge.chi2 import LEVELS
-from lusee_bayes.judge.coverage import Counts
+from lusee_bayes.judge.coverage import N_DRAWS, Counts
 from lusee_bayes.judge.measures import (
     expected_chi2,
     highest_altitude,
@@ -55,7 +55,9 @@ from lusee_bayes.sky.prior import DensePrior, Prior
 DOES_NOT_FIT = LEVELS[-1]
 # groups of the data of a channel of many are judged where what no sky explains is less probable
 DOUBTFUL = 0.01
-REGION_NSIDE, N_DRAWS = 8, 4
+REGION_NSIDE = 8
+# draws that a report shows
+FEW = 4
 # of a byte with its sign
 LARGEST_STEP = 127
 # the nodes of the beams that are drawn, and which: an auto, and its crosses with the antennas
@@ -128,8 +130,8 @@ class Conditioned:
     @cached_property
     def information(self) -> Information:
         """Of all data."""
-        data = self.experiment.data.data
-        return self.own.model.inform(data)[0] if self.given is None else self.given
+        known = self.own.information if self.given is None else self.given
+        return known or self.own.model.inform(self.experiment.data.data)[0]
 
     @cached_property
     def posterior(self) -> Posterior:
@@ -177,10 +179,16 @@ class Conditioned:
         return misfit + float(posterior.prior_chi2())
 
     @cached_property
+    def drawn(self) -> Float[np.ndarray, "n modes"]:
+        """All draws that are needed, in K; parameters of the prior are drawn once for all."""
+        known = self.experiment.data.truth is not None
+        n = max(self.experiment.scenario.output.draws, FEW) + known * N_DRAWS
+        return posterior_draws(self.experiment, self.posterior, lambda: self.information, n)
+
+    @property
     def draws(self) -> Float[np.ndarray, "n modes"]:
         """So many draws as the scenario's output asks for, in K."""
-        n_draws = self.experiment.scenario.output.draws
-        return posterior_draws(self.experiment, self.posterior, n_draws)
+        return self.drawn[: self.experiment.scenario.output.draws]
 
     def log_likelihood(self) -> Float[np.ndarray, " n"]:
         """ln p(d | m) of these data for every draw."""
@@ -193,7 +201,7 @@ class Conditioned:
         """Draws less the mean for :class:`.Counts`, in K; None where no truth is known."""
         if self.experiment.data.truth is None:
             return None
-        return deviations(self.experiment, self.posterior)
+        return self.drawn[-N_DRAWS:] - np.asarray(self.posterior.mean)
 
     def figures(self) -> dict[str, float]:
         """Numbers of :class:`.ChannelResult`."""
@@ -407,7 +415,7 @@ def _details(channel: Conditioned) -> Details:
     drawn = [(name, patterns[k]) for name, k in zip(names, BEAMS, strict=True) if k < len(patterns)]
     return Details(
         pattern_names=tuple(name for name, _ in drawn),
-        draws=posterior_draws(channel.experiment, channel.posterior, N_DRAWS),
+        draws=channel.drawn[:FEW],
         prior_fraction=left / before,
         region_mean=rows @ channel.posterior.mean,
         region_std=np.sqrt(of_regions),
