@@ -48,7 +48,6 @@ from .noise.instrument_errors import beam_error_noise as beam_error_noise
 from .noise.instrument_errors import template_noise as template_noise
 from .noise.radiometer import radiometer_noise as radiometer_noise
 from .results.channel import ChannelResult as ChannelResult
-from .results.cube import CubeResult as CubeResult
 from .results.map_result import MapResult as MapResult
 from .runs.compare_run import run_compare as run_compare
 from .runs.compare_run import run_compare_priors as run_compare_priors

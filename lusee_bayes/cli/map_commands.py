@@ -26,8 +26,8 @@ def map_command(
     truth: Flag = False,
     draws: Number | None = None,
     covariance: Flag = False,
-    updatable: Flag = False,
-    onto: Path | None = None,
+    information: Flag = False,
+    add: Path | None = None,
     diagnose: Flag = False,
     frequencies: str | None = None,
     joint: Flag = False,
@@ -46,13 +46,13 @@ def map_command(
         Number of posterior draws to keep in posterior.nc (output.draws).
     covariance
         Keep the posterior covariance in posterior.nc (output.covariance).
-    updatable
-        Keep in posterior.nc what --onto needs (output.updatable).
-    onto
-        Folder of an updatable run: the data are added to those behind it.
+    information
+        Keep in posterior.nc what the data say of the sky, for --add (output.information).
+    add
+        Folder of a run with --information: the data are added to those behind it.
     diagnose
-        Try the usual mistakes (signs, exchanged ports, angles, clocks, ...) even if the data fit;
-        where they do not, they are tried anyway.
+        Judge every group of data, and try the usual mistakes (signs, exchanged ports, angles,
+        clocks, ...), even if the data fit; where they do not, both is done anyway.
     frequencies
         Channels in MHz, as 10,25,30 or as first:last:step: a map of each, on its own. The same
         command continues an interrupted run.
@@ -69,9 +69,9 @@ def map_command(
         joint=joint,
         output__draws=draws,
         output__covariance=covariance,
-        output__updatable=updatable,
+        output__information=information,
     )
-    given = {"data": options.data, "truth": truth, "onto": onto, "diagnosed": diagnose}
+    given = {"data": options.data, "truth": truth, "earlier": add, "thorough": diagnose}
     given |= options.running()
     folder = options.folder(scenario)
     if resolved.frequencies_mhz:

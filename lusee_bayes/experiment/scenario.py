@@ -279,6 +279,11 @@ class Scenario(Section):
         section = getattr(self, name).model_copy(update=values)
         return self.model_copy(update={name: section})
 
+    @property
+    def single(self) -> bool:
+        """Whether it is of one frequency."""
+        return not self.frequencies_mhz
+
     def channels(self) -> tuple[Scenario, ...]:
         """The scenario of every channel; draws of each have a seed of their own, one further."""
         alone: dict[str, Any] = {"frequencies_mhz": (), "joint": False}

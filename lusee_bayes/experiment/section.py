@@ -160,10 +160,10 @@ class OutputSection(Section):
         Number of posterior draws ``posterior.nc`` keeps.
     covariance : bool
         Keep the posterior covariance in ``posterior.nc``.
-    updatable : bool
-        Keep in ``posterior.nc`` what new data need to be added later.
+    information : bool
+        Keep in ``posterior.nc`` what the data say of the sky, so that new data can be added later.
     """
 
     draws: Annotated[int, Field(ge=0)] = 0
     covariance: bool = False
-    updatable: bool = False
+    information: bool = False

@@ -222,13 +222,17 @@ class LinearGaussian(Described, eqx.Module):
         enough = self.n_data >= self.prior.size
         return self.prior.invertible and enough and has_structure(self.coupling, self.noise)
 
-    def inform(self, data: DataVector) -> tuple[Information, Posterior]:
+    def inform(
+        self, data: DataVector, known: Information | None = None
+    ) -> tuple[Information, Posterior]:
         """Compute the information of data, and the posterior; see :meth:`Information.of`.
 
         Parameters
         ----------
         data : (data,) array
             d, in K.
+        known : Information, optional
+            Of the same data, found with another prior.
 
         Returns
         -------
@@ -242,7 +246,7 @@ class LinearGaussian(Described, eqx.Module):
         InputError
             As :meth:`Information.of`.
         """
-        return Information.of(self.coupling, self.prior, self.noise, self.offset, data)
+        return Information.of(self.coupling, self.prior, self.noise, self.offset, data, known)
 
     def log_prob(self, data: DataVector) -> Float[Array, ""]:
         """Compute the evidence ln p(d), with the sky integrated out. Differentiable.

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import require_files
-from lusee_bayes.core.reading import entries, read_json
-from lusee_bayes.report.rendering import render, render_run, sentences
+from lusee_bayes.core.reading import read_model
+from lusee_bayes.report.rendering import render, render_run
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
-from lusee_bayes.results.prior_comparison import prior_table
-from lusee_bayes.results.saved import COVERAGE, HELD_OUT, PRIOR, PRIORS, SKY_ERRORS, SNR
+from lusee_bayes.results.prior_comparison import PriorsSummary, prior_table
 
 
 def comparison_page(runs: Sequence[FinishedRun], folder: Path) -> str:
@@ -26,34 +23,8 @@ def priors_page(folder: Path, name: str) -> str:
     """The page as text, of the folder and the name of a run. InputError as :func:`.map_page`."""
     require_files(folder, ("priors.json", "scenario.yaml", "figures/priors.png"), "compare-priors")
     path = folder / "priors.json"
-    found = read_json(path, PRIORS)
-    priors = _priors(path, found)
-    header, rows = prior_table(priors)
-    return render_run(
-        "priors.html",
-        path,
-        found,
-        name=name,
-        notes=sentences(path, {"notes": None} | found, "notes"),
-        header=header,
-        rows=rows,
-        words=[(one["name"], one["prior"]) for one in priors],
-    )
-
-
-def _priors(path: Path, found: dict[str, Any]) -> list[dict[str, Any]]:
-    """The entries, checked as deep as the table reads them."""
-    priors = entries(path, found, "priors", PRIOR)
-    if not priors:
-        raise InputError(f"{path} has no prior; make the results anew")
-    lengths = set()
-    for one in priors:
-        held = entries(path, one, "held_out", HELD_OUT)
-        known = one.get("coverage") is not None
-        parts = entries(path, one, "coverage", COVERAGE) if known else []
-        errors = entries(path, one, "errors", SKY_ERRORS) if known else []
-        snr = entries(path, one, "snr", SNR)
-        lengths.add(tuple(map(len, (held, parts, errors, snr))))
-    if len(lengths) > 1:
-        raise InputError(f"{path}: its priors tell different things; make the results anew")
-    return priors
+    found = read_model(path, PriorsSummary, "a comparison of priors")
+    header, rows = prior_table(found.priors)
+    words = [(one.name, one.prior) for one in found.priors]
+    shown = {"header": header, "rows": rows, "words": words, "notes": found.notes}
+    return render_run("priors.html", path, found.model_dump(), name=name, **shown)

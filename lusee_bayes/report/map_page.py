@@ -1,4 +1,4 @@
-"""The report of a map run, out of what it has left in its folder."""
+"""The report of a map run of one channel or many, out of what it has left in its folder."""
 
 from __future__ import annotations
 
@@ -6,29 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from lusee_bayes.core.files import require_files
-from lusee_bayes.core.layouts import Layout
-from lusee_bayes.core.reading import entries
-from lusee_bayes.report.rendering import render_run, rows_if_there, sentences
-from lusee_bayes.report.sections import flight_section
+from lusee_bayes.core.harmonics import modes_to_map
+from lusee_bayes.flight.reduced import REASONS, REDUCED, Reduced, read_reduced
+from lusee_bayes.judge.chi2 import stands_out
+from lusee_bayes.judge.cube_fit import N_TESTS
+from lusee_bayes.report.rendering import render_run
 from lusee_bayes.report.viewer import resolution, viewer
-from lusee_bayes.results.diagnostics_file import GROUP
+from lusee_bayes.results.channel import ChannelResult, Judged
 from lusee_bayes.results.finished_runs import FinishedRun
-from lusee_bayes.results.saved import (
-    COVERAGE,
-    DIAGNOSIS,
-    NULL_DIRECTION,
-    POINTING,
-    SOURCES,
-    UNKNOWNS,
-)
-from lusee_bayes.sky.sky_files import SkyMap
 
-NEEDED = ("summary.json", "spectra.csv", "scenario.yaml", "diagnostics.nc", "mean.fits", "std.fits")
-# kinds of groups of data in the order of their tables, with what verdicts call them
-GROUPS = {"product": "product", "day": "day", "angle": "turntable angle"}
 # days in the table, the worst first
 WORST_DAYS = 5
 
@@ -48,84 +36,91 @@ def map_page(folder: Path, name: str) -> str:
     InputError
         If something is missing in the folder.
     """
-    require_files(folder, NEEDED, "map")
+    require_files(folder, ("summary.json", "scenario.yaml", "diagnostics.nc"), "map")
     run = FinishedRun.read(folder)
-    summary, found = run.summary, run.diagnostics
-    path = folder / "summary.json"
-    unknowns = rows_if_there(folder / "unknowns.csv", UNKNOWNS)
+    summary, channels = run.summary, run.channels
+    tests = N_TESTS * len(channels)
     return render_run(
         "map.html",
-        path,
-        summary,
+        folder / "summary.json",
+        summary.model_dump(),
         name=name,
-        level=found.attrs["level"],
-        verdict=found.attrs["verdict"],
-        mistakes=_entries_if_any(path, summary, "diagnosis", DIAGNOSIS),
-        coverage=_entries_if_any(path, summary, "coverage", COVERAGE),
-        viewer=_viewer(folder, run),
-        spectra=run.spectra,
-        groups=_groups(found),
-        offsets=rows_if_there(folder / "pointing.csv", POINTING),
-        unknowns=unknowns,
-        untold=_untold(path, summary) if unknowns else [],
-        sources=rows_if_there(folder / "sources.csv", SOURCES),
-        flight=flight_section(folder),
+        channels=channels,
+        judged=[_groups(c.judged) for c in channels],
+        unfit=[test.level != "consistent" for test in summary.tests],
+        bad=[stands_out(channel.instrument.p, tests) for channel in channels],
+        viewer=_viewer(channels),
+        flight=_flight(folder),
     )
 
 
-def _entries_if_any(
-    path: Path, summary: dict[str, Any], name: str, layout: Layout
-) -> list[dict[str, Any]] | None:
-    """Checked objects of summary.json; None where the run has none."""
-    return None if summary.get(name) is None else entries(path, summary, name, layout)
+def _viewer(channels: tuple[ChannelResult, ...]) -> dict[str, Any]:
+    def stacked(values: list[np.ndarray]) -> np.ndarray:
+        return np.stack(values)
 
-
-def _viewer(folder: Path, run: FinishedRun) -> dict[str, Any]:
-    found = run.diagnostics
-    maps = {"mean": run.mean, "std": run.std}
-    if (folder / "truth.fits").is_file():
-        maps["truth"] = SkyMap.read(folder / "truth.fits").pixels
-    maps["prior_fraction"] = found["prior_fraction"].values
-    maps |= {f"draw{k}": draw for k, draw in enumerate(found["draws"].values, 1)}
+    nside = channels[0].nside
+    maps = {
+        "mean": stacked([modes_to_map(channel.mean, nside) for channel in channels]),
+        "std": stacked([channel.pixel_std for channel in channels]),
+    }
+    if all(channel.truth is not None for channel in channels):
+        maps["truth"] = stacked([modes_to_map(channel.truth, nside) for channel in channels])
+    details = [channel.details for channel in channels if channel.details is not None]
+    if len(details) < len(channels):
+        return viewer([channel.frequency_mhz for channel in channels], maps)
+    maps["prior_fraction"] = stacked([one.prior_fraction for one in details])
+    for k in range(len(details[0].draws)):
+        maps[f"draw{k + 1}"] = stacked([modes_to_map(one.draws[k], nside) for one in details])
     names = ("mean", "std", "prior_fraction")
     return viewer(
-        [run.summary["frequency_mhz"]],
-        {key: values[None] for key, values in maps.items()},
-        highest_altitude=found["highest_altitude"].values,
-        regions={name: found[f"region_{name}"].values[None] for name in names},
-        resolutions=[resolution(found)],
+        [channel.frequency_mhz for channel in channels],
+        maps,
+        highest_altitude=channels[0].highest_altitude,
+        regions={n: stacked([getattr(one, f"region_{n}") for one in details]) for n in names},
+        resolutions=[resolution(one) for one in details],
     )
 
 
-def _groups(found: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """By kind: how many groups were left out, and the rows of those that are shown.
+def _groups(judged: Judged | None) -> dict[str, dict[str, Any]]:
+    """By kind: how many groups were left out, and those that are shown, with the bad ones marked.
 
     There is none where there are too many data whose noise couples times: the verdict says so.
     """
-    marked = {
-        str(x) for key in ("suspects", "extremes") for x in np.atleast_1d(found.attrs.get(key, ()))
-    }
-    rows = [
-        dict(zip(GROUP, row, strict=True))
-        for row in zip(*(found[f"group_{name}"].values for name in GROUP), strict=True)
-    ]
-    shown = {}
-    for kind, words in GROUPS.items():
-        mine = [row for row in rows if row["kind"] == kind]
-        for row in mine:
-            row["bad"] = f"{words} {row['name']}" in marked
-        n = len(mine)
-        if kind == "day" and n > WORST_DAYS:
-            mine = sorted(mine, key=lambda row: row["p"])[:WORST_DAYS]
-        if mine:
-            shown[kind] = {"number": n, "rows": mine}
+    shown: dict[str, dict[str, Any]] = {}
+    if judged is None:
+        return shown
+    marked = {*judged.suspects, *judged.extremes}
+    for kind, groups in judged.kinds():
+        listed = list(groups)
+        if kind == "day" and len(listed) > WORST_DAYS:
+            listed = sorted(listed, key=lambda group: group.p)[:WORST_DAYS]
+        if listed:
+            bad = [f"{kind} {group.name}" in marked for group in listed]
+            shown[kind] = {"number": len(groups), "rows": listed, "bad": bad}
     return shown
 
 
-def _untold(path: Path, summary: dict[str, Any]) -> list[str]:
-    """What the data cannot tell of receivers, ground and gain table."""
-    found = {"unknowns": [summary.get("unknowns")]}
-    (null,) = entries(path, found, "unknowns", NULL_DIRECTION)
-    # runs of older versions have no notes
-    told = [null["null_sentence"], *sentences(path, null, "notes")]
-    return [sentence for sentence in told if sentence]
+def _flight(folder: Path) -> dict[str, Any] | None:
+    """Sessions, flags and noise as ``flight.html`` shows them; None for other data."""
+    if not (folder / REDUCED).is_file():
+        return None
+    reduced = read_reduced(folder / REDUCED)
+    reasons = [k for k in range(len(REASONS)) if not k or (reduced.reason == k).any()]
+    return {
+        "reduced": reduced,
+        "reasons": [REASONS[k] for k in reasons],
+        "bands": [_band(reduced, band, reasons) for band in range(len(reduced.frequencies_mhz))],
+    }
+
+
+def _band(reduced: Reduced, band: int, reasons: list[int]) -> dict[str, Any]:
+    """Shares of the spectra by reason, of the flagged channels of those used, and the noise."""
+    used = reduced.reason[band] == 0
+    return {
+        "frequency_mhz": reduced.frequencies_mhz[band],
+        "shares": [(reduced.reason[band] == k).mean() for k in reasons],
+        "flagged": reduced.lines[band][used].mean() if used.any() else np.nan,
+        "scatter": reduced.scatter[band],
+        "line_scatter": reduced.line_scatter[band],
+        "doubts": reduced.doubts(band),
+    }

@@ -20,8 +20,7 @@ from markupsafe import Markup
 from lusee_bayes.core.checks import counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import require_files
-from lusee_bayes.core.layouts import Layout
-from lusee_bayes.core.reading import read_table, read_text, rows_of
+from lusee_bayes.core.reading import read_text
 from lusee_bayes.core.version import __version__, printable
 from lusee_bayes.judge.chi2 import RULE, probability
 from lusee_bayes.judge.convergence import CRITERIA
@@ -151,11 +150,3 @@ def sentences(path: Path, found: Mapping[str, Any], name: str) -> list[str]:
     if not isinstance(told, list) or not all(isinstance(text, str) for text in told):
         raise InputError(f"{path}: {name} is no list of texts; make the results anew")
     return told
-
-
-def rows_if_there(path: Path, layout: Layout) -> list[dict[str, Any]]:
-    """The rows of a CSV table by the names of its columns; none if there is no such file.
-
-    InputError as :func:`.read_table`.
-    """
-    return rows_of(read_table(path, layout)) if path.is_file() else []

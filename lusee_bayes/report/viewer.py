@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from jaxtyping import Float
 from matplotlib import colormaps
 
@@ -20,6 +19,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.lazy import coordinates, healpy
 from lusee_bayes.report.figures.drawing import DIVERGING, SEQUENTIAL, seen_range
+from lusee_bayes.results.channel import Details
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 
 # of the map that point-spread functions are drawn on
@@ -80,21 +80,19 @@ def viewer(
     }
 
 
-def resolution(diagnostics: xr.Dataset) -> dict[str, Any]:
-    """The resolution matrix in units of the prior, of a run's diagnostics, for point_spread.js."""
-    lmax = min(LARGEST_ELL, lmax_of(diagnostics.sizes["mode"]))
+def resolution(details: Details) -> dict[str, Any]:
+    """The resolution matrix of a channel in units of the prior, for point_spread.js."""
+    lmax = min(LARGEST_ELL, lmax_of(len(details.prior_width)))
     n = n_modes(lmax)
-    steps = diagnostics["resolution_step"].values[: lmax + 1, : lmax + 1]
-    known = diagnostics["resolution"].values[:n, :n].astype(np.int8)
+    known = details.resolution[:n, :n].astype(np.int8)
     symmetric = bool((known == known.T).all())
-    entries = known[np.triu_indices(n)] if symmetric else known
     return {
         "lmax": lmax,
         "nside": KERNEL_NSIDE,
         "symmetric": symmetric,
-        "entries": _base64(entries),
-        "steps": packed(steps),
-        "prior_std": packed(diagnostics["prior_std"].values[:n]),
+        "entries": _base64(known[np.triu_indices(n)] if symmetric else known),
+        "steps": packed(details.resolution_step[: lmax + 1, : lmax + 1]),
+        "prior_std": packed(details.prior_width[:n]),
     }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import BaseModel
 
 from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.results.sample_result import SampleResult
@@ -88,29 +89,38 @@ class ValidationResult:
         lines.append(f"| standard error | {errors} |")
         return "\n".join(lines) + "\n"
 
-    def as_json(self) -> dict[str, object]:
-        """validation.json: every check, mode by mode where there are modes."""
-        found, ranks = self.comparison, self.ranks
-        return {
-            "passed": self.passed,
-            "checks": [
-                {
-                    "name": check.name,
-                    "value": check.value,
-                    "lower": check.lower if np.isfinite(check.lower) else None,
-                    "upper": check.upper if np.isfinite(check.upper) else None,
-                    "passed": check.passed,
-                    "meaning": check.meaning,
-                }
-                for check in self.checks
-            ],
-            **{name: getattr(found, name).tolist() for name in OF_MODES},
-            "coverage": {
-                name: {f"{p:g}": share for p, share in levels.items()}
-                for name, levels in ranks.coverage().items()
-            },
-            "p_values": dict(zip(ranks.names, ranks.p_values().tolist(), strict=True)),
-        }
+    def summary(self) -> ValidationSummary:
+        """validation.json."""
+        ranks = self.ranks
+        levels = ranks.coverage().items()
+        return ValidationSummary(
+            passed=self.passed,
+            checks=[CheckSummary.model_validate(check) for check in self.checks],
+            modes={name: getattr(self.comparison, name).tolist() for name in OF_MODES},
+            coverage={name: {f"{p:g}": x for p, x in shares.items()} for name, shares in levels},
+            p_values=dict(zip(ranks.names, ranks.p_values().tolist(), strict=True)),
+        )
+
+
+class CheckSummary(BaseModel, from_attributes=True):
+    """A check in validation.json; bounds that are not finite are null."""
+
+    name: str
+    value: float
+    lower: float | None
+    upper: float | None
+    passed: bool
+    meaning: str
+
+
+class ValidationSummary(BaseModel):
+    """validation.json: every check, and mode by mode what there is."""
+
+    passed: bool
+    checks: list[CheckSummary]
+    modes: dict[str, list[float | None]]
+    coverage: dict[str, dict[str, float]]
+    p_values: dict[str, float]
 
 
 def calibration_check(ranks: Ranks) -> Check:

@@ -36,7 +36,7 @@ from lusee_bayes.runs.folder import (
     RunFolder,
     RunKind,
     RunOutcome,
-    json_file,
+    model_file,
     netcdf_file,
     scenario_run,
     text_file,
@@ -317,7 +317,7 @@ SAMPLE_OUTPUTS = (
     Output(lambda run, folder: write_maps(folder, run.maps, run.experiment.scenario)),
     text_file("summary.csv", lambda run: run.summary.to_csv(index_label="quantity")),
     text_file("scenario.yaml", lambda run: run.experiment.scenario.to_yaml()),
-    json_file("sampling.json", lambda run: run.figures()),
+    model_file("sampling.json", lambda run: run.figures()),
 )
 
 # what the folder of a sampled program holds; a new file is one line here

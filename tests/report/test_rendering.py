@@ -48,6 +48,6 @@ def test_scripts_and_styles_are_as_in_their_files():
 
 def test_every_template_can_be_read():
     names = [name for name in ENVIRONMENT.list_templates() if name.endswith(".html")]
-    assert {"map.html", "cube.html", "sample.html", "priors.html", "comparison.html"} <= set(names)
+    assert {"map.html", "sample.html", "priors.html", "comparison.html"} <= set(names)
     for name in names:
         ENVIRONMENT.get_template(name)

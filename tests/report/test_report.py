@@ -21,8 +21,8 @@ from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.judge import residuals as residuals_module
-from lusee_bayes.results.diagnostics_file import read_diagnostics
-from lusee_bayes.runs.diagnostics import region_of
+from lusee_bayes.results.channel_map import region_of
+from lusee_bayes.results.map_files import read_channels
 from lusee_bayes.runs.map_run import run_map
 from lusee_bayes.runs.sample_run import run_sample
 from lusee_bayes.sampling.hmc import Sampler
@@ -108,7 +108,7 @@ def test_pages_are_whole_and_need_nothing_else(which, request):
 def test_a_pixels_posterior_is_that_of_the_file(folder):
     data = viewer_data((folder / "report.html").read_text())
     with xr.open_dataset(folder / "posterior.nc", engine="h5netcdf") as file:
-        mean, covariance = file["mean"].values, file["covariance"].values
+        mean, covariance = file["mean"].values[0], file["covariance"].values[0]
     nside = data["nside"]
     y = pixel_matrix(nside, 8)
     single = {"rtol": 2e-7, "atol": 0}
@@ -126,7 +126,7 @@ def test_a_pixels_posterior_is_that_of_the_file(folder):
         np.testing.assert_allclose(got[[0, 300, 767]], values, rtol=1e-6)
     # what is left of the prior, the monopole apart
     with xr.open_dataset(folder / "posterior.nc", engine="h5netcdf") as file:
-        prior = file["prior_std"].values[1:] ** 2
+        prior = file["prior_std"].values[0, 1:] ** 2
     inner = np.einsum("pi,ij,pj->p", y[:, 1:], covariance[1:, 1:], y[:, 1:])
     share = inner / (y[:, 1:] ** 2 @ prior)
     np.testing.assert_allclose(layer(data, "prior_fraction"), share, rtol=1e-5)
@@ -171,8 +171,8 @@ def test_a_corrupted_product_is_pointed_at(tmp_path, factor):
     told = {1.2: "without product 12R .*: leave it out", 1.02: "any one of .* do not tell which"}
     assert re.search(rf'class="verdict bad">Does not fit.*{told[factor]}', page)
     assert re.search(r"<tr class=bad><td>12R</td>", page)
-    found = read_diagnostics(tmp_path / "out" / "diagnostics.nc")
-    suspects = np.atleast_1d(found.attrs["suspects"])
+    (channel,) = read_channels(tmp_path / "out" / "diagnostics.nc")
+    suspects = channel.judged.suspects
     assert "product 12R" in suspects
     assert (sum(name.startswith("product") for name in suspects) == 1) == (factor == 1.2)
 
@@ -183,15 +183,16 @@ def test_a_page_without_groups(tmp_path, monkeypatch):
     monkeypatch.setattr(residuals_module, "DENSE_BYTES", 0.0)
     overrides = ["lmax=4", "observation.runs.0.cycles=0.1", "noise.gain={sigma: 0.01}"]
     run = run_map(load_scenario("fiducial", overrides), tmp_path / "map")
-    found = read_diagnostics(run.folder / "diagnostics.nc")
-    assert found.sizes["group"] == 0 and np.isnan(found["z"]).all()
-    assert found.attrs["verdict"] == run.result.verdict()
+    (channel,) = read_channels(run.folder / "diagnostics.nc")
+    assert not any(groups for _, groups in channel.judged.kinds())
+    assert np.isnan(channel.judged.z).all()
+    assert channel.judged.verdict == run.result.verdict()
     # the rest is judged as ever: chi^2 of all data under the model, by matrices
     model, data = run.result.inference.model, run.result.experiment.data.data
     a = np.asarray(model.coupling.dense())
     k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
     expected = np.asarray(data) @ np.linalg.solve(k, np.asarray(data))
-    told = found.attrs["instrument_chi2"] + found.attrs["prior_chi2"]
+    told = channel.instrument.chi2 + channel.judged.prior.chi2
     assert told == pytest.approx(expected, rel=1e-4)
     page = (run.folder / "report.html").read_text()
     assert "By product" not in page and run.result.verdict() in page

@@ -9,6 +9,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import astropy.units as u
 import healpy
@@ -23,7 +24,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
 from lusee_bayes.report.rendering import render
 from lusee_bayes.report.viewer import BUDGET, KERNEL_NSIDE, nside_of_page, resolution, viewer
-from lusee_bayes.results.diagnostics_file import read_diagnostics
+from lusee_bayes.results.map_files import read_channels
 
 NODE = shutil.which("node")
 # elements that remember; a canvas whose context keeps the last image
@@ -44,7 +45,8 @@ function element(id) {
     replaceChildren() { this.rows = []; }, append(...x) { this.rows.push(...x); },
     getBoundingClientRect: () => ({ left: 0, top: 0, width: size[0], height: size[1] }) });
 }
-globalThis.document = { getElementById: element, createElement: () => ({}) };
+globalThis.document = { getElementById: element, createElement: () => ({}),
+  querySelectorAll: () => [] };
 globalThis.Option = function (text, value) { this.text = text; this.value = value; };
 globalThis.window = globalThis;
 globalThis.requestAnimationFrame = (f) => f();
@@ -112,9 +114,9 @@ def test_point_spread_functions_are_those_of_the_posterior(which, request, tmp_p
     y = synthesis_matrix(np.pi / 2 - lat, lon, 8)
     there = pixel_matrix(KERNEL_NSIDE, 8)
     expected = np.asarray(resolution_rows(run.result.inference.posterior, y)) @ there.T
-    found = read_diagnostics(run.folder / "diagnostics.nc")
+    details = read_channels(run.folder / "diagnostics.nc")[0].details
     ell, _ = mode_numbers(8)
-    step, width = found["resolution_step"].values[np.ix_(ell, ell)], found["prior_std"].values
+    step, width = details.resolution_step[np.ix_(ell, ell)], details.prior_width
     variance = (y * width) ** 2 @ (step**2 / 12) @ ((there / width) ** 2).T
     # entries of the two triangles are the same number: errors may add, sqrt(2) at most
     assert (np.abs(kernels - expected) < 6 * np.sqrt(2 * variance) + 1e-6 * expected.max()).all()
@@ -224,7 +226,8 @@ def test_keys_move_the_direction_and_parts_are_those_that_the_page_has(which, re
 @needs_node
 def test_everything_that_is_given_of_two_channels_is_shown(small_map, tmp_path):
     """The second channel has twice the temperatures of the first, and another resolution."""
-    found = read_diagnostics(small_map.folder / "diagnostics.nc")
+    (channel,) = read_channels(small_map.folder / "diagnostics.nc")
+    details = channel.details
     both = np.array([[1.0], [2.0]])
     maps = {
         name: both * healpy.read_map(small_map.folder / f"{name}.fits", dtype=np.float64)
@@ -232,15 +235,14 @@ def test_everything_that_is_given_of_two_channels_is_shown(small_map, tmp_path):
     }
     maps["prior_fraction"] = both / 4 * np.ones(maps["mean"].shape)
     maps["draw1"] = maps["mean"] + 1.0
-    first = resolution(found)
-    second = resolution(found.assign(resolution_step=3.0 * found["resolution_step"]))
+    larger = replace(details, resolution_step=3.0 * details.resolution_step)
     names = ("mean", "std", "prior_fraction")
     shown = viewer(
         [10.0, 20.0],
         maps,
-        highest_altitude=found["highest_altitude"].values,
-        regions={name: both * found[f"region_{name}"].values for name in names},
-        resolutions=[first, second],
+        highest_altitude=channel.highest_altitude,
+        regions={name: both * getattr(details, f"region_{name}") for name in names},
+        resolutions=[resolution(details), resolution(larger)],
     )
     told = run_page(
         render("viewer.html", tmp_path, viewer=shown),

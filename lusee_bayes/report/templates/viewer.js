@@ -105,6 +105,10 @@
       const text = `${frequencies[state.channel]} MHz`;
       element("frequency").textContent = text;
       slider.setAttribute("aria-valuetext", text);
+      // what the page says of each channel
+      for (const part of document.querySelectorAll("[data-channel]")) {
+        part.hidden = Number(part.dataset.channel) !== state.channel;
+      }
     }
     draw();
   }
@@ -257,11 +261,15 @@
     describe();
   });
   if (many) {
-    slider.addEventListener("input", () => {
-      state.channel = Number(slider.value);
-      select();
-      describe();
-    });
+    const selectors = Array.from(document.querySelectorAll("select.channel"));
+    for (const one of [slider, ...selectors]) {
+      one.addEventListener("input", () => {
+        state.channel = Number(one.value);
+        for (const other of [slider, ...selectors]) other.value = one.value;
+        select();
+        describe();
+      });
+    }
   }
   skyView.controls(map, element, () => skyView.place(state.z, state.longitude), draw);
   select();
