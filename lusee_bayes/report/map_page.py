@@ -55,29 +55,27 @@ def map_page(folder: Path, name: str) -> str:
 
 
 def _viewer(channels: tuple[ChannelResult, ...]) -> dict[str, Any]:
-    def stacked(values: list[np.ndarray]) -> np.ndarray:
-        return np.stack(values)
-
-    nside = channels[0].nside
+    nside, frequencies = channels[0].nside, [channel.frequency_mhz for channel in channels]
+    altitude = channels[0].highest_altitude
     maps = {
-        "mean": stacked([modes_to_map(channel.mean, nside) for channel in channels]),
-        "std": stacked([channel.pixel_std for channel in channels]),
+        "mean": np.stack([modes_to_map(channel.mean, nside) for channel in channels]),
+        "std": np.stack([channel.pixel_std for channel in channels]),
     }
     if all(channel.truth is not None for channel in channels):
-        maps["truth"] = stacked([modes_to_map(channel.truth, nside) for channel in channels])
-    details = [channel.details for channel in channels if channel.details is not None]
-    if len(details) < len(channels):
-        return viewer([channel.frequency_mhz for channel in channels], maps)
-    maps["prior_fraction"] = stacked([one.prior_fraction for one in details])
-    for k in range(len(details[0].draws)):
-        maps[f"draw{k + 1}"] = stacked([modes_to_map(one.draws[k], nside) for one in details])
+        maps["truth"] = np.stack([modes_to_map(channel.truth, nside) for channel in channels])
+    details = channels[0].details
+    if details is None:
+        return viewer(frequencies, maps, highest_altitude=altitude)
+    maps["prior_fraction"] = details.prior_fraction[None]
+    for k, sky in enumerate(details.draws, 1):
+        maps[f"draw{k}"] = modes_to_map(sky, nside)[None]
     names = ("mean", "std", "prior_fraction")
     return viewer(
-        [channel.frequency_mhz for channel in channels],
+        frequencies,
         maps,
-        highest_altitude=channels[0].highest_altitude,
-        regions={n: stacked([getattr(one, f"region_{n}") for one in details]) for n in names},
-        resolutions=[resolution(one) for one in details],
+        highest_altitude=altitude,
+        regions={name: getattr(details, f"region_{name}")[None] for name in names},
+        resolutions=[resolution(details)],
     )
 
 
