@@ -18,7 +18,7 @@ import xarray as xr
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
-from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.experiment import build, infer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.judge import residuals as residuals_module
 from lusee_bayes.results.channel_map import region_of
@@ -188,7 +188,8 @@ def test_a_page_without_groups(tmp_path, monkeypatch):
     assert np.isnan(channel.judged.z).all()
     assert channel.judged.verdict == run.result.verdict()
     # the rest is judged as ever: chi^2 of all data under the model, by matrices
-    model, data = run.result.inference.model, run.result.experiment.data.data
+    experiment = build(run.result.scenario)
+    model, data = infer(experiment).model, experiment.data.data
     a = np.asarray(model.coupling.dense())
     k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
     expected = np.asarray(data) @ np.linalg.solve(k, np.asarray(data))

@@ -113,7 +113,8 @@ def test_point_spread_functions_are_those_of_the_posterior(which, request, tmp_p
     lon, lat = np.radians(POINTS).T
     y = synthesis_matrix(np.pi / 2 - lat, lon, 8)
     there = pixel_matrix(KERNEL_NSIDE, 8)
-    expected = np.asarray(resolution_rows(run.result.inference.posterior, y)) @ there.T
+    posterior = lb.infer(lb.build(run.result.scenario)).posterior
+    expected = np.asarray(resolution_rows(posterior, y)) @ there.T
     details = read_channels(run.folder / "diagnostics.nc")[0].details
     ell, _ = mode_numbers(8)
     step, width = details.resolution_step[np.ix_(ell, ell)], details.prior_width
