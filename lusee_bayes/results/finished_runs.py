@@ -24,7 +24,7 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.map_files import read_channels
-from lusee_bayes.results.map_result import MapSummary
+from lusee_bayes.results.summaries import MapSummary
 
 NAME = "provenance.json"
 

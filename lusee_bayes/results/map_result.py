@@ -10,12 +10,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from textwrap import wrap
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
-from pydantic import BaseModel, field_validator
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import Described, counted, extent
@@ -23,16 +21,21 @@ from lusee_bayes.core.harmonics import synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import about_run
 from lusee_bayes.core.reading import rows_of
-from lusee_bayes.experiment.diagnosis import Diagnosis
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.unknowns import PointingReport, UnknownsReport, flux_lines
+from lusee_bayes.experiment.unknowns import UnknownsReport, flux_lines
 from lusee_bayes.flight.reduced import Reduced
-from lusee_bayes.judge.chi2 import RULE, ChiSquare, Fit, Level
-from lusee_bayes.judge.coverage import Coverage
+from lusee_bayes.judge.chi2 import RULE, ChiSquare, Fit
 from lusee_bayes.judge.cube_fit import ChannelFits
 from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.results.channel import ChannelResult
+from lusee_bayes.results.summaries import (
+    ChannelSummary,
+    JointSummary,
+    JointTestSummary,
+    MapSummary,
+    PullSummary,
+)
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
@@ -165,119 +168,6 @@ class Components:
     def iterations(self) -> int:
         """Rounds of positive skies."""
         return 0 if self.mode is None else self.mode.rounds
-
-
-class ChiSquareSummary(BaseModel, from_attributes=True):
-    """A chi^2 in summary.json, with its expectation and its probability."""
-
-    chi2: float
-    degrees: float
-    p: float
-
-
-class JudgedSummary(BaseModel, from_attributes=True):
-    """How the data of a channel fit, in summary.json."""
-
-    level: Level
-    verdict: str
-    prior: ChiSquareSummary
-    extremes: list[str]
-    suspects: list[str]
-
-
-class ChannelSummary(BaseModel, from_attributes=True):
-    """Figures of a channel in summary.json; null where they are not known."""
-
-    frequency_mhz: float
-    instrument: ChiSquareSummary
-    judged: JudgedSummary | None
-    diagnosis: Diagnosis | None
-    ell_cross: int | None
-    resolution_deg: float | None
-    log_evidence: float | None
-    information_bits: float | None
-    chi2: float
-    chi2_expected: float
-    chi2_model: float | None
-    refinement: float | None
-    n_data: int
-    n_missing: int
-    rounds: int
-    never_observed: float
-    beam_rms_difference: float | None
-    prior: str
-    parameters: list[dict[str, Any]]
-    log_evidence_learned: float | None
-    coverage: tuple[Coverage, ...]
-    unknowns: dict[str, Any] | None
-    pointing: list[dict[str, Any]] | None
-    doubts: list[str]
-
-    @field_validator("unknowns", mode="before")
-    @classmethod
-    def _rows_of_unknowns(cls, told: Any) -> Any:
-        return told.summary() if isinstance(told, UnknownsReport) else told
-
-    @field_validator("pointing", mode="before")
-    @classmethod
-    def _rows_of_offsets(cls, told: Any) -> Any:
-        if not isinstance(told, PointingReport):
-            return told
-        return None if told.offsets is None else told.offsets.to_dict("records")
-
-
-class JointSummary(BaseModel, from_attributes=True):
-    """Figures of a joint posterior in summary.json."""
-
-    prior: str
-    components: tuple[str, ...]
-    solver: str
-    iterations: int
-    chi2: float
-    log_evidence: float
-    information_bits: float
-    refinement: float
-
-
-class JointTestSummary(BaseModel, from_attributes=True):
-    """A joint test of all channels in summary.json."""
-
-    name: str
-    found: str
-    p: float
-    n: int
-    level: Level
-
-
-class PullSummary(BaseModel):
-    """How far the spectrum of a direction is from the truth, in standard deviations."""
-
-    direction: str
-    rms: float
-    worst: float
-    worst_mhz: float
-
-
-class MapSummary(BaseModel):
-    """summary.json of a map run."""
-
-    frequencies_mhz: list[float]
-    unmapped: list[str]
-    joint: JointSummary | None
-    tied: bool
-    level: Level
-    verdict: str
-    log_evidence: float
-    n_data: int
-    n_modes: int
-    doubts: list[str]
-    tests: list[JointTestSummary]
-    pulls: list[PullSummary]
-    unknowns: list[str]
-    channels: list[ChannelSummary]
-    seconds: dict[str, float]
-    peak_memory_gb: float
-    versions: dict[str, str]
 
 
 @dataclass(frozen=True, repr=False)
