@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
+from lusee_bayes.report.explorer import BUDGET, KERNEL_NSIDE, nside_of_page
+from lusee_bayes.results.diagnostics_file import read_diagnostics
 from reference_linear import resolution_rows
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
-from lusee_bayes.report.explorer import BUDGET, KERNEL_NSIDE, nside_of_page
-from lusee_bayes.results.diagnostics_file import read_diagnostics
 
 NODE = shutil.which("node")
 # elements that remember; a canvas whose context keeps the last image

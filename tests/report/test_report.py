@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from lusee_bayes.results.diagnostics_file import read_diagnostics
+from lusee_bayes.runs.diagnostics import region_of
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.judge import residuals as residuals_module
-from lusee_bayes.results.diagnostics_file import read_diagnostics
-from lusee_bayes.runs.diagnostics import region_of
 from lusee_bayes.runs.map_run import run_map
 from lusee_bayes.runs.sample_run import run_sample
 from lusee_bayes.sampling.hmc import Sampler

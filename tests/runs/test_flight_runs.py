@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
+from lusee_bayes.report.sections import flight_section
 from matplotlib.figure import Figure
 
 import lusee_bayes as lb
@@ -20,7 +21,6 @@ from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
 from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.report.figures.judgement import calibration
-from lusee_bayes.report.sections import flight_section
 from lusee_bayes.runs.data_run import reduced_lines, run_simulate_flight
 
 SET = [
