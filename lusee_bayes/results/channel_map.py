@@ -195,8 +195,8 @@ class Conditioned:
             return None
         return deviations(self.experiment, self.posterior)
 
-    def figures(self) -> dict[str, float]:
-        """Numbers of :class:`.ChannelResult`."""
+    def figures(self) -> dict[str, float | bool]:
+        """What :func:`channel_result` takes besides: numbers, and whether C is kept."""
         model, posterior, data = self.found.model, self.posterior, self.experiment.data.data
         return {
             "log_evidence": float(posterior.log_evidence),

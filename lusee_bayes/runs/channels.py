@@ -164,8 +164,8 @@ class ChannelAlone:
         in K.
     n_draws : int
         That are kept.
-    figures : dict of float
-        log_evidence, information_bits, chi2_model and refinement, as in :class:`.ChannelResult`.
+    figures : dict
+        :meth:`.Conditioned.figures`.
     """
 
     known: ChannelData
@@ -175,7 +175,7 @@ class ChannelAlone:
     covariance: Float[np.ndarray, "mode mode_2"]
     deviations: Float[np.ndarray, "all mode"]
     n_draws: int
-    figures: dict[str, float]
+    figures: dict[str, float | bool]
 
     def receivers(self) -> tuple[Float[np.ndarray, " ports"], Float[np.ndarray, "ports ports"]]:
         """E and V of the receivers' powers, in prior standard deviations."""
