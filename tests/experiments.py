@@ -19,6 +19,8 @@ from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.term import Around
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.channel_map import Conditioned, conditioned
 from lusee_bayes.results.map_files import SavedInformation
@@ -57,6 +59,16 @@ def mapped(
     """What a map run finds of one frequency, without its folder."""
     made = conditioned(experiment, earlier)
     return made, made.result(made.known(Stages(), alone=True, thorough=thorough), Stages())
+
+
+def of_run(data: Visibilities, run: int) -> Visibilities:
+    """The data of one run by themselves."""
+    keep = data.observation.run == run
+    observation = data.observation.select(keep)
+    flat = jnp.asarray(data.grid()[:, keep].ravel())
+    return replace(
+        data, data=flat, layout=DataLayout(16, observation.n_times), observation=observation
+    )
 
 
 def program_arguments(program: Program, experiment: Experiment) -> dict[str, Any]:

@@ -53,6 +53,8 @@ from lusee_bayes.results.map_result import prior_sentence
 from lusee_bayes.sky.prior import DensePrior, Prior
 
 DOES_NOT_FIT = LEVELS[-1]
+# standard deviation of modes without prior variance, over the widest
+EXACT = 1e-12
 # groups of the data of a channel of many are judged where what no sky explains is less probable
 DOUBTFUL = 0.01
 REGION_NSIDE, N_DRAWS = 8, 4
@@ -88,8 +90,7 @@ def conditioned(
             information = earlier.with_more(made.information, data.digest())
             prior = own.model.prior
             posterior = information.posterior(prior)
-            before = earlier.information.posterior(prior)
-            model = replace(own.model, prior=DensePrior(before.root(), mean=before.mean))
+            model = replace(own.model, prior=_given_earlier(earlier.information.posterior(prior)))
             made = Conditioned(
                 experiment,
                 own,
@@ -100,6 +101,15 @@ def conditioned(
             )
         jax.block_until_ready(made.found.posterior.white_mean)
         return made
+
+
+def _given_earlier(posterior: Posterior) -> DensePrior:
+    """What earlier data leave of the sky, as the prior of data to come."""
+    width = np.sqrt(np.asarray(posterior.prior.variance()))
+    # a prior has no density where modes are known exactly
+    exact = np.diag(EXACT * width.max() * (width == 0))[:, width == 0]
+    root = np.concatenate([np.asarray(posterior.root()), exact], axis=1)
+    return DensePrior.of_root(root, np.asarray(posterior.mean))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from experiments import of_run
 from reference_linear import posterior, random_covariance
 from scipy.linalg import block_diag
 from scipy.stats import multivariate_normal
@@ -14,17 +15,6 @@ from scipy.stats import multivariate_normal
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.term import Around
-from lusee_bayes.instrument.products import DataLayout
-
-
-def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:
-    """The data of one run by themselves."""
-    keep = data.observation.run == run
-    observation = data.observation.select(keep)
-    flat = jnp.asarray(data.grid()[:, keep].ravel())
-    return replace(
-        data, data=flat, layout=DataLayout(16, observation.n_times), observation=observation
-    )
 
 
 def two_cycles(*overrides):
