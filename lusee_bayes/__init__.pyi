@@ -35,7 +35,6 @@ from .instrument.waterfalls import write_waterfall as write_waterfall
 from .linear.information import Information as Information
 from .linear.joint import solve_directly as solve_directly
 from .linear.linear_gaussian import LinearGaussian as LinearGaussian
-from .linear.linear_gaussian import updated as updated
 from .linear.posterior import Posterior as Posterior
 from .noise.covariance import Covariance as Covariance
 from .noise.covariance import DenseCovariance as DenseCovariance

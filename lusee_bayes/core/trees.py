@@ -18,6 +18,7 @@ from functools import lru_cache
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import pandas as pd
@@ -164,7 +165,8 @@ def _kind_of(hint: Any) -> _Kind:
         dims = [n if n not in names[:k] else f"{n}_{k + 1}" for k, n in enumerate(names)]
         return _Kind("array", hint.dtypes, tuple(dims))
     if get_origin(hint) is tuple and is_dataclass(arguments[0]):
-        plain = all(k.what in ("number", "text") for _, k, _ in _fields(arguments[0]))
+        kinds = [k for _, k, _ in _fields(arguments[0])]
+        plain = all(k.what == "number" or (k.what == "text" and not k.optional) for k in kinds)
         return _Kind("table" if plain else "groups", arguments[0])
     if is_dataclass(hint):
         return _Kind("group", hint)
@@ -174,11 +176,11 @@ def _kind_of(hint: Any) -> _Kind:
         return _Kind("text", str)
     if getattr(hint, "__name__", "") == "DataFrame":
         return _Kind("frame")
-    return _Kind("json", get_origin(hint) or hint)
+    return _Kind("json", hint)
 
 
 def _table(name: str, columns: Mapping[str, list]) -> xr.DataTree:
-    """Columns as variables; one of text may have gaps."""
+    """Columns as variables; one of numbers may have gaps."""
     found = {}
     for key, values in columns.items():
         array = np.array([np.nan if value is None else value for value in values])
@@ -241,13 +243,16 @@ def _dtype(names: Any) -> np.dtype:
 def _value(kind: _Kind, value: Any, where: str) -> Any:
     value = value.item() if isinstance(value, np.generic) else value
     if kind.what == "json":
-        held = _json(where, value)
-        return kind.of(held) if kind.of in (tuple, frozenset) else held
+        try:
+            return TypeAdapter(kind.of).validate_python(_json(where, value))
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            raise InputError(f"{where} is {value!r}: {first['msg']}") from error
     good = isinstance(value, str) if kind.what == "text" else isinstance(value, int | float)
     if kind.what == "number" and kind.optional and good and np.isnan(value):
         return None
-    if not good or (kind.of is int and value != int(value)):
-        expected = "text" if kind.of is str else "a number"
+    if not good or (kind.of is int and not float(value).is_integer()):
+        expected = {str: "text", int: "a whole number"}.get(kind.of, "a number")
         raise InputError(f"{where} is {value!r}, expected {expected}")
     return kind.of(value)
 

@@ -186,14 +186,15 @@ class Information(Described, eqx.Module):
             If it is for another number of modes.
         """
         require_shape("the other reference sky", other.reference, (self.n_modes,))
-        here = other.recentred(self.reference)
+        here, xp = other.recentred(self.reference), namespace(self.matrix)
         return Information(
             self.matrix + here.matrix,
             self.vector + here.vector,
             self.reference,
-            self.misfit + here.misfit,
-            self.log_det + here.log_det,
-            self.n_data + here.n_data,
+            *(
+                xp.asarray(getattr(self, name) + getattr(here, name))
+                for name in ("misfit", "log_det", "n_data")
+            ),
         )
 
     def raised(self, factor: float) -> Information:

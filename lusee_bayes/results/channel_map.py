@@ -53,6 +53,8 @@ from lusee_bayes.results.map_result import prior_sentence
 from lusee_bayes.sky.prior import DensePrior, Prior
 
 DOES_NOT_FIT = LEVELS[-1]
+# standard deviation of modes without prior variance, over the widest
+EXACT = 1e-12
 # groups of the data of a channel of many are judged where what no sky explains is less probable
 DOUBTFUL = 0.01
 REGION_NSIDE = 8
@@ -89,18 +91,27 @@ def conditioned(
         if earlier is not None:
             information = earlier.with_more(made.information, data.digest())
             prior = own.model.prior
-            before = earlier.information.posterior(prior)
-            model = replace(own.model, prior=DensePrior(before.root(), mean=before.mean))
+            posterior = information.posterior(prior)
+            model = replace(own.model, prior=_given_earlier(earlier.information.posterior(prior)))
             made = Conditioned(
                 experiment,
                 own,
-                replace(own, posterior=information.posterior(prior)),
+                replace(own, posterior=posterior),
                 replace(own, model=model, posterior=model.condition(data.data)),
                 (*earlier.digests, data.digest()),
-                information,
+                information.recentred(np.asarray(posterior.mean)),
             )
         jax.block_until_ready(made.found.posterior.white_mean)
         return made
+
+
+def _given_earlier(posterior: Posterior) -> DensePrior:
+    """What earlier data leave of the sky, as the prior of data to come."""
+    width = np.sqrt(np.asarray(posterior.prior.variance()))
+    # a prior has no density where modes are known exactly
+    exact = np.diag(EXACT * width.max() * (width == 0))[:, width == 0]
+    root = np.concatenate([np.asarray(posterior.root()), exact], axis=1)
+    return DensePrior.of_root(root, np.asarray(posterior.mean))
 
 
 @dataclass(frozen=True)
@@ -118,6 +129,8 @@ class Conditioned:
         The model that predicts these data, with what earlier ones tell of the sky in its prior.
     digests : tuple of str
         Of all data.
+    given : Information or None
+        Of all data; None where there are no earlier ones.
     """
 
     experiment: Experiment
@@ -193,9 +206,22 @@ class Conditioned:
     def log_likelihood(self) -> Float[np.ndarray, " n"]:
         """ln p(d | m) of these data for every draw."""
         model, data = on_host(self.own.model), self.experiment.data.data
-        chi2 = np.array([float(model.chi2(sky, data)) for sky in self.draws])
-        rest = float(model.noise.factor().log_det()) if len(chi2) else 0.0
-        return -0.5 * (chi2 + rest + model.n_data * np.log(2.0 * np.pi))
+        if not len(self.draws):
+            return np.zeros(0)
+        # factorised once: it takes far longer than a prediction where N couples times
+        factor = model.noise.factor()
+        white = [factor.whiten(data - model.predict(sky)) for sky in self.draws]
+        chi2 = np.array([float(one @ one) for one in white])
+        return -0.5 * (chi2 + float(factor.log_det()) + model.n_data * np.log(2.0 * np.pi))
+
+    def of_all(self, known: ChannelData) -> ChannelData:
+        """The same with number and chi^2 of all data: a joint posterior is given their sum."""
+        if self.given is None:
+            return known
+        posterior, n_data = self.posterior, int(self.given.n_data)
+        chi2 = float(self.given.chi2(posterior.mean) + posterior.prior_chi2())
+        instrument = Split.of(posterior, chi2, n_data).instrument
+        return replace(known, n_data=n_data, instrument=instrument)
 
     def compared(self) -> Float[np.ndarray, "more modes"] | None:
         """Draws less the mean for :class:`.Counts`, in K; None where no truth is known."""
@@ -203,8 +229,8 @@ class Conditioned:
             return None
         return self.drawn[-N_DRAWS:] - np.asarray(self.posterior.mean)
 
-    def figures(self) -> dict[str, float]:
-        """Numbers of :class:`.ChannelResult`."""
+    def figures(self) -> dict[str, float | bool]:
+        """What :func:`channel_result` takes besides: numbers, and whether C is kept."""
         model, posterior, data = self.found.model, self.posterior, self.experiment.data.data
         return {
             "log_evidence": float(posterior.log_evidence),

@@ -20,6 +20,7 @@ from lusee_bayes.core.files import recover, user_path
 from lusee_bayes.core.formats import opened_tree
 from lusee_bayes.core.harmonics import mode_numbers, n_modes
 from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.trees import from_tree, to_tree
 from lusee_bayes.core.version import __version__, versions
 from lusee_bayes.experiment.scenario import Scenario
@@ -202,16 +203,22 @@ class SavedInformation:
         return information + self.information
 
 
-def read_information(folder: str | Path, channel: Scenario) -> SavedInformation:
-    """The information that a run has kept of a channel (``map --information``).
+KEPT = "a posterior of lusee-bayes map --information"
 
-    InputError if the folder has none, or none of this frequency or lmax.
-    """
+
+def information_file(folder: str | Path) -> Path:
+    """The file in which a run has kept its information. InputError if the folder has none."""
     recover(folder)
-    path = user_path(folder) / "posterior.nc"
+    return require_file(user_path(folder).resolve() / "posterior.nc", KEPT)
+
+
+def read_information(path: Path, channel: Scenario) -> SavedInformation:
+    """The information of a channel that a run has kept (:func:`information_file`).
+
+    InputError if there is none, or none of this frequency or lmax.
+    """
     name = f"{channel.frequency_mhz:.15g}"
-    what = "a posterior of lusee-bayes map --information"
-    with opened_tree(path, formats.POSTERIOR, what) as tree:
+    with opened_tree(path, formats.POSTERIOR, KEPT) as tree:
         kept = tree.children.get(INFORMATION)
         if kept is None:
             raise InputError(

@@ -31,7 +31,7 @@ from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.data_files import Data, anchored
+from lusee_bayes.experiment.data_files import Data, anchored, digest_of
 from lusee_bayes.experiment.draws import draw_key
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.positive import lmax_of_fields, positive_skies
@@ -52,7 +52,7 @@ from lusee_bayes.linear.positive_joint import (
 )
 from lusee_bayes.results.channel import ChannelData, ChannelResult
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
-from lusee_bayes.results.map_files import read_information
+from lusee_bayes.results.map_files import information_file, read_information
 from lusee_bayes.results.map_result import Components, MapResult
 from lusee_bayes.runs.channel_files import (
     ChannelFiles,
@@ -164,8 +164,8 @@ class ChannelAlone:
         in K.
     n_draws : int
         That are kept.
-    figures : dict of float
-        log_evidence, information_bits, chi2_model and refinement, as in :class:`.ChannelResult`.
+    figures : dict
+        :meth:`.Conditioned.figures`.
     """
 
     known: ChannelData
@@ -175,7 +175,7 @@ class ChannelAlone:
     covariance: Float[np.ndarray, "mode mode_2"]
     deviations: Float[np.ndarray, "all mode"]
     n_draws: int
-    figures: dict[str, float]
+    figures: dict[str, float | bool]
 
     def receivers(self) -> tuple[Float[np.ndarray, " ports"], Float[np.ndarray, "ports ports"]]:
         """E and V of the receivers' powers, in prior standard deviations."""
@@ -337,10 +337,12 @@ def map_channels(
         :func:`.conditioned`.
     """
     engine, stages, single = engine or ThisProcess(), stages or Stages(), scenario.single
+    # workers may have other folders of their own
     data = None if data is None else anchored(data)
+    kept = None if earlier is None else information_file(earlier)
 
     def condition(channel: Scenario, told: Stages) -> Conditioned:
-        before = None if earlier is None else read_information(earlier, channel)
+        before = None if kept is None else read_information(kept, channel)
         information = None if before is None else before.information
         make = partial(build, earlier=information)
         experiment = measured_experiment(channel, data, told, truth=truth, make=make)
@@ -352,8 +354,8 @@ def map_channels(
         return MapResult(scenario, (made.result(known, stages),), seconds=stages.seconds)
     engine.work_in(folder)
     n_draws = scenario.output.draws
-    # workers may have other folders of their own
-    identity = identity_of(scenario, data, truth, earlier, thorough)
+    digest = None if kept is None else digest_of(kept)
+    identity = identity_of(scenario, data, truth, digest, thorough)
     files = ChannelFiles(folder.resolve(), identity)
     channels = tuple(channel.anchored() for channel in scenario.channels())
     names, tied = [names_of((channel,)) for channel in channels], scenario.ties_receivers
@@ -367,8 +369,9 @@ def map_channels(
         known = made.known(silent, alone=False, thorough=thorough)
         if scenario.joint:
             sky = np.asarray(made.experiment.setup.sky.modes)
-            kept = ChannelInformation(made.information, known, made.unknowns, sky)
-            files.write(channel, wanted, kept)
+            known = made.of_all(known)
+            found = ChannelInformation(made.information, known, made.unknowns, sky)
+            files.write(channel, wanted, found)
         elif tied:
             compared = made.compared()
             deviations = [

@@ -14,6 +14,7 @@ from changes import SCALE, byte_changes, change_bytes, change_items, item_change
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from layout_4 import write_layout_4
+from lusee_bayes.results.updatable import read_updatable
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.data_files import read_data
@@ -27,7 +28,6 @@ from lusee_bayes.instrument.beams.sampled import read_beam, sampled_beams, write
 from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe
-from lusee_bayes.results.updatable import read_updatable
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
 from lusee_bayes.runs.data_run import run_simulate_flight

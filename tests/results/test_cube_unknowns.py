@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from experiments import four_ports
+from lusee_bayes.report.cube_page import cube_page
 from matplotlib.figure import Figure
 from reference_linear import white_posterior
 
@@ -15,7 +16,6 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import per_mode
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.unknowns import unknowns_report
-from lusee_bayes.report.cube_page import cube_page
 from lusee_bayes.runs import map_run
 from lusee_bayes.runs.channels import cube_result
 

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lusee_bayes.results.updatable import read_updatable
+from lusee_bayes.runs.diagnostics import region_rows
 from reference_linear import matrices, random_covariance
 
 import lusee_bayes as lb
@@ -13,8 +15,6 @@ from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.results.map_files import posterior_dataset
 from lusee_bayes.results.map_result import MapResult
-from lusee_bayes.results.updatable import read_updatable
-from lusee_bayes.runs.diagnostics import region_rows
 from lusee_bayes.runs.map_run import map_result
 from lusee_bayes.testing.scenarios import small_scenario
 
