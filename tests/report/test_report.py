@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from lusee_bayes.runs.diagnostics import region_of
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
-from lusee_bayes.report.explorer import BUDGET, KERNEL_NSIDE, nside_of_page
 from reference_linear import resolution_rows
 
 import lusee_bayes as lb
