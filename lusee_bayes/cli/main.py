@@ -15,6 +15,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from os.path import expanduser
 from threading import current_thread, main_thread
 
 from cyclopts import App, CycloptsError, Parameter
@@ -22,7 +23,6 @@ from rich.console import Console
 
 from lusee_bayes.cli.commands import MODULES, help_of
 from lusee_bayes.core.errors import InputError, WorkersLost
-from lusee_bayes.core.files import user_path
 from lusee_bayes.core.version import COMMAND, printable, release
 
 # the beginning of a path in the user's folder, by itself or after the name of an option
@@ -81,7 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
     gc.set_threshold(100_000, 20, 100)
     given = sys.argv[1:] if arguments is None else arguments
     # ~ within an option, as in --data=~/a.nc, is one that no shell has replaced
-    expanded = [HOME.sub(lambda own: (own[1] or "") + str(user_path(own[2])), one) for one in given]
+    expanded = [HOME.sub(lambda own: (own[1] or "") + expanduser(own[2]), one) for one in given]
     for stream in (sys.stdout, sys.stderr):
         # names of files may have bytes, and reports letters, that the terminal's encoding lacks
         if isinstance(stream, io.TextIOWrapper):
