@@ -18,36 +18,15 @@ from contextlib import contextmanager
 from os.path import expanduser
 from threading import current_thread, main_thread
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import CycloptsError
 from rich.console import Console
 
-from lusee_bayes.cli.commands import MODULES, help_of
+from lusee_bayes.cli.commands import app
 from lusee_bayes.core.errors import InputError, WorkersLost
-from lusee_bayes.core.version import COMMAND, printable, release
+from lusee_bayes.core.version import COMMAND, printable
 
 # the beginning of a path in the user's folder, by itself or after the name of an option
 HOME = re.compile(r"^(--[a-z-]+=)?(~.*)$", re.DOTALL)
-
-app = App(
-    name="lusee-bayes",
-    version=release,
-    suppress_keyboard_interrupt=False,
-    # [ begins a file's name like any other character
-    default_parameter=Parameter(json_list=False, json_dict=False),
-    help=(
-        "Bayesian maps of the low-frequency sky from LuSEE-Night's visibilities.\n\n"
-        "Exit codes: 0 success, 1 a validation failed, or workers, memory or disk gave out, 2 bad "
-        "input (one sentence on standard error), 130 interrupted, 143 terminated. lusee-bayes "
-        "COMMAND --help shows examples."
-    ),
-)
-app.register_install_completion_command()
-# named by path: each is imported when called, so that --help and completion answer at once
-for _module, _names in MODULES.items():
-    for _name in _names:
-        _command = f"lusee_bayes.cli.{_module}:{_name.replace('-', '_')}_command"
-        app.command(_command, name=_name, help=help_of(_name))
-
 
 # beginnings of messages of RuntimeErrors for want of memory: of XLA, and of Python's threads
 NO_MEMORY = ("RESOURCE_EXHAUSTED", "can't start new thread")

@@ -64,6 +64,12 @@ class Key:
     default: str
     meaning: str
 
+    def __str__(self) -> str:
+        model = f"  (model {self.kind})" if self.kind else ""
+        unit = f" [{self.unit}]" if self.unit else ""
+        choices = f"{self.choices}{unit}"
+        return f"{self.path} = {self.default}{model}\n    {self.meaning}\n    {choices}"
+
 
 def scenario_keys(within: str = "") -> list[Key]:
     """List the keys of a scenario in the order of the schema.

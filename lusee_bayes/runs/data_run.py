@@ -194,10 +194,12 @@ class FlightFiles:
     scenario: Path
     n_spectra: int
 
-    @property
-    def command(self) -> str:
-        """The command that maps them."""
-        return f"lusee-bayes map {self.scenario} --data {' '.join(map(str, self.sessions))}"
+    def lines(self) -> tuple[str, str]:
+        """What was written, and the command that maps it."""
+        return (
+            f"{self.n_spectra} spectra of {len(self.sessions)} sessions -> {self.scenario.parent}",
+            f"lusee-bayes map {self.scenario} --data {' '.join(map(str, self.sessions))}",
+        )
 
 
 def run_simulate_flight(
