@@ -12,7 +12,7 @@ import hashlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -167,10 +167,11 @@ def variations_of(
             found += given_variations(source, vary, overrides)
             continue
         first, *others = default_variations(source, load_scenario(source, overrides))
-        obstacles = [variation.obstacle() for variation in others]
-        found += [first, *(one for one, why in zip(others, obstacles, strict=True) if why is None)]
-        for one, why in zip(others, obstacles, strict=True):
-            if why is not None:
+        found.append(first)
+        for one in others:
+            if (why := one.obstacle()) is None:
+                found.append(one)
+            else:
                 stages.say(f"  left out: {source}, {one.family}, {one.name}: {why}")
     return found
 
@@ -303,12 +304,10 @@ def kept_forecast(folder: Path, variation: Variation) -> Forecast:
     path = folder / f"{_digest(variation)}.json"
     if path.is_file():
         kept = json.loads(path.read_text(encoding="utf-8"))
-        kept["snr_squared"] = np.array(kept["snr_squared"], dtype=np.float64)
-        return Forecast(variation=variation, **kept)
+        return Forecast(variation, **kept | {"snr_squared": np.array(kept["snr_squared"])})
     made = forecast(variation)
-    names = (field.name for field in fields(Forecast) if field.name != "variation")
-    kept = {name: getattr(made, name) for name in names}
-    kept["snr_squared"] = np.asarray(made.snr_squared).tolist()
+    kept = vars(made) | {"snr_squared": made.snr_squared.tolist()}
+    del kept["variation"]
     with replacing(path) as scratch:
         scratch.write_text(json.dumps(kept), encoding="utf-8")
     return made
