@@ -22,6 +22,7 @@ from cyclopts import CycloptsError
 from rich.console import Console
 
 from lusee_bayes.cli.commands import app
+from lusee_bayes.cli.options import say
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.version import COMMAND, printable
 
@@ -68,46 +69,42 @@ def main(arguments: list[str] | None = None) -> int:
     before = COMMAND.set(printable(shlex.join(["lusee-bayes", *given])))
     try:
         with _heeding_termination() as came:
-            return _run(expanded, came)
+            code, sentence = _outcome(expanded, came)
     finally:
         COMMAND.reset(before)
+    if sentence:
+        say(Console(stderr=True, soft_wrap=True), f"lusee-bayes: {sentence}")
+    return code
 
 
-def _run(arguments: list[str], came: list[int]) -> int:
-    def refused(sentence: object, code: int) -> int:
-        errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
-        errors.print(f"lusee-bayes: {sentence}")
-        return code
-
+def _outcome(arguments: list[str], came: list[int]) -> tuple[int, str]:
+    """The exit code of a command, and why it has failed, if it has."""
     try:
         code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
-    except InputError as error:
-        return refused(error, 2)
-    except CycloptsError as error:
-        return refused(" ".join(str(error).split()), 2)
+    except (InputError, CycloptsError) as error:
+        return 2, " ".join(str(error).split())
     except BrokenPipeError:
         # whoever was to read the output has gone: head has its lines
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        return 1, ""
     except OSError as error:
         if error.errno is None:
             raise
         at = f" ('{error.filename}')" if error.filename else ""
-        return refused(f"{error.strerror}{at}; {UNCHANGED}", 1)
+        return 1, f"{error.strerror}{at}; {UNCHANGED}"
     except WorkersLost as error:
-        return refused(error, 1)
+        return 1, str(error)
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not str(error).startswith(NO_MEMORY):
             raise
         why = " ".join(str(error).split())[:200]
-        return refused(
+        return 1, (
             f"not enough memory{f' ({why})' if why else ''}; {UNCHANGED}. Use a smaller lmax, "
-            "fewer times or fewer draws, or a machine with more memory",
-            1,
+            "fewer times or fewer draws, or a machine with more memory"
         )
     except KeyboardInterrupt as interrupt:
         # runs say what their folder holds
         held = str(interrupt) or "nothing has been written"
         how = "terminated" if came else "interrupted"
-        return refused(f"{how}; {held}", 128 + (came or [signal.SIGINT])[0])
-    return code if isinstance(code, int) else 0
+        return 128 + (came or [signal.SIGINT])[0], f"{how}; {held}"
+    return code if isinstance(code, int) else 0, ""

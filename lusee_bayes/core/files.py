@@ -17,7 +17,6 @@ import os
 import re
 import shutil
 import socket
-import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -52,15 +51,17 @@ def require_folder(folder: str | Path) -> None:
     _require_name(folder)
     if folder.resolve() == Path(folder.resolve().anchor):
         raise InputError(f"'{folder}' is the root of all files; give a folder for the results")
-    for place in (folder, *folder.absolute().parents):
-        mode = _mode(place)
-        if mode is None:
-            continue
-        if not stat.S_ISDIR(mode):
-            kind = "a file" if stat.S_ISREG(mode) else "neither a file nor a folder"
-            raise InputError(f"'{place}' is {kind}; give a folder for the results")
-        _require_writable(place)
-        return
+    place = next(place for place in (folder, *folder.absolute().parents) if _is_there(place))
+    if not place.is_dir():
+        kind = "a file" if place.is_file() else "neither a file nor a folder"
+        raise InputError(f"'{place}' is {kind}; give a folder for the results")
+    try:
+        # a file without a name: whatever happens, nothing of it is left
+        tempfile.TemporaryFile(dir=place).close()
+    except OSError as error:
+        raise InputError(
+            f"nothing can be written into '{place}': {error.strerror}; give another folder"
+        ) from error
 
 
 def require_target(path: str | Path) -> None:
@@ -77,10 +78,10 @@ def require_target(path: str | Path) -> None:
     """
     path = user_path(path)
     _require_name(path)
-    mode = _mode(path)
-    if not path.name or (mode is not None and stat.S_ISDIR(mode)):
+    is_there = _is_there(path)
+    if not path.name or path.is_dir():
         raise InputError(f"'{path}' is a folder; give the name of a file for the results")
-    if mode is not None and not stat.S_ISREG(mode):
+    if is_there and not path.is_file():
         raise InputError(f"'{path}' is neither a file nor a folder; give the name of a file")
     if path.absolute().parent != Path(path.absolute().anchor):
         require_folder(path.parent)
@@ -115,26 +116,17 @@ def _require_name(path: Path) -> None:
         raise InputError(f"'{path!s}' is no name of a file; give one without NUL characters")
 
 
-def _mode(path: Path) -> int | None:
-    """What is at a path; None if nothing is. A link to nothing is something that cannot be used."""
+def _is_there(path: Path) -> bool:
+    """Whether something is at a path. A link to nothing is something that cannot be used."""
     try:
-        return path.stat().st_mode
+        path.stat()
     except (FileNotFoundError, NotADirectoryError):
         if path.is_symlink():
             raise InputError(f"'{path}' is a link that leads nowhere; remove it") from None
-        return None
+        return False
     except OSError as error:
         raise InputError(f"'{path}' cannot be used for the results: {error.strerror}") from error
-
-
-def _require_writable(place: Path) -> None:
-    try:
-        # a file without a name: whatever happens, nothing of it is left
-        tempfile.TemporaryFile(dir=place).close()
-    except OSError as error:
-        raise InputError(
-            f"nothing can be written into '{place}': {error.strerror}; give another folder"
-        ) from error
+    return True
 
 
 # names inside a folder of results: the lock of the run that works in it, which says whose it is,
