@@ -51,7 +51,9 @@ from .results.map_result import MapResult as MapResult
 from .runs.compare_run import run_compare as run_compare
 from .runs.compare_run import run_compare_priors as run_compare_priors
 from .runs.data_run import run_average as run_average
+from .runs.data_run import run_reduce as run_reduce
 from .runs.data_run import run_simulate as run_simulate
+from .runs.data_run import run_simulate_flight as run_simulate_flight
 from .runs.map_run import run_map as run_map
 from .runs.paper_run import run_paper as run_paper
 from .runs.plan_run import run_plan as run_plan

@@ -19,6 +19,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from lusee_bayes.experiment.section import (
     LARGEST,
+    NOT_TINY,
     Angle,
     Frequency,
     Positive,
@@ -164,7 +165,7 @@ def _observation(section: ObservationSection, intervals: tuple[Interval, ...]) -
 
 
 # wider priors are none: the sky looks nothing like it did
-Offset = Annotated[Positive, Field(le=45)]
+Offset = Annotated[float, Field(gt=0, le=45), NOT_TINY]
 
 
 class PointingSection(Section):
@@ -197,8 +198,8 @@ class PointingSection(Section):
         the others are drawn from their priors.
     """
 
-    clock_s: Annotated[Positive, Field(le=1e6)] | None = None
-    clock_drift_s_per_day: Annotated[Positive, Field(le=1e4)] | None = None
+    clock_s: Annotated[float, Field(gt=0, le=1e6), NOT_TINY] | None = None
+    clock_drift_s_per_day: Annotated[float, Field(gt=0, le=1e4), NOT_TINY] | None = None
     turntable_deg: Offset | None = None
     lon_deg: Offset | None = None
     lat_deg: Offset | None = None

@@ -7,7 +7,15 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from lusee_bayes.experiment.instrument_sections import PointingSection
-from lusee_bayes.experiment.section import Megahertz, Positive, Section, Seed, Treatment, requires
+from lusee_bayes.experiment.section import (
+    NOT_TINY,
+    Megahertz,
+    Positive,
+    Section,
+    Seed,
+    Treatment,
+    requires,
+)
 
 
 class ReceiverNoiseSection(Section):
@@ -80,7 +88,7 @@ class GainTableSection(Section):
         they are sampled with the map; or they are left out of the model.
     """
 
-    std: Annotated[Positive, Field(le=0.1)] | None = None
+    std: Annotated[float, Field(gt=0, le=0.1), NOT_TINY] | None = None
     treatment: Treatment = "marginalised"
 
 

@@ -20,6 +20,7 @@ from astropy.io import fits
 from commands import content, posterior_of, run
 
 import lusee_bayes
+from lusee_bayes.cli.options import ScenarioOptions
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
 from lusee_bayes.experiment.section import OutputSection
 from lusee_bayes.results.map_result import MapResult
@@ -125,6 +126,11 @@ def test_options_of_the_output_reach_the_scenario(flag, monkeypatch):
     monkeypatch.setattr(runs, "run_map", lambda *a, **_: given.append(a) or stop())
     assert run("map", "fiducial", f"--{flag}", "--draws", 7, "-o", "x", "-q") == 130
     assert given[0][0].output == OutputSection(draws=7, **{flag: True})
+
+
+def test_names_of_files_keep_their_capitals():
+    loaded = ScenarioOptions(set_=("lmax=6",)).load("fiducial", flight__clock="Of/A Clock.JSON")
+    assert (loaded.flight.clock, loaded.lmax) == ("Of/A Clock.JSON", 6)
 
 
 def test_info_recognises_its_files(folder, tmp_path, capsys):

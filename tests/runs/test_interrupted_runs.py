@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from commands import content
 
-from lusee_bayes.core.files import MANIFEST, SCRATCH, recover
+from lusee_bayes.core.files import MANIFEST, SCRATCH, locked, recover
 
 pytestmark = pytest.mark.long
 
@@ -140,10 +140,13 @@ def assert_same_results(folder: Path, expected: Path) -> None:
 
 def state_of(folder: Path, command: Command, earlier: Path | None) -> str:
     """``old`` or ``new``, with unfinished work or without; fails if it is neither."""
-    recover(folder)
     if not folder.exists():
         assert earlier is None
         return "old"
+    recover(folder)
+    # as the next run does
+    with locked(folder):
+        pass
     assert not list(folder.glob(f"{SCRATCH}*")) and not (folder / ".committed").exists()
     before = content(earlier) if earlier else {}
     found = content(folder)
