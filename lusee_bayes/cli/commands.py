@@ -92,8 +92,8 @@ def map_command(
     add
         Folder of a run with --information: the data are added to those behind it.
     diagnose
-        Try the usual mistakes (signs, exchanged ports, angles, clocks, ...) even if the data fit;
-        where they do not, they are tried anyway.
+        Judge every group of data, and try the usual mistakes (signs, exchanged ports, angles,
+        clocks, ...), even if the data fit; where they do not, both is done anyway.
     frequencies
         Channels in MHz, as 10,25,30 or as first:last:step: a map of each, on its own. The same
         command continues an interrupted run.
