@@ -18,8 +18,13 @@ from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.term import Around
-from lusee_bayes.sampling.hmc import WHITE_SUFFIX, whitened
-from lusee_bayes.sampling.programs import Program, latent_sites, numpyro_promotion
+from lusee_bayes.sampling.hmc import whitened
+from lusee_bayes.sampling.programs import (
+    WHITE_SUFFIX,
+    Program,
+    latent_sites,
+    numpyro_promotion,
+)
 from lusee_bayes.testing.scenarios import small_scenario
 
 # nothing of these enters a setup (test_experiment.py checks it), only the data and N; the mean of

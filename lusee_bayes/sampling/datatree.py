@@ -20,10 +20,14 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling.hmc import Chains
-from lusee_bayes.sampling.programs import Program, collapsed_draws, is_collapsed, numpyro_promotion
+from lusee_bayes.sampling.programs import (
+    Program,
+    collapsed_draws,
+    is_collapsed,
+    numpyro_promotion,
+)
 from lusee_bayes.systematics.systematic import SKY
 
-DATA = "data"
 # what a file of samples holds at least
 STATISTIC = ("chain", "draw")
 GROUPS = Layout(

@@ -28,11 +28,10 @@ from numpyro.infer.util import potential_energy
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling.mode import LaplaceApproximation, laplace_approximation
-from lusee_bayes.sampling.programs import Program, numpyro_promotion, side_by_side
+from lusee_bayes.sampling.programs import DATA, Program, numpyro_promotion
 
 # degrees of freedom of the proposal, whose tails are heavier than a Gaussian's
 TAILS = 7.0
-DATA = "data"
 
 
 @dataclass(frozen=True)
@@ -140,17 +139,9 @@ def pointwise(
     InputError
         If the program's data are not at a site Marginal or CorrelatedNormal.
     """
-    shape = next(iter(sites.values())).shape[:2]
-    with numpyro_promotion():
-        given = {**arguments, DATA: jnp.asarray(data)}
-        rows = _pointwise(program, given, side_by_side(dict(sites)))
-    return np.asarray(rows).reshape(*shape, -1)
+    arguments = {**arguments, DATA: jnp.asarray(data)}
+    n_chains, n_draws = next(iter(sites.values())).shape[:2]
 
-
-@eqx.filter_jit
-def _pointwise(
-    program: Program, arguments: dict[str, Any], sites: dict[str, Array]
-) -> Float[Array, "draws data"]:
     def one(values):
         model = handlers.substitute(handlers.seed(program.model, 0), values)
         fn = handlers.trace(model).get_trace(**arguments)[DATA]["fn"]
@@ -161,7 +152,9 @@ def _pointwise(
             )
         return fn.leave_one_out(arguments[DATA])
 
-    return jax.lax.map(one, sites)
+    with numpyro_promotion():
+        flat = {n: jnp.reshape(v, (-1, *v.shape[2:])) for n, v in sites.items()}
+        return np.asarray(jax.lax.map(one, flat)).reshape(n_chains, n_draws, -1)
 
 
 def with_log_likelihood(

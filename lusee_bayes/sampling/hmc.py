@@ -37,7 +37,7 @@ from lusee_bayes.core.layouts import Layout
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.reading import read_json, reading
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.sampling.programs import latent_sites, numpyro_promotion, predicts
+from lusee_bayes.sampling.programs import WHITE_SUFFIX, latent_sites, numpyro_promotion, predicts
 from lusee_bayes.systematics.systematic import Chart
 
 # statistics of every draw, by their ArviZ names
@@ -70,10 +70,6 @@ class Chains:
     def gradients(self) -> int:
         """Gradient evaluations behind the draws, all chains together, warmup left out."""
         return int(self.statistics["n_steps"].sum())
-
-
-# the site of z is that of m with this appended
-WHITE_SUFFIX = "_white"
 
 
 class Whitening(eqx.Module):
