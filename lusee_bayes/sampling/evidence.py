@@ -27,8 +27,9 @@ from numpyro.infer.util import potential_energy
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.sampling.hmc import whitened
 from lusee_bayes.sampling.mode import LaplaceApproximation, laplace_approximation
-from lusee_bayes.sampling.programs import DATA, Program, numpyro_promotion
+from lusee_bayes.sampling.programs import DATA, WHITE_SUFFIX, Program, numpyro_promotion
 
 # degrees of freedom of the proposal, whose tails are heavier than a Gaussian's
 TAILS = 7.0
@@ -108,11 +109,10 @@ def _log_weights(
     proposal = dist.MultivariateStudentT(TAILS, jnp.zeros(size), jnp.eye(size))
     z = proposal.sample(key, (n,))
 
-    def one(z):
-        x = whitening.split(whitening.mean + whitening.root @ z)
-        return whitening.log_det - potential_energy(program.model, (), arguments, x)
-
-    return jax.lax.map(one, z) - proposal.log_prob(z)
+    model = whitened(program.model, whitening)
+    site = f"{whitening.names[0]}{WHITE_SUFFIX}"
+    log_p = jax.lax.map(lambda z: -potential_energy(model, (), arguments, {site: z}), z)
+    return log_p - proposal.log_prob(z)
 
 
 def pointwise(

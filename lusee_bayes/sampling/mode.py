@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float, Int
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer import init_to_median
-from numpyro.infer.util import potential_energy
+from numpyro.infer.util import constrain_fn, potential_energy
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced, require_shape
@@ -92,13 +92,8 @@ class Potential(eqx.Module):
 
     def _predictions(self, x: Float[Array, " n"], still: bool) -> list[tuple[Prediction, Array]]:
         values, _ = self.shapes.to_values(x, self.hold if still else ())
-
-        def place(site):
-            if site["name"] in values:
-                return dist.biject_to(site["fn"].support)(values[site["name"]])
-            return None
-
-        model = handlers.substitute(handlers.seed(self.program, 0), substitute_fn=place)
+        program = handlers.seed(self.program, 0)
+        model = handlers.substitute(program, constrain_fn(program, (), self.arguments, values))
         return [
             (site["fn"], site["value"])
             for site in handlers.trace(model).get_trace(**self.arguments).values()
@@ -399,10 +394,7 @@ def _climb(
         return (~(length_of(white, positive) < SETTLED)) & (n < MAX_STEPS)
 
     start = (first, problem.value(first), *look(first, scale), jnp.asarray(0))
-    x, value, white, _, positive, scale, n = jax.lax.while_loop(going, step, start)
-    root, _ = root_of_inverse(
-        without_held(problem.gradient_and_curvature(x, scale)[1], free), problem
-    )
+    x, value, white, root, positive, _, n = jax.lax.while_loop(going, step, start)
     log_det = jnp.linalg.slogdet(root)[1]
     whitening = Whitening(x, root, log_det, problem.shapes.sites, problem.shapes.chart)
     log_evidence = -value + log_det + x.shape[0] * HALF_LOG_2PI
