@@ -89,7 +89,12 @@ def estimate_evidence(
         If the mode of the posterior is not found.
     """
     arguments = {**arguments, DATA: jnp.asarray(data)}
-    laplace = laplace_approximation(program.model, arguments).require_converged()
+    laplace = laplace_approximation(program.model, arguments)
+    if not bool(laplace.converged):
+        raise InputError(
+            f"no mode of the posterior was found in {int(laplace.steps)} steps (the last moved by "
+            f"{float(laplace.moved):.2g} standard deviations); narrow the priors"
+        )
     with numpyro_promotion():
         weights = np.asarray(_log_weights(program, arguments, laplace, n, jax.random.key(seed)))
     largest, relative = weights.max(), np.exp(weights - weights.max())
@@ -115,48 +120,6 @@ def _log_weights(
     return log_p - proposal.log_prob(z)
 
 
-def pointwise(
-    program: Program,
-    arguments: Mapping[str, Any],
-    data: Float[Array, " data"],
-    sites: Mapping[str, np.ndarray],
-) -> Float[np.ndarray, "chains draws data"]:
-    """Compute ln p(d_i | all other data, sites) of every datum and draw.
-
-    Parameters
-    ----------
-    program : Program
-        The program.
-    arguments : mapping
-        What it asks for, without the data.
-    data : (data,) array
-        d, in K.
-    sites : mapping of (chains, draws, ...) array
-        Draws by site.
-
-    Raises
-    ------
-    InputError
-        If the program's data are not at a site Marginal or CorrelatedNormal.
-    """
-    arguments = {**arguments, DATA: jnp.asarray(data)}
-    n_chains, n_draws = next(iter(sites.values())).shape[:2]
-
-    def one(values):
-        model = handlers.substitute(handlers.seed(program.model, 0), values)
-        fn = handlers.trace(model).get_trace(**arguments)[DATA]["fn"]
-        if not hasattr(fn, "leave_one_out"):
-            raise InputError(
-                f"the data of the program '{program.name}' follow {type(fn).__name__}; a "
-                "comparison needs Marginal or CorrelatedNormal"
-            )
-        return fn.leave_one_out(arguments[DATA])
-
-    with numpyro_promotion():
-        flat = {n: jnp.reshape(v, (-1, *v.shape[2:])) for n, v in sites.items()}
-        return np.asarray(jax.lax.map(one, flat)).reshape(n_chains, n_draws, -1)
-
-
 def with_log_likelihood(
     tree: xr.DataTree, program: Program, arguments: Mapping[str, Any], *, most: int = 400
 ) -> xr.DataTree:
@@ -177,14 +140,33 @@ def with_log_likelihood(
     -------
     DataTree
         Its posterior has these draws only.
+
+    Raises
+    ------
+    InputError
+        If the program's data are not at a site Marginal or CorrelatedNormal.
     """
     posterior = tree["posterior"].dataset
     each = max(1, most // posterior.sizes["chain"])
-    step = -(-posterior.sizes["draw"] // each)
-    few = posterior.isel(draw=slice(None, None, step))
-    data = tree["observed_data"]["data"].values
+    few = posterior.isel(draw=slice(None, None, -(-posterior.sizes["draw"] // each)))
     sites = {str(name): value.values for name, value in few.data_vars.items()}
-    rows = pointwise(program, arguments, data, sites)
+    data = jnp.asarray(tree["observed_data"][DATA].values)
+
+    def predicted(values):
+        """ln p(d_i | all other data, sites) of every datum."""
+        model = handlers.substitute(handlers.seed(program.model, 0), values)
+        fn = handlers.trace(model).get_trace(**arguments, data=data)[DATA]["fn"]
+        if not hasattr(fn, "leave_one_out"):
+            raise InputError(
+                f"the data of the program '{program.name}' follow {type(fn).__name__}; a "
+                "comparison needs Marginal or CorrelatedNormal"
+            )
+        return fn.leave_one_out(data)
+
+    with numpyro_promotion():
+        flat = {name: jnp.reshape(v, (-1, *v.shape[2:])) for name, v in sites.items()}
+        rows = np.asarray(jax.lax.map(predicted, flat))
+    rows = rows.reshape(few.sizes["chain"], few.sizes["draw"], -1)
     return arviz_base.from_dict(
         {"posterior": sites, "log_likelihood": {DATA: rows}},
         dims={DATA: ["datum"]},

@@ -142,12 +142,7 @@ class StraightSky(Chart):
 
     def _begun(
         self, values: dict[str, Array]
-    ) -> tuple[
-        LogNormalSky,
-        Float[Array, " directions"],
-        Float[Array, " directions"],
-        Float[Array, " unknowns"],
-    ]:
+    ) -> tuple[LogNormalSky, Array, Array, Float[Array, " unknowns"]]:
         """The sky with the sites' C_ell, k, V^T (x - u*), and u* + V_0 x_0.
 
         Where C_ell is not that of the mode, u* is what keeps the logarithm as it is there.

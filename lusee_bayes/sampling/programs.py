@@ -243,10 +243,11 @@ def predicts(program: Callable, arguments: dict, kind: type[Prediction] = Predic
 
 def latent_sites(program: Callable, arguments: dict) -> list[str]:
     """Return the names of the sites that a program samples and does not observe."""
-    return _latent(traced(program, arguments)[0])
+    return latent_of(traced(program, arguments)[0])
 
 
-def _latent(sites: dict[str, dict]) -> list[str]:
+def latent_of(sites: Mapping[str, dict]) -> list[str]:
+    """Return the names of those of a program's sites that it samples and does not observe."""
     return [n for n, s in sites.items() if s["type"] == "sample" and not s["is_observed"]]
 
 
@@ -332,7 +333,7 @@ def require_sampleable(
     who, given = f"the program '{program.path or program.name}'", {**arguments, DATA: data}
     with _blaming(who, "when it is called"):
         sites, returned = traced(program.model, given)
-    latent = _latent(sites)
+    latent = latent_of(sites)
     for name, site in sites.items():
         if site["type"] in ("sample", "deterministic"):
             _require_site(name, site, name in latent, who)
