@@ -24,8 +24,13 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.channel_map import Conditioned, conditioned
 from lusee_bayes.results.map_files import SavedInformation
-from lusee_bayes.sampling.hmc import WHITE_SUFFIX, whitened
-from lusee_bayes.sampling.programs import Program, latent_sites, numpyro_promotion
+from lusee_bayes.sampling.hmc import whitened
+from lusee_bayes.sampling.programs import (
+    WHITE_SUFFIX,
+    Program,
+    latent_sites,
+    numpyro_promotion,
+)
 from lusee_bayes.testing.scenarios import small_scenario
 
 # nothing of these enters a setup (test_experiment.py checks it), only the data and N; the mean of

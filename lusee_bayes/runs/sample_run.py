@@ -46,8 +46,7 @@ from lusee_bayes.sampling.distributions import TimesStudentT
 from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sample
 from lusee_bayes.sampling.log_normal_program import coordinates_of
 from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.program_checks import require_sampleable
-from lusee_bayes.sampling.programs import Program, load_program, predicts
+from lusee_bayes.sampling.programs import Program, load_program, predicts, require_sampleable
 from lusee_bayes.systematics.gain_drifts import SCALES
 from lusee_bayes.systematics.systematic import SKY, Chart, Systematic
 

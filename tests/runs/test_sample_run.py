@@ -171,15 +171,15 @@ def test_a_killed_run_resumes_to_the_draws_of_an_undisturbed_one(killed, tree, m
     """Bit by bit, in another process, with nothing done twice."""
     before = {i: (p.stat().st_ino, p.stat().st_mtime_ns) for i, p in chunks(killed).items()}
     written, untouched = [], []
-    write = hmc.Chunk.write
+    append = hmc.Checkpoints.append
 
-    def spy(chunk, folder):
+    def spy(checkpoints, chunk):
         written.append(chunk.iteration)
-        write(chunk, folder)
+        append(checkpoints, chunk)
         now = {i: (p.stat().st_ino, p.stat().st_mtime_ns) for i, p in chunks(killed).items()}
         untouched.append(before.items() <= now.items())
 
-    monkeypatch.setattr(hmc.Chunk, "write", spy)
+    monkeypatch.setattr(hmc.Checkpoints, "append", spy)
     assert run("sample", *SMALL, *SETTINGS, "-q", "-o", killed, "--resume") == 0
     total = SAMPLER.warmup + SAMPLER.draws
     assert written == list(range(max(before) + CHUNK, total + 1, CHUNK))
