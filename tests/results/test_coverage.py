@@ -12,7 +12,6 @@ from experiments import mapped
 
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.core.trees import from_tree, to_tree
-from lusee_bayes.experiment.draws import deviations
 from lusee_bayes.experiment.experiment import build, under_sky
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.judge.coverage import Counts, Coverage
@@ -136,7 +135,7 @@ def test_skies_of_the_prior_are_covered_within_the_printed_errors(tmp_path):
         sky[0] = setup.sky.modes[0]
         path = write_alms(tmp_path / f"{seed}.fits", sky, {})
         made, channel = mapped(under_sky(setup, FileSource(path), seed))
-        drawn = deviations(made.experiment, made.found.posterior)
+        drawn = made.compared()
         error = channel.truth - channel.mean
         for factor, found in far.items():
             pixels = Counts.of_pixels(factor * channel.pixel_std, error, drawn).coverage()
