@@ -208,27 +208,31 @@ class ThisProcess(Engine):
     side_by_side: int = SIDE_BY_SIDE
 
     def each(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> list[R]:
-        return list(self._results(tasks, stages, stage))
+        with self._results(tasks, stages, stage) as results:
+            return list(results)
 
     def reduced(
         self, tasks: Tasks[T, R], merge: Callable[[R, R], R], stages: Stages, stage: str
     ) -> R:
-        return merged_as_tree(self._results(tasks, stages, stage), len(tasks.items), merge)
+        with self._results(tasks, stages, stage) as results:
+            return merged_as_tree(results, len(tasks.items), merge)
 
     def work_in(self, folder: Path) -> None:
         pass
 
-    def _results(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> Iterator[R]:
+    @contextmanager
+    def _results(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> Iterator[Iterator[R]]:
         """What the function gives, in the order of the items, as soon as it is there."""
         n_threads = max(1, min(self.side_by_side, len(tasks.items)))
-        early: dict[int, R] = {}
-        given = 0
         with stages.progress(stage, len(tasks.items)) as done, threads(n_threads) as pool:
             numbers = {
                 pool.submit(carry_out, tasks.function, item): number
                 for number, item in enumerate(tasks.items)
             }
-            try:
+
+            def in_order() -> Iterator[R]:
+                early: dict[int, R] = {}
+                given = 0
                 for finished, future in enumerate(as_completed(numbers), start=1):
                     number = numbers.pop(future)
                     early[number] = future.result()
@@ -236,6 +240,9 @@ class ThisProcess(Engine):
                     while given in early:
                         yield early.pop(given)
                         given += 1
+
+            try:
+                yield in_order()
             finally:
                 pool.shutdown(wait=False, cancel_futures=True)
 
