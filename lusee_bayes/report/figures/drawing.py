@@ -15,7 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -115,7 +115,7 @@ def without_minor_ticks(axis: Axis) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Complex[np.ndarray, "theta phi"]):
+def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Float[np.ndarray, "theta phi"]):
     """Draw ``|pattern|`` on the plane of the horizon: x East, y North."""
     power = np.abs(pattern)
     phi = np.append(grid.phi, 2 * np.pi)

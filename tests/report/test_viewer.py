@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
-from lusee_bayes.report.explorer import BUDGET, KERNEL_NSIDE, nside_of_page
-from lusee_bayes.results.diagnostics_file import read_diagnostics
 from reference_linear import resolution_rows
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
+from lusee_bayes.report.viewer import BUDGET, KERNEL_NSIDE, nside_of_page
+from lusee_bayes.results.map_files import read_channels
 
 NODE = shutil.which("node")
 # elements that remember; a canvas whose context keeps the last image
@@ -42,24 +42,27 @@ function element(id) {
     replaceChildren() { this.rows = []; }, append(...x) { this.rows.push(...x); },
     getBoundingClientRect: () => ({ left: 0, top: 0, width: size[0], height: size[1] }) });
 }
-globalThis.document = { getElementById: element, createElement: () => ({}) };
+const parts = [0, 1, 2].map((k) => ({ dataset: { channel: String(k) }, hidden: k > 0 }));
+const selectors = [element("first"), element("second")];
+globalThis.document = { getElementById: element, createElement: () => ({}),
+  querySelectorAll: (of) => (of === "select.channel" ? selectors : parts) };
 globalThis.Option = function (text, value) { this.text = text; this.value = value; };
 globalThis.window = globalThis;
 globalThis.requestAnimationFrame = (f) => f();
 """
-SIZES = {"explorer-map": [400, 200], "explorer-psf": [120, 60]}
+SIZES = {"viewer-map": [400, 200], "viewer-psf": [120, 60]}
 
 
 def run_page(page: str, tmp_path, commands: str) -> dict:
     """What ``commands`` leave in ``told`` after the scripts of the page have run."""
     (data,) = re.findall(
-        r'<script type="application/json" id="explorer-data">(.*?)</script>', page, re.DOTALL
+        r'<script type="application/json" id="viewer-data">(.*?)</script>', page, re.DOTALL
     )
     scripts = re.findall(r"<script>\n(.*?)\n</script>", page, re.DOTALL)
     text = "\n".join(
         [
             STUB.replace("SIZES", json.dumps(SIZES)),
-            f"element('explorer-data').textContent = {json.dumps(data)};",
+            f"element('viewer-data').textContent = {json.dumps(data)};",
             *scripts,
             "const told = {};",
             commands,
@@ -85,7 +88,7 @@ def test_pixels_and_equatorial_coordinates(page, small_map, tmp_path):
     rng = np.random.default_rng(3)
     lon, lat = rng.uniform(0, 360, 300), np.degrees(np.arcsin(rng.uniform(-1, 1, 300)))
     points = json.dumps(np.stack([lon, lat], 1).tolist())
-    told = run_page(page, tmp_path, f"told.at = {points}.map((p) => explorer.at(...p));")["at"]
+    told = run_page(page, tmp_path, f"told.at = {points}.map((p) => viewer.at(...p));")["at"]
     nside = small_map.result.channel.nside
     expected = healpy.ang2pix(nside, lon, lat, lonlat=True)
     np.testing.assert_array_equal([one["pixel"] for one in told], expected)
@@ -103,16 +106,18 @@ def test_pixels_and_equatorial_coordinates(page, small_map, tmp_path):
 def test_point_spread_functions_are_those_of_the_posterior(which, request, tmp_path):
     """Against y^T R from the posterior; bytes are wrong by half a step at most, at random."""
     run = request.getfixturevalue(which)
-    commands = f"told.kernels = {json.dumps(POINTS)}.map((p) => explorer.kernel(...p));"
+    commands = f"told.kernels = {json.dumps(POINTS)}.map((p) => viewer.kernel(...p));"
     page = (run.folder / "report.html").read_text()
     kernels = np.array(run_page(page, tmp_path, commands)["kernels"])
     lon, lat = np.radians(POINTS).T
     y = synthesis_matrix(np.pi / 2 - lat, lon, 8)
     there = pixel_matrix(KERNEL_NSIDE, 8)
-    expected = np.asarray(resolution_rows(run.result.inference.posterior, y)) @ there.T
-    found = read_diagnostics(run.folder / "diagnostics.nc")
+    posterior = lb.infer(lb.build(run.result.scenario)).posterior
+    expected = np.asarray(resolution_rows(posterior, y)) @ there.T
+    (channel,) = read_channels(run.folder / "diagnostics.nc")
     ell, _ = mode_numbers(8)
-    step, width = found["resolution_step"].values[np.ix_(ell, ell)], found["prior_std"].values
+    details = channel.details
+    step, width = details.resolution_step[np.ix_(ell, ell)], details.prior_width
     variance = (y * width) ** 2 @ (step**2 / 12) @ ((there / width) ** 2).T
     # entries of the two triangles are the same number: errors may add, sqrt(2) at most
     assert (np.abs(kernels - expected) < 6 * np.sqrt(2 * variance) + 1e-6 * expected.max()).all()
@@ -124,18 +129,18 @@ def test_what_a_direction_and_the_pointer_tell(page, tmp_path):
     told = run_page(
         page,
         tmp_path,
-        """explorer.choose(280, -30);
-        told.rows = elements["explorer-values"].rows.map((one) => one.textContent);
-        elements["explorer-map"].listeners.pointermove({ clientX: 200, clientY: 100, buttons: 0 });
-        told.hover = elements["explorer-hover"].textContent;
-        told.texts = elements["explorer-map"].texts;
-        told.options = elements["explorer-layer"].options.map((one) => one.value);
-        told.ticks = [explorer.ticks(1, 1000, true), explorer.ticks(-4, 4, false),
-          explorer.ticks(3700, 6300, true)];
+        """viewer.choose(280, -30);
+        told.rows = elements["viewer-values"].rows.map((one) => one.textContent);
+        elements["viewer-map"].listeners.pointermove({ clientX: 200, clientY: 100, buttons: 0 });
+        told.hover = elements["viewer-hover"].textContent;
+        told.texts = elements["viewer-map"].texts;
+        told.options = elements["viewer-layer"].options.map((one) => one.value);
+        told.ticks = [viewer.ticks(1, 1000, true), viewer.ticks(-4, 4, false),
+          viewer.ticks(3700, 6300, true)];
         const seen = (id) => elements[id].image.data.filter((x, k) => k % 4 === 3 && x).length;
-        told.seen = [seen("explorer-map"), seen("explorer-psf")];
-        elements["explorer-in"].listeners.click();
-        told.zoomed = seen("explorer-map");""",
+        told.seen = [seen("viewer-map"), seen("viewer-psf")];
+        elements["viewer-in"].listeners.click();
+        told.zoomed = seen("viewer-map");""",
     )
     assert "right ascension, declination (ICRS)" in told["rows"]
     assert told["hover"].startswith("posterior mean: ") and "RA, Dec" in told["hover"]
@@ -172,15 +177,23 @@ def test_channels_of_the_page_are_those_of_the_files(small_cube, tmp_path):
     told = run_page(
         page,
         tmp_path,
-        f"""told.at = [0, 1, 2].map((k) => {points}.map((p) => explorer.at(k, ...p)));
+        f"""told.at = [0, 1, 2].map((k) => {points}.map((p) => viewer.at(...p, k)));
         told.texts = [0, 2].map((k) => {{
-          elements["explorer-channel"].value = k;
-          elements["explorer-channel"].listeners.input();
-          return elements["explorer-frequency"].textContent;
+          elements["viewer-channel"].value = k;
+          elements["viewer-channel"].listeners.input();
+          return elements["viewer-frequency"].textContent;
         }});
-        told.options = elements["explorer-layer"].options.map((one) => one.value);
-        told.rows = elements["explorer-values"].rows.map((one) => one.textContent);""",
+        told.options = elements["viewer-layer"].options.map((one) => one.value);
+        told.rows = elements["viewer-values"].rows.map((one) => one.textContent);
+        told.hidden = parts.map((one) => one.hidden);
+        elements["second"].value = 1;
+        elements["second"].listeners.input();
+        told.chosen = ["viewer-channel", "first"].map((id) => elements[id].value);
+        told.shown = parts.map((one) => !one.hidden);""",
     )
+    # the slider, and every selector of the page, choose the channel that is told of
+    assert told["hidden"] == [True, True, False] and told["chosen"] == [1, 1]
+    assert told["shown"] == [False, True, False]
     nside = small_cube.result.scenario.map_nside
     pixels = healpy.ang2pix(nside, lon, lat, lonlat=True)
     for name in ("mean", "std", "truth"):
