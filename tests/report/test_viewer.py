@@ -45,8 +45,10 @@ function element(id) {
     replaceChildren() { this.rows = []; }, append(...x) { this.rows.push(...x); },
     getBoundingClientRect: () => ({ left: 0, top: 0, width: size[0], height: size[1] }) });
 }
+const parts = [0, 1, 2].map((k) => ({ dataset: { channel: String(k) }, hidden: k > 0 }));
+const selectors = [element("first"), element("second")];
 globalThis.document = { getElementById: element, createElement: () => ({}),
-  querySelectorAll: () => [] };
+  querySelectorAll: (of) => (of === "select.channel" ? selectors : parts) };
 globalThis.Option = function (text, value) { this.text = text; this.value = value; };
 globalThis.window = globalThis;
 globalThis.requestAnimationFrame = (f) => f();
@@ -115,8 +117,9 @@ def test_point_spread_functions_are_those_of_the_posterior(which, request, tmp_p
     there = pixel_matrix(KERNEL_NSIDE, 8)
     posterior = lb.infer(lb.build(run.result.scenario)).posterior
     expected = np.asarray(resolution_rows(posterior, y)) @ there.T
-    details = read_channels(run.folder / "diagnostics.nc")[0].details
+    (channel,) = read_channels(run.folder / "diagnostics.nc")
     ell, _ = mode_numbers(8)
+    details = channel.details
     step, width = details.resolution_step[np.ix_(ell, ell)], details.prior_width
     variance = (y * width) ** 2 @ (step**2 / 12) @ ((there / width) ** 2).T
     # entries of the two triangles are the same number: errors may add, sqrt(2) at most
@@ -184,8 +187,16 @@ def test_channels_of_the_page_are_those_of_the_files(small_cube, tmp_path):
           return elements["viewer-frequency"].textContent;
         }});
         told.options = elements["viewer-layer"].options.map((one) => one.value);
-        told.rows = elements["viewer-values"].rows.map((one) => one.textContent);""",
+        told.rows = elements["viewer-values"].rows.map((one) => one.textContent);
+        told.hidden = parts.map((one) => one.hidden);
+        elements["second"].value = 1;
+        elements["second"].listeners.input();
+        told.chosen = ["viewer-channel", "first"].map((id) => elements[id].value);
+        told.shown = parts.map((one) => !one.hidden);""",
     )
+    # the slider, and every selector of the page, choose the channel that is told of
+    assert told["hidden"] == [True, True, False] and told["chosen"] == [1, 1]
+    assert told["shown"] == [False, True, False]
     nside = small_cube.result.scenario.map_nside
     pixels = healpy.ang2pix(nside, lon, lat, lonlat=True)
     for name in ("mean", "std", "truth"):

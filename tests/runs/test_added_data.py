@@ -12,7 +12,6 @@ from experiments import of_run
 
 import lusee_bayes as lb
 from lusee_bayes.results.map_files import information_file, read_information
-from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
 
 # N of the parts is that of the whole: about the model, and not about each one's data
@@ -26,11 +25,7 @@ LEARNED = "prior={model: isotropic}"
 JOINT = ["joint=true", "spectral.components=[power_law]"]
 
 
-@pytest.fixture(autouse=True)
-def numbers_alone(monkeypatch):
-    """Runs of this process write neither figures nor pages."""
-    monkeypatch.setattr(map_run, "MAP", replace(map_run.MAP, figures={}))
-    monkeypatch.setattr(folder_module, "PAGES", {})
+pytestmark = pytest.mark.usefixtures("numbers_alone")
 
 
 @pytest.fixture

@@ -250,6 +250,19 @@ def test_sums_of_information_and_few_data():
     )
 
 
+def test_a_dense_prior_of_any_root():
+    """Wide and ill conditioned: S = R R^T is not formed."""
+    rng = np.random.default_rng(8)
+    for columns in (6, 9):
+        root = rng.normal(size=(6, columns)) * np.geomspace(1.0, 1e-7, 6)[:, None]
+        prior = DensePrior.of_root(root, np.arange(6.0))
+        np.testing.assert_array_equal(prior.root, np.tril(prior.root))
+        np.testing.assert_allclose(prior.covariance(), root @ root.T, rtol=1e-9)
+        np.testing.assert_array_equal(prior.mean, np.arange(6.0))
+    with pytest.raises(InputError, match="positive diagonal"):
+        DensePrior.of_root(np.zeros((3, 3)))
+
+
 def test_draws_and_densities():
     prior = model().prior
     assert_draws_follow(prior.sample(jax.random.key(0), 4000), SKY_MEAN, np.diag(VARIANCES))
