@@ -18,7 +18,6 @@ from lusee_bayes.experiment.experiment import Experiment, build, program_pieces
 from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.results.channel import ChannelResult
@@ -31,6 +30,7 @@ from lusee_bayes.sampling.programs import (
     latent_sites,
     numpyro_promotion,
 )
+from lusee_bayes.systematics.context import Around
 from lusee_bayes.testing.scenarios import small_scenario
 
 # nothing of these enters a setup (test_experiment.py checks it), only the data and N; the mean of

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,6 @@ from lusee_bayes.core.arrays import on_device
 from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.instrument_terms import gain_drifts
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, simulate
 from lusee_bayes.experiment.rounds import (
@@ -29,15 +29,17 @@ from lusee_bayes.experiment.rounds import (
 )
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.sky_terms import point_sources
-from lusee_bayes.experiment.term import Around
-from lusee_bayes.experiment.terms import TERMS
 from lusee_bayes.instrument.instrument import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.plausibility import require_plausible
 from lusee_bayes.linear.information import Information
 from lusee_bayes.priors.learning import Learned
 from lusee_bayes.sky.sky_source import SkySource
+from lusee_bayes.systematics.beam import BeamErrors
+from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.gain_drifts import GainDrifts
+from lusee_bayes.systematics.sources import PointSources
+from lusee_bayes.systematics.systematic import Systematic
 
 
 @dataclass(frozen=True, repr=False)
@@ -252,14 +254,22 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     """
     setup, data, log_normal = experiment.setup, experiment.data, experiment.scenario.log_normal
 
-    def free(key: str, piece: Any) -> Any:
-        term = next(term for term in TERMS if term.key == key)
-        if any(t == "marginalised" for t, _ in term.build(setup, Around())):
+    def require_free(cls: type[Systematic]) -> None:
+        if cls.treatment(experiment.scenario) == "marginalised":
             raise InputError(
                 "the program samples what the scenario marginalises, so that it would count "
-                f"twice; set {key}.treatment=sampled"
+                f"twice; set {cls.key}.treatment=sampled"
             )
-        return piece
+
+    def own(cls: type[Systematic]) -> Systematic:
+        if cls.treatment(experiment.scenario) is None:
+            raise InputError(f"the scenario has no {cls.key} that could be sampled")
+        require_free(cls)
+        return cls.build(attrgetter(cls.key)(experiment.scenario), setup, around())
+
+    def instrument() -> Instrument:
+        require_free(BeamErrors)
+        return embedded_instrument(setup)
 
     @cache
     def around() -> Around:
@@ -272,9 +282,9 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     return {
         "gaussian": lambda: to_sample()[0],
         "systematics": lambda: to_sample()[1],
-        "gain_drifts": lambda: free("noise.gain", gain_drifts(setup, around())),
-        "instrument": lambda: free("noise.beam", embedded_instrument(setup)),
-        "sources": lambda: free("sources", point_sources(setup)),
+        "gain_drifts": lambda: own(GainDrifts),
+        "instrument": instrument,
+        "sources": lambda: own(PointSources),
         "log_normal": lambda: on_device(log_normal.prior(setup.sky.frequency_mhz, setup.sky.lmax)),
         "layout": lambda: data.layout,
     }

@@ -109,8 +109,11 @@ def _keys_of(section: Schema, sections: Schema, prefix: str, kind: str) -> Itera
         if kind and name == "model":
             continue
         path, meaning = f"{prefix}{name}", entry.get("description", "")
-        default = "required" if name in section.get("required", ()) else _default(entry)
         inner = [sections[reference] for reference in _references(entry)]
+        # where nothing is said of an entry, what its section says of itself
+        if not meaning and len(inner) == 1:
+            meaning = str(inner[0].get("description", "")).rstrip(".").replace("``", "`")
+        default = "required" if name in section.get("required", ()) else _default(entry)
         is_list = entry.get("type") == "array"
         if not inner:
             meaning = meaning or (f"Kind of {prefix.rstrip('.')}" if name == "model" else "")

@@ -29,7 +29,6 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.draws import doubts, posterior_draws
 from lusee_bayes.experiment.experiment import Experiment, explained, infer
-from lusee_bayes.experiment.instrument_terms import beam_rms_difference
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport, flux_table, pointing_report
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
@@ -51,6 +50,7 @@ from lusee_bayes.results.finished_runs import taken
 from lusee_bayes.results.map_files import SavedInformation
 from lusee_bayes.results.map_result import prior_sentence
 from lusee_bayes.sky.prior import DensePrior, Prior
+from lusee_bayes.systematics.beam import beam_rms_difference
 
 DOES_NOT_FIT = LEVELS[-1]
 # standard deviation of modes without prior variance, over the widest

@@ -36,7 +36,6 @@ from lusee_bayes.experiment.draws import draw_key
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.positive import lmax_of_fields, positive_skies
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.sky_terms import is_receiver
 from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.coverage import N_DRAWS
 from lusee_bayes.linear.amplitudes import Amplitudes, Tied, information_given, tie, told_by_others
@@ -62,6 +61,7 @@ from lusee_bayes.runs.channel_files import (
     names_of,
 )
 from lusee_bayes.runs.cost import measured_experiment
+from lusee_bayes.systematics.receivers import is_receiver
 
 
 def positive_mode(scenario: Scenario, channels: ChannelsInFiles, stages: Stages) -> PositiveMode:

@@ -32,7 +32,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import NO_ROOM, write_four_port, write_waterfall
 from lusee_bayes.runs.cost import require_fits, require_resources, simulation_cost
 from lusee_bayes.runs.folder import RunKind, inputs_of, scenario_run
-from lusee_bayes.runs.forecasting import expected_posterior
+from lusee_bayes.runs.forecasting import expected_inference
 
 
 def run_simulate(
@@ -446,4 +446,4 @@ def run_average(
 
 
 def _bits(scenario: Scenario, data: Visibilities) -> float:
-    return float(expected_posterior(set_up(scenario, data))[1].information_bits())
+    return float(expected_inference(set_up(scenario, data)).posterior.information_bits())

@@ -30,18 +30,17 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.instrument_sections import RunSection
-from lusee_bayes.experiment.instrument_terms import pointing_offsets
-from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.model import model_about
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.judge.measures import effective_resolution_deg, prior_fraction_per_ell
 from lusee_bayes.linear.amplitudes import template_amplitudes
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation
 from lusee_bayes.runs.cost import duration
+from lusee_bayes.systematics.context import Around
 
 
 def expected_snr_squared(posterior: Posterior) -> Float[np.ndarray, " ells"]:
@@ -87,28 +86,27 @@ def without_ports(setup: Setup, lost: Sequence[int]) -> Setup:
     return replace(setup, instrument=instrument, coupling=coupling)
 
 
-def expected_posterior(setup: Setup) -> tuple[LinearGaussian, Posterior]:
+def expected_inference(setup: Setup) -> Inference:
     """The model of a setup, and its posterior, of which all but the mean is known without data.
 
     N is the model's, with marginalised systematics and noise levels from the modelled sky.
     """
-    model = full_model(setup)
+    model, held = model_about(setup, Around())
     # the covariance is that of any data; these are the shortest to write
-    return model, model.condition(np.zeros(model.n_data))
+    return Inference(model, held, model.condition(np.zeros(model.n_data)), 1, Around())
 
 
-def expected_offsets(setup: Setup, model: LinearGaussian, posterior: Posterior) -> dict[str, float]:
+def expected_offsets(found: Inference) -> dict[str, float]:
     """Expected standard deviations of clock and pointing, in the units that their names end with.
 
     To first order about the scenario's sky and no offsets; empty where the model has none.
     """
-    section = setup.scenario.noise.pointing
-    if section is None or section.treatment == "ignored":
+    if found.offsets is None:
         return {}
-    offsets = pointing_offsets(setup, Around())
-    no_data = np.zeros(model.n_data)
-    amplitudes = template_amplitudes(model, posterior, no_data, offsets.templates)
-    return offsets.in_units(amplitudes.std)
+    no_data = np.zeros(found.model.n_data)
+    columns = found.offsets.columns
+    amplitudes = template_amplitudes(found.model, found.posterior, no_data, columns)
+    return found.offsets.systematic.in_units(amplitudes.std)
 
 
 def forecast(variation: Variation) -> Forecast:
@@ -123,7 +121,8 @@ def forecast(variation: Variation) -> Forecast:
         setup = set_up(variation.scenario)
         if variation.lost:
             setup = without_ports(setup, variation.lost)
-        model, posterior = expected_posterior(setup)
+        found = expected_inference(setup)
+        posterior = found.posterior
         return Forecast(
             variation=variation,
             days=float(setup.observation.live_s.sum()) / 86400.0,
@@ -132,7 +131,7 @@ def forecast(variation: Variation) -> Forecast:
             modes=informed_modes(posterior),
             snr_squared=expected_snr_squared(posterior),
             resolution_deg=effective_resolution_deg(prior_fraction_per_ell(posterior)),
-            offsets=expected_offsets(setup, model, posterior),
+            offsets=expected_offsets(found),
         )
     except InputError as error:
         raise InputError(f"{variation.source}, {variation.name}: {error}") from error

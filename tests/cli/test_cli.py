@@ -22,7 +22,7 @@ from commands import content, posterior_of, run
 import lusee_bayes
 from lusee_bayes.cli.options import ScenarioOptions
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
-from lusee_bayes.experiment.section import OutputSection
+from lusee_bayes.experiment.scenario import OutputSection
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.runs import map_run as runs
 from lusee_bayes.runs.folder import Output

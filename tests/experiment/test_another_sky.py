@@ -29,12 +29,14 @@ from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.rounds import learned_prior, settled
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.experiment.sky_sections import FileSkySection
-from lusee_bayes.experiment.term import Around, gains_about, radiometer_about
 from lusee_bayes.instrument.products import DataLayout, to_matrix, to_real
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.noise.instrument_errors import GainDrift, with_gains
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.sky.sky_source import Sky
+from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.gain_drifts import gains_about
+from lusee_bayes.systematics.noise_level import radiometer_about
 
 LMAX = 8
 TERMS = {

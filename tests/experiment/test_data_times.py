@@ -31,7 +31,7 @@ from lusee_bayes.instrument.waterfalls import write_waterfall
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.runs.cost import posterior_cost, simulation_cost
 from lusee_bayes.runs.data_run import run_simulate
-from lusee_bayes.runs.forecasting import default_variations, expected_posterior, forecast
+from lusee_bayes.runs.forecasting import default_variations, expected_inference, forecast
 from lusee_bayes.testing.contracts import assert_refused
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -312,7 +312,7 @@ def map_of(scenario, data, observation):
     setup = set_up(scenario, replace(data, observation=observation))
     model = full_model(setup)
     covariance = np.asarray(model.condition(np.zeros(model.n_data)).covariance())
-    bits = float(expected_posterior(setup)[1].information_bits())
+    bits = float(expected_inference(setup).posterior.information_bits())
     return Map(model, covariance, bits)
 
 

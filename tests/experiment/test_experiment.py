@@ -17,12 +17,12 @@ from lusee_bayes.core.harmonics import map_to_modes
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model, simulate
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.experiment.term import measured_visibilities
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.sky.prior import read_spectrum
+from lusee_bayes.systematics.context import measured_visibilities
 from lusee_bayes.testing.scenarios import small_scenario
 
 

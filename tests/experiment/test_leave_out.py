@@ -16,10 +16,10 @@ from lusee_bayes.experiment.leave_out import NOT_JUDGED, TOO_MANY, fitting, with
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.experiment.term import measured_visibilities
 from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.judge.plausibility import SIGNIFICANT, about_information, require_plausible
 from lusee_bayes.noise.radiometer import radiometer_noise
+from lusee_bayes.systematics.context import measured_visibilities
 from lusee_bayes.testing.contracts import assert_refused
 
 FALSE_ALARM = 1e-4

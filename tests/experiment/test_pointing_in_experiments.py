@@ -12,17 +12,24 @@ from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import Experiment, build, infer, program_pieces
-from lusee_bayes.experiment.instrument_terms import pointing_offsets, shifted
-from lusee_bayes.experiment.model import base_model, full_model, radiometer, simulate, true_values
+from lusee_bayes.experiment.model import (
+    base_model,
+    full_model,
+    model_about,
+    radiometer,
+    simulate,
+    true_values,
+)
 from lusee_bayes.experiment.rounds import offset_posterior
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.term import Around
 from lusee_bayes.experiment.unknowns import pointing_report
 from lusee_bayes.instrument.source_response import source_response
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.sky.galaxy import galactic_unit_vector
 from lusee_bayes.sky.prior import HarmonicPrior
+from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.pointing import PointingOffsets, shifted
 
 TWO_RUNS = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
 OFF = "clock_s: 60, turntable_0_deg: 0.3, turntable_1_deg: 0.0, clock_drift_s_per_day: 0.0"
@@ -174,7 +181,7 @@ def test_sampled_sites_move_a_as_the_exact_shift_does(name):
     # about a mean: a sky of which nothing is known may as well have turned
     setup = about_a_mean(set_up(scenario_of(runs, pointing, lmax=5)), 1e-4, 1)
     data = simulate(setup)
-    offsets = pointing_offsets(setup, Around(data))
+    offsets = PointingOffsets.build(setup.scenario.noise.pointing, setup, Around(data))
     values = dict.fromkeys(offsets.names, 0.0) | {
         name: 1.5 * dict(zip(offsets.names, offsets.stds.tolist(), strict=True))[name]
     }
@@ -262,17 +269,16 @@ def test_sources_and_gains_are_those_of_the_offsets():
     there = set_up(scenario_of(turned, *extra, lmax=5, step_s=43200.0))
     expected = full_model(there)
     around = Around(None, None, setup.sky.modes, values)
-    offsets = pointing_offsets(setup, around)
-    found = full_model(setup, around)
-    # the templates' own part left out; gains make 1 + sigma^2 of every auto, that part too
-    own = offsets.templates @ offsets.centre
+    found, (offsets, *_) = model_about(setup, around)
+    # the columns' own part left out; gains make 1 + sigma^2 of every auto, that part too
+    own = offsets.columns @ offsets.centre
     np.testing.assert_allclose(
         found.predict(setup.sky.modes) + own,
         expected.predict(setup.sky.modes),
         rtol=0,
         atol=2e-4 * np.abs(own).max(),
     )
-    systematic = np.asarray(found.noise.dense()) - offsets.templates @ offsets.templates.T
+    systematic = np.asarray(found.noise.dense()) - offsets.columns @ offsets.columns.T
     systematic -= np.diag(np.asarray(radiometer(setup).diagonal()))
     wanted = np.asarray(expected.noise.dense())
     wanted = wanted - np.diag(np.asarray(radiometer(there).diagonal()))
@@ -315,9 +321,8 @@ def test_what_cannot_be():
         "noise.pointing={clock_s: 60, treatment: sampled}",
         "noise.beam={parameters: {height_m: 0.1}, treatment: sampled}",
     ]
-    experiment = build(scenario_of(*both, lmax=4))
     with pytest.raises(InputError, match="cannot both be sampled"):
-        infer(experiment)
+        scenario_of(*both, lmax=4)
 
 
 def test_sources_are_seen_as_means_over_windows():

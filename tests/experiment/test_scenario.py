@@ -12,6 +12,7 @@ from fits_files import write_images
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import as_yaml, parse_yaml
+from lusee_bayes.core.section import FILES
 from lusee_bayes.experiment.instrument_sections import (
     MonopoleBeamSection,
     ResponseSection,
@@ -20,7 +21,6 @@ from lusee_bayes.experiment.instrument_sections import (
 )
 from lusee_bayes.experiment.keys import keys_as_markdown, scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario, scenario_names
-from lusee_bayes.experiment.section import FILES
 from lusee_bayes.experiment.sky_sections import (
     FileSkySection,
     GalaxySection,

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from experiments import small_experiment
 
+from lusee_bayes.core.section import Positive, Section, Treatment
 from lusee_bayes.experiment import model as model_module
 from lusee_bayes.experiment.experiment import Experiment, build, infer
-from lusee_bayes.experiment.instrument_terms import beam_directions, beam_rms_difference, true_beams
 from lusee_bayes.experiment.model import (
     full_model,
     model_to_sample,
@@ -22,13 +22,9 @@ from lusee_bayes.experiment.model import (
     systematics,
     true_values,
 )
-from lusee_bayes.experiment.noise_sections import NoiseSection
 from lusee_bayes.experiment.rounds import SETTLED, Inference, prediction
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.section import Positive, Section, Treatment
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.term import AdditiveTerm, Around, Term, Truth
-from lusee_bayes.experiment.terms import TERMS
 from lusee_bayes.instrument.beams.monopoles import monopole_beams
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.noise.covariance import (
@@ -37,7 +33,10 @@ from lusee_bayes.noise.covariance import (
     LowRankCovariance,
     LowRankUpdate,
 )
-from lusee_bayes.systematics.systematic import AdditiveNoise
+from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams, true_beams
+from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
+from lusee_bayes.systematics.systematic import AdditiveNoise, Systematic, Truth, multiplied
 from lusee_bayes.testing.scenarios import small_scenario
 
 GAIN = "noise.gain.sigma=0.01"
@@ -122,7 +121,10 @@ def test_a_shifted_beam_is_that_of_the_other_frequency():
     # the same beams compiled twice: rounding
     for got, expected in [
         (true_beams(setup).modes, np.asarray(other.modes)),
-        (beam_directions(setup)[0].modes, np.asarray(other.modes) - np.asarray(setup.beams.modes)),
+        (
+            difference_of_beams(setup.scenario.noise.beam, setup).modes,
+            np.asarray(other.modes) - np.asarray(setup.beams.modes),
+        ),
     ]:
         np.testing.assert_allclose(got, expected, rtol=0, atol=1e-15)
     seen = CouplingMatrix.build(other, setup.pointing) @ setup.sky.modes
@@ -173,7 +175,15 @@ class ScenarioWithHum(Scenario):
 class Hum(AdditiveNoise):
     """Patterns with unknown amplitudes of zero mean."""
 
+    key = KEY
+    section = HumSection
+
     root: jax.Array
+
+    @classmethod
+    def build(cls, section, context, around) -> Hum:
+        root = patterns(context.layout.size, section.sigma_k)
+        return cls("hum", context.layout, jnp.asarray(root))
 
     def covariance(self) -> Covariance:
         return LowRankCovariance(self.root, "the hum")
@@ -184,19 +194,10 @@ def patterns(n_data: int, sigma_k: float) -> np.ndarray:
     return sigma_k * np.random.default_rng(5).normal(size=(n_data, 3))
 
 
-def hum(setup: Setup, section: HumSection) -> Hum:
-    """The term of a scenario."""
-    root = jnp.asarray(patterns(setup.layout.size, section.sigma_k))
-    return Hum("hum", setup.layout, root)
-
-
-TERM = AdditiveTerm(KEY, hum)
-
-
 @pytest.fixture
 def registered(monkeypatch, tiny_experiment):
     """The term behind those of the package, once there is an experiment without it."""
-    monkeypatch.setattr(model_module, "TERMS", (*TERMS, TERM))
+    monkeypatch.setattr(model_module, "SYSTEMATICS", (*SYSTEMATICS, Hum))
 
 
 def with_hum(**section) -> Scenario:
@@ -265,35 +266,32 @@ def test_simulated_data_hold_it_whatever_its_treatment(registered):
 # --- a term with values of its own ----------------------------------------------------------------
 
 
-class Amplifier(Term):
+class Amplifier(Systematic):
     """A factor that simulated data hold and the model does not know."""
 
-    key = "amplifier"
+    key = "noise.hum"
 
-    def build(self, setup, around):
-        return []
-
-    def truth(self, setup, key) -> Truth:
+    @classmethod
+    def truth(cls, section, context, key) -> Truth:
         return {"factor": 3.0}
 
-    def distort(self, visibilities, setup, truth, key):
-        return truth["factor"] * visibilities
+    @classmethod
+    def in_data(cls, section, context, model, truth, key):
+        return multiplied(model, np.full(model.n_data, truth["factor"]))
 
 
-def test_terms_distort_in_their_order(monkeypatch):
+def test_systematics_act_in_their_order(monkeypatch):
     """What comes before the amplifier is amplified with the sky; radiometer noise never is."""
     setup = setup_with(sigma_k=100.0)
 
-    def simulated(*terms: Term) -> np.ndarray:
-        monkeypatch.setattr(model_module, "TERMS", (*TERMS, *terms))
-        assert true_values(setup) == ({"factor": 3.0} if Amplifier in map(type, terms) else {})
+    def simulated(*more: type[Systematic]) -> np.ndarray:
+        monkeypatch.setattr(model_module, "SYSTEMATICS", (*SYSTEMATICS, *more))
+        assert true_values(setup) == ({"factor": 3.0} if Amplifier in more else {})
         return np.asarray(simulate(setup).data)
 
     signal = np.asarray(setup.layout.gather(setup.signal))
     noise = simulated() - signal
-    added = simulated(TERM) - signal - noise
+    added = simulated(Hum) - signal - noise
     close = {"rtol": 0, "atol": 1e-9}
-    np.testing.assert_allclose(
-        simulated(TERM, Amplifier()), 3.0 * (signal + added) + noise, **close
-    )
-    np.testing.assert_allclose(simulated(Amplifier(), TERM), 3.0 * signal + added + noise, **close)
+    np.testing.assert_allclose(simulated(Hum, Amplifier), 3.0 * (signal + added) + noise, **close)
+    np.testing.assert_allclose(simulated(Amplifier, Hum), 3.0 * signal + added + noise, **close)

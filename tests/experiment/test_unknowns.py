@@ -13,10 +13,11 @@ from reference_linear import white_posterior
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import radiometer, simulate, true_values
-from lusee_bayes.experiment.setup import Setup, ground_per_kelvin, set_up
+from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.unknowns import NullDirection, unknowns_report
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.report.map_page import map_page
+from lusee_bayes.systematics.regolith import ground_per_kelvin
 
 RECEIVER, GROUND = "noise.receiver={power_k: 2000}", "noise.regolith={std_k: 30}"
 TABLE = "noise.gain_table={std: 0.01}"
@@ -32,12 +33,12 @@ def joint(experiment: lb.Experiment):
     """Sky and unknowns of the model about what the data told, as one Gaussian in NumPy."""
     found, setup = lb.infer(experiment), experiment.setup
     table = found.systematics[-1]
-    factors = np.asarray(table.errors.factors(table.centre))
+    factors = np.asarray(table.systematic.errors.factors(table.centre))
     t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
     a = np.concatenate([factors[:, None] * np.asarray(setup.coupling.dense()), t], axis=1)
     prior = np.append(np.sqrt(np.asarray(setup.prior.variance())), np.ones(t.shape[1]))
     noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
-    own = table.templates @ (np.asarray(table.centre) - table.expected)
+    own = table.columns @ (np.asarray(table.centre) - table.expected)
     rest = np.asarray(experiment.data.data) - factors * np.asarray(setup.offset) + own
     return found, prior, white_posterior(a, prior, noise, rest)
 

@@ -18,13 +18,13 @@ import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.experiment import program_pieces
-from lusee_bayes.experiment.instrument_terms import beam_directions, beam_rms_difference, true_beams
 from lusee_bayes.experiment.model import true_signal, true_values
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.instrument.beams.luseepy_files import FIELDS, ScalarBeam
 from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.products import labels
+from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams, true_beams
 from lusee_bayes.testing.scenarios import small_scenario
 
 LMAX, PORTS = 47, 4
@@ -277,7 +277,7 @@ def test_a_second_file_as_the_true_beams(tmp_path):
     path, other = write(tmp_path / "a.fits"), write(tmp_path / "b.fits", change=brighter)
     setup = set_up(small_scenario(f"beam.file={path}", f"noise.beam.file={other}"))
     assert beam_rms_difference(setup) == pytest.approx(1.01**2 - 1, rel=1e-9)
-    (direction,) = beam_directions(setup)
+    direction = difference_of_beams(setup.scenario.noise.beam, setup)
     more = (1.01**2 - 1) * np.asarray(setup.beams.modes)
     np.testing.assert_allclose(direction.modes, more, rtol=0, atol=1e-12)
     signal = np.asarray(true_signal(setup, true_values(setup)))

@@ -17,7 +17,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import Rotation, n_modes, turn_about_z
 from lusee_bayes.instrument.coupling import BeamOperator, CouplingMatrix, DenseCoupling, as_coupling
 from lusee_bayes.instrument.products import DataLayout, auto_indices, labels
-from lusee_bayes.systematics.instrument_unknowns import BeamError, InstrumentParameters
+from lusee_bayes.systematics.beam import BeamError, InstrumentParameters
 from lusee_bayes.testing.contracts import check_coupling
 
 LMAX = 8

@@ -14,7 +14,7 @@ from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.term import Around
+from lusee_bayes.systematics.context import Around
 
 
 def two_cycles(*overrides):

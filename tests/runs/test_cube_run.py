@@ -19,7 +19,6 @@ from lusee_bayes.core.harmonics import modes_to_map, n_modes
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.experiment.term import Around
 from lusee_bayes.judge.measures import signal_to_noise
 from lusee_bayes.report.rendering import sentences
 from lusee_bayes.runs import channels, map_run
@@ -28,6 +27,7 @@ from lusee_bayes.runs.channels import cube_result, lmax_of_fields, positive_skie
 from lusee_bayes.runs.map_run import run_map
 from lusee_bayes.sampling.datatree import read_datatree
 from lusee_bayes.sky.sky_files import SkyCube
+from lusee_bayes.systematics.context import Around
 
 SMALL = ["--set", "lmax=4", "--set", "observation.runs.0.cycles=0.1"]
 THREE = ["--frequencies", "20:30:5", *SMALL]

@@ -18,13 +18,13 @@ from scipy.stats import lognorm, multivariate_normal, norm
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model, model_to_sample, radiometer, true_values
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.sky_terms import point_sources
-from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise.instrument_errors import difference
 from lusee_bayes.sampling.programs import numpyro_promotion
-from lusee_bayes.systematics.instrument_unknowns import NoiseLevel
-from lusee_bayes.systematics.sky_unknowns import PointSources, PowerSpectrum, Source, SpectrumBands
+from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.noise_level import NoiseLevel
+from lusee_bayes.systematics.prior_spectrum import PowerSpectrum, SpectrumBands
+from lusee_bayes.systematics.sources import PointSources, Source
 from lusee_bayes.systematics.systematic import (
     MOST_COLLAPSED,
     AdditiveNoise,
@@ -200,7 +200,7 @@ def test_the_level_is_that_of_the_radiometer_only():
     np.testing.assert_array_equal(base.noise.diagonal(), radiometer(setup).diagonal())
     _, da, s, n = matrices(setup)
     t = np.stack([np.asarray(r).reshape(-1) for r in setup.responses], axis=1)
-    std = np.array([source.std for source in point_sources(setup).sources])
+    std = PointSources.build(setup.scenario.sources, setup, Around()).stds
     arguments = program_arguments(program, e)
     with numpyro_promotion():
         model = handlers.substitute(program.model, {"noise_level": jnp.asarray(9.0)})
@@ -296,17 +296,9 @@ def test_sampled_noise_is_added_to_what_is_there(model):
 
 
 @pytest.mark.parametrize("term", terms(), ids=lambda term: term.name)
-def test_simulated_data_hold_a_draw_of_it(term):
-    grid = jnp.ones((N_PRODUCTS, N_TIMES))
+def test_simulated_data_hold_a_draw_of_it(model, term, monkeypatch):
+    monkeypatch.setattr(type(term), "build", classmethod(lambda cls, *args: term))
     key = jax.random.key(3)
-    drawn = np.asarray(term.layout.gather(term.distort(grid, key) - grid))
-    np.testing.assert_allclose(drawn, term.covariance().sample(key), rtol=0, atol=1e-14)
-
-
-def test_samples_that_are_not_there_stay_as_they_are():
-    flags = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
-    flags[1, 3:5] = True
-    layout = DataLayout.from_flags(flags)
-    term = Pickup("pickup", layout, jnp.ones((layout.size, 1)))
-    changed = np.asarray(term.distort(jnp.zeros(flags.shape), jax.random.key(0)))
-    np.testing.assert_array_equal(changed == 0.0, flags)
+    drawn = np.asarray(type(term).in_data(None, None, model, {}, key).offset)
+    expected = term.covariance().sample(type(term).own_key(key))
+    np.testing.assert_allclose(drawn, expected, rtol=0, atol=1e-14)

@@ -50,12 +50,15 @@ FILES = ("clock", "file", "gain_table", "lines", "mean_file", "schedule", "spect
 
 
 def _described(schema: dict[str, Any], section: type[BaseModel]) -> None:
-    """Give the entries of a JSON schema the meanings that the section's docstring has."""
-    docstring = parse(section.__doc__ or "", style=DocstringStyle.NUMPYDOC)
-    schema["description"] = docstring.short_description
-    for entry in docstring.params:
-        meaning = " ".join((entry.description or "").split())
-        schema["properties"][entry.arg_name]["description"] = meaning.rstrip(".").replace("``", "`")
+    """Give the entries of a JSON schema the meanings that docstrings of the section have."""
+    for cls in reversed(section.__mro__):
+        if not issubclass(cls, Section) or cls is Section:
+            continue
+        docstring = parse(cls.__doc__ or "", style=DocstringStyle.NUMPYDOC)
+        schema["description"] = docstring.short_description
+        for entry in docstring.params:
+            meaning = " ".join((entry.description or "").split()).rstrip(".").replace("``", "`")
+            schema["properties"][entry.arg_name]["description"] = meaning
 
 
 class Section(BaseModel):
@@ -166,21 +169,3 @@ def without_other_kinds(
             names = ", ".join(name for name, kind in kinds.items() if kind in others)
             raise ValueError(f"{key} is an entry of model {names}, not of {tree['model']}")
     return kept
-
-
-class OutputSection(Section):
-    """Results that are written on request.
-
-    Attributes
-    ----------
-    draws : int
-        Number of posterior draws ``posterior.nc`` keeps.
-    covariance : bool
-        Keep the posterior covariance in ``posterior.nc``.
-    information : bool
-        Keep in ``posterior.nc`` what the data say of the sky, so that new data can be added later.
-    """
-
-    draws: Annotated[int, Field(ge=0)] = 0
-    covariance: bool = False
-    information: bool = False
