@@ -48,7 +48,7 @@ COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
             "lusee-bayes map first_light.yaml --data session_*.h5 --clock clock.json",
             "lusee-bayes map first_light.yaml --data reduced.nc --frequencies 5:50:1",
             "lusee-bayes map fiducial --frequencies 5:50:1 --joint --draws 20 -o output/cube",
-            "lusee-bayes map fiducial --data second_cycle.nc --onto output/first_cycle",
+            "lusee-bayes map fiducial --data second_cycle.nc --add output/first_cycle",
         ),
     ),
     "sample": (

@@ -35,9 +35,8 @@ def printed(table) -> list[str]:
 
 def with_data(run, name, change):
     """The same run with other data."""
-    diagnostics = run.diagnostics.copy(deep=True)
-    diagnostics["data"] = change(diagnostics["data"])
-    return replace(run, name=name, diagnostics=diagnostics)
+    channel = replace(run.channel, data=change(run.channel.data))
+    return replace(run, name=name, channels=(channel,))
 
 
 @pytest.mark.parametrize(("arguments", "code"), [(["keys"], 0), (["map", "no.yaml"], 2)])
@@ -49,7 +48,7 @@ def test_what_a_program_calls_next_is_not_said_to_be_of_a_command_before(argumen
 def test_tables_fit_eighty_columns(finished):
     others = [
         replace(finished, name="a run with a name that is longer than it had better be " * 2),
-        replace(finished, name="unknown", summary=finished.summary | {"ell_cross": None}),
+        replace(finished, name="unknown", channels=(replace(finished.channel, truth=None),)),
     ]
     lines = printed(comparison_table([finished, *others]))
     assert max(map(len, lines)) <= 80
