@@ -50,7 +50,7 @@ def map_page(folder: Path, name: str) -> str:
         unfit=[test.level != "consistent" for test in summary.tests],
         bad=[stands_out(channel.instrument.p, tests) for channel in channels],
         viewer=_viewer(channels),
-        flight=_flight(folder),
+        flight=flight_section(folder),
     )
 
 
@@ -100,7 +100,7 @@ def _groups(judged: Judged | None) -> dict[str, dict[str, Any]]:
     return shown
 
 
-def _flight(folder: Path) -> dict[str, Any] | None:
+def flight_section(folder: Path) -> dict[str, Any] | None:
     """Sessions, flags and noise as ``flight.html`` shows them; None for other data."""
     if not (folder / REDUCED).is_file():
         return None

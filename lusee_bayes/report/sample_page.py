@@ -11,8 +11,7 @@ from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.reading import read_model, read_table
 from lusee_bayes.judge.convergence import FAR, FEW, warnings_of
 from lusee_bayes.report.rendering import render_run
-from lusee_bayes.results.sample_result import SamplingSummary
-from lusee_bayes.results.validation_result import ValidationSummary
+from lusee_bayes.results.sampling_files import SamplingSummary, ValidationSummary
 
 ROWS = ("quantity",)
 SUMMARY_TABLE = Layout(

@@ -8,34 +8,17 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 import xarray as xr
-from pydantic import BaseModel
 
 from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.judge.convergence import warnings_of
+from lusee_bayes.results.sampling_files import SamplingSummary
 from lusee_bayes.sampling import mode
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.systematics.systematic import SKY
 
 SAMPLES, CHAINS = "samples.nc", "chains"
-
-
-class SamplingSummary(BaseModel):
-    """sampling.json of a sampled run."""
-
-    program: str
-    chains: int
-    draws: int
-    divergences: int
-    mean_acceptance: float
-    doubts: list[str]
-    step_size: list[float]
-    mean_steps: float
-    gradients_per_second: float | None
-    seconds: dict[str, float]
-    peak_memory_gb: float
-    versions: dict[str, str]
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel
 
 from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.results.sample_result import SampleResult
+from lusee_bayes.results.sampling_files import CheckSummary, ValidationSummary
 from lusee_bayes.sampling.validation import Check, Comparison, Ranks
 
 # what a comparison has mode by mode
@@ -100,27 +100,6 @@ class ValidationResult:
             coverage={name: {f"{p:g}": x for p, x in shares.items()} for name, shares in levels},
             p_values=dict(zip(ranks.names, ranks.p_values().tolist(), strict=True)),
         )
-
-
-class CheckSummary(BaseModel, from_attributes=True):
-    """A check in validation.json; bounds that are not finite are null."""
-
-    name: str
-    value: float
-    lower: float | None
-    upper: float | None
-    passed: bool
-    meaning: str
-
-
-class ValidationSummary(BaseModel):
-    """validation.json: every check, and mode by mode what there is."""
-
-    passed: bool
-    checks: list[CheckSummary]
-    modes: dict[str, list[float | None]]
-    coverage: dict[str, dict[str, float]]
-    p_values: dict[str, float]
 
 
 def calibration_check(ranks: Ranks) -> Check:

@@ -72,7 +72,8 @@ def test_the_files_agree_with_each_other(folder):
     with (folder / "spectra.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0])[:8] == [
-        "frequency_mhz", "ell", "rho", "snr", "cl_prior", "cl_mean", "cl_truth", "cl_posterior_variance",
+        "frequency_mhz", "ell", "rho", "snr", "cl_prior", "cl_mean", "cl_truth",
+        "cl_posterior_variance",
     ]  # fmt: skip
     assert float(rows[2]["cl_posterior_variance"]) == pytest.approx(np.mean(std[4:9] ** 2))
     summary = json.loads((folder / "summary.json").read_text())
