@@ -36,9 +36,8 @@ def printed(table) -> list[str]:
 
 def with_data(run, name, change):
     """The same run with other data."""
-    diagnostics = run.diagnostics.copy(deep=True)
-    diagnostics["data"] = change(diagnostics["data"])
-    return replace(run, name=name, diagnostics=diagnostics)
+    channel = replace(run.channel, data=change(run.channel.data))
+    return replace(run, name=name, channels=(channel,))
 
 
 @pytest.mark.parametrize(("arguments", "code"), [(["keys"], 0), (["map", "no.yaml"], 2)])
@@ -50,7 +49,7 @@ def test_what_a_program_calls_next_is_not_said_to_be_of_a_command_before(argumen
 def test_tables_fit_eighty_columns(finished):
     others = [
         replace(finished, name="a run with a name that is longer than it had better be " * 2),
-        replace(finished, name="unknown", summary=finished.summary | {"ell_cross": None}),
+        replace(finished, name="unknown", channels=(replace(finished.channel, truth=None),)),
     ]
     lines = printed(comparison_table([finished, *others]))
     assert max(map(len, lines)) <= 80
@@ -64,7 +63,7 @@ def test_tables_fit_eighty_columns(finished):
     [
         (lambda d: d + 1.0, "other values at the same times"),
         (lambda d: 4e-24 * d, "the same data in another unit (times 4e-24)"),
-        (lambda d: d.where(np.arange(d.sizes["time"]) > 3), "samples instead of"),
+        (lambda d: np.where(np.arange(d.shape[1]) > 3, d, np.nan), "samples instead of"),
     ],
 )
 def test_evidences_of_other_data_are_not_compared(finished, change, reason):
@@ -75,7 +74,7 @@ def test_evidences_of_other_data_are_not_compared(finished, change, reason):
     assert reason in evidence_caveat([finished, same, other])
     assert "same has" not in evidence_caveat([finished, same, other])
     assert comparison_rows([finished, other])[0]["log_evidence_less_best"] is None
-    ten = replace(finished, name="ten", summary=finished.summary | {"frequency_mhz": 10.0})
+    ten = replace(finished, name="ten", channels=(replace(finished.channel, frequency_mhz=10.0),))
     assert "ten is at 10 MHz instead of 25" in evidence_caveat([finished, ten])
 
 

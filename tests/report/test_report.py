@@ -132,6 +132,30 @@ def test_a_pixels_posterior_is_that_of_the_file(folder):
     np.testing.assert_allclose(layer(data, "prior_fraction"), share, rtol=1e-5)
 
 
+def test_a_page_of_many_channels_has_a_part_for_each(cube):
+    """One is shown at a time; selectors stand above them, and the maps have a slider."""
+    page = (cube / "report.html").read_text()
+    summary = json.loads((cube / "summary.json").read_text())
+    n = len(summary["channels"])
+    assert n == 3 and viewer_data(page)["frequencies"] == [20.0, 25.0, 30.0]
+    (slider,) = re.findall(r'<input id="viewer-channel" type="range" [^>]*>', page)
+    assert 'max="2"' in slider
+    selectors = re.findall(r'<select class="channel">\s*(.*?)\s*</select>', page, re.DOTALL)
+    options = "".join(f'<option value="{k}">{20 + 5 * k} MHz</option>' for k in range(n))
+    assert selectors and all("".join(one.split("\n")) == options for one in selectors)
+    parts = re.findall(r'<div data-channel="(\d)"( hidden)?>', page)
+    assert parts == [("0", ""), ("1", " hidden"), ("2", " hidden")] * len(selectors)
+    # what each says is that channel's
+    for channel in summary["channels"]:
+        assert f"expected {channel['chi2_expected']:.1f}" in page
+        assert f"<td>{channel['frequency_mhz']:g}</td><td>{channel['n_data']}</td>" in page
+
+
+def test_a_page_of_one_channel_has_no_selector(folder):
+    page = (folder / "report.html").read_text()
+    assert 'class="channel"' not in page and "viewer-channel" not in page.split("<script", 1)[0]
+
+
 @pytest.mark.parametrize("which", [FOLDER, CUBE, SAMPLED])
 @pytest.mark.parametrize("manifest", [True, False], ids=["manifest", "an older folder without"])
 def test_report_makes_a_page_anew(which, manifest, request, tmp_path, capsys):

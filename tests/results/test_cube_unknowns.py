@@ -65,7 +65,7 @@ def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch
     assert f"at 2 of 2 frequencies. At {worst:g} MHz ({nulls[worst].words()}, in" in sentence
     page = map_page(tmp_path / "cube", "a run")
     assert line in page and sentence in page
-    assert "Powers of receivers" in page and "<td>15</td><td>regolith_k</td><td>K</td>" in page
+    assert "Powers of receivers" in page and page.count("<td>regolith_k</td><td>K</td>") == 2
 
 
 def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(

@@ -32,8 +32,7 @@ from lusee_bayes.runs import folder, map_run, paper_run, sample_run
 # listened to even where the tests run in the background, which ignores it
 signal.signal(signal.SIGINT, signal.default_int_handler)
 folder.PAGES = {}
-for module, name in ((map_run, "MAP"), (map_run, "CUBE"), (sample_run, "SAMPLE"),
-                     (paper_run, "PAPER")):
+for module, name in ((map_run, "MAP"), (sample_run, "SAMPLE"), (paper_run, "PAPER")):
     setattr(module, name, replace(getattr(module, name), figures={}))
 tiny, *arguments = sys.argv[1:]
 cases.CASES = {name: ("fiducial", [*tiny.split(), f"noise.radiometer.factor={factor}"])
