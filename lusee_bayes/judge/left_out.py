@@ -37,7 +37,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from lusee_bayes.core.arrays import DataVector, Grid, GridFlags, Square, Vector, on_host
 from lusee_bayes.core.engine import in_threads, once
@@ -70,7 +70,9 @@ SHARED, NEAR = 1000, 144
 Cells = Float[np.ndarray, "blocks places"]
 CellFlags = Bool[np.ndarray, "blocks places"]
 Weights = Float[np.ndarray, "blocks places *places"]
+Roots = Float[np.ndarray, "blocks used *used"]
 Rows = Float[np.ndarray, "rows rank"]
+SkyRows = Float[np.ndarray, "rows sky"]
 
 
 class Missed(NamedTuple):
@@ -159,7 +161,7 @@ class Chosen(NamedTuple):
     blocks: Int[np.ndarray, " n"]
     places: Int[np.ndarray, " m"]
     some: Bool[np.ndarray, "n m"]
-    root: Weights
+    root: Roots
     b: Float[np.ndarray, "n m 1"]
 
 
@@ -368,7 +370,7 @@ class LeftOut:
             weighted = weigh(self._weights, self._by_cell((rest - seen)[:, None]))
         return weighted[..., 0]
 
-    def _by_cell(self, columns: Float[np.ndarray, "data *rest"]) -> np.ndarray:
+    def _by_cell(self, columns: Shaped[np.ndarray, "data *rest"]) -> np.ndarray:
         return self._cells.scatter(columns).swapaxes(0, 1)
 
     def _on_cells(self, flags: GridFlags) -> CellFlags:
@@ -441,7 +443,7 @@ class LeftOut:
 
     # --- groups in the space of their data ----------------------------------------------------
 
-    def _small(self, chosen: Chosen) -> tuple[Rows, Rows, Vector] | None:
+    def _small(self, chosen: Chosen) -> tuple[Rows, SkyRows, Vector] | None:
         """q^T W, q^T W L^-1, and q^T c^-1 u_s; None for a large group."""
         (cells, blocks, places, some, root, b), rank = chosen, len(self._lower)
         if self._kept is not None:
@@ -471,7 +473,7 @@ class LeftOut:
         return w, with_sky, (q.swapaxes(1, 2) @ b).ravel()
 
     def _among_data(
-        self, chosen: Chosen, w: Rows, with_sky: Rows, inside: Vector
+        self, chosen: Chosen, w: Rows, with_sky: SkyRows, inside: Vector
     ) -> tuple[float, float, float]:
         """chi^2_s, directions and ln|1 - W W^T|."""
         lower = cholesky(np.eye(len(w)) - w @ w.T, overwrite=True)
@@ -518,7 +520,7 @@ def weigh(weights: Weights, x: Float[np.ndarray, "blocks places k"]) -> np.ndarr
     return weights[..., None] * x if weights.ndim == 2 else weights @ x
 
 
-def roots(weights: Weights, chosen: CellFlags) -> Weights:
+def roots(weights: Weights, chosen: CellFlags) -> Roots:
     """c of D_ss = c c^T in every block, at the places that any block uses; 1 where it does not."""
     used = np.flatnonzero(chosen.any(axis=0))
     some, within = chosen[:, used], weights[:, used]
@@ -528,7 +530,7 @@ def roots(weights: Weights, chosen: CellFlags) -> Weights:
     return np.linalg.cholesky(np.where(both, within[..., used], np.eye(len(used))))
 
 
-def whitened(root: Weights, x: np.ndarray, *, transpose: bool = False) -> np.ndarray:
+def whitened(root: Roots, x: np.ndarray, *, transpose: bool = False) -> np.ndarray:
     """c^-1 x, or c^-T x."""
     if root.ndim == 2:
         return x / root[..., None]

@@ -252,7 +252,7 @@ def residuals(
     groups = groups_of(data)
     for group, missed in zip(groups, left_out.each([one.data for one in groups]), strict=True):
         found[group.kind].append(judged(group, missed))
-    z = layout.gather(left_out.u / np.sqrt(left_out.inverse_diagonal))
+    z = layout.gather(left_out.u) / np.sqrt(layout.gather(left_out.inverse_diagonal))
     return Residuals(predicted, z, split, *map(tuple, found.values()))
 
 
