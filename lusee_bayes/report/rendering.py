@@ -18,10 +18,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from lusee_bayes.core.checks import counted
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import require_files
-from lusee_bayes.core.layouts import Layout
-from lusee_bayes.core.reading import read_table, read_text
+from lusee_bayes.core.reading import read_text
 from lusee_bayes.core.version import __version__, printable
 from lusee_bayes.judge.chi2 import RULE, probability
 from lusee_bayes.judge.convergence import CRITERIA
@@ -69,7 +67,7 @@ def asset(name: str) -> Markup:
     return Markup(ENVIRONMENT.loader.get_source(ENVIRONMENT, name)[0])
 
 
-def number(value: Any, form: str, missing: str = "") -> str:
+def formatted(value: Any, form: str, missing: str = "") -> str:
     """Format a number.
 
     Parameters
@@ -98,7 +96,7 @@ ENVIRONMENT = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-ENVIRONMENT.filters |= {"number": number, "probability": p_value}
+ENVIRONMENT.filters |= {"number": formatted, "probability": p_value}
 ENVIRONMENT.globals |= {"asset": asset, "counted": counted, "RULE": RULE, "CRITERIA": CRITERIA}
 
 
@@ -118,18 +116,15 @@ def render_run(template: str, path: Path, run: Mapping[str, Any], **context: Any
     Raises
     ------
     InputError
-        As in :func:`render`; if seconds or versions are missing, or the scenario.
+        As in :func:`render`; if the scenario is missing.
     """
     folder = path.parent
     scenario = read_text(folder / "scenario.yaml", "a scenario")
-    for name in ("seconds", "versions"):
-        if not isinstance(run.get(name), dict):
-            raise InputError(f"the figures of the run in '{folder}' have no {name}; make it again")
     return render(
         template,
         folder,
         run=run,
-        doubts=sentences(path, run, "doubts"),
+        doubts=run.get("doubts", ()),
         provenance=Provenance.read(folder),
         version=__version__,
         scenario=scenario,
@@ -137,32 +132,3 @@ def render_run(template: str, path: Path, run: Mapping[str, Any], **context: Any
         bytes_of={file.name: file.stat().st_size for file in folder.iterdir() if file.is_file()},
         **context,
     )
-
-
-def sentences(path: Path, found: Mapping[str, Any], name: str) -> list[str]:
-    """Sentences of a run's figures; none if they do not have them.
-
-    Raises
-    ------
-    InputError
-        If it is no list of texts.
-    """
-    told = found.get(name, [])
-    if not isinstance(told, list) or not all(isinstance(text, str) for text in told):
-        raise InputError(f"{path}: {name} is no list of texts; make the results anew")
-    return told
-
-
-def rows_of(path: Path, layout: Layout) -> list[dict[str, Any]]:
-    """The rows of a CSV table by the names of its columns; none if there is no such file.
-
-    InputError as :func:`.read_table`.
-    """
-    if not path.is_file():
-        return []
-    table = read_table(path, layout)
-    names = list(layout.variables)
-    return [
-        dict(zip(names, row, strict=True))
-        for row in zip(*(table[name] for name in names), strict=True)
-    ]
