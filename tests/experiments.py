@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro.infer.util import log_density
 
-from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.experiment import Experiment, build, program_pieces
 from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
@@ -63,7 +62,7 @@ def mapped(
 ) -> tuple[Conditioned, ChannelResult]:
     """What a map run finds of one frequency, without its folder."""
     made = conditioned(experiment, earlier)
-    return made, made.result(made.known(Stages(), alone=True, thorough=thorough), Stages())
+    return made, made.result(made.known(thorough=thorough))
 
 
 def of_run(data: Visibilities, run: int) -> Visibilities:

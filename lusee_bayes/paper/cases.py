@@ -13,7 +13,6 @@ import xarray as xr
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import says
-from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.version import __version__, versions
 from lusee_bayes.experiment.experiment import build
@@ -110,7 +109,7 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
     """
     experiment = build(scenario)
     setup, data, made = experiment.setup, experiment.data, conditioned(experiment)
-    channel = made.result(made.known(Stages(), alone=False, thorough=False), Stages())
+    channel = made.result(made.known(alone=False))
     spectra, maps = channel.spectra(), channel.maps()
     variances = data.layout.scatter(radiometer(setup).diagonal())
     grid = HemisphereGrid.gauss_legendre(*BEAM_NODES)

@@ -18,7 +18,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from lusee_bayes.core.checks import counted
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import read_text
 from lusee_bayes.core.version import __version__, printable
@@ -117,18 +116,15 @@ def render_run(template: str, path: Path, run: Mapping[str, Any], **context: Any
     Raises
     ------
     InputError
-        As in :func:`render`; if seconds or versions are missing, or the scenario.
+        As in :func:`render`; if the scenario is missing.
     """
     folder = path.parent
     scenario = read_text(folder / "scenario.yaml", "a scenario")
-    for name in ("seconds", "versions"):
-        if not isinstance(run.get(name), dict):
-            raise InputError(f"the figures of the run in '{folder}' have no {name}; make it again")
     return render(
         template,
         folder,
         run=run,
-        doubts=sentences(path, run, "doubts"),
+        doubts=run.get("doubts", ()),
         provenance=Provenance.read(folder),
         version=__version__,
         scenario=scenario,
@@ -136,17 +132,3 @@ def render_run(template: str, path: Path, run: Mapping[str, Any], **context: Any
         bytes_of={file.name: file.stat().st_size for file in folder.iterdir() if file.is_file()},
         **context,
     )
-
-
-def sentences(path: Path, found: Mapping[str, Any], name: str) -> list[str]:
-    """Sentences of a run's figures; none if they do not have them.
-
-    Raises
-    ------
-    InputError
-        If it is no list of texts.
-    """
-    told = found.get(name, [])
-    if not isinstance(told, list) or not all(isinstance(text, str) for text in told):
-        raise InputError(f"{path}: {name} is no list of texts; make the results anew")
-    return told

@@ -242,9 +242,9 @@ class Conditioned:
             "covariance_kept": self.experiment.scenario.output.covariance,
         }
 
-    def result(self, known: ChannelData, stages: Stages) -> ChannelResult:
+    def result(self, known: ChannelData, stages: Stages | None = None) -> ChannelResult:
         """The channel's result under this posterior."""
-        with stages("standard deviations"):
+        with (stages or Stages())("standard deviations"):
             report = None
             if self.unknowns is not None:
                 mean = np.asarray(self.own.posterior.mean)
@@ -254,19 +254,21 @@ class Conditioned:
             more = {"unknowns": report, "pixels": self.pixel_std, **self.figures()}
             return channel_result(*given, self.compared(), **more)
 
-    def known(self, stages: Stages, *, alone: bool, thorough: bool) -> ChannelData:
+    def known(
+        self, stages: Stages | None = None, *, alone: bool = True, thorough: bool = False
+    ) -> ChannelData:
         """Look at these data.
 
         Parameters
         ----------
-        stages : Stages
+        stages : Stages, optional
             Told what is being done.
         alone : bool
             It is the only channel: a report shows more of it.
         thorough : bool
             Judge groups of data and try the usual mistakes even if the data fit.
         """
-        experiment, own = self.experiment, self.own
+        experiment, own, stages = self.experiment, self.own, stages or Stages()
         scenario, data, learned = experiment.scenario, experiment.data, experiment.learned
         fluxes, pointing, diagnosis, left, judged = None, None, None, None, None
         if experiment.setup.responses and scenario.sources.treatment != "ignored":

@@ -156,7 +156,7 @@ def _under(name: str, setup: Setup, experiment: Experiment, information: Informa
         setup, evidence = replace(setup, prior=learned.prior), learned.log_evidence
     mapped = replace(experiment, setup=setup, learned=learned)
     made = conditioned(mapped)
-    channel = made.result(made.known(Stages(), alone=False, thorough=False), Stages())
+    channel = made.result(made.known(alone=False))
     model, posterior = made.own.model, made.own.posterior
     return UnderPrior(
         name,
