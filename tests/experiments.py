@@ -17,8 +17,18 @@ from lusee_bayes.experiment.experiment import Experiment, build, program_pieces
 from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.sampling.hmc import WHITE_SUFFIX, whitened
-from lusee_bayes.sampling.programs import Program, latent_sites, numpyro_promotion
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.results.channel import ChannelResult
+from lusee_bayes.results.channel_map import Conditioned, conditioned
+from lusee_bayes.results.map_files import SavedInformation
+from lusee_bayes.sampling.hmc import whitened
+from lusee_bayes.sampling.programs import (
+    WHITE_SUFFIX,
+    Program,
+    latent_sites,
+    numpyro_promotion,
+)
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -45,6 +55,24 @@ def four_ports(response: Path, *overrides: str) -> Scenario:
     noise = ["noise.radiometer.bandwidth_hz=1e5", "prior={model: isotropic, spectrum: sky}"]
     beam = [f"beam.file={response}", "beam.moon_temperature_k=250"]
     return load_scenario("fiducial", [*plain, *noise, *beam, *overrides])
+
+
+def mapped(
+    experiment: Experiment, earlier: SavedInformation | None = None, *, thorough: bool = False
+) -> tuple[Conditioned, ChannelResult]:
+    """What a map run finds of one frequency, without its folder."""
+    made = conditioned(experiment, earlier)
+    return made, made.result(made.known(thorough=thorough))
+
+
+def of_run(data: Visibilities, run: int) -> Visibilities:
+    """The data of one run by themselves."""
+    keep = data.observation.run == run
+    observation = data.observation.select(keep)
+    flat = jnp.asarray(data.grid()[:, keep].ravel())
+    return replace(
+        data, data=flat, layout=DataLayout(16, observation.n_times), observation=observation
+    )
 
 
 def program_arguments(program: Program, experiment: Experiment) -> dict[str, Any]:

@@ -117,6 +117,9 @@ N_STRIPS, FEW_ROWS = 8, 64
 # rows of a lower triangle that are mirrored at once
 MIRRORED = 128
 
+# of the largest row of a matrix, what combinations of a few of its rows may miss
+SPANNED = 1e-12
+
 # largest triangle that is inverted by substitution
 MAX_SUBSTITUTED = 160
 
@@ -301,6 +304,44 @@ def inverse_from_cholesky(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return _from_strips(
         [x[first:, first:end].T @ x[first:, :end] for first, end in _strips(x.shape[0])]
     )
+
+
+def spanning_rows(
+    matrix: Float[np.ndarray, "rows columns"], kind: np.ndarray, most: int
+) -> tuple[np.ndarray, Float[np.ndarray, "rows few"]] | None:
+    """Find few rows of a matrix that all of its rows are combinations of.
+
+    Parameters
+    ----------
+    matrix : (rows, columns) array
+    kind : (rows,) array
+        Rows are combined with those of their kind only.
+    most : int
+        More rows are not looked for.
+
+    Returns
+    -------
+    (few,) array of int
+        Which rows; or None, in place of both, where more would be needed.
+    (rows, few) array
+        Factors: the product with the few rows is the matrix, to ``SPANNED`` of its largest row.
+    """
+    # rows of fewer numbers, with the same products
+    rest = np.linalg.qr(matrix.T, mode="r").T.copy()
+    picked, along = [], []
+    squares = (rest**2).sum(axis=1)
+    least = SPANNED**2 * squares.max()
+    while squares.max() > least:
+        if len(picked) == most:
+            return None
+        k = int(squares.argmax())
+        unit = rest[k] / np.sqrt(squares[k])
+        along.append(np.where(kind == kind[k], rest @ unit, 0.0))
+        picked.append(k)
+        rest -= along[-1][:, None] * unit
+        squares = (rest**2).sum(axis=1)
+    coordinates = np.stack(along, axis=1)
+    return np.array(picked), np.linalg.solve(coordinates[picked].T, coordinates.T).T
 
 
 def mirrored(lower: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:

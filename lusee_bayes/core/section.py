@@ -8,6 +8,7 @@ from functools import reduce
 from operator import or_
 from typing import Annotated, Any, Literal, TypeVar
 
+from docstring_parser import DocstringStyle, parse
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from lusee_bayes.core.files import user_path
@@ -30,7 +31,8 @@ def _not_hz(value: Any) -> Any:
 
 # what is smaller or larger has no meaning here, and its powers no room in 64 bits
 SMALLEST, LARGEST = 1e-30, 1e30
-Positive = Annotated[float, Field(gt=0, le=LARGEST), AfterValidator(_not_tiny)]
+NOT_TINY = AfterValidator(_not_tiny)
+Positive = Annotated[float, Field(gt=0, le=LARGEST), NOT_TINY]
 Temperature = Annotated[float, Field(ge=0, le=1e6)]
 Angle = Annotated[float, Field(ge=-3600, le=3600)]
 # of random numbers; channels have one each, so that some room is left below 64 bits
@@ -47,13 +49,31 @@ Treatment = Literal["marginalised", "sampled", "ignored"]
 FILES = ("clock", "file", "gain_table", "lines", "mean_file", "schedule", "spectrum_file")
 
 
+def _described(schema: dict[str, Any], section: type[BaseModel]) -> None:
+    """Give the entries of a JSON schema the meanings that docstrings of the section have."""
+    for cls in reversed(section.__mro__):
+        if not issubclass(cls, Section) or cls is Section:
+            continue
+        docstring = parse(cls.__doc__ or "", style=DocstringStyle.NUMPYDOC)
+        schema["description"] = docstring.short_description
+        for entry in docstring.params:
+            meaning = " ".join((entry.description or "").split()).rstrip(".").replace("``", "`")
+            schema["properties"][entry.arg_name]["description"] = meaning
+
+
 class Section(BaseModel):
     """Part of a scenario: no key that is not declared, no NaN, nothing changed once made.
 
     Types are strict: no text for numbers, no ``true`` for 1, no 12.0 for 12.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        strict=True,
+        json_schema_extra=_described,
+    )
 
     def anchored(self: S) -> S:
         """The same with absolute names of files, which are then the same in any folder."""

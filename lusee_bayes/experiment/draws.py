@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
@@ -10,12 +12,12 @@ from lusee_bayes.core.arrays import Draws, on_host
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.judge.coverage import N_DRAWS
+from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.learning import draws_with_parameters
 
-# what the seed is folded with for posterior draws, and for those that coverage is compared with
-DRAWS, COMPARED = 1, 8
+# what the seed is folded with for posterior draws
+DRAWS = 1
 
 
 def draw_key(scenario: Scenario) -> PRNGKeyArray:
@@ -24,7 +26,7 @@ def draw_key(scenario: Scenario) -> PRNGKeyArray:
 
 
 def posterior_draws(
-    experiment: Experiment, posterior: Posterior, n: int, purpose: int = DRAWS
+    experiment: Experiment, posterior: Posterior, information: Callable[[], Information], n: int
 ) -> Draws:
     """Draw the sky.
 
@@ -36,26 +38,20 @@ def posterior_draws(
     experiment : Experiment
     posterior : Posterior
         The Gaussian posterior.
+    information : callable
+        ``information()`` of the data behind it, asked for where parameters are drawn.
     n : int
-    purpose : int
-        What the seed is folded with.
 
     Returns
     -------
     (draws, modes) array
         In K.
     """
-    key = jax.random.fold_in(jax.random.key(experiment.scenario.seed), purpose)
-    if experiment.learned is not None and experiment.learned.fits:
+    key, learned = draw_key(experiment.scenario), experiment.learned
+    if learned is not None and learned.fits:
         family = experiment.setup.family
-        return draws_with_parameters(family, experiment.learned, posterior, key, n)
+        return draws_with_parameters(family, learned, information(), key, n)
     return np.asarray(on_host(posterior).sample(key, n))
-
-
-def deviations(experiment: Experiment, posterior: Posterior, n: int = N_DRAWS) -> Draws:
-    """Draws of a posterior less its mean, in K, that coverage is compared with."""
-    draws = posterior_draws(experiment, posterior, n, COMPARED)
-    return draws - np.asarray(posterior.mean)
 
 
 def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
-from lusee_bayes.experiment.model import model_about, model_to_sample, radiometer, simulate
+from lusee_bayes.experiment.model import model_to_sample, radiometer, simulate
 from lusee_bayes.experiment.rounds import (
     Inference,
     rebuilds,
@@ -60,6 +60,8 @@ class Experiment(Described):
         Of flight data: the times that did not fit and are left out; None for other data.
     around : Around or None
         What N was built around when the prior was learned, in rounds; None for the data alone.
+    information : Information or None
+        What the data say of the sky, where the prior was learned from it.
     """
 
     setup: Setup
@@ -68,6 +70,7 @@ class Experiment(Described):
     learned: Learned | None = None
     fitting: Fitting | None = None
     around: Around | None = None
+    information: Information | None = None
 
     def description(self) -> tuple[str, ...]:
         scenario = self.scenario
@@ -83,7 +86,11 @@ class Experiment(Described):
 
 
 def build(
-    scenario: Scenario, data: Visibilities | None = None, stages: Stages | None = None
+    scenario: Scenario,
+    data: Visibilities | None = None,
+    stages: Stages | None = None,
+    *,
+    earlier: Information | None = None,
 ) -> Experiment:
     """Build the experiment of a scenario, with the prior that its data tell.
 
@@ -96,6 +103,8 @@ def build(
         cut, or filled with zeros.
     stages : Stages, optional
         Told what is being done.
+    earlier : Information, optional
+        Of earlier data, which the prior learns from, too.
 
     Raises
     ------
@@ -104,7 +113,7 @@ def build(
         gives (:func:`.require_plausible`), and for a prior that does not settle.
     """
     stages = stages or Stages()
-    return _learned(_fitting(observed(scenario, data, stages), stages), stages)
+    return _learned(_fitting(observed(scenario, data, stages), stages), stages, earlier)
 
 
 @contextmanager
@@ -180,12 +189,16 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
     return replace(experiment, setup=setup, data=kept, doubts=doubts, fitting=found)
 
 
-def _learned(experiment: Experiment, stages: Stages) -> Experiment:
+def _learned(
+    experiment: Experiment, stages: Stages, earlier: Information | None = None
+) -> Experiment:
     if experiment.setup.family is None:
         return experiment
     with stages("prior"):
-        setup, learned, around = with_learned_prior(experiment.setup, experiment.data)
-    return replace(experiment, setup=setup, learned=learned, around=around)
+        setup, learned, around, known = with_learned_prior(
+            experiment.setup, experiment.data, earlier
+        )
+    return replace(experiment, setup=setup, learned=learned, around=around, information=known)
 
 
 def with_truth(experiment: Experiment) -> Experiment:
@@ -231,28 +244,7 @@ def infer(experiment: Experiment) -> Inference:
     InputError
         As :func:`.settled`.
     """
-    return settled(experiment.setup, experiment.data, experiment.around)
-
-
-def inform(experiment: Experiment) -> tuple[Information, Inference]:
-    """What the data say of the sky as a quadratic form, and the posterior that it gives.
-
-    Parameters
-    ----------
-    experiment : Experiment
-
-    Raises
-    ------
-    InputError
-        As :func:`infer`.
-    """
-    if rebuilds(experiment.setup):
-        found = infer(experiment)
-    else:
-        around = Around(experiment.data)
-        found = Inference(*model_about(experiment.setup, around), None, 1, around)
-    information, posterior = found.model.inform(experiment.data.data)
-    return information, replace(found, posterior=posterior)
+    return settled(experiment.setup, experiment.data, experiment.around, experiment.information)
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:

@@ -15,14 +15,11 @@ fits no data; so before much is flagged, higher ones are tried.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Grid, GridFlags, TimeFlags, Vector, on_host
-from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.lazy import special
@@ -32,8 +29,7 @@ from lusee_bayes.experiment.rounds import model_about, rebuilds, settled
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.judge.left_out import DenseLeftOut, Missed
-from lusee_bayes.judge.residuals import HOURS_A_DAY
+from lusee_bayes.judge.left_out import DataGroup, LeftOut, Missed, groups_of
 from lusee_bayes.judge.split import WIDER, Split
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
@@ -45,22 +41,6 @@ WORST = 0.3
 ARRAYS, MOST_MEMORY = 5, 0.5
 
 
-class ComparedGroup(NamedTuple):
-    """A product or a day.
-
-    Attributes
-    ----------
-    kind : {"product", "day"}
-    name : str
-    data : (products, times) array of bool
-        Which data it has.
-    """
-
-    kind: str
-    name: str
-    data: GridFlags
-
-
 @dataclass(frozen=True)
 class GroupsCompared:
     """Times and data against their prediction by all others.
@@ -69,7 +49,7 @@ class GroupsCompared:
     ----------
     data : Visibilities
         With the times and the labels; which of them are compared, ``left_out`` knows.
-    left_out : DenseLeftOut
+    left_out : LeftOut
     chi2, degrees : (times,) arrays
         Of each time, and its mean; 0 where there is nothing to compare with.
     z : (products, times) array
@@ -77,23 +57,22 @@ class GroupsCompared:
     """
 
     data: Visibilities
-    left_out: DenseLeftOut
+    left_out: LeftOut
     chi2: Float[np.ndarray, " times"]
     degrees: Float[np.ndarray, " times"]
     z: Grid
 
     @classmethod
-    def of(cls, left_out: DenseLeftOut, data: Visibilities) -> GroupsCompared:
+    def of(cls, left_out: LeftOut, data: Visibilities) -> GroupsCompared:
         """Leave out every time, one after the other."""
-        layout, n = left_out.layout, data.layout.n_times
-        counts = np.bincount(layout.time, minlength=n)
-        some, times = np.flatnonzero(counts), np.arange(n)
-        missed = in_threads(lambda k: left_out.stretch(times == k), some.tolist())
-        chi2, degrees = np.zeros(n), np.zeros(n)
-        chi2[some], degrees[some] = _judged(missed, counts[some])
+        present, times = left_out.present, np.arange(data.layout.n_times)
+        some = np.flatnonzero(present.any(axis=0))
+        of_time = [np.broadcast_to(times == k, present.shape) for k in some]
+        chi2, degrees = np.zeros((2, len(times)))
+        chi2[some], degrees[some] = _judged(left_out.each(of_time))
         with np.errstate(invalid="ignore"):
             z = left_out.u / np.sqrt(left_out.inverse_diagonal)
-        known = np.asarray(layout.present) & np.isfinite(z) & (degrees > 0.0)
+        known = present & np.isfinite(z) & (degrees > 0.0)
         return cls(data, left_out, chi2, degrees, np.where(known, z, 0.0))
 
     def without(self, gone: GridFlags) -> GroupsCompared:
@@ -139,7 +118,7 @@ class GroupsCompared:
         found[product[alone], np.flatnonzero(alone)] = True
         return found
 
-    def worst_group(self, false_alarm: float) -> ComparedGroup | None:
+    def worst_group(self, false_alarm: float) -> DataGroup | None:
         """Find the product or day that stands out and without which chi^2 falls most.
 
         Parameters
@@ -149,39 +128,28 @@ class GroupsCompared:
 
         Returns
         -------
-        ComparedGroup or None
+        DataGroup or None
             None if none stands out.
         """
-        left_out = self.left_out
-        layout = left_out.layout
-        shape = (layout.n_products, layout.n_times)
-        day = np.floor(self.data.observation.hours / HOURS_A_DAY).astype(int)
-        groups, leave = [], []
-        for number in np.unique(layout.product).tolist():
-            mine = np.arange(shape[0])[:, None] == number
-            name, mine = self.data.labels[number], np.broadcast_to(mine, shape)
-            groups.append(ComparedGroup("product", name, mine))
-            leave.append(partial(left_out.product, number))
-        for number in np.unique(day[layout.time]).tolist():
-            mine = np.broadcast_to(day == number, shape)
-            groups.append(ComparedGroup("day", str(number), mine))
-            leave.append(partial(left_out.stretch, day == number))
-        present = np.asarray(layout.present)
-        counts = np.array([int((group.data & present).sum()) for group in groups])
+        present = self.left_out.present
         # one that holds all data has nothing to be compared with
-        some = np.flatnonzero(counts < layout.size)
-        missed: list[Missed] = in_threads(lambda k: leave[k](), some.tolist())
-        chi2, degrees = _judged(missed, counts[some])
+        groups = [
+            group
+            for group in groups_of(self.data)
+            if group.kind in ("product", "day")
+            and (group.data & present).any()
+            and (present & ~group.data).any()
+        ]
+        chi2, degrees = _judged(self.left_out.each([group.data for group in groups]))
         out = _tail(chi2, degrees) < false_alarm
         if not out.any():
             return None
-        return groups[some[np.where(out, chi2 - degrees, -np.inf).argmax()]]
+        return groups[np.where(out, chi2 - degrees, -np.inf).argmax()]
 
 
-def _judged(missed: list[Missed], counts: Int[np.ndarray, " n"]) -> tuple[Vector, Vector]:
+def _judged(missed: list[Missed]) -> tuple[Vector, Vector]:
     """chi^2 of groups and its means; 0 where the others tell less than half a datum."""
-    chi2, new = np.array([(m.chi2, m.directions) for m in missed]).reshape(-1, 2).T
-    degrees = counts - np.clip(new, 0.0, counts)
+    chi2, degrees = np.reshape([(one.chi2, one.degrees) for one in missed], (-1, 2)).T
     told = np.isfinite(chi2) & (degrees >= 0.5)
     return np.where(told, chi2, 0.0), np.where(told, degrees, 0.0)
 
@@ -219,11 +187,12 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
         return None
     if settle:
         model, posterior = on_host(_conditioned(setup, data))
-        prior = Split.of(posterior, 0.0, model.n_data).wide.prior
+        wide = Split.of(posterior, 0.0, model.n_data).wide
+        prior = wide.prior
     else:
-        model = on_host(model_about(setup, Around(data))[0])
+        model, wide = on_host(model_about(setup, Around(data))[0]), None
         prior = model.prior.widened(WIDER)
-    left_out = DenseLeftOut(replace(model, prior=prior), data.data, data.layout)
+    left_out = LeftOut(replace(model, prior=prior), data.data, data.layout, posterior=wide)
     return GroupsCompared.of(left_out, data)
 
 
@@ -285,7 +254,7 @@ class Fitting:
     rounds: int
     chi2: Float[np.ndarray, " times"]
     remark: str = ""
-    groups: tuple[ComparedGroup, ...] = ()
+    groups: tuple[DataGroup, ...] = ()
     share: float = 0.0
     refused: bool = False
     cause: str = ""
@@ -465,7 +434,7 @@ def _one_by_one(
 
 def _eliminated(
     start: GroupsCompared, gone: GridFlags, limits: _Limits, false_alarm: float
-) -> tuple[tuple[GridFlags, tuple[ComparedGroup, ...]] | None, str]:
+) -> tuple[tuple[GridFlags, tuple[DataGroup, ...]] | None, str]:
     """What goes under one model, besides what is ``gone``; None if that is too much.
 
     And what is to be said of an auto that cannot go.
@@ -502,7 +471,7 @@ def _about_auto(port: int | None) -> str:
 
 
 def _remark(
-    gone: GridFlags, groups: tuple[ComparedGroup, ...], share: float, false_alarm: float
+    gone: GridFlags, groups: tuple[DataGroup, ...], share: float, false_alarm: float
 ) -> str:
     single = gone & ~np.any([np.zeros_like(gone), *(group.data for group in groups)], axis=0)
     whole = gone.all(axis=0) & single.any(axis=0)

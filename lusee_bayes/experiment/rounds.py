@@ -74,6 +74,8 @@ class Inference:
         What it was built around.
     unsettled : str
         A sentence if the map still moves from round to round; empty otherwise.
+    information : Information or None
+        What the data say of the sky, where the posterior was found through it.
     """
 
     model: LinearGaussian
@@ -82,6 +84,7 @@ class Inference:
     rounds: int
     around: Around
     unsettled: str = ""
+    information: Information | None = None
 
     @property
     def expanded(self) -> tuple[Expanded, ...]:
@@ -99,7 +102,12 @@ class Inference:
         return next((s for s in self.expanded if isinstance(s.systematic, PointingOffsets)), None)
 
 
-def settled(setup: Setup, data: Visibilities, start: Around | None = None) -> Inference:
+def settled(
+    setup: Setup,
+    data: Visibilities,
+    start: Around | None = None,
+    known: Information | None = None,
+) -> Inference:
     """Condition the model on data, in as many rounds as its N needs.
 
     One round, unless a term of N is built around what the data tell: the gains around the
@@ -114,6 +122,8 @@ def settled(setup: Setup, data: Visibilities, start: Around | None = None) -> In
     data : Visibilities
     start : Around, optional
         What N is built around in the first round; by default the data.
+    known : Information, optional
+        Of the data, where N is built once.
 
     Returns
     -------
@@ -128,7 +138,12 @@ def settled(setup: Setup, data: Visibilities, start: Around | None = None) -> In
 
     def conditioned(around: Around, rounds: int) -> Inference:
         model, found = model_about(setup, around)
-        return Inference(model, found, model.condition(data.data), rounds, around)
+        information, posterior = None, None
+        if model.is_structured:
+            information, posterior = model.inform(data.data, known)
+        else:
+            posterior = model.condition(data.data)
+        return Inference(model, found, posterior, rounds, around, information=information)
 
     found = conditioned(start or _start(setup, data), 1)
     if not rebuilds(setup):
@@ -290,7 +305,9 @@ PRIOR_SETTLED, MAX_PRIOR_ROUNDS = 0.05, 8
 COARSE_LMAX = 24
 
 
-def with_learned_prior(setup: Setup, data: Visibilities) -> tuple[Setup, Learned, Around | None]:
+def with_learned_prior(
+    setup: Setup, data: Visibilities, earlier: Information | None = None
+) -> tuple[Setup, Learned, Around | None, Information | None]:
     """Learn the prior from data.
 
     Systematics are in N as far as they are marginalised. Where N is built around what the data
@@ -302,6 +319,8 @@ def with_learned_prior(setup: Setup, data: Visibilities) -> tuple[Setup, Learned
     setup : Setup
         With a family of priors.
     data : Visibilities
+    earlier : Information, optional
+        Of earlier data, which are learned from, too.
 
     Returns
     -------
@@ -311,21 +330,25 @@ def with_learned_prior(setup: Setup, data: Visibilities) -> tuple[Setup, Learned
         How it was learned.
     Around or None
         What N was built around in the last round; None where that is the data alone.
+    Information or None
+        Of these data, where N is built once.
     """
     if not rebuilds(setup):
-        learned = learned_prior(setup, setup.family, about_sky(setup, data))
-        return replace(setup, prior=learned.prior), learned, None
+        information = about_sky(setup, data)
+        learned = learned_prior(setup, setup.family, _with_more(information, earlier))
+        return replace(setup, prior=learned.prior), learned, None, information
     learned, before, found = None, None, settled(setup, data)
     for _ in range(MAX_PRIOR_ROUNDS):
-        information = full_model(setup, found.around).inform(data.data)[0]
+        own = full_model(setup, found.around).inform(data.data)[0]
+        information = _with_more(own, earlier)
         start = None if learned is None or not learned.settled else learned.parameters
         learned = learned_prior(setup, setup.family, information, start)
         setup = replace(setup, prior=learned.prior)
         before, found = found, settled(setup, data, found.around)
         moved = float(found.posterior.rms_shift_from(before.posterior))
         if moved < PRIOR_SETTLED:
-            return setup, learned, found.around
-    return setup, replace(learned, still_moves=moved), found.around
+            return setup, learned, found.around, None
+    return setup, replace(learned, still_moves=moved), found.around, None
 
 
 def about_sky(setup: Setup, data: Visibilities) -> Information:
@@ -335,6 +358,10 @@ def about_sky(setup: Setup, data: Visibilities) -> Information:
     """
     around = settled(setup, data).around if rebuilds(setup) else Around(data)
     return full_model(setup, around).inform(data.data)[0]
+
+
+def _with_more(information: Information, earlier: Information | None) -> Information:
+    return information if earlier is None else information + earlier
 
 
 def learned_prior(

@@ -156,13 +156,13 @@ class OutputSection(Section):
         Number of posterior draws ``posterior.nc`` keeps.
     covariance : bool
         Keep the posterior covariance in ``posterior.nc``.
-    updatable : bool
-        Keep in ``posterior.nc`` what new data need to be added later.
+    information : bool
+        Keep in ``posterior.nc`` what the data say of the sky, so that new data can be added later.
     """
 
     draws: Annotated[int, Field(ge=0)] = 0
     covariance: bool = False
-    updatable: bool = False
+    information: bool = False
 
 
 class Scenario(Section):
@@ -303,6 +303,11 @@ class Scenario(Section):
         """The scenario with some values of a section changed."""
         section = getattr(self, name).model_copy(update=values)
         return self.model_copy(update={name: section})
+
+    @property
+    def single(self) -> bool:
+        """Whether it is of one frequency."""
+        return not self.frequencies_mhz
 
     def channels(self) -> tuple[Scenario, ...]:
         """The scenario of every channel; draws of each have a seed of their own, one further."""

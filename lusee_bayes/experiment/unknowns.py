@@ -28,7 +28,6 @@ from lusee_bayes.experiment.model import base_model, radiometer, true_values
 from lusee_bayes.experiment.rounds import Inference, offset_posterior
 from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
-from lusee_bayes.judge.residuals import HOURS_A_DAY
 from lusee_bayes.linear.amplitudes import (
     Amplitudes,
     AmplitudesOfSky,
@@ -399,7 +398,7 @@ def _preferred(
     offsets = PointingOffsets.of(there, steps, centre)
     about = Expanded.about(offsets, on_host(base_model(setup)), sky, centre)
     per_unit = np.asarray(about.columns) / offsets.stds
-    day = np.floor(setup.observation.hours / HOURS_A_DAY).astype(int)
+    day = setup.observation.day
     length = -(-(int(day.max()) + 1) // MOST_STRETCHES)
     stretches = np.unique(day // length)
     rows, columns = [], []

@@ -450,6 +450,22 @@ class CouplingMatrix(Coupling):
             blocks.append(self._block(run, times)[product[here], position])
         return namespace(*blocks).concatenate(blocks)[np.argsort(np.concatenate(places))]
 
+    def time_features(self, times: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n features"]:
+        """Return all that rows of A know of time: of one run they are linear in these numbers.
+
+        Parameters
+        ----------
+        times : (n,) array of int
+
+        Returns
+        -------
+        (n, features) array
+            cos m phi(t) and sin m phi(t) times every u_j(t).
+        """
+        angle = self.pointing.azimuth[times, None] * np.arange(self.lmax + 1.0)
+        waves = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+        return (self.pointing.functions[times][:, :, None] * waves[:, None]).reshape(len(times), -1)
+
     @compiled
     def _matrix(self) -> Float[Array, "data modes"]:
         """96 MB for 5232 x 2304."""

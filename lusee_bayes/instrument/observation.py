@@ -309,6 +309,11 @@ class Observation(Described):
             tdb = self.times.tdb
         return (tdb - tdb[0]).to_value(u.hour)
 
+    @property
+    def day(self) -> Int[np.ndarray, " times"]:
+        """Number of the day of 24 hours since the first sample."""
+        return np.floor(self.hours / 24.0).astype(int)
+
     @cached_property
     def mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
         """The rotations that take Galactic unit vectors to MCMF ones at every time."""

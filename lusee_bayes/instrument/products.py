@@ -401,7 +401,7 @@ class DataLayout(Described, eqx.Module):
                 "both terms for the same observation and flags"
             )
 
-    def gather(self, grid: Float[Array, "products times *rest"]) -> Float[Array, "data *rest"]:
+    def gather(self, grid: Shaped[Array, "products times *rest"]) -> Shaped[Array, "data *rest"]:
         """Return the entries of d, with any trailing axes, of a full grid."""
         flat = grid.reshape(self.n_products * self.n_times, *grid.shape[2:])
         return flat if self.index is None else flat[self.index]

@@ -16,33 +16,20 @@ that predicts too much is punished as one that predicts too little is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Int
 
 from lusee_bayes.core.arrays import DataVector, on_host
-from lusee_bayes.core.engine import in_threads
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.chi2 import ChiSquare, Fit, Level, probability, stands_out, two_sided
-from lusee_bayes.judge.left_out import (
-    NOT_TOLD,
-    DenseLeftOut,
-    LeftOut,
-    Missed,
-    StructuredLeftOut,
-    base_and_templates,
-)
+from lusee_bayes.judge.left_out import KINDS, DataGroup, LeftOut, Missed, groups_of
 from lusee_bayes.judge.split import Split, with_sky
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 
-# a larger A is not formed, and its groups of data are not judged: 60,000 data at lmax 47
-DENSE_BYTES = 1.2e9
 # groups that stand out and are named in a sentence
 NAMED = 4
-HOURS_A_DAY = 24.0
 # of a prior that the sky is unlike
 TOO_WIDE = (
     "The prior is wider than the sky needs: where the sky is weaker than it expects, error bars "
@@ -98,7 +85,7 @@ class Residuals:
         chi^2 of all data: what no sky explains, and what the prior does not expect.
     products, days, angles : tuple of Group
         The data of every product, day and turntable angle; none where they are not judged, since
-        noise that couples times would need an A of more than ``DENSE_BYTES``.
+        noise that couples times would need too large an A (:meth:`.LeftOut.of`).
     """
 
     predicted: DataVector
@@ -110,7 +97,7 @@ class Residuals:
 
     def kinds(self) -> tuple[tuple[str, tuple[Group, ...]], ...]:
         """The groups by kind, each with the kind's name."""
-        return (("product", self.products), ("day", self.days), ("turntable angle", self.angles))
+        return tuple(zip(KINDS, (self.products, self.days, self.angles), strict=True))
 
     def compared(self) -> list[tuple[str, Group]]:
         """The groups that others predict, with their kinds."""
@@ -243,74 +230,30 @@ def residuals(
     InputError
         If the model cannot be factorised.
     """
-    model = on_host(model)
-    layout, observation, n_data = data.layout, data.observation, model.n_data
+    model, layout = on_host(model), data.layout
     predicted = np.asarray(model.predict(posterior.mean))
-    split = Split.of(posterior, chi2, n_data)
+    split = Split.of(posterior, chi2, model.n_data)
     wide = replace(model, prior=split.wide.prior)
-    left_out = leave_out(wide, split.wide, data)
+    left_out = LeftOut.of(wide, data, split.wide)
     if left_out is None:
-        return Residuals(predicted, np.full(n_data, np.nan), split, (), (), ())
-    day = np.floor(observation.hours / HOURS_A_DAY).astype(int)
-    angles, angle_of_run = np.unique(observation.turntable_deg, return_inverse=True)
-    angle, whole = angle_of_run[observation.run], split.instrument
+        return Residuals(predicted, np.full(model.n_data, np.nan), split, (), (), ())
+    whole = split.instrument
 
-    def group(name: str, n: int, missed: Missed) -> Group:
-        if n == n_data:
-            return Group(name, n, whole.degrees, whole.chi2, whole.p, np.nan)
-        # random directions tell the number of those in the sky: it may come out a little beyond
-        degrees = n - with_sky(float(np.clip(missed.directions, 0.0, n)))
+    def judged(group: DataGroup, missed: Missed) -> Group:
+        n = missed.n
+        if n == model.n_data:
+            return Group(group.name, n, whole.degrees, whole.chi2, whole.p, np.nan)
+        degrees = n - with_sky(n - missed.degrees)
         others = ChiSquare(whole.chi2 - missed.chi2, whole.degrees - degrees)
-        return Group(name, n, degrees, missed.chi2, two_sided(missed.chi2, degrees), others.p)
+        p = two_sided(missed.chi2, degrees)
+        return Group(group.name, n, degrees, missed.chi2, p, others.p)
 
-    def groups(
-        names: Sequence[str],
-        number: Int[np.ndarray, " data"],
-        leave: Callable[[int], Missed],
-        *,
-        always: bool = False,
-    ) -> tuple[Group, ...]:
-        """Of those that have data; one that has all of them is left out only if ``always``."""
-        counts = np.bincount(number, minlength=len(names))
-        some = np.flatnonzero(counts).tolist()
-        missed = in_threads(lambda k: leave(k) if always or counts[k] < n_data else NOT_TOLD, some)
-        return tuple(group(names[k], int(counts[k]), x) for k, x in zip(some, missed, strict=True))
-
-    products = groups(data.labels, layout.product, left_out.product)
-    # every day is left out, even if there is but one: that gives each datum's own variance
-    names = [str(k) for k in range(day.max() + 1)]
-    days = groups(names, day[layout.time], lambda k: left_out.stretch(day == k), always=True)
-    names = [f"{value:g}" for value in angles]
-    of_angles = groups(names, angle[layout.time], lambda k: left_out.together(angle == k))
-    u = left_out.u[layout.product, layout.time]
-    z = u / np.sqrt(left_out.inverse_diagonal[layout.product, layout.time])
-    return Residuals(predicted, z, split, products, days, of_angles)
-
-
-def leave_out(model: LinearGaussian, posterior: Posterior, data: Visibilities) -> LeftOut | None:
-    """Choose how groups are left out: through the structure of A, or dense.
-
-    Parameters
-    ----------
-    model : LinearGaussian
-        Of these data.
-    posterior : Posterior
-        Of the model, given these data.
-    data : Visibilities
-        In K.
-
-    Returns
-    -------
-    LeftOut or None
-        None if A would be needed and be larger than ``DENSE_BYTES``.
-    """
-    within_times = base_and_templates(model.noise)[0].time_weights(data.layout) is not None
-    of_modes = posterior.basis is None and model.prior.invertible
-    if model.coupling.has_time_structure and within_times and of_modes:
-        return StructuredLeftOut(model, posterior, data.data)
-    if 8 * model.n_data * model.prior.size > DENSE_BYTES:
-        return None
-    return DenseLeftOut(model, data.data, data.layout)
+    found: dict[str, list[Group]] = {kind: [] for kind in KINDS}
+    groups = groups_of(data)
+    for group, missed in zip(groups, left_out.each([one.data for one in groups]), strict=True):
+        found[group.kind].append(judged(group, missed))
+    z = layout.gather(left_out.u) / np.sqrt(layout.gather(left_out.inverse_diagonal))
+    return Residuals(predicted, z, split, *map(tuple, found.values()))
 
 
 @dataclass(frozen=True)
@@ -353,31 +296,20 @@ def held_out(
     -------
     tuple of HeldOut
         One for each kind that has several groups; none where noise couples times and A would be
-        too large to be formed (:func:`.leave_out`).
+        too large to be formed.
 
     Raises
     ------
     InputError
         If the model cannot be factorised.
     """
-    model, layout = on_host(model), data.layout
-    left_out = leave_out(model, posterior, data)
+    left_out = LeftOut.of(model, data, posterior)
     if left_out is None:
         return ()
-    day = np.floor(data.observation.hours / HOURS_A_DAY).astype(int)
-    found = (
-        _added("product", layout.product, left_out.product),
-        _added("day", day[layout.time], lambda k: left_out.stretch(day == k)),
-    )
-    return tuple(one for one in found if one.groups > 1)
-
-
-def _added(kind: str, group: Int[np.ndarray, " data"], leave: Callable[[int], Missed]) -> HeldOut:
-    counts = np.bincount(group)
-    some = np.flatnonzero(counts).tolist()
-    if len(some) < 2:
-        return HeldOut(kind, len(some), len(group), np.nan, np.nan)
-    missed = in_threads(leave, some)
-    densities = [one.log_density(int(counts[k])) for k, one in zip(some, missed, strict=True)]
-    chi2 = sum(one.chi2 for one in missed)
-    return HeldOut(kind, len(some), len(group), float(chi2), float(sum(densities)))
+    groups, found = groups_of(data), []
+    for kind in ("product", "day"):
+        missed = left_out.each([group.data for group in groups if group.kind == kind])
+        if len(missed) > 1:
+            sums = zip(*((one.n, one.chi2, one.log_density) for one in missed), strict=True)
+            found.append(HeldOut(kind, len(missed), *map(sum, sums)))
+    return tuple(found)

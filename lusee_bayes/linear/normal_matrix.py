@@ -340,7 +340,16 @@ def summed(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> ModesMatri
         In Galactic modes; symmetric to the last bit.
     """
     xp, pointing = namespace(coupling, weights), coupling.pointing
-    runs, total = dict(pointing.runs()), 0.0
+    runs, total, beams = dict(pointing.runs()), 0.0, coupling.by_order
+    n_products = coupling.body_beams.shape[1]
+    if xp is np:
+        # products without weight, such as all but one that is left out
+        used = np.flatnonzero(weights.any(axis=-1).reshape(-1, n_products).any(axis=0))
+        if len(used) < n_products:
+            by_product = beams.reshape(*beams.shape[:2], n_products, -1, beams.shape[3])
+            beams = by_product[:, :, used].reshape(*beams.shape[:2], -1, beams.shape[3])
+            weights = weights[used] if weights.ndim == 2 else weights[used][:, used]
+            n_products = len(used)
     for group in _turntable_groups(coupling, weights):
         spans = [runs[run] for run in group]
         here = [
@@ -349,7 +358,7 @@ def summed(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> ModesMatri
         ]
         missing = -here[1].shape[0] % CHUNK
         padded = [xp.pad(x, ((0, 0),) * (x.ndim - 1) + ((0, missing),)) for x in here]
-        part = of_one_angle(coupling.by_order[group[0]], *padded, coupling.body_beams.shape[1])
+        part = of_one_angle(beams[group[0]], *padded, n_products)
         total = total + part
     turn = pointing.pole_from_galactic
     return _to_galactic(turn, total, places(len(turn.blocks) - 1))

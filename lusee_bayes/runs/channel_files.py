@@ -10,14 +10,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from pkgutil import resolve_name
-from typing import Any
+from typing import Any, TypeVar
 
-import jax
 import numpy as np
-import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
@@ -26,18 +23,17 @@ from lusee_bayes.core.engine import Engine, Tasks
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.formats import says
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.trees import from_tree, to_tree
 from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.data_files import Data, digest_of
-from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns
-from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.joint import ComponentSums, summed_information
-from lusee_bayes.results.channel import Observed
+from lusee_bayes.results.channel import ChannelData
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
+T = TypeVar("T")
 CHANNELS = "channels"
 
 
@@ -67,68 +63,31 @@ class ChannelFiles:
     def write(self, scenario: Scenario, kind: str, value: Any) -> None:
         """Write a dataclass whole or not at all."""
         with replacing(self.path(scenario, kind)) as partial:
-            dataset = to_dataset(value).assign_attrs(identity=self.identity)
-            dataset.to_netcdf(partial, engine="h5netcdf")
+            tree = to_tree(value)
+            tree.attrs["identity"] = self.identity
+            tree.to_netcdf(partial, engine="h5netcdf")
 
-    def read(self, scenario: Scenario, kind: str) -> Any:
-        """Read what was written."""
-        with xr.open_dataset(self.path(scenario, kind), engine="h5netcdf") as file:
-            return from_dataset(file)
+    def read(self, scenario: Scenario, kind: str, of: type[T], part: str = "/") -> T:
+        """Read what was written, or a part of it by its path."""
+        path = self.path(scenario, kind)
+        with xr.open_datatree(path, engine="h5netcdf") as tree:
+            return from_tree(of, tree[part], str(path))
 
     def arrays(self, scenario: Scenario, kind: str, *names: str) -> list[np.ndarray]:
-        """Read some arrays of it, each named as ``Class.field``."""
-        with xr.open_dataset(self.path(scenario, kind), engine="h5netcdf") as file:
-            return [np.asarray(file[name]) for name in names]
+        """Read some arrays of it, by their paths."""
+        with xr.open_datatree(self.path(scenario, kind), engine="h5netcdf") as tree:
+            return [np.asarray(tree[name]) for name in names]
 
 
-def to_dataset(value: Any) -> xr.Dataset:
-    """Lay out a dataclass of arrays, tables, other dataclasses, and what JSON holds.
-
-    Arrays are variables named as ``Class.field``; a class that has some occurs once. The rest is
-    one attribute.
-    """
-    arrays = {}
-
-    def outlined(part: Any) -> dict[str, Any]:
-        if isinstance(part, pd.DataFrame):
-            return {"rows": part.to_dict("records")}
-        kind = type(part)
-        found = {"class": f"{kind.__module__}:{kind.__name__}"}
-        for field in fields(part):
-            found[field.name] = inner = getattr(part, field.name)
-            if isinstance(inner, (np.ndarray, jax.Array)):
-                name = f"{kind.__name__}.{field.name}"
-                arrays[name] = [f"{name}.{axis}" for axis in range(inner.ndim)], np.asarray(inner)
-                found[field.name] = {"array": name}
-        return found
-
-    outline = json.dumps(value, default=outlined)
-    return xr.Dataset(arrays, attrs={"outline": outline})
-
-
-def from_dataset(dataset: xr.Dataset) -> Any:
-    """The inverse of :func:`to_dataset`."""
-
-    def made(found: dict[str, Any]) -> Any:
-        if "class" in found:
-            kind = resolve_name(found.pop("class"))
-            return kind(**{k: tuple(x) if isinstance(x, list) else x for k, x in found.items()})
-        if "rows" in found:
-            return pd.DataFrame(found["rows"])
-        return np.asarray(dataset[found["array"]]) if "array" in found else found
-
-    return json.loads(dataset.attrs["outline"], object_hook=made)
-
-
-def identity_of(scenario: Scenario, data: Data | None, truth: bool, n_draws: int) -> str:
-    """Of all that the results of a run depend on: scenario, data, draws, and the package.
+def identity_of(scenario: Scenario, data: Data | None, *others: object) -> str:
+    """Of all that the results of a run depend on: scenario, data, others, and the package.
 
     Raises
     ------
     InputError
         If there are no data at the path.
     """
-    parts = [scenario.to_yaml(), str(truth), str(n_draws), __version__]
+    parts = [scenario.to_yaml(), *map(str, others), __version__]
     if data is not None:
         parts.append(digest_of(data))
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
@@ -141,26 +100,17 @@ class ChannelInformation:
     Attributes
     ----------
     information : Information
-    observed : Observed
+    known : ChannelData
+    unknowns : Unknowns or None
+        Receivers, ground and gain table given the sky, where the model has them.
     sky : (modes,) array
         The scenario's model sky, in K.
     """
 
     information: Information
-    observed: Observed
-    sky: Float[np.ndarray, " modes"]
-
-    @classmethod
-    def of(
-        cls, experiment: Experiment, information: Information, inference: Inference
-    ) -> ChannelInformation:
-        """Of an experiment and what was inferred from its data."""
-        sky, posterior = np.asarray(experiment.setup.sky.modes), inference.posterior
-        chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
-        split = Split.of(posterior, chi2, inference.model.n_data)
-        unknowns = Unknowns.of(experiment, inference, information.reference)
-        observed = Observed.of(experiment, inference, split.instrument, unknowns)
-        return cls(information, observed, sky)
+    known: ChannelData
+    unknowns: Unknowns | None
+    sky: Float[np.ndarray, " mode"]
 
 
 # channels that one task adds up, one after the other
@@ -238,4 +188,4 @@ def names_of(channels: tuple[Scenario, ...]) -> str:
 
 
 def _information(files: ChannelFiles, channel: Scenario) -> Information:
-    return files.read(channel, "information").information
+    return files.read(channel, "information", Information, "information")

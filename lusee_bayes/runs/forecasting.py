@@ -12,7 +12,7 @@ import hashlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,11 +27,12 @@ from lusee_bayes.core.files import replacing
 from lusee_bayes.core.harmonics import sum_over_m
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.instrument_sections import RunSection
 from lusee_bayes.experiment.model import model_about
 from lusee_bayes.experiment.rounds import Inference
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.judge.measures import effective_resolution_deg, prior_fraction_per_ell
@@ -134,6 +135,65 @@ def forecast(variation: Variation) -> Forecast:
         )
     except InputError as error:
         raise InputError(f"{variation.source}, {variation.name}: {error}") from error
+
+
+def variations_of(
+    sources: Sequence[str], overrides: Sequence[str], vary: Sequence[str], stages: Stages
+) -> list[Variation]:
+    """List what a plan is to forecast: every scenario as it is, and its variations.
+
+    Parameters
+    ----------
+    sources : sequence of str
+        Files or names of scenarios.
+    overrides : sequence of str
+        ``key.path=value``, for all of them.
+    vary : sequence of str
+        ``key.path=value,value,...``; without it, :func:`default_variations`.
+    stages : Stages
+        Told which of these are left out, since they cannot be observed.
+
+    Raises
+    ------
+    InputError
+        If a scenario is given twice, and as :func:`given_variations`.
+    """
+    found: list[Variation] = []
+    for number, source in enumerate(sources):
+        if source in sources[:number]:
+            raise InputError(f"the scenario '{source}' is given twice; give each once")
+        if vary:
+            found += given_variations(source, vary, overrides)
+            continue
+        first, *others = default_variations(source, load_scenario(source, overrides))
+        found.append(first)
+        for one in others:
+            if (why := one.obstacle()) is None:
+                found.append(one)
+            else:
+                stages.say(f"  left out: {source}, {one.family}, {one.name}: {why}")
+    return found
+
+
+def given_variations(source: str, vary: Sequence[str], overrides: Sequence[str]) -> list[Variation]:
+    """The scenario as baseline, and with every value of every ``key.path=value,value,...``.
+
+    InputError if one of them is not of that form, or its values are not the scenario's.
+    """
+    found = [Variation(source, AS_GIVEN, AS_GIVEN, load_scenario(source, overrides))]
+    for text in vary:
+        key, _, listed = text.partition("=")
+        values = parse_yaml(f"[{listed}]", f"--vary {text}")
+        if not key or not isinstance(values, list) or not values:
+            raise InputError(
+                f"--vary takes key.path=value,value,... (as "
+                f"noise.radiometer.duty_cycle=0.25,0.5), got '{text}'"
+            )
+        for value in values:
+            change = f"{key}={json.dumps(value, default=str)}"
+            scenario = load_scenario(source, [*overrides, change])
+            found.append(Variation(source, key, f"{value}", scenario))
+    return found
 
 
 # one turn of the table
@@ -243,12 +303,10 @@ def kept_forecast(folder: Path, variation: Variation) -> Forecast:
     path = folder / f"{_digest(variation)}.json"
     if path.is_file():
         kept = json.loads(path.read_text(encoding="utf-8"))
-        kept["snr_squared"] = np.array(kept["snr_squared"], dtype=np.float64)
-        return Forecast(variation=variation, **kept)
+        return Forecast(variation, **kept | {"snr_squared": np.array(kept["snr_squared"])})
     made = forecast(variation)
-    names = (field.name for field in fields(Forecast) if field.name != "variation")
-    kept = {name: getattr(made, name) for name in names}
-    kept["snr_squared"] = np.asarray(made.snr_squared).tolist()
+    kept = vars(made) | {"snr_squared": made.snr_squared.tolist()}
+    del kept["variation"]
     with replacing(path) as scratch:
         scratch.write_text(json.dumps(kept), encoding="utf-8")
     return made

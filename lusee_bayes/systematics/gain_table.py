@@ -30,7 +30,7 @@ from pydantic import Field
 
 from lusee_bayes.core.arrays import Array, Vector, namespace
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.section import Positive, Section, Treatment
+from lusee_bayes.core.section import NOT_TINY, Section, Treatment
 from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.instrument.products import DataLayout, ports
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
@@ -60,7 +60,7 @@ class GainTableSection(Section):
         they are sampled with the map; or they are left out of the model.
     """
 
-    std: Annotated[Positive, Field(le=LARGEST)] | None = None
+    std: Annotated[float, Field(gt=0, le=LARGEST), NOT_TINY] | None = None
     treatment: Treatment = "marginalised"
 
 

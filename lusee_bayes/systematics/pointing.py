@@ -21,7 +21,7 @@ from lusee_bayes.core.arrays import Array, DataVector, Modes, namespace, on_devi
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import Rotation, generators, lmax_of
 from lusee_bayes.core.reading import naming
-from lusee_bayes.core.section import Positive, Section, Treatment, requires
+from lusee_bayes.core.section import NOT_TINY, Section, Treatment, requires
 from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing import (
@@ -40,7 +40,7 @@ from lusee_bayes.systematics.sources import SOURCE_NODES, expected_signal, sourc
 from lusee_bayes.systematics.systematic import Systematic, Truth, Unknown, Values, with_added
 
 # wider priors are none: the sky looks nothing like it did
-Offset = Annotated[Positive, Field(le=45)]
+Offset = Annotated[float, Field(gt=0, le=45), NOT_TINY]
 
 
 class PointingSection(Section):
@@ -73,8 +73,8 @@ class PointingSection(Section):
         the others are drawn from their priors.
     """
 
-    clock_s: Annotated[Positive, Field(le=1e6)] | None = None
-    clock_drift_s_per_day: Annotated[Positive, Field(le=1e4)] | None = None
+    clock_s: Annotated[float, Field(gt=0, le=1e6), NOT_TINY] | None = None
+    clock_drift_s_per_day: Annotated[float, Field(gt=0, le=1e4), NOT_TINY] | None = None
     turntable_deg: Offset | None = None
     lon_deg: Offset | None = None
     lat_deg: Offset | None = None

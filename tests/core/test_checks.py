@@ -108,8 +108,8 @@ def test_the_representation_is_the_description():
 
 
 def objects(small_map):
-    experiment = small_map.result.experiment
-    inference = small_map.result.inference
+    experiment = lb.build(small_map.result.scenario)
+    inference = lb.infer(experiment)
     setup = experiment.setup
     return [
         (experiment.data, ["16 products", "25 MHz", "K", "00R, 01R", "2027-01-15"]),

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from experiments import mapped
 
 import lusee_bayes as lb
 from lusee_bayes.core.errors import InputError
@@ -20,7 +21,6 @@ from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
-from lusee_bayes.runs.map_run import map_result
 from lusee_bayes.sky.prior import read_spectrum
 from lusee_bayes.systematics.context import measured_visibilities
 from lusee_bayes.testing.scenarios import small_scenario
@@ -111,14 +111,13 @@ def test_data_of_another_frequency_are_refused(small_experiment):
 
 def test_the_map_recovers_the_sky(small_experiment):
     experiment = small_experiment
-    result = map_result(experiment)
-    channel = result.channel
+    _, channel = mapped(experiment)
     # z^2 of the truth averaged over 49 modes: a sky that is no Gaussian draw but has the
     # prior's spectrum stays well below twice its expectation
     z = (channel.mean - np.asarray(experiment.data.truth)) / channel.std
     assert np.mean(z**2) < 2.0
-    assert result.summary()["chi2"] == pytest.approx(
-        result.summary()["chi2_expected"], abs=5 * np.sqrt(2 * experiment.data.layout.size)
+    assert channel.chi2 == pytest.approx(
+        channel.chi2_expected, abs=5 * np.sqrt(2 * experiment.data.layout.size)
     )
 
 
@@ -127,12 +126,11 @@ def test_the_main_job_on_ulsa(test_data):
     # thresholds from the first attempt on record: rho > 0.9 to ell 10, > 0.5 to 28, cross >= 20
     path = test_data / "ulsa" / "exp10.0MHz_sky_map_with_absorption.hdf5"
     scenario = load_scenario("fiducial", [f"sky.file={path}", "frequency_mhz=10"])
-    result = map_result(build(scenario))
-    channel = result.channel
-    spectra, summary = channel.spectra(), result.summary()
+    _, channel = mapped(build(scenario))
+    spectra = channel.spectra()
     assert spectra["rho"][1:11].min() > 0.9
     assert spectra["rho"][1:29].min() > 0.5
-    assert summary["ell_cross"] >= 20
+    assert channel.ell_cross >= 20
     # residuals at the few per cent level away from the cap that never rises
     maps = channel.maps()
     away = channel.highest_altitude > np.sin(np.radians(10.0))

@@ -119,13 +119,13 @@ def test_the_common_gain_is_told_where_it_keeps_its_prior(experiment, common, to
 
 
 @pytest.mark.long
-def test_unknowns_of_a_map_onto_another_are_said_to_be_of_the_new_data(response_file, tmp_path):
+def test_unknowns_of_added_data_are_said_to_be_of_the_new_data(response_file, tmp_path):
     """As numbers: those of these data mapped alone."""
-    first = four_ports(response_file, GROUND, "output.updatable=true")
+    first = four_ports(response_file, GROUND, "output.information=true")
     lb.run_map(first, tmp_path / "first")
     second = first.model_copy(update={"seed": 7})
     alone = lb.build(second)
-    run = lb.run_map(second, tmp_path / "both", onto=tmp_path / "first")
+    run = lb.run_map(second, tmp_path / "both", earlier=tmp_path / "first")
     expected = unknowns_report(alone, lb.infer(alone))
     pd.testing.assert_frame_equal(run.result.unknowns.table, expected.table)
     note = "what the new data alone tell"
@@ -138,7 +138,7 @@ def test_a_run_writes_them(experiment, tmp_path):
     run = lb.run_map(experiment.scenario, tmp_path / "map")
     table = pd.read_csv(tmp_path / "map" / "unknowns.csv", keep_default_na=False)
     assert len(table) == 9
-    summary = json.loads((tmp_path / "map" / "summary.json").read_text())["unknowns"]
+    summary = json.loads((tmp_path / "map" / "summary.json").read_text())["channels"][0]["unknowns"]
     np.testing.assert_allclose([row["value"] for row in summary["rows"]], table["value"], rtol=1e-9)
     assert summary["null_share"] > 0.5
     assert sum(weight**2 for weight in summary["null_direction"].values()) == pytest.approx(1.0)
@@ -155,7 +155,10 @@ def test_a_run_writes_them(experiment, tmp_path):
 
 def test_runs_without_them_are_as_before(small_map):
     assert not (small_map.folder / "unknowns.csv").exists()
-    assert json.loads((small_map.folder / "summary.json").read_text())["unknowns"] is None
+    assert (
+        json.loads((small_map.folder / "summary.json").read_text())["channels"][0]["unknowns"]
+        is None
+    )
     assert "gain table" not in map_page(small_map.folder, "a run")
 
 

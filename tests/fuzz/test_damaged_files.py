@@ -27,7 +27,7 @@ from lusee_bayes.instrument.beams.sampled import read_beam, sampled_beams, write
 from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe
-from lusee_bayes.results.updatable import read_updatable
+from lusee_bayes.results.map_files import read_channels, read_information
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
 from lusee_bayes.runs.data_run import run_simulate_flight
@@ -46,14 +46,8 @@ def read_any_data(path: Path) -> object:
     return read_data(path, small_scenario(lmax=2))
 
 
-def read_onto(path: Path) -> object:
-    folder = path.parent / "onto"
-    folder.mkdir(exist_ok=True)
-    try:
-        shutil.copy(path, folder / "posterior.nc")
-        return read_updatable(folder, small_scenario(lmax=2))
-    finally:
-        shutil.rmtree(folder)
+def read_kept(path: Path) -> object:
+    return read_information(path, small_scenario(lmax=2))
 
 
 def read_spectra(path: Path) -> object:
@@ -73,9 +67,9 @@ READERS = {
     "sampled_fields.fits": (describe, lambda path: read_beam(path).beams(25.0, 2)),
     "sampled_products.nc": (describe, lambda path: read_beam(path).beams(25.0, 2)),
     "posterior.nc": (describe,),
-    "updatable.nc": (describe, read_onto),
+    "information.nc": (describe, read_kept),
     "cube.nc": (describe,),
-    "diagnostics.nc": (describe,),
+    "diagnostics.nc": (describe, read_channels),
     "map.fits": (describe, read_sky),
     "cube.fits": (describe, read_sky),
     "alm.fits": (describe, read_sky),
@@ -115,8 +109,8 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
         # neither figures nor a page, which take longer than the map
         patch.setattr(map_run, "MAP", replace(map_run.MAP, figures={}))
         patch.setattr(folder_module, "PAGES", {})
-        run = lb.run_map(small_scenario("output.updatable=true", lmax=2), folder / "run")
-    shutil.copy(run.folder / "posterior.nc", folder / "updatable.nc")
+        run = lb.run_map(small_scenario("output.information=true", lmax=2), folder / "run")
+    shutil.copy(run.folder / "posterior.nc", folder / "information.nc")
     for name in ("posterior.nc", "diagnostics.nc"):
         shutil.copy(small_map.folder / name, folder / name)
     shutil.copy(small_map.folder / "mean.fits", folder / "map.fits")

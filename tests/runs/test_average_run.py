@@ -118,7 +118,7 @@ def test_average_s_of_the_scenario_does_not_count(path, data, tmp_path):
         (["--to", "2hours"], "'2hours' is not a length of time; give a positive number"),
         (["--to", "10min"], "shorter than their samples of 1800 s"),
         (["--to", "2h", "-o", "w.fits"], "give -o a name that does not end in .fits"),
-        (["--to", "2h", "-o", "data.nc"], "would replace the data that they are made of"),
+        (["--to", "2h", "-o", "data.nc"], "'data.nc' is an input of this run"),
         (["--to", "2h", "--set", "frequency_mhz=10"], "the data are at 25.0 MHz"),
         (["--to", "2h", "--set", "frequencies_mhz=[10,20]"], "averages are of one frequency"),
         (["--to", "2h", "--set", "observation.timestamp=start"], "leave that out"),

@@ -171,15 +171,15 @@ def test_a_killed_run_resumes_to_the_draws_of_an_undisturbed_one(killed, tree, m
     """Bit by bit, in another process, with nothing done twice."""
     before = {i: (p.stat().st_ino, p.stat().st_mtime_ns) for i, p in chunks(killed).items()}
     written, untouched = [], []
-    write = hmc.Chunk.write
+    append = hmc.Checkpoints.append
 
-    def spy(chunk, folder):
+    def spy(checkpoints, chunk):
         written.append(chunk.iteration)
-        write(chunk, folder)
+        append(checkpoints, chunk)
         now = {i: (p.stat().st_ino, p.stat().st_mtime_ns) for i, p in chunks(killed).items()}
         untouched.append(before.items() <= now.items())
 
-    monkeypatch.setattr(hmc.Chunk, "write", spy)
+    monkeypatch.setattr(hmc.Checkpoints, "append", spy)
     assert run("sample", *SMALL, *SETTINGS, "-q", "-o", killed, "--resume") == 0
     total = SAMPLER.warmup + SAMPLER.draws
     assert written == list(range(max(before) + CHUNK, total + 1, CHUNK))
@@ -424,16 +424,18 @@ def test_validation_json_and_md_agree_with_each_other_and_the_draws(validated, t
     report = consistent(folder)
     skies, constants = tree["posterior"]["sky"].values, tree["constant_data"]
     scaled = (skies - constants["analytic_mean"].values) / constants["analytic_std"].values
-    np.testing.assert_allclose(report["variance_ratio"], (scaled**2).mean((0, 1)), rtol=1e-9)
+    np.testing.assert_allclose(
+        report["modes"]["variance_ratio"], (scaled**2).mean((0, 1)), rtol=1e-9
+    )
     ess = array_stats.ess(scaled, chain_axis=0, draw_axis=1, method="mean")
     expected = scaled.mean((0, 1)) * np.sqrt(ess)
     # ESS by the same library: rounding, of numbers that may be near zero
-    np.testing.assert_allclose(report["mean_z"], expected, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(report["modes"]["mean_z"], expected, rtol=1e-6, atol=1e-6)
     values = {check["name"]: check["value"] for check in report["checks"]}
     assert abs(values["mean"]) == pytest.approx(np.abs(expected).max(), rel=1e-6)
     assert values["divergences"] == tree["sample_stats"]["diverging"].values.sum()
     assert values["calibration"] == pytest.approx(min(report["p_values"].values()))
-    assert len(report["eigenvalues"]) == N_MODES
+    assert len(report["modes"]["eigenvalues"]) == N_MODES
     for levels in report["coverage"].values():
         for level, share in levels.items():
             # binomial of 100 simulations; about a hundred shares
@@ -462,8 +464,9 @@ def test_half_the_covariance_is_found_out_with_exit_code_1(validated, tmp_path, 
     # which may or may not be seen; nothing else knows of the covariance
     assert {"variance", "covariance, largest"} <= failed
     assert all(name.startswith(("variance", "covariance", "mean")) for name in failed)
+    before = json.loads((validated[1] / "validation.json").read_text())
     np.testing.assert_allclose(
-        np.array(report["variance_ratio"]),
-        2 * np.array(json.loads((validated[1] / "validation.json").read_text())["variance_ratio"]),
+        np.array(report["modes"]["variance_ratio"]),
+        2 * np.array(before["modes"]["variance_ratio"]),
         rtol=1e-6,
     )

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import arviz_base
-import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
@@ -18,7 +17,7 @@ from scipy.stats import multivariate_normal, norm
 import lusee_bayes as lb
 from lusee_bayes.sampling import evidence as comparison
 from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.sampling.programs import Program, load_program
 
 FIXED = '''
 import numpyro
@@ -198,11 +197,9 @@ def test_where_there_is_no_mode_nothing_is_found():
         x = numpyro.sample("x", dist.Normal(jnp.zeros(()), 1.0))
         numpyro.factor("ever more", 0.1 * (x - 1.0) ** 4)
 
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        found = laplace_approximation(model, {"data": None})
-    assert not bool(found.converged)
+    assert not bool(laplace_approximation(model, {"data": None}).converged)
     with pytest.raises(lb.InputError, match="no mode of the posterior was found"):
-        found.require_converged()
+        comparison.estimate_evidence(Program("endless", model, ""), {}, np.zeros(1))
 
 
 # --- leaving one out ------------------------------------------------------------------------------

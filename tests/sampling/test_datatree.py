@@ -303,7 +303,7 @@ def test_files_that_are_no_samples_are_refused(setting, tmp_path):
     xr.Dataset({"x": ("x", [1.0])}).to_netcdf(tmp_path / "bare.nc", engine="h5netcdf")
     np.savez(tmp_path / "arrays.nc", x=np.ones(3))
     for name, message in [
-        ("gone.nc", "no samples at .*gone.nc"),
+        ("gone.nc", "no samples of lusee-bayes sample at .*gone.nc"),
         ("text.nc", "its format is 'absent', expected"),
         ("empty.nc", "its format is 'absent', expected"),
         ("arrays.nc.npz", "its format is 'absent', expected"),

@@ -19,12 +19,12 @@ import lusee_bayes
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.experiment.experiment import program_pieces
-from lusee_bayes.sampling.program_checks import require_sampleable
 from lusee_bayes.sampling.programs import (
     collapsed_draws,
     is_collapsed,
     load_program,
     numpyro_promotion,
+    require_sampleable,
 )
 
 SPECTRUM = np.array([4.0, 1.0, 0.5])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import jax
@@ -124,7 +125,8 @@ def test_the_gradient_vanishes_at_the_mode():
 def test_straight_coordinates_are_one_to_one_with_the_determinant_they_say(learned):
     power_law = np.array([np.log(0.03), TILTED]) if learned else None
     covariance = np.array([[0.04, 0.01], [0.01, 0.09]]) if learned else None
-    coordinates = straight_coordinates(mode(), power_law, covariance)
+    found = replace(mode(), power_law=power_law, covariance=covariance)
+    coordinates = straight_coordinates(found)
     n = coordinates.root.shape[0]
     z = jax.random.normal(jax.random.key(3), (n,), dtype=jnp.float64)
     x = coordinates.mean + coordinates.root @ z

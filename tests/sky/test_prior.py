@@ -20,7 +20,7 @@ from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.judge.residuals import residuals
-from lusee_bayes.linear.linear_gaussian import LinearGaussian, updated
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import DiagonalCovariance
 from lusee_bayes.noise.instrument_errors import beam_error_noise
 from lusee_bayes.priors.families import Hyperprior, IsotropicFamily, PriorFamily
@@ -230,18 +230,11 @@ def test_chi2_is_of_the_deviation_from_the_prior():
     np.testing.assert_allclose(told, direct, rtol=CLOSE)
 
 
-def test_a_posterior_is_not_updated_under_another_mean():
-    earlier = model().condition(jnp.asarray(DATA), "root")
-    for mean in (None, jnp.asarray(SKY_MEAN + 1e-6)):
-        other = replace(model(), prior=HarmonicPrior(jnp.asarray(POWER), mean=mean))
-        with pytest.raises(InputError, match="another mean"):
-            updated(earlier, other, jnp.asarray(DATA))
-
-
-def test_updates_information_and_few_data():
+def test_sums_of_information_and_few_data():
     first, rest = slice(0, 12), slice(12, 24)
-    earlier = model(first).condition(jnp.asarray(DATA[first]), "root")
-    found = updated(earlier, model(rest), jnp.asarray(DATA[rest]))
+    earlier, _ = model(first).inform(jnp.asarray(DATA[first]))
+    later, _ = model(rest).inform(jnp.asarray(DATA[rest]))
+    found = (later + earlier).posterior(model().prior)
     np.testing.assert_allclose(found.mean, expected().mean, atol=CLOSE)
     np.testing.assert_allclose(found.log_evidence, expected().log_prob, rtol=CLOSE)
     few = model(rest).condition(jnp.asarray(DATA[rest]))
@@ -255,6 +248,19 @@ def test_updates_information_and_few_data():
         without.condition(jnp.asarray(DATA)).mean,
         atol=CLOSE,
     )
+
+
+def test_a_dense_prior_of_any_root():
+    """Wide and ill conditioned: S = R R^T is not formed."""
+    rng = np.random.default_rng(8)
+    for columns in (6, 9):
+        root = rng.normal(size=(6, columns)) * np.geomspace(1.0, 1e-7, 6)[:, None]
+        prior = DensePrior.of_root(root, np.arange(6.0))
+        np.testing.assert_array_equal(prior.root, np.tril(prior.root))
+        np.testing.assert_allclose(prior.covariance(), root @ root.T, rtol=1e-9)
+        np.testing.assert_array_equal(prior.mean, np.arange(6.0))
+    with pytest.raises(InputError, match="positive diagonal"):
+        DensePrior.of_root(np.zeros((3, 3)))
 
 
 def test_draws_and_densities():

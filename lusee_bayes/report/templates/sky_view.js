@@ -235,14 +235,23 @@ const skyView = (function () {
       for (let lon = -180; lon <= 180; lon += 30) curve(steps.map((k) => [lon, -90 + 2 * k]));
       for (let lat = -60; lat <= 60; lat += 30) curve(steps.map((k) => [-180 + 4 * k, lat]));
       const unit = (lon) => (galactic ? `${(lon + 360) % 360}°` : `${((lon + 360) % 360) / 15}h`);
-      for (let lon = -150; lon <= 150; lon += 30) this.label(unit(lon), to(lon, 0), 0, -6);
+      // half of them where they would touch
+      const apart = this.growth() / this.zoom > 1.5 ? 60 : 30;
+      for (let lon = apart - 180; lon < 180; lon += apart) this.label(unit(lon), to(lon, 0), 0, -6);
       for (let lat = -60; lat <= 60; lat += 30) {
         if (lat) this.label(`${lat}°`, to(galactic ? 90 : 0, lat), 0, -6);
       }
     }
+    // names and marks grow where a narrow screen shrinks the canvas, up to twice
+    growth() {
+      const { width } = this.canvas.getBoundingClientRect();
+      return Math.min(2, Math.max(1, this.canvas.width / (1.2 * width)));
+    }
     label(text, at, dx, dy, size = 15) {
       const context = this.canvas.getContext("2d");
       const [x, y] = this.point(at.z, at.longitude);
+      const growth = this.growth();
+      [dx, dy, size] = [dx * growth, dy * growth, size * growth];
       context.font = `${size}px system-ui, sans-serif`;
       // at the right rim a name stands left of its mark
       const beyond = dx > 0 && x + dx + context.measureText(text).width > context.canvas.width;
@@ -265,10 +274,11 @@ const skyView = (function () {
     ring(z, longitude, radius, colour) {
       const context = this.canvas.getContext("2d");
       const [x, y] = this.point(z, longitude);
+      const growth = this.growth();
       for (const [width, style] of [[4, "#000000"], [2, colour]]) {
         context.beginPath();
-        context.arc(x, y, radius, 0, TURN);
-        context.lineWidth = width;
+        context.arc(x, y, radius * growth, 0, TURN);
+        context.lineWidth = width * growth;
         context.strokeStyle = style;
         context.stroke();
       }
