@@ -376,6 +376,27 @@ class Systematic(eqx.Module):
         bare = LinearGaussian(coupling, prior, noise, model.offset)
         return _derivative(*on_device((self, bare, sky, centre)))
 
+    def beyond_first_order(
+        self, model: LinearGaussian, sky: Modes, z: Vector
+    ) -> dict[str, DataVector]:
+        """What each unknown does to the data beyond first order, in K, by name.
+
+        Parameters
+        ----------
+        model : LinearGaussian
+            Without it.
+        sky : (modes,) array
+            In K.
+        z : (n,) array
+            How far each is off on either side, in prior standard deviations.
+        """
+
+        def seen(way: Vector) -> DataVector:
+            return np.asarray(self.effect(model, self.values(way)).predict(sky))
+
+        middle, ways = seen(0.0 * z), zip(self.names, np.diag(z), strict=True)
+        return {name: (seen(way) + seen(-way)) / 2.0 - middle for name, way in ways}
+
     def expected(self, centre: Vector) -> Vector:
         """What :meth:`marginalised` takes the prior mean for, about values, in prior std's."""
         return np.zeros(len(centre))
