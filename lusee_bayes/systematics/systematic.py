@@ -587,17 +587,6 @@ class AdditiveNoise(Systematic):
         """Add the covariance to N."""
         return replace(model, noise=model.noise + self.covariance())
 
-    @classmethod
-    def truth(cls, section, context, key) -> Truth:
-        """None: the noise is drawn with its covariance."""
-        return {}
-
-    @classmethod
-    def in_data(cls, section, context, model, truth, key) -> LinearGaussian:
-        """Add one draw of the noise."""
-        covariance = cls.build(section, context, Around()).covariance()
-        return with_added(model, np.asarray(covariance.sample(cls.own_key(key))))
-
 
 class Scale(Systematic):
     """A systematic without a Gaussian term: marginalised, it stays at its median."""

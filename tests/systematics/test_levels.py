@@ -300,7 +300,9 @@ def test_sampled_noise_is_added_to_what_is_there(model):
 @pytest.mark.parametrize("term", terms(), ids=lambda term: term.name)
 def test_simulated_data_hold_a_draw_of_it(model, term, monkeypatch):
     monkeypatch.setattr(type(term), "build", classmethod(lambda cls, *args: term))
-    key = jax.random.key(3)
-    drawn = np.asarray(type(term).in_data(None, None, model, {}, key).offset)
+    setup, key = small_experiment().setup, jax.random.key(3)
+    truth = type(term).truth(None, setup, key)
+    assert set(truth) == {f"{term.name}_noise"}
+    drawn = np.asarray(type(term).in_data(None, setup, model, truth, key).offset)
     expected = term.covariance().sample(type(term).own_key(key))
     np.testing.assert_allclose(drawn, expected, rtol=0, atol=1e-14)
