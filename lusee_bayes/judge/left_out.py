@@ -220,7 +220,7 @@ class LeftOut:
             self.present = self.present & ~gone
         self._set_noise()
         if gone is not None:
-            self._weights = self._weights - taken(self._weights, self._on_cells(gone))
+            self._weights = self._weights - lost_weights(self._weights, self._on_cells(gone))
         self._lower = self._factorised(None if gone is not None else on_host(posterior))
         self._u = self._weighted_residuals()
         self.u = self._layout.scatter(self._cells.gather(self._u.T))
@@ -288,7 +288,7 @@ class LeftOut:
         blocks, places = (np.flatnonzero(cells.any(axis)) for axis in (1, 0))
         where = np.ix_(blocks, places)
         root = roots(self._weights[blocks], cells[blocks])
-        b = whitened(root, np.where(cells[where], self._u[where], 0.0)[..., None])
+        b = solve_roots(root, np.where(cells[where], self._u[where], 0.0)[..., None])
         chosen = Chosen(cells, blocks, places, cells[where], root, b)
         small = self._small(chosen)
         answer = self._taken_out(chosen) if small is None else self._among_data(chosen, *small)
@@ -452,7 +452,7 @@ class LeftOut:
             halves = [x[np.ix_(blocks, places)] for x in self._kept]
             for half in halves:
                 half[~some] = 0.0
-            w, with_sky = (whitened(root, x).reshape(some.size, -1) for x in halves)
+            w, with_sky = (solve_roots(root, x).reshape(some.size, -1) for x in halves)
             return w, with_sky, b.ravel()
         independent = self._weights.ndim == 2
         whole = independent or (cells[blocks] == self._on_cells(self.present)[blocks]).all()
@@ -499,11 +499,11 @@ class LeftOut:
 
     def _taken_out(self, chosen: Chosen) -> tuple[float, float, float]:
         """chi^2_s, directions and ln|Q_s| - ln|Q|."""
-        left = self._normal - self._gram(taken(self._weights, chosen.cells))
+        left = self._normal - self._gram(lost_weights(self._weights, chosen.cells))
         lower = cholesky(left, overwrite=True)
         mean = np.zeros((*chosen.cells.shape, 1))
         where = np.ix_(chosen.blocks, chosen.places)
-        mean[where] = whitened(chosen.root, chosen.b, transpose=True)
+        mean[where] = solve_roots(chosen.root, chosen.b, transpose=True)
         h = solve_lower(lower, self._pull(weigh(self._weights, mean)), transpose=False)
         directions = self._trace_of_sky(lower) - self._trace
         chi2 = float((chosen.b**2).sum() + (h**2).sum())
@@ -530,21 +530,21 @@ def roots(weights: Weights, chosen: CellFlags) -> Roots:
     return np.linalg.cholesky(np.where(both, within[..., used], np.eye(len(used))))
 
 
-def whitened(root: Roots, x: np.ndarray, *, transpose: bool = False) -> np.ndarray:
+def solve_roots(root: Roots, x: np.ndarray, *, transpose: bool = False) -> np.ndarray:
     """c^-1 x, or c^-T x."""
     if root.ndim == 2:
         return x / root[..., None]
     return np.linalg.solve(root.swapaxes(1, 2) if transpose else root, x)
 
 
-def taken(weights: Weights, chosen: CellFlags) -> Weights:
+def lost_weights(weights: Weights, chosen: CellFlags) -> Weights:
     """What D loses without a group: D_:s D_ss^-1 D_s:, all of it in the rows of the group."""
     if weights.ndim == 2:
         return np.where(chosen, weights, 0.0)
     lost, blocks = np.zeros_like(weights), np.flatnonzero(chosen.any(axis=1))
     some, within = chosen[blocks], weights[blocks]
     used = np.flatnonzero(some.any(axis=0))
-    e = whitened(roots(within, some), np.where(some[:, used, None], within[:, used], 0.0))
+    e = solve_roots(roots(within, some), np.where(some[:, used, None], within[:, used], 0.0))
     # the rows of the group to the last bit
     whole = some[:, :, None] | some[:, None]
     lost[blocks] = np.where(whole, within, e.swapaxes(1, 2) @ e)
