@@ -258,7 +258,10 @@ class PointingOffsets(Systematic):
         )
 
     def orientation(self, values: Values) -> Float[Array, "times 3 3"]:
-        """The rotation from the antennas' frame to the Moon-fixed one at every sample."""
+        """The rotation from the antennas' frame to the Moon-fixed one at every sample.
+
+        The Moon turns about its z axis, 0.04 degrees from the pole.
+        """
         pointing = self.turned(values)
         lon, lat, east, north = (pointing.turns[k] for k in range(4))
         spans = [span.stop - span.start for _, span in pointing.runs()]
