@@ -36,7 +36,7 @@ from lusee_bayes.linear.amplitudes import (
 )
 from lusee_bayes.sky.galaxy import kelvin_steradian
 from lusee_bayes.systematics.gain_table import COMMON_GAIN
-from lusee_bayes.systematics.pointing import PointingOffsets, second_order, shifted
+from lusee_bayes.systematics.pointing import PointingOffsets, shifted
 from lusee_bayes.systematics.sources import PointSources
 from lusee_bayes.systematics.systematic import Expanded
 
@@ -370,17 +370,19 @@ def pointing_report(
 
 def _table(experiment: Experiment, found: Inference, sky: Modes) -> pd.DataFrame:
     mean, covariance = offset_posterior(found)
-    std = dict(zip(mean, np.sqrt(np.diagonal(covariance)).tolist(), strict=True))
-    prior = found.offsets.systematic.in_units(np.ones(len(mean)))
+    std, prior = np.sqrt(np.diagonal(covariance)), found.offsets.systematic.stds
     # where values and sky are those that the data tell, only what is left of the offsets counts
-    about = prior if found.around.sky is None else std
+    about = np.ones(len(prior)) if found.around.sky is None else std / prior
     noise = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
-    left = second_order(experiment.setup, about, sky)
-    truth = true_values(experiment.setup) if experiment.data.truth is not None else {}
-    beyond = {name: float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in mean}
-    columns = {"value": mean, "std": std, "prior_std": prior, "beyond_first_order": beyond}
-    columns |= {"true": {name: truth[name] for name in mean}} if truth else {}
-    return pd.DataFrame(columns, index=list(mean)).rename_axis("offset").reset_index()
+    model = on_host(base_model(experiment.setup))
+    left = found.offsets.systematic.beyond_first_order(model, sky, about)
+    beyond = [float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in mean]
+    parts = {"value": mean.values(), "std": std, "prior_std": prior, "beyond_first_order": beyond}
+    table = pd.DataFrame({"offset": list(mean), **parts})
+    if experiment.data.truth is None:
+        return table
+    truth = true_values(experiment.setup)
+    return table.assign(true=[truth[name] for name in mean])
 
 
 def _preferred(

@@ -24,18 +24,16 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from lusee_bayes.core.arrays import Array, Vector, namespace
+from lusee_bayes.core.arrays import Array, DataVector, Vector, namespace, on_device
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.section import NOT_TINY, Section, Treatment
-from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.instrument.products import DataLayout, ports
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.noise.covariance import DiagonalCovariance
-from lusee_bayes.sky.prior import IndependentPrior
 from lusee_bayes.systematics.context import Around, Context
 from lusee_bayes.systematics.systematic import Systematic, Unknown, multiplied
 
@@ -64,47 +62,19 @@ class GainTableSection(Section):
     treatment: Treatment = "marginalised"
 
 
-class TableErrors(eqx.Module):
-    """Slopes of the errors, and what values of them make of the data.
+class GainTable(Systematic):
+    """Errors of the gain table with independent Gaussian priors, in prior standard deviations.
 
     Attributes
     ----------
-    names : tuple of str
-        Of the errors.
+    errors : tuple of str
+        Their names.
     port : tuple of int
         The port of each.
     slope : (errors, times) array
         Relative change of the port's power gain per prior standard deviation.
     layout : DataLayout
         The data.
-    """
-
-    names: tuple[str, ...] = eqx.field(static=True)
-    port: tuple[int, ...] = eqx.field(static=True)
-    slope: Float[Array, "errors times"]
-    layout: DataLayout
-
-    def factors(self, z: Float[Array, " errors"]) -> Float[Array, " data"]:
-        """Compute F of every datum, of values in prior standard deviations."""
-        n_ports = round(np.sqrt(self.layout.n_products))
-        own = (np.arange(n_ports)[:, None] == np.array(self.port)[None]).astype(np.float64)
-        first, second, _ = ports(n_ports)
-        gains = 1.0 + own @ (z[:, None] * self.slope)
-        return self.layout.gather(namespace(gains).sqrt(gains[first] * gains[second]))
-
-    @property
-    def stds(self) -> Float[np.ndarray, " errors"]:
-        """Prior standard deviations of the power gains, relative: rms over the times of each."""
-        slope = np.asarray(self.slope)
-        return np.sqrt((slope**2).sum(1) / (slope != 0).sum(1))
-
-
-class GainTable(Systematic):
-    """Errors of the gain table with independent Gaussian priors, in prior standard deviations.
-
-    Attributes
-    ----------
-    errors : TableErrors
     freedom : (data,) array or None
         h: the share of each datum that sky and others follow; None for zeros.
     """
@@ -118,26 +88,30 @@ class GainTable(Systematic):
     moves: ClassVar[bool] = True
     scales_sky: ClassVar[bool] = True
 
-    errors: TableErrors
+    errors: tuple[str, ...] = eqx.field(static=True)
+    port: tuple[int, ...] = eqx.field(static=True)
+    slope: Float[Array, "errors times"]
+    layout: DataLayout
     freedom: Float[Array, " data"] | None = None
 
     @classmethod
     def build(cls, section: GainTableSection, context: Context, around: Around) -> GainTable:
-        return cls(table_errors(context), around.freedom)
+        return cls(*table_errors(context), context.layout, around.freedom)
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        return (Unknown(GAIN_TABLE, size=len(self.errors.names)),)
+        return (Unknown(GAIN_TABLE, size=len(self.errors)),)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the errors."""
-        return self.errors.names
+        return self.errors
 
     @property
     def stds(self) -> Vector:
-        """Prior standard deviations of the power gains, relative."""
-        return self.errors.stds
+        """Prior standard deviations of the power gains, relative: rms over the times of each."""
+        slope = np.asarray(self.slope)
+        return np.sqrt((slope**2).sum(1) / (slope != 0).sum(1))
 
     def like_the_sky(self) -> tuple[tuple[str, ...], Float[np.ndarray, "parts n"]]:
         """What all have in common: those of single ports and levels look like no sky."""
@@ -146,28 +120,37 @@ class GainTable(Systematic):
     @property
     def common(self) -> Vector:
         """Unit vector of errors along the mean power gain of all ports and times."""
-        along = np.asarray(self.errors.slope).mean(1)
+        along = np.asarray(self.slope).mean(1)
         return along / max(float(np.linalg.norm(along)), np.finfo(np.float64).tiny)
+
+    def factors(self, z: Float[Array, " errors"]) -> DataVector:
+        """Compute F of every datum, of values in prior standard deviations."""
+        n_ports = round(np.sqrt(self.layout.n_products))
+        own = (np.arange(n_ports)[:, None] == np.array(self.port)[None]).astype(np.float64)
+        first, second, _ = ports(n_ports)
+        gains = 1.0 + own @ (z[:, None] * self.slope)
+        return self.layout.gather(namespace(gains).sqrt(gains[first] * gains[second]))
 
     def effect(self, model, values):
         """Multiply by F."""
-        return multiplied(model, self.errors.factors(values[GAIN_TABLE]))
+        return multiplied(model, self.factors(values[GAIN_TABLE]))
 
     def expected(self, centre: Vector) -> Vector:
         """What makes up for the volume of skies that fit: -dln F/dz^T h."""
         if self.freedom is None:
             return np.zeros(len(centre))
-        n = self.errors.layout.size
-        # visibilities of one, so that T is dF/dz
-        ones, unit = DenseCoupling(np.ones((n, 1))), np.ones(1)
-        model = LinearGaussian(ones, IndependentPrior(unit), DiagonalCovariance(np.ones(n)))
-        slopes = np.asarray(self.derivative(model, unit, centre))
-        log_slopes = slopes / np.asarray(self.errors.factors(centre))[:, None]
-        return -log_slopes.T @ np.asarray(self.freedom)
+        return -np.asarray(_volume_slopes(*on_device((self, centre))))
 
 
-def table_errors(context: Context) -> TableErrors:
-    """The errors that the data name, or one for each port.
+@eqx.filter_jit
+def _volume_slopes(table: GainTable, z: Array) -> Array:
+    return jax.grad(lambda z: table.freedom @ jnp.log(table.factors(z)))(z)
+
+
+def table_errors(
+    context: Context,
+) -> tuple[tuple[str, ...], tuple[int, ...], Float[np.ndarray, "errors times"]]:
+    """Names, ports and slopes of the errors that the data name, or of one for each port.
 
     Raises
     ------
@@ -198,7 +181,7 @@ def table_errors(context: Context) -> TableErrors:
             )
         ports = tuple(range(context.beam_source.n_ports))
         slope = np.full((len(ports), context.layout.n_times), std)
-        return TableErrors(tuple(f"gain_{port}" for port in ports), ports, slope, context.layout)
+        return tuple(f"gain_{port}" for port in ports), ports, slope
     # of levels that no port has at these times the data say nothing
     used = np.flatnonzero(calibration.gain_slope.any(1))
     port, slope = calibration.gain_port[used], calibration.gain_slope[used]
@@ -211,4 +194,4 @@ def table_errors(context: Context) -> TableErrors:
                 "it as it is"
             )
     names = tuple(f"gain_{calibration.gain_names[k].replace(' ', '_')}" for k in used)
-    return TableErrors(names, tuple(port.tolist()), slope, context.layout)
+    return names, tuple(port.tolist()), slope

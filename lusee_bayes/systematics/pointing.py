@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from pydantic import Field
 
-from lusee_bayes.core.arrays import Array, DataVector, Modes, namespace, on_device
+from lusee_bayes.core.arrays import Array, DataVector, namespace, on_device
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import Rotation, generators, lmax_of
 from lusee_bayes.core.reading import naming
@@ -192,13 +192,7 @@ class PointingOffsets(Systematic):
         """Seen at other times, from other places: A, the responses to sources, and the signal."""
         names = offset_names(section.kinds, context.observation.n_runs)
         offsets = {name: value for name, value in values.items() if name in names}
-        if not offsets:
-            return context
-        there = shifted(context, offsets)
-        complete = CouplingMatrix.build(there.beams, there.pointing)
-        sources = there.scenario.sources.list
-        parts = complete, there.sky, there.background, there.responses
-        return replace(there, signal=expected_signal(sources, *parts))
+        return shifted(context, offsets) if offsets else context
 
     @classmethod
     def truth(cls, section: PointingSection, context: Context, key: Any) -> Truth:
@@ -264,7 +258,10 @@ class PointingOffsets(Systematic):
         )
 
     def orientation(self, values: Values) -> Float[Array, "times 3 3"]:
-        """The rotation from the antennas' frame to the Moon-fixed one at every sample."""
+        """The rotation from the antennas' frame to the Moon-fixed one at every sample.
+
+        The Moon turns about its z axis, 0.04 degrees from the pole.
+        """
         pointing = self.turned(values)
         lon, lat, east, north = (pointing.turns[k] for k in range(4))
         spans = [span.stop - span.start for _, span in pointing.runs()]
@@ -367,7 +364,7 @@ class MovingSources(eqx.Module):
 
 
 def shifted(context: Context, values: Mapping[str, float]) -> Context:
-    """The context with another observation, coupling and responses to sources; else as it is."""
+    """The context with another observation, and what follows: A, responses to sources, signal."""
     given = ", ".join(f"{name} = {value:g}" for name, value in values.items() if value)
     with naming(f"noise.pointing, with {given or 'no offsets'}"):
         observation = with_offsets(context.observation, values)
@@ -377,28 +374,14 @@ def shifted(context: Context, values: Mapping[str, float]) -> Context:
     else:  # the sky turns as before
         pointing = context.pointing.placed(observation)
     sources, frequency_mhz = context.scenario.sources.list, context.frequency_mhz
+    responses = source_responses(sources, observation, context.beam_source, frequency_mhz)
+    complete = CouplingMatrix.build(context.beams, pointing)
+    parts = complete, context.sky, context.background, responses
     return replace(
         context,
         observation=observation,
         instrument=replace(context.instrument, pointing=pointing),
-        coupling=CouplingMatrix.build(context.beams, pointing, context.layout),
-        responses=source_responses(sources, observation, context.beam_source, frequency_mhz),
+        coupling=replace(complete, layout=context.layout),
+        responses=responses,
+        signal=expected_signal(sources, *parts),
     )
-
-
-def second_order(context: Context, stds: Mapping[str, float], sky: Modes) -> dict[str, DataVector]:
-    """What offsets of one standard deviation do to the data beyond first order, in K."""
-
-    def seen(values: Mapping[str, float]) -> DataVector:
-        there = shifted(context, values)
-        found = np.asarray(there.coupling @ sky)
-        for section, response in zip(there.scenario.sources.list, there.responses, strict=True):
-            flux = section.mean_flux(there.frequency_mhz)
-            found = found + flux * np.asarray(there.layout.gather(np.asarray(response)))
-        return found
-
-    middle = seen({})
-    return {
-        name: sum(seen({name: sign * std}) for sign in (1.0, -1.0)) / 2.0 - middle
-        for name, std in stds.items()
-    }

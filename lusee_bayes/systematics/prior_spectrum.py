@@ -66,10 +66,27 @@ class SpectrumSection(Section):
 
 
 class PriorSpectrum(Scale):
-    """C_ell times a factor that depends on ell, which :meth:`factor` gives."""
+    """C_ell up to an amplitude and a tilt, A ((ell + 1) / 10)^tilt, or a factor for each band.
+
+    Attributes
+    ----------
+    log_amplitude_std : () array, optional
+        Prior standard deviation of ln A; None if A is known.
+    tilt_std : () array, optional
+        Prior standard deviation of the tilt; None if it is known.
+    edges : tuple of int
+        First ell of every band but the lowest, growing; none for no bands.
+    log_band_std : () array
+        Prior standard deviation of the natural logarithm of each band's factor.
+    """
 
     key: ClassVar[str] = "prior"
     section: ClassVar[type[Section]] = SpectrumSection
+
+    log_amplitude_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
+    tilt_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
+    edges: tuple[int, ...] = eqx.field(static=True, default=())
+    log_band_std: Float[Array, ""] = eqx.field(default=1.0, converter=scalar)
 
     @classmethod
     def treatment(cls, scenario: Any) -> str | None:
@@ -77,9 +94,8 @@ class PriorSpectrum(Scale):
 
     @classmethod
     def build(cls, section: SpectrumSection, context: Context, around: Around) -> PriorSpectrum:
-        if section.band_edges:
-            return SpectrumBands(section.band_edges, section.log_band_std)
-        return PowerSpectrum(section.log_amplitude_std, section.tilt_std)
+        stds = section.log_amplitude_std, section.tilt_std
+        return cls(*stds, section.band_edges, section.log_band_std)
 
     @classmethod
     def truth(cls, section: Any, context: Context, key: PRNGKeyArray) -> Truth:
@@ -89,9 +105,18 @@ class PriorSpectrum(Scale):
     def in_data(cls, section, context, model, truth, key) -> LinearGaussian:
         return model
 
-    def factor(self, lmax: int, values) -> Float[Array, " ells"]:
-        """Factors of C_ell, up to an ell."""
-        raise NotImplementedError
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """The sites ``amplitude`` and ``tilt``, or ``band_power``: lowest ells first."""
+        found = []
+        if self.log_amplitude_std is not None:
+            found.append(Unknown("amplitude", 1.0, self.log_amplitude_std, log=True))
+        if self.tilt_std is not None:
+            found.append(Unknown("tilt", 0.0, self.tilt_std))
+        if self.edges:
+            n_bands = len(self.edges) + 1
+            found.append(Unknown("band_power", 1.0, self.log_band_std, n_bands, log=True))
+        return tuple(found)
 
     def effect(self, model, values):
         """Multiply C_ell by the factor of each ell.
@@ -107,60 +132,12 @@ class PriorSpectrum(Scale):
                 f"{type(model.prior).__name__}; use a HarmonicPrior"
             )
         spectrum = model.prior.spectrum
-        spectrum = spectrum * self.factor(spectrum.shape[0] - 1, values)
+        ell = np.arange(spectrum.shape[0])
+        if self.edges:
+            if self.edges[-1] > ell[-1]:
+                raise InputError(f"a band begins at ell = {self.edges[-1]}, above lmax = {ell[-1]}")
+            band = np.searchsorted(np.asarray(self.edges), ell, side="right")
+            spectrum = spectrum * values["band_power"][band]
+        slope = jnp.asarray((ell + 1.0) / PIVOT) ** values.get("tilt", 0.0)
+        spectrum = spectrum * values.get("amplitude", 1.0) * slope
         return replace(model, prior=HarmonicPrior(spectrum, mean=model.prior.mean))
-
-
-class PowerSpectrum(PriorSpectrum):
-    """The spectrum up to an amplitude and a tilt: C_ell A ((ell + 1) / 10)^tilt.
-
-    Attributes
-    ----------
-    log_amplitude_std : () array, optional
-        Prior standard deviation of ln A; None if A is known.
-    tilt_std : () array, optional
-        Prior standard deviation of the tilt; None if it is known.
-    """
-
-    log_amplitude_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
-    tilt_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
-
-    @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        """The sites ``amplitude`` and ``tilt``, if they are not known."""
-        found = []
-        if self.log_amplitude_std is not None:
-            found.append(Unknown("amplitude", 1.0, self.log_amplitude_std, log=True))
-        if self.tilt_std is not None:
-            found.append(Unknown("tilt", 0.0, self.tilt_std))
-        return tuple(found)
-
-    def factor(self, lmax, values):
-        ell = jnp.arange(lmax + 1.0)
-        return values.get("amplitude", 1.0) * ((ell + 1.0) / PIVOT) ** values.get("tilt", 0.0)
-
-
-class SpectrumBands(PriorSpectrum):
-    """The spectrum up to a factor for each band of ells.
-
-    Attributes
-    ----------
-    edges : tuple of int
-        First ell of every band but the lowest, growing.
-    log_std : () array
-        Prior standard deviation of the natural logarithm of each factor.
-    """
-
-    edges: tuple[int, ...] = eqx.field(static=True)
-    log_std: Float[Array, ""] = eqx.field(default=1.0, converter=scalar)
-
-    @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        """The site ``band_power`` (bands,): factors of C_ell, lowest ells first."""
-        return (Unknown("band_power", 1.0, self.log_std, len(self.edges) + 1, log=True),)
-
-    def factor(self, lmax, values):
-        if self.edges[-1] > lmax:
-            raise InputError(f"a band begins at ell = {self.edges[-1]}, above lmax = {lmax}")
-        band = np.searchsorted(np.asarray(self.edges), np.arange(lmax + 1), side="right")
-        return values["band_power"][band]

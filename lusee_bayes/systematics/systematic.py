@@ -376,6 +376,27 @@ class Systematic(eqx.Module):
         bare = LinearGaussian(coupling, prior, noise, model.offset)
         return _derivative(*on_device((self, bare, sky, centre)))
 
+    def beyond_first_order(
+        self, model: LinearGaussian, sky: Modes, z: Vector
+    ) -> dict[str, DataVector]:
+        """What each unknown does to the data beyond first order, in K, by name.
+
+        Parameters
+        ----------
+        model : LinearGaussian
+            Without it.
+        sky : (modes,) array
+            In K.
+        z : (n,) array
+            How far each is off on either side, in prior standard deviations.
+        """
+
+        def seen(way: Vector) -> DataVector:
+            return np.asarray(self.effect(model, self.values(way)).predict(sky))
+
+        middle, ways = seen(0.0 * z), zip(self.names, np.diag(z), strict=True)
+        return {name: (seen(way) + seen(-way)) / 2.0 - middle for name, way in ways}
+
     def expected(self, centre: Vector) -> Vector:
         """What :meth:`marginalised` takes the prior mean for, about values, in prior std's."""
         return np.zeros(len(centre))
@@ -565,17 +586,6 @@ class AdditiveNoise(Systematic):
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Add the covariance to N."""
         return replace(model, noise=model.noise + self.covariance())
-
-    @classmethod
-    def truth(cls, section, context, key) -> Truth:
-        """None: the noise is drawn with its covariance."""
-        return {}
-
-    @classmethod
-    def in_data(cls, section, context, model, truth, key) -> LinearGaussian:
-        """Add one draw of the noise."""
-        covariance = cls.build(section, context, Around()).covariance()
-        return with_added(model, np.asarray(covariance.sample(cls.own_key(key))))
 
 
 class Scale(Systematic):

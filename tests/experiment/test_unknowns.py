@@ -33,7 +33,7 @@ def joint(experiment: lb.Experiment):
     """Sky and unknowns of the model about what the data told, as one Gaussian in NumPy."""
     found, setup = lb.infer(experiment), experiment.setup
     table = found.systematics[-1]
-    factors = np.asarray(table.systematic.errors.factors(table.centre))
+    factors = np.asarray(table.systematic.factors(table.centre))
     t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
     a = np.concatenate([factors[:, None] * np.asarray(setup.coupling.dense()), t], axis=1)
     prior = np.append(np.sqrt(np.asarray(setup.prior.variance())), np.ones(t.shape[1]))

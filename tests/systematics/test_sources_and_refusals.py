@@ -37,7 +37,7 @@ from lusee_bayes.experiment.unknowns import flux_table
 from lusee_bayes.sampling.programs import latent_sites
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.systematics.context import Around
-from lusee_bayes.systematics.prior_spectrum import SpectrumBands
+from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
 from lusee_bayes.systematics.sources import (
     PointSources,
     Source,
@@ -390,7 +390,7 @@ def test_bands_beyond_the_highest_ell():
     # 6 is the highest ell itself
     base = replace(base_model(e.setup), prior=lb.HarmonicPrior(jnp.ones(7)))
     with handlers.seed(rng_seed=0):
-        SpectrumBands((3, 6)).sampled(base)
+        PriorSpectrum(edges=(3, 6)).sampled(base)
 
 
 # --- programs that do not fit the scenario --------------------------------------------------------
