@@ -23,8 +23,7 @@ from lusee_bayes.experiment.diagnosis import (
     model_mistakes,
     port_mixing,
 )
-from lusee_bayes.experiment.draws import doubts
-from lusee_bayes.experiment.experiment import build, infer
+from lusee_bayes.experiment.experiment import build, doubts, infer
 from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.rounds import learned_prior, settled
 from lusee_bayes.experiment.setup import set_up

@@ -31,7 +31,7 @@ from lusee_bayes.instrument.waterfalls import write_waterfall
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.runs.cost import posterior_cost, simulation_cost
 from lusee_bayes.runs.data_run import run_simulate
-from lusee_bayes.runs.forecasting import default_variations, expected_inference, forecast
+from lusee_bayes.runs.plan_run import default_variations, expected_inference, forecast
 from lusee_bayes.testing.contracts import assert_refused
 from lusee_bayes.testing.scenarios import small_scenario
 

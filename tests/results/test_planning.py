@@ -21,8 +21,8 @@ from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.judge.measures import ell_cross
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.results.forecast import Variation, forecast_rows
-from lusee_bayes.runs import forecasting
-from lusee_bayes.runs.forecasting import (
+from lusee_bayes.runs import plan_run
+from lusee_bayes.runs.plan_run import (
     default_variations,
     expected_snr_squared,
     forecast,
@@ -210,7 +210,7 @@ def test_what_is_there_twice_is_computed_once(monkeypatch, tmp_path):
     whole = varied()
     first = forecast(whole)
     monkeypatch.setattr(
-        "lusee_bayes.runs.forecasting.forecast",
+        "lusee_bayes.runs.plan_run.forecast",
         lambda variation: computed.append(variation) or replace(first, variation=variation),
     )
     again, broken = replace(whole, name="again"), replace(whole, lost=(1,))
@@ -269,8 +269,8 @@ def rows_of(folder):
 
 def test_the_command_writes_table_and_figure(tmp_path, capsys, monkeypatch):
     # a few variations are enough; the Sun is up all the time
-    monkeypatch.setattr(forecasting, "CYCLES", (0.05,))
-    monkeypatch.setattr(forecasting, "PARTS", (1,))
+    monkeypatch.setattr(plan_run, "CYCLES", (0.05,))
+    monkeypatch.setattr(plan_run, "PARTS", (1,))
     tiny = [*TINY, "--set", "observation.start=2027-02-03"]
     assert run("plan", "fiducial", "noise_x100", *tiny, "-o", tmp_path) == 0
     assert {p.name for p in tmp_path.iterdir()} == {"plan.csv", "figures", "manifest.json"}
