@@ -15,7 +15,7 @@ means E and covariance V of z, becomes that given all data (:mod:`.amplitudes`) 
 
 since m depends on other channels through z alone, and so do ground and gains.
 
-Unfinished work is kept in files: ``DIR/channels/25.information.nc`` holds what a channel's data say,
+Unfinished work is kept in files: ``DIR/channels/25.information.nc`` holds what its data say,
 ``25.result.nc`` its posterior. So memory stays bounded, and an interrupted run goes on where it
 was. Files of other scenarios or data are made anew. A joint posterior adds up what the files of all
 channels say.
