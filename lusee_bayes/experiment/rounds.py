@@ -44,7 +44,7 @@ from lusee_bayes.priors.learning import Learned, learn_whatever_fits
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.gain_drifts import gains_about
 from lusee_bayes.systematics.noise_level import radiometer_about
-from lusee_bayes.systematics.pointing import PointingOffsets
+from lusee_bayes.systematics.pointing_offsets import PointingOffsets
 from lusee_bayes.systematics.registered import SYSTEMATICS
 from lusee_bayes.systematics.systematic import Expanded, Marginalised, Systematic, present
 

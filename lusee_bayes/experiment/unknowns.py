@@ -36,7 +36,7 @@ from lusee_bayes.linear.amplitudes import (
 )
 from lusee_bayes.sky.galaxy import kelvin_steradian
 from lusee_bayes.systematics.gain_table import COMMON_GAIN
-from lusee_bayes.systematics.pointing import PointingOffsets, shifted
+from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
 from lusee_bayes.systematics.sources import PointSources
 from lusee_bayes.systematics.systematic import Expanded
 

@@ -188,10 +188,9 @@ def read_runs(folders: Sequence[str | Path]) -> list[FinishedRun]:
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"two of the folders are named '{twice}'; rename one of them")
     for run in runs:
-        if len(run.channels) > 1:
+        if len(run.channels) > 1 or run.channel.judged is None:
             raise InputError(
-                f"'{run.name}' is a run of {len(run.channels)} frequencies; give folders of maps "
-                "of one frequency"
+                f"'{run.name}' is a run of frequencies_mhz; give folders of maps of one frequency"
             )
     return runs
 

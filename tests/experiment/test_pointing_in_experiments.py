@@ -29,7 +29,7 @@ from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.sky.galaxy import galactic_unit_vector
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.context import Around
-from lusee_bayes.systematics.pointing import PointingOffsets, shifted
+from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
 
 TWO_RUNS = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
 OFF = "clock_s: 60, turntable_0_deg: 0.3, turntable_1_deg: 0.0, clock_drift_s_per_day: 0.0"

@@ -127,7 +127,7 @@ def test_unknowns_of_added_data_are_said_to_be_of_the_new_data(response_file, tm
     alone = lb.build(second)
     run = lb.run_map(second, tmp_path / "both", earlier=tmp_path / "first")
     expected = unknowns_report(alone, lb.infer(alone))
-    pd.testing.assert_frame_equal(run.result.unknowns.table, expected.table)
+    pd.testing.assert_frame_equal(run.result.channel.unknowns.table, expected.table)
     note = "what the new data alone tell"
     assert any(note in line for line in run.result.lines())
     assert note in map_page(tmp_path / "both", "both")

@@ -60,8 +60,13 @@ def test_different_data_are_told_apart(runs, tmp_path, capsys):
     assert "Do not compare the evidences" in capsys.readouterr().out
 
 
-def test_what_cannot_be_compared(runs, tmp_path, capsys):
+def test_what_cannot_be_compared(runs, small_cube, tmp_path, capsys, numbers_alone):
+    one = lb.run_map(
+        lb.load_scenario("fiducial", [*SMALL, "frequencies_mhz=[25]"]), tmp_path / "one"
+    )
     for folders, message in (
+        ([runs / "fiducial", small_cube.folder], "'cube' is a run of frequencies_mhz"),
+        ([runs / "fiducial", one.folder], "'one' is a run of frequencies_mhz"),
         ([runs / "fiducial"], "give two folders or more to compare, got 1"),
         ([runs / "fiducial", tmp_path], "has no summary.json"),
         ([runs / "fiducial", runs / "fiducial"], "two of the folders are named 'fiducial'"),

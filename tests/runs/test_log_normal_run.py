@@ -67,7 +67,7 @@ def test_samples_have_the_moments_of_weighted_draws(tmp_path):
     run = lb.run_sample(scenario, tmp_path / "samples", program=program, sampler=sampler)
     (sampled,) = run.result
     # tails of A where the sky hardly tells it are steep: one of a thousand may fail
-    assert sampled.figures()["divergences"] <= 5
+    assert sampled.figures().divergences <= 5
     table = sampled.summary
     assert table["r_hat"].max() < 1.02
     rows, weights = weighted_draws(sampled, 4000)
