@@ -142,7 +142,7 @@ def test_permittivity_loss_tangent_and_tilt():
     arguments = {**arguments, "systematics": (coarse,)}
     sampler = Sampler(warmup=40, draws=N_DRAWS, algorithm="hmc")
     draws = Draws(program, arguments, sampler, starts=3)
-    found = ranks_of(program, arguments, Sites(tuple(antennas.stds)), draws=draws)
+    found = ranks_of(program, arguments, Sites(antennas.names), draws=draws)
     assert_calibrated(found)
 
 
