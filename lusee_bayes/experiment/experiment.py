@@ -23,12 +23,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, simulate
-from lusee_bayes.experiment.rounds import (
-    Inference,
-    rebuilds,
-    settled,
-    with_learned_prior,
-)
+from lusee_bayes.experiment.rounds import Inference, rebuilds, settled, with_learned_prior
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.instrument.instrument import Instrument

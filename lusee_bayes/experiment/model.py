@@ -22,14 +22,7 @@ from lusee_bayes.noise.radiometer import radiometer_noise
 from lusee_bayes.systematics.context import Around, Context, noise_visibilities
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.registered import SYSTEMATICS
-from lusee_bayes.systematics.systematic import (
-    Expanded,
-    Marginalised,
-    Systematic,
-    Truth,
-    Values,
-    present,
-)
+from lusee_bayes.systematics.systematic import Expanded, Marginalised, Systematic, Truth, present
 
 
 def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
@@ -49,7 +42,7 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
     return radiometer_noise(visibilities, setup.layout, **given, **common)
 
 
-def moved(setup: Setup, values: Values | None) -> Context:
+def moved(setup: Setup, values: Truth | None) -> Context:
     """The setup with the instrument that has these values, its signal with it."""
     for cls, section in present(SYSTEMATICS, setup.scenario) if values else ():
         setup = cls.moved(section, setup, values)
@@ -106,10 +99,21 @@ def in_noise(
     return [s.behind(g) if isinstance(s, Expanded) else s for s, g in zip(held, later, strict=True)]
 
 
-def model_about(setup: Setup, around: Around) -> tuple[LinearGaussian, tuple[Marginalised, ...]]:
-    """The full model, and the systematics in its N."""
-    model, found = base_model(setup, around), systematics(setup, around)
-    held = in_noise(setup, model, (systematic for _, systematic in found), around)
+def model_about(
+    setup: Setup, around: Around, *, scaling: bool = True
+) -> tuple[LinearGaussian, tuple[Marginalised, ...]]:
+    """The full model, and the systematics in its N.
+
+    Parameters
+    ----------
+    setup : Setup
+    around : Around
+        What N is built around.
+    scaling : bool
+        Whether those are part of it that scale the sky.
+    """
+    model, found = base_model(setup, around), (s for _, s in systematics(setup, around))
+    held = in_noise(setup, model, (s for s in found if scaling or not s.scales_sky), around)
     return marginalised(model, held), tuple(held)
 
 

@@ -16,15 +16,7 @@ from lusee_bayes.core.arrays import DataVector, Grid, Vector
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.section import is_modelled
-from lusee_bayes.experiment.model import (
-    base_model,
-    full_model,
-    in_noise,
-    marginalised,
-    model_about,
-    moved,
-    systematics,
-)
+from lusee_bayes.experiment.model import full_model, model_about, moved
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.sky_sections import (
@@ -215,13 +207,9 @@ def _start(setup: Setup, data: Visibilities) -> Around:
     the data's, the sky.
     """
     around = Around(data)
-    found = [systematic for _, systematic in systematics(setup, around)]
-    others = [systematic for systematic in found if not systematic.scales_sky]
-    if len(others) == len(found):
+    if not any(cls.scales_sky for cls in first_order(setup)):
         return around
-    model = base_model(setup, around)
-    held = in_noise(setup, model, others, around)
-    model = marginalised(model, held)
+    model, held = model_about(setup, around, scaling=False)
     columns = [np.zeros((model.n_data, 0))]
     columns += [s.columns for s in held if isinstance(s, Expanded)]
     posterior = model.condition(data.data)

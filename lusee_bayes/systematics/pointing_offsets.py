@@ -34,7 +34,6 @@ from lusee_bayes.instrument.pointing import (
     with_offsets,
 )
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.systematics.context import Around, Context
 from lusee_bayes.systematics.sources import SOURCE_NODES, expected_signal, source_responses
 from lusee_bayes.systematics.systematic import Systematic, Truth, Unknown, Values, with_added
@@ -206,7 +205,7 @@ class PointingOffsets(Systematic):
         return drawn | {name: float(value) for name, value in section.true_values.items()}
 
     @classmethod
-    def in_data(cls, section, context, model, truth, key) -> LinearGaussian:
+    def in_data(cls, section, context, model, truth, key):
         """The same: its A is that of the offsets."""
         return model
 

@@ -18,7 +18,6 @@ from pydantic import Field
 from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.section import Positive, Section, requires
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.context import Around, Context
 from lusee_bayes.systematics.systematic import Scale, Truth, Unknown, scalar_or_none
@@ -102,7 +101,7 @@ class PriorSpectrum(Scale):
         return {}
 
     @classmethod
-    def in_data(cls, section, context, model, truth, key) -> LinearGaussian:
+    def in_data(cls, section, context, model, truth, key):
         return model
 
     @property

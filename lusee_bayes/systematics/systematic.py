@@ -34,15 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import (
-    Array,
-    DataVector,
-    Modes,
-    Vector,
-    namespace,
-    on_device,
-    scalar,
-)
+from lusee_bayes.core.arrays import Array, DataVector, Modes, Vector, namespace, on_device, scalar
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import dist, numpyro
