@@ -15,13 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference_linear import (
-    assert_draws_follow,
-    exact,
-    posterior,
-    random_covariance,
-    solve_exactly,
-)
+from reference_linear import assert_draws_follow, exact, posterior, random_covariance, solve_exactly
 from scipy.stats import multivariate_normal, ortho_group
 
 import lusee_bayes as lb

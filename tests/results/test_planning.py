@@ -19,7 +19,6 @@ from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.judge.measures import ell_cross
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.results.forecast import Variation, forecast_rows
 from lusee_bayes.runs import plan_run
 from lusee_bayes.runs.plan_run import (
@@ -169,7 +168,7 @@ def test_an_ell_that_is_not_seen_and_one_without_power():
     """Expected SNR^2 of 0 and NaN; neither is clipped."""
     a = jnp.eye(9)[:4]
     prior = lb.HarmonicPrior(jnp.asarray([0.0, 3.0, 2.0]))
-    model = LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(4)))
+    model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(4)))
     found = expected_snr_squared(model.factorise("map").condition(jnp.zeros(4)))
     assert np.isnan(found[0])
     np.testing.assert_allclose(found[1:], [3.0, 0.0], atol=1e-15)
