@@ -28,7 +28,7 @@ W = q (r F_few L^-T): of a day of ten-minute samples a sixth of the rows is comp
     chi^2_s = u_s^T D_ss^-1 u_s + h^T Q_s^-1 h,    |K_ss| = |D_ss| |Q_s| / |Q|,
     directions = tr (Q_s^-1 - Q^-1) of the sky.
 
-What is left without a group has N_0 without it, so that D loses D_:s D_ss^-1 D_s:.
+What is left without a group has N_0 without it, so that D loses ``D_:s D_ss^-1 D_s:``.
 """
 
 from __future__ import annotations
@@ -546,7 +546,7 @@ def solve_roots(root: Roots, x: np.ndarray, *, transpose: bool = False) -> np.nd
 
 
 def lost_weights(weights: Weights, chosen: CellFlags) -> Weights:
-    """What D loses without a group: D_:s D_ss^-1 D_s:, all of it in the rows of the group."""
+    """What D loses without a group, ``D_:s D_ss^-1 D_s:``, all of it in the rows of the group."""
     if weights.ndim == 2:
         return np.where(chosen, weights, 0.0)
     lost, blocks = np.zeros_like(weights), np.flatnonzero(chosen.any(axis=1))
