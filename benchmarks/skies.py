@@ -27,8 +27,7 @@ from rich.table import Table
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
-from lusee_bayes.experiment.draws import deviations
-from lusee_bayes.experiment.experiment import under_sky
+from lusee_bayes.experiment.experiment import deviations, under_sky
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.judge.coverage import Counts
 from lusee_bayes.judge.levels import LEVELS

@@ -389,8 +389,7 @@ def plan_command(
     from lusee_bayes.cli.tables import forecast_table
     from lusee_bayes.results.forecast import forecast_lines
     from lusee_bayes.runs.cost import demand_of, posterior_cost
-    from lusee_bayes.runs.forecasting import variations_of
-    from lusee_bayes.runs.plan_run import run_plan
+    from lusee_bayes.runs.plan_run import run_plan, variations_of
 
     sources, given = [scenario, *others], options.running()
     variations = variations_of(sources, options.set_, vary, given["stages"])

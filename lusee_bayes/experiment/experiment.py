@@ -13,9 +13,11 @@ from functools import cache
 from operator import attrgetter
 from typing import Any
 
+import jax
 import numpy as np
+from jaxtyping import PRNGKeyArray
 
-from lusee_bayes.core.arrays import on_device
+from lusee_bayes.core.arrays import Draws, on_device, on_host
 from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
@@ -28,7 +30,8 @@ from lusee_bayes.instrument.instrument import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.plausibility import require_plausible
 from lusee_bayes.linear.information import Information
-from lusee_bayes.priors.learning import Learned
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.priors.learning import Learned, draws_with_parameters
 from lusee_bayes.sky.sky_source import SkySource
 from lusee_bayes.systematics.beam import BeamErrors
 from lusee_bayes.systematics.context import Around
@@ -293,3 +296,63 @@ def embedded_instrument(setup: Setup) -> Instrument:
             "beam.file"
         )
     return setup.prepared
+
+
+# what the seed is folded with for posterior draws
+DRAWS = 1
+
+
+def draw_key(scenario: Scenario) -> PRNGKeyArray:
+    """The key of a scenario's posterior draws."""
+    return jax.random.fold_in(jax.random.key(scenario.seed), DRAWS)
+
+
+def posterior_draws(
+    experiment: Experiment, posterior: Posterior, information: Callable[[], Information], n: int
+) -> Draws:
+    """Draw the sky.
+
+    Where the prior was learned, its parameters are drawn, too (:mod:`.learning`); not for
+    data that do not fit, which would not let them be uncertain.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    posterior : Posterior
+        The Gaussian posterior.
+    information : callable
+        ``information()`` of the data behind it, asked for where parameters are drawn.
+    n : int
+
+    Returns
+    -------
+    (draws, modes) array
+        In K.
+    """
+    key, learned = draw_key(experiment.scenario), experiment.learned
+    if learned is not None and learned.fits:
+        family = experiment.setup.family
+        return draws_with_parameters(family, learned, information(), key, n)
+    return np.asarray(on_host(posterior).sample(key, n))
+
+
+def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
+    """What is doubtful about an experiment's data, its prior and its rounds."""
+    learned, found = experiment.learned, list(experiment.doubts)
+    if learned is not None and not learned.settled:
+        found.append(
+            "The prior is a fixed, wide one: its parameters do not settle, whatever the noise."
+        )
+    elif learned is not None and learned.noise_factor > 1.0:
+        found.append(
+            f"The prior was learned with N times {learned.noise_factor:.2g}, as the residual chi^2 "
+            "demands; the map has the scenario's N."
+        )
+    if learned is not None and learned.still_moves > 0.0:
+        found.append(
+            f"The map still moves by {learned.still_moves:.2g} of its standard deviations from one "
+            "round of learning its prior to the next."
+        )
+    if inference.unsettled:
+        found.append(inference.unsettled)
+    return tuple(found)

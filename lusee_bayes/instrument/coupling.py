@@ -47,6 +47,9 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
 
+# times whose data A^T d takes at once: it bounds the memory
+MOST_TIMES = 8192
+
 
 class Coupling(Described, eqx.Module):
     """A matrix A, of shape (data, unknowns), from a sky in K to data in K.
@@ -500,12 +503,14 @@ class CouplingMatrix(Coupling):
         functions = self.pointing.functions
         both = 0.0
         for run, span in self.pointing.runs():
-            weighted = grid[:, span].T[:, :, None] * functions[span][:, None]
-            weighted = weighted.reshape(weighted.shape[0], -1)
-            x_and_y = namespace(weighted).stack(
-                [cosine[span].T @ weighted, sine[span].T @ weighted], axis=-1
-            )
-            both = both + self.by_order[run].swapaxes(1, 2) @ x_and_y
+            for first in range(span.start, span.stop, MOST_TIMES):
+                part = slice(first, min(first + MOST_TIMES, span.stop))
+                weighted = grid[:, part].T[:, :, None] * functions[part][:, None]
+                weighted = weighted.reshape(weighted.shape[0], -1)
+                x_and_y = namespace(weighted).stack(
+                    [cosine[part].T @ weighted, sine[part].T @ weighted], axis=-1
+                )
+                both = both + self.by_order[run].swapaxes(1, 2) @ x_and_y
         # (orders, degrees): of pairs, and of what they are crossed to
         straight, crossed = both[..., 0], both[..., 1]
         plus, minus = straight[:, :n] - crossed[:, n:], straight[:, n:] + crossed[:, :n]

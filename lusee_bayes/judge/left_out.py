@@ -45,6 +45,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import (
     cholesky,
     inverse_from_cholesky,
+    invert_factorised,
     solve_lower,
     spanning_rows,
     times_lower,
@@ -65,6 +66,8 @@ REFINEMENTS = 2
 # runs of no more times have one F_few for all groups; in others, own entries of K^-1 have one for
 # so many times
 SHARED, NEAR = 1000, 144
+# times whose rows are computed at once
+CHUNK = 64
 
 # arrays by block of D (times, or one block of all data) and place in it (products, or data)
 Cells = Float[np.ndarray, "blocks places"]
@@ -390,11 +393,11 @@ class LeftOut:
             some = weights.any(axis=-1) if weights.ndim == 3 else weights != 0.0
             return rows[some].T @ weigh(weights, rows)[some].reshape(-1, rank)
         n, coupling = self._n_templates, self._model.coupling
+        sky = self._model.prior.sandwich(summed(coupling, np.moveaxis(weights, 0, -1)))
+        if not n:
+            return sky
         across = self._pull(weigh(weights, self._t))
-        gram = np.empty((len(across),) * 2)
-        gram[:, :n], gram[:n] = across, across.T
-        gram[n:, n:] = self._model.prior.sandwich(summed(coupling, np.moveaxis(weights, 0, -1)))
-        return gram
+        return np.block([[across[:n], across[n:].T], [across[n:], sky]])
 
     def _rows(self, blocks: Int[np.ndarray, " n"] | None) -> Float[np.ndarray, "n places rank"]:
         """F at some times, of all products; or of all data."""
@@ -428,7 +431,9 @@ class LeftOut:
         few = spanning_rows(np.concatenate(features, axis=1), run, most or len(times))
         if few is None:
             return None
-        return Near(*self._halves(self._rows(times[few[0]]).swapaxes(0, 1)), few[1])
+        parts = np.array_split(times[few[0]], -(-len(few[0]) // CHUNK))
+        halves = in_threads(lambda part: self._halves(self._rows(part).swapaxes(0, 1)), parts)
+        return Near(*(np.concatenate(x, axis=1) for x in zip(*halves, strict=True)), few[1])
 
     def _lost_by_prediction(self, times: Int[np.ndarray, " n"]) -> Cells:
         """The diagonal of Y Q^-1 Y^T at these times."""
@@ -492,22 +497,25 @@ class LeftOut:
     @once
     def _trace(self) -> float:
         """tr Q^-1 of the sky."""
-        return self._trace_of_sky(self._lower)
+        return self._trace_of_sky(self._lower.copy())
 
     def _trace_of_sky(self, lower: Square) -> float:
-        return float(np.diagonal(inverse_from_cholesky(lower))[self._n_templates :].sum())
+        """tr (L L^T)^-1 of the sky; overwrites L."""
+        invert_factorised(lower)
+        return float(np.diagonal(lower)[self._n_templates :].sum())
 
     def _taken_out(self, chosen: Chosen) -> tuple[float, float, float]:
         """chi^2_s, directions and ln|Q_s| - ln|Q|."""
-        left = self._normal - self._gram(lost_weights(self._weights, chosen.cells))
-        lower = cholesky(left, overwrite=True)
         mean = np.zeros((*chosen.cells.shape, 1))
         where = np.ix_(chosen.blocks, chosen.places)
         mean[where] = solve_roots(chosen.root, chosen.b, transpose=True)
-        h = solve_lower(lower, self._pull(weigh(self._weights, mean)), transpose=False)
+        h = self._pull(weigh(self._weights, mean))
+        gram = self._gram(lost_weights(self._weights, chosen.cells))
+        lower = cholesky(np.subtract(self._normal, gram, out=gram), overwrite=True)
+        h = solve_lower(lower, h, transpose=False)
+        log_det = log_det_of(lower) - log_det_of(self._lower)
         directions = self._trace_of_sky(lower) - self._trace
-        chi2 = float((chosen.b**2).sum() + (h**2).sum())
-        return chi2, directions, log_det_of(lower) - log_det_of(self._lower)
+        return float((chosen.b**2).sum() + (h**2).sum()), directions, log_det
 
 
 def log_det_of(root: Square) -> float:

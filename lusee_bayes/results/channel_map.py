@@ -27,8 +27,7 @@ from lusee_bayes.core.harmonics import (
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.diagnosis import diagnose
-from lusee_bayes.experiment.draws import doubts, posterior_draws
-from lusee_bayes.experiment.experiment import Experiment, explained, infer
+from lusee_bayes.experiment.experiment import Experiment, doubts, explained, infer, posterior_draws
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport, flux_table, pointing_report
 from lusee_bayes.instrument.beams.fields import HemisphereGrid

@@ -32,7 +32,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import NO_ROOM, write_four_port, write_waterfall
 from lusee_bayes.runs.cost import require_fits, require_resources, simulation_cost
 from lusee_bayes.runs.folder import RunKind, inputs_of, scenario_run
-from lusee_bayes.runs.forecasting import expected_inference
+from lusee_bayes.runs.plan_run import expected_inference
 
 
 def run_simulate(

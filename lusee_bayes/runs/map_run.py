@@ -23,8 +23,7 @@ from lusee_bayes.results.map_files import (
     write_maps,
 )
 from lusee_bayes.results.map_result import MapResult
-from lusee_bayes.runs.channel_files import CHANNELS
-from lusee_bayes.runs.channels import map_channels
+from lusee_bayes.runs.channels import CHANNELS, map_channels
 from lusee_bayes.runs.cost import posterior_cost, require_fits
 from lusee_bayes.runs.folder import (
     SCENARIO,

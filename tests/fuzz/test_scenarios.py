@@ -14,7 +14,7 @@ from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.keys import scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.runs.cost import posterior_cost, require_fits
-from lusee_bayes.runs.forecasting import given_variations
+from lusee_bayes.runs.plan_run import given_variations
 
 few_and_many = pytest.mark.parametrize("n", [50, pytest.param(500 * SCALE, marks=pytest.mark.long)])
 

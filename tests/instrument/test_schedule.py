@@ -292,10 +292,7 @@ def test_a_command_table_of_opsim(write):
             "1: {start: 61050.8, mode: science}\n2: {start: 61050.7, mode: maint}\n",
             "entry 2: start 61050.7 does not come after that of the entry before, 61050.8; sort",
         ),
-        (
-            "1: {start: 61050.8, mode: maint}\n",
-            "comtable.yml: a schedule needs at least one",
-        ),
+        ("1: {start: 61050.8, mode: maint}\n", "comtable.yml: a schedule needs at least one"),
         (
             "1: {start: 61050.8, mode: maint}\n2: {start: 61051, mode: science}\n",
             "entry 2: the last entry is in the mode science, and nothing says when it ends; add an",

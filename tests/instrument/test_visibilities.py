@@ -12,7 +12,6 @@ from assertions import close, refused
 from astropy.time import Time
 
 import lusee_bayes as lb
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.products import (
     DataLayout,
     Product,
@@ -166,9 +165,7 @@ def test_any_order_of_products_and_of_their_ports():
     np.testing.assert_array_equal(made.grid(), expected())
     # the other convention: every array is the conjugate, and said so once
     made = make(
-        columns(pairs).conj(),
-        products=[f"{i}-{j}" for i, j in pairs],
-        convention="conj(s_i) s_j",
+        columns(pairs).conj(), products=[f"{i}-{j}" for i, j in pairs], convention="conj(s_i) s_j"
     )
     np.testing.assert_array_equal(made.grid(), expected())
 
@@ -326,7 +323,7 @@ def test_scatter_is_the_transpose_of_gather(flags, rest):
 
 
 def test_nothing_left_is_an_error():
-    with pytest.raises(InputError, match="all 15 samples are flagged"):
+    with pytest.raises(lb.InputError, match="all 15 samples are flagged"):
         DataLayout.from_flags(np.ones((3, 5), dtype=bool))
 
 

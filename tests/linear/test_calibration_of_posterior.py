@@ -18,7 +18,6 @@ from scipy.stats import chi2, kstest
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.solver import FORMS
 
 LMAX, N_MODES, N_DRAWS, SEED = 8, 81, 4000, 20270115
@@ -61,7 +60,7 @@ class Setup:
         """C^-1/2 (m - mean), shape (draws, modes), of data with noise ``truth``."""
         skies, data = self.simulate(truth)
         prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM))
-        solver = LinearGaussian(self.coupling, prior, assumed).factorise(form)
+        solver = lb.LinearGaussian(self.coupling, prior, assumed).factorise(form)
         means = jax.jit(jax.vmap(lambda d: solver.condition(d).mean))(jnp.asarray(data))
         covariance = np.asarray(solver.condition(jnp.asarray(data[0])).covariance())
         # in units of the prior: the monopole's variance is 1e-10 of it, the rest of order one

@@ -15,13 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference_linear import (
-    assert_draws_follow,
-    exact,
-    posterior,
-    random_covariance,
-    solve_exactly,
-)
+from reference_linear import assert_draws_follow, exact, posterior, random_covariance, solve_exactly
 from scipy.stats import multivariate_normal, ortho_group
 
 import lusee_bayes as lb
@@ -29,7 +23,7 @@ from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.judge.left_out import LeftOut, groups_of
 from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
-from lusee_bayes.runs.forecasting import informed_modes
+from lusee_bayes.runs.plan_run import informed_modes
 
 N = 25
 RNG = np.random.default_rng(3)

@@ -22,7 +22,6 @@ from lusee_bayes.judge.measures import (
     signal_to_noise,
 )
 from lusee_bayes.linear import posterior as posterior_module
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.solver import FORMS
 
 SPECTRUM = np.array([4.0, 1.0, 0.5, 0.25])
@@ -42,7 +41,7 @@ def conditioned(n_data, form, prior=None, blind=False):
     prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM)) if prior is None else prior
     a = jnp.asarray(a)
     a = prior.coupling(a) if isinstance(prior, lb.PixelPrior) else a
-    model = LinearGaussian(a, prior, lb.DenseCovariance(jnp.asarray(n)))
+    model = lb.LinearGaussian(a, prior, lb.DenseCovariance(jnp.asarray(n)))
     return model.condition(jnp.asarray(d), form), posterior(a, prior.covariance(), n, d)
 
 

@@ -16,16 +16,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
-from lusee_bayes.experiment.experiment import build, infer
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.judge import residuals as residuals_module
 from lusee_bayes.results.channel_map import region_of
 from lusee_bayes.results.map_files import read_channels
-from lusee_bayes.runs.map_run import run_map
-from lusee_bayes.runs.sample_run import run_sample
-from lusee_bayes.sampling.hmc import Sampler
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
@@ -44,9 +40,9 @@ def cube(small_cube):
 
 @pytest.fixture(scope="module")
 def sampled(tmp_path_factory):
-    scenario = load_scenario("fiducial", ["lmax=2", "observation.runs.0.cycles=0.05"])
-    sampler = Sampler(draws=50, warmup=50, seed=scenario.seed)
-    return run_sample(scenario, tmp_path_factory.mktemp("run") / "s", sampler=sampler).folder
+    scenario = lb.load_scenario("fiducial", ["lmax=2", "observation.runs.0.cycles=0.05"])
+    sampler = lb.Sampler(draws=50, warmup=50, seed=scenario.seed)
+    return lb.run_sample(scenario, tmp_path_factory.mktemp("run") / "s", sampler=sampler).folder
 
 
 def viewer_data(page: str) -> dict:
@@ -185,12 +181,12 @@ def test_what_has_no_report_is_told(tmp_path, capsys):
 def test_a_corrupted_product_is_pointed_at(tmp_path, factor):
     """One product of a gain run is too large: the page says which, or that the data do not tell."""
     given = ["lmax=8", "observation.runs.0.cycles=0.2"]
-    scenario = load_scenario("gain_1e-3", given)
-    data = build(scenario).data
+    scenario = lb.load_scenario("gain_1e-3", given)
+    data = lb.build(scenario).data
     grid = data.grid()
     grid[8] *= factor
     replace(data, data=data.layout.gather(jnp.asarray(grid))).write(tmp_path / "bad.nc")
-    run_map(scenario, tmp_path / "out", data=tmp_path / "bad.nc")
+    lb.run_map(scenario, tmp_path / "out", data=tmp_path / "bad.nc")
     page = (tmp_path / "out" / "report.html").read_text()
     told = {1.2: "without product 12R .*: leave it out", 1.02: "any one of .* do not tell which"}
     assert re.search(rf'class="verdict bad">Does not fit.*{told[factor]}', page)
@@ -206,14 +202,14 @@ def test_a_page_without_groups(tmp_path, monkeypatch):
     """Noise that couples times, and an A that would be too large to judge its data one by one."""
     monkeypatch.setattr(residuals_module, "DENSE_BYTES", 0.0)
     overrides = ["lmax=4", "observation.runs.0.cycles=0.1", "noise.gain={sigma: 0.01}"]
-    run = run_map(load_scenario("fiducial", overrides), tmp_path / "map")
+    run = lb.run_map(lb.load_scenario("fiducial", overrides), tmp_path / "map")
     (channel,) = read_channels(run.folder / "diagnostics.nc")
     assert not any(groups for _, groups in channel.judged.kinds())
     assert np.isnan(channel.judged.z).all()
     assert channel.judged.verdict == run.result.verdict()
     # the rest is judged as ever: chi^2 of all data under the model, by matrices
-    experiment = build(run.result.scenario)
-    model, data = infer(experiment).model, experiment.data.data
+    experiment = lb.build(run.result.scenario)
+    model, data = lb.infer(experiment).model, experiment.data.data
     a = np.asarray(model.coupling.dense())
     k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
     expected = np.asarray(data) @ np.linalg.solve(k, np.asarray(data))

@@ -20,7 +20,6 @@ from astropy.io import fits
 from reference_linear import resolution_rows
 
 import lusee_bayes as lb
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
 from lusee_bayes.report.rendering import render
 from lusee_bayes.report.viewer import BUDGET, KERNEL_NSIDE, nside_of_page, resolution, viewer
@@ -288,9 +287,9 @@ def test_everything_that_is_given_of_two_channels_is_shown(small_map, tmp_path):
 def test_maps_that_do_not_go_together_are_refused():
     mean = np.ones((2, 12))
     for other in (np.ones((1, 12)), np.ones((2, 48))):
-        with pytest.raises(InputError, match="maps of std have the shape"):
+        with pytest.raises(lb.InputError, match="maps of std have the shape"):
             viewer([10.0, 20.0], {"mean": mean, "std": other})
-    with pytest.raises(InputError, match="on a HEALPix grid"):
+    with pytest.raises(lb.InputError, match="on a HEALPix grid"):
         viewer([10.0], {"mean": np.ones((1, 13)), "std": np.ones((1, 13))})
 
 

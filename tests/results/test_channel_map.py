@@ -189,3 +189,29 @@ def test_modes_that_the_prior_knows_exactly_can_have_earlier_data():
     # the same data twice: what the second asks of the first is nothing
     assert channel.chi2_model < 1.5 * channel.n_data
     assert np.isfinite(channel.judged.z).all()
+
+
+@pytest.mark.parametrize(
+    "kind", [[], ["joint=true", "spectral.components=[power_law]"]], ids=["independent", "joint"]
+)
+def test_covariances_of_every_channel_are_kept(kind, tmp_path, numbers_alone):
+    """And with all that can be asked for at once, every channel is judged."""
+    sizes = ["lmax=3", "observation.runs.0.cycles=0.1", "frequencies_mhz=[20, 25, 30]"]
+    output = "output={covariance: true, draws: 2, information: true}"
+    scenario = lb.load_scenario("fiducial", [*sizes, output, *kind])
+    run = lb.run_map(scenario, tmp_path / "run", thorough=True)
+    tree = posterior_of(run.folder)
+    assert tree["covariance"].dims == ("frequency", "mode", "mode_2")
+    variances = np.diagonal(tree["covariance"].values, axis1=1, axis2=2)
+    np.testing.assert_allclose(np.sqrt(variances), tree["std"], rtol=1e-9)
+    assert list(tree["information"].children) == ["20", "25", "30"]
+    for channel in run.result.channels:
+        assert channel.judged.level == "consistent" and channel.diagnosis is not None
+    # what is written is read back
+    again = FinishedRun.read(run.folder).channels
+    for here, there in zip(run.result.channels, again, strict=True):
+        assert here.judged.suspects == there.judged.suspects
+        assert here.judged.products == there.judged.products
+        assert here.diagnosis == there.diagnosis and here.coverage == there.coverage
+        np.testing.assert_array_equal(here.mean, there.mean)
+        np.testing.assert_array_equal(here.judged.z, there.judged.z)

@@ -14,7 +14,6 @@ from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.results.channel_map import region_rows
 from lusee_bayes.results.map_files import posterior_tree, read_information
-from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.testing.scenarios import small_scenario
 
 LMAX = 6
@@ -80,7 +79,7 @@ def test_its_resolution_is_packed(found):
 def test_new_data_are_added_to_its_file(found, tmp_path):
     made, channel = found
     scenario, path = made.experiment.scenario, tmp_path / "posterior.nc"
-    posterior_tree(MapResult(scenario, (channel,))).to_netcdf(path, engine="h5netcdf")
+    posterior_tree(lb.MapResult(scenario, (channel,))).to_netcdf(path, engine="h5netcdf")
     saved, full = read_information(path, scenario), made.found.posterior
     assert saved.digests == (made.experiment.data.digest(),)
     # what is saved is information, from which the posterior is found anew

@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 from commands import posterior_of, sky_draws_of
 
+import lusee_bayes as lb
 from lusee_bayes.core.engine import ThisProcess
-from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.runs.map_run import run_map
 
 pytest.importorskip("distributed")
 
@@ -111,8 +110,10 @@ def alone(tmp_path_factory):
     folder = tmp_path_factory.mktemp("alone")
     settings = [*SETTINGS, f"frequencies_mhz={TWELVE}", "output.draws=3"]
     for name in ("independent", "joint"):
-        scenario = load_scenario("fiducial", [*settings, f"joint={str(name == 'joint').lower()}"])
-        run_map(scenario, folder / name, engine=ThisProcess(2))
+        scenario = lb.load_scenario(
+            "fiducial", [*settings, f"joint={str(name == 'joint').lower()}"]
+        )
+        lb.run_map(scenario, folder / name, engine=ThisProcess(2))
     return {name: (folder / name) for name in ("independent", "joint")}
 
 

@@ -11,10 +11,9 @@ import pytest
 from commands import run
 from experiments import mapped
 
-from lusee_bayes.experiment.experiment import build
+import lusee_bayes as lb
 from lusee_bayes.experiment.rounds import NAMED
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.runs.compare_run import run_compare_priors
 from lusee_bayes.sky.sky_files import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -63,7 +62,7 @@ def test_it_is_what_separate_maps_find(finished):
     found = json.loads((finished / "priors.json").read_text())["priors"]
     for one in found[:2]:  # learned, and given
         scenario = small_scenario(**SIZES).model_copy(update={"prior": NAMED[one["name"]]})
-        experiment = build(scenario)
+        experiment = lb.build(scenario)
         _, channel = mapped(experiment)
         learned = experiment.learned
         expected = channel.log_evidence if learned is None else learned.log_evidence
@@ -84,7 +83,9 @@ def test_data_of_a_prior_prefer_it(name, tmp_path):
     sky[0] = setup.sky.modes[0]
     path = write_alms(tmp_path / "sky.fits", sky, {})
     drawn = small_scenario(f"sky={{model: file, file: {path}}}", "sky.sources=null", **SIZES)
-    result = run_compare_priors(drawn, tmp_path / "out", ["isotropic-sky", "local_scales"]).result
+    result = lb.run_compare_priors(
+        drawn, tmp_path / "out", ["isotropic-sky", "local_scales"]
+    ).result
     assert result.best.name == name
     assert f"The data prefer {name}" in result.headline()
     if name == "local_scales":  # it has seen what it predicts, with parameters enough to gain by it

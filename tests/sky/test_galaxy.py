@@ -12,7 +12,6 @@ import pytest
 from scipy.integrate import quad
 
 import lusee_bayes as lb
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.sky import galaxy
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
@@ -303,7 +302,7 @@ def test_random_component_has_the_stated_rms_and_large_scales_at_every_nside():
     ],
 )
 def test_bad_input_is_named(arguments, word):
-    with pytest.raises(InputError, match=f"is {word}, expected .*; (use|give) "):
+    with pytest.raises(lb.InputError, match=f"is {word}, expected .*; (use|give) "):
         galaxy.galaxy_map(*arguments)
 
 
@@ -321,7 +320,7 @@ def test_bad_input_is_named(arguments, word):
 )
 def test_sizes_that_would_end_the_process_are_refused(call, value):
     """healpy's C code aborts for some of them."""
-    with pytest.raises(InputError, match="expected a whole number"):
+    with pytest.raises(lb.InputError, match="expected a whole number"):
         call(value)
 
 
@@ -330,7 +329,7 @@ SOURCES = {source.name: source for source in BRIGHT_SOURCES}
 
 @pytest.mark.parametrize("bad", [0.0, -3.0, float("nan")])
 def test_frequencies_are_positive(bad):
-    with pytest.raises(InputError, match="expected positive"):
+    with pytest.raises(lb.InputError, match="expected positive"):
         SOURCES["Cyg A"].flux_jy(bad)
 
 
