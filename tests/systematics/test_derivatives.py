@@ -19,12 +19,8 @@ POINTING = (
     "lat_deg: 0.1, tilt_east_deg: 0.2, tilt_north_deg: 0.1}"
 )
 SOURCES = ["sky.sources=false", "sources.list=[{name: Cas A}, {name: Cyg A, stokes_v: 0.3}]"]
-OTHERS = [
-    "noise.receiver={power_k: 500}",
-    "noise.gain_table={std: 0.02}",
-    "sources.list=[{name: Cas A, block_h: 50}]",
-    "sky.sources=false",
-]
+TABLE = ["noise.receiver={power_k: 500}", "noise.gain_table={std: 0.02}"]
+OTHERS = [*TABLE, "sources.list=[{name: Cas A, block_h: 50}]", "sky.sources=false"]
 
 
 def scenario(*more: str) -> lb.Scenario:
@@ -51,16 +47,14 @@ def test_columns_are_the_derivative_of_the_effect(more):
     data that are 1e3 times what a standard deviation does; a clock's drift turns the Moon about its
     z axis there and about the mean pole here, 0.04 degrees apart."""
     setup = set_up(scenario(*more))
-    rng = np.random.default_rng(0)
-    values = {}
+    rng, values = np.random.default_rng(0), {}
     for _, systematic in systematics(setup):
         values |= systematic.in_units(rng.normal(size=len(systematic.names)))
     model, sky = on_host(base_model(setup)), setup.sky.modes
     for _, systematic in systematics(setup, Around(values=values)):
         expanded = on_host(Expanded.about(systematic, model, sky, values))
         expected = differences(systematic, model, sky, expanded.centre)
-        size = np.linalg.norm(expected, axis=0)
-        off = np.linalg.norm(expanded.columns - expected, axis=0)
+        size, off = (np.linalg.norm(x, axis=0) for x in (expected, expanded.columns - expected))
         for name, size_of, off_of in zip(systematic.names, size, off, strict=True):
             # a source that is down in a block does nothing
             assert size_of > 0.0 or name.startswith("flux_")
@@ -73,17 +67,15 @@ def test_about_values_a_is_that_of_the_shifted_observation():
     values = nominal.in_units(np.random.default_rng(1).normal(size=len(nominal.names)))
     (_, offsets), *_ = systematics(setup, Around(values=values))
     model, sky = on_host(base_model(setup)), setup.sky.modes
-    there = moved(setup, values)
     got = np.asarray(offsets.effect(model, values).predict(sky))
-    exact = np.asarray(there.coupling @ sky)
+    exact = np.asarray(moved(setup, values).coupling @ sky)
     np.testing.assert_allclose(got, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
     # sources that the context has moved are not moved twice, and angles alone need no ephemeris
     angles = {name: value for name, value in values.items() if name not in CLOCK}
     got = np.asarray(nominal.effect(model, dict.fromkeys(CLOCK, 0.0) | angles).predict(sky))
     there = moved(setup, angles)
     exact = np.asarray(there.coupling @ sky)
-    for section, before, after in zip(
-        setup.scenario.sources.list, setup.responses, there.responses, strict=True
-    ):
-        exact = exact + section.mean_flux(25.0) * setup.layout.gather(after - before)
+    change = np.array(there.responses) - np.array(setup.responses)
+    for section, seen in zip(setup.scenario.sources.list, change, strict=True):
+        exact = exact + section.mean_flux(25.0) * setup.layout.gather(seen)
     np.testing.assert_allclose(got, exact, rtol=0, atol=1e-9 * np.abs(exact).max())

@@ -288,7 +288,7 @@ def test_the_map_command_writes_the_fluxes(tmp_path, capsys):
     with (tmp_path / "sources.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     table = flux_table(experiment(), lb.infer(experiment()))
-    assert list(rows[0]) == list(table.columns)
+    assert list(rows[0]) == ["frequency_mhz", *table.columns]
     assert [row["source"] for row in rows] == list(table["source"])
     # written in full
     for name in ("flux_jy", "std_jy", "true_jy"):
