@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from assertions import refuse
 
 import lusee_bayes
 from lusee_bayes.core.errors import InputError
@@ -273,12 +274,10 @@ def test_what_is_in_the_way_is_refused_before_the_commit(folder, tmp_path):
         "figures": "'.*figures' is a folder, and a file of the results has its name",
         "mean.fits/x": "'.*mean.fits' is a file",
     }.items():
-        with pytest.raises(InputError, match=words):
-            finished(folder, {name: "x"})
+        refuse(words, finished, folder, {name: "x"})
         assert content(folder) == before
     for place in ("notes.txt", "notes.txt/below"):
-        with pytest.raises(InputError, match="notes.txt' is a file; give a folder"):
-            finished(folder / place, NEW)
+        refuse("notes.txt' is a file; give a folder", finished, folder / place, NEW)
     assert content(folder) == before
 
 

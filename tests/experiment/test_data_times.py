@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from assertions import refuse
 from fits_files import write_images
 from scipy import stats
 from scipy.linalg import eigh
@@ -70,8 +71,7 @@ def test_data_come_as_paths_or_in_memory(tmp_path, monkeypatch):
         ([read, path], "not in both"),
         ([], "no data"),
     ):
-        with pytest.raises(lb.InputError, match=noun):
-            lb.read_data(given, scenario("frequency_mhz=20"))
+        refuse(noun, lb.read_data, given, scenario("frequency_mhz=20"))
     for given in (np.zeros(3), [3.0]):
         assert_refused(lambda given=given: items_of(given))
 
@@ -132,8 +132,7 @@ def test_what_is_unclear_or_contradicts_is_refused(tmp_path, window, timestamp, 
 
 def test_no_experiment_of_data_with_unclear_times_or_a_fixed_axis_in_windows(tmp_path):
     data = lb.read_visibilities(file_of(tmp_path, None)[0])
-    with pytest.raises(lb.InputError, match="do not say what their times are; use data.stamped"):
-        set_up(scenario(), data)
+    refuse("do not say what their times are; use data.stamped", set_up, scenario(), data)
     data = lb.read_visibilities(file_of(tmp_path, "mean")[0])
     with pytest.raises(lb.InputError, match="means over windows.*leave out observation.fixed_axis"):
         set_up(scenario("observation.fixed_axis=true"), data)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from assertions import close
+from assertions import close, refuse
 from numpy.polynomial import Polynomial
 from numpy.polynomial.legendre import Legendre
 from reference import SPEED_OF_LIGHT, hemisphere, real_harmonics, unit_vectors
@@ -177,8 +177,7 @@ def test_modes_keep_leading_axes_and_refuse_a_coarse_azimuth():
     both = GRID.modes(patterns.reshape(2, 2, *patterns.shape[1:]), 4)
     np.testing.assert_allclose(both[1, 0], GRID.modes(patterns[2], 4), rtol=0, atol=1e-14)
     coarse = HemisphereGrid.gauss_legendre(10, 8)
-    with pytest.raises(lb.InputError, match="8 azimuths cannot resolve lmax = 4"):
-        coarse.modes(np.ones((10, 8)), 4)
+    refuse("8 azimuths cannot resolve lmax = 4", coarse.modes, np.ones((10, 8)), 4)
 
 
 def test_fields_are_checked():
@@ -194,8 +193,7 @@ def test_unknown_stokes_and_products_are_refused():
         stokes_beam(short_dipole([0, 0, 1]), "W")
     with pytest.raises(lb.InputError, match="3 products do not come from any number of antennas"):
         lb.ProductBeams(np.zeros((3, 4)), 10.0)
-    with pytest.raises(lb.InputError, match="5 coefficients do not fill any lmax"):
-        lb.ProductBeams(np.zeros((4, 5)), 10.0)
+    refuse("5 coefficients do not fill any lmax", lb.ProductBeams, np.zeros((4, 5)), 10.0)
 
 
 # --- luseepy's quadrature rules, against closed forms ---------------------------------------------

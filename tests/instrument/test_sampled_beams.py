@@ -9,7 +9,7 @@ import healpy
 import numpy as np
 import pytest
 import xarray as xr
-from assertions import close, refused
+from assertions import close, refuse
 from astropy.io import fits
 from reference import unit_vectors
 
@@ -171,8 +171,7 @@ def test_files_come_back(tmp_path, kind, suffix):
     for f in (20.0, 24.0):
         ours, own = (np.asarray(b.beams(f, LMAX).modes) for b in (again, made))
         close(ours, own, 1e-13)
-    with pytest.raises(lb.InputError, match="from 20 to 30 MHz, not at 31"):
-        again.beams(31.0, LMAX)
+    refuse("from 20 to 30 MHz, not at 31", again.beams, 31.0, LMAX)
     text = describe(path)
     assert "4 antennas" in text
     assert "at 20, 30 MHz" in text
@@ -202,8 +201,7 @@ def test_product_beams_of_a_file_may_be_in_any_order(tmp_path):
     np.testing.assert_array_equal(lb.read_beam(path).products, made.products)
     shuffled.attrs["products"] = "00R, 01R"
     shuffled.to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(lb.InputError, match=r"mine\.nc: products is 00R, 01R, expected the names"):
-        lb.read_beam(path)
+    refuse(r"mine\.nc: products is 00R, 01R, expected the names", lb.read_beam, path)
 
 
 @pytest.mark.parametrize("kind", ["pixels", "grid"])
@@ -247,14 +245,12 @@ def nan_at_the_zenith():
     ],
 )
 def test_arrays_that_are_no_beams_are_refused(given, words):
-    with refused(words):
-        lb.sampled_beams(FREQUENCY, **given())
+    refuse(words, lb.sampled_beams, FREQUENCY, **given())
 
 
 def test_what_cannot_be_computed_is_refused():
     zero = lb.sampled_beams(FREQUENCY, products=np.zeros((16, 12 * 4**2)))
-    with pytest.raises(lb.InputError, match="autos integrate to 0 sr"):
-        zero.beams(FREQUENCY, 2)
+    refuse("autos integrate to 0 sr", zero.beams, FREQUENCY, 2)
     with pytest.raises(lb.InputError, match="beams of products, not the E fields"):
         zero.fields(FREQUENCY, HemisphereGrid.for_lmax(2))
     with pytest.raises(lb.InputError, match="must be positive and grow"):
@@ -295,8 +291,7 @@ def test_damaged_files_are_refused(tmp_path, change, suffix):
         with xr.open_dataset(path, engine="h5netcdf") as file:
             found = DAMAGE[change][0](file.load())
         found.to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(lb.InputError, match=str(path)):
-        lb.read_beam(path)
+    refuse(str(path), lb.read_beam, path)
 
 
 # --- pyuvdata -------------------------------------------------------------------------------------
@@ -345,8 +340,7 @@ def test_a_uvbeam_is_its_fields(tmp_path, coordinates):
     conjugate = lb.from_uvbeam(beam, conjugate=True).beams(20.0, LMAX).modes
     np.testing.assert_allclose(conjugate[2], -found.beams(20.0, LMAX).modes[2], atol=1e-15)
     beam.efield_to_power()
-    with pytest.raises(lb.InputError, match="give one of type efield"):
-        lb.from_uvbeam(beam)
+    refuse("give one of type efield", lb.from_uvbeam, beam)
 
 
 def test_without_pyuvdata_its_files_are_refused_with_what_to_install(tmp_path, monkeypatch):
@@ -355,5 +349,4 @@ def test_without_pyuvdata_its_files_are_refused_with_what_to_install(tmp_path, m
     hdu.header["NORMSTD"], hdu.header["FEEDLIST"] = "physical", "[x, y]"
     hdu.writeto(path)
     monkeypatch.setattr("lusee_bayes.instrument.beams.sampled.find_spec", lambda name: None)
-    with pytest.raises(lb.InputError, match=r"pip install '\.\[uvdata\]'"):
-        lb.read_beam(path)
+    refuse(r"pip install '\.\[uvdata\]'", lb.read_beam, path)

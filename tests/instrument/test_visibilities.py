@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from assertions import close, refused
+from assertions import close, refuse
 from astropy.time import Time
 
 import lusee_bayes as lb
@@ -83,8 +83,7 @@ def nan(dataset):
 def test_bad_files_are_refused(data, tmp_path, change, message):
     path = tmp_path / "bad.nc"
     altered(change)(data, path)
-    with pytest.raises(lb.InputError, match=message):
-        lb.read_visibilities(path)
+    refuse(message, lb.read_visibilities, path)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mK", 1e-3), ("kK", 1e3), ("", 1.0)])
@@ -106,11 +105,9 @@ def test_times_in_other_scales_are_brought_to_utc(data, tmp_path, scale, s):
 
 
 def test_other_files_are_refused(tmp_path):
-    with pytest.raises(lb.InputError, match="no data at .*lusee-bayes simulate"):
-        lb.read_visibilities(tmp_path / "none.nc")
+    refuse("no data at .*lusee-bayes simulate", lb.read_visibilities, tmp_path / "none.nc")
     (tmp_path / "text.nc").write_text("hello")
-    with pytest.raises(lb.InputError, match="not a file of visibilities"):
-        lb.read_visibilities(tmp_path / "text.nc")
+    refuse("not a file of visibilities", lb.read_visibilities, tmp_path / "text.nc")
 
 
 def test_lengths_must_fit(data):
@@ -267,8 +264,7 @@ def test_angles_are_runs_and_sites_are_places(tmp_path):
     ],
 )
 def test_what_is_wrong_is_said_in_a_sentence(options, words):
-    with refused(words):
-        make(**options)
+    refuse(words, make, **options)
 
 
 # --- layouts --------------------------------------------------------------------------------------
@@ -323,8 +319,7 @@ def test_scatter_is_the_transpose_of_gather(flags, rest):
 
 
 def test_nothing_left_is_an_error():
-    with pytest.raises(lb.InputError, match="all 15 samples are flagged"):
-        DataLayout.from_flags(np.ones((3, 5), dtype=bool))
+    refuse("all 15 samples are flagged", DataLayout.from_flags, np.ones((3, 5), dtype=bool))
 
 
 # --- products -------------------------------------------------------------------------------------

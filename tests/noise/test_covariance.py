@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import refused
+from assertions import refuse
 from reference_linear import random_covariance
 
 import lusee_bayes as lb
@@ -240,10 +240,7 @@ def test_low_rank_alone():
         close(cov.mv(jnp.asarray(x)), dense @ x, 1e-14)
         close(cov.mv(jnp.asarray(x[:, 0])), dense @ x[:, 0], 1e-14)
     for use in (directions.factor, directions.log_det, lambda: directions.solve(jnp.ones(6))):
-        with pytest.raises(
-            lb.InputError, match="the templates has rank 2 .* 6 data.* add the radio"
-        ):
-            use()
+        refuse("the templates has rank 2 .* 6 data.* add the radio", use)
 
 
 @pytest.mark.parametrize("kind", ["diagonal", "banded"])
@@ -356,8 +353,7 @@ MAKERS = {
     ],
 )
 def test_entries_that_no_covariance_has_are_refused(kind, entries, message):
-    with pytest.raises(lb.InputError, match=message):
-        MAKERS[kind](entries)
+    refuse(message, MAKERS[kind], entries)
 
 
 def test_what_passes_and_a_factor_that_does_not():
@@ -365,8 +361,7 @@ def test_what_passes_and_a_factor_that_does_not():
     # blocks between times need not be symmetric
     lb.TimeBandedCovariance(BAND.at[1, 1, 0, 1].set(0.5), LAYOUT)
     for bad in (0.0, -2.0):
-        with pytest.raises(lb.InputError, match="must be positive"):
-            lb.DiagonalCovariance(jnp.ones(3)).scaled(bad)
+        refuse("must be positive", lb.DiagonalCovariance(jnp.ones(3)).scaled, bad)
 
 
 def _indefinite():
@@ -379,8 +374,7 @@ def _indefinite():
 def test_indefinite_terms_are_named_with_their_lowest_eigenvalue():
     cov = lb.DenseCovariance(_indefinite(), "the gain term")
     for use in (cov.factor, cov.log_det, lambda: cov.solve(jnp.ones(6))):
-        with refused(r"the gain term is not positive definite: .* eigenvalue is -0\.25 "):
-            use()
+        refuse(r"the gain term is not positive definite: .* eigenvalue is -0\.25 ", use)
 
 
 def test_indefinite_bands_are_named_with_their_lowest_eigenvalue():
@@ -389,8 +383,7 @@ def test_indefinite_bands_are_named_with_their_lowest_eigenvalue():
     cov = lb.TimeBandedCovariance(band, DataLayout(4, 3), "the gain term")
     cov = LowRankUpdate(cov, lb.LowRankCovariance(1e-3 * jnp.ones((12, 1))))
     for use in (cov.factor, cov.log_det, lambda: cov.solve(jnp.ones(12))):
-        with refused(r"the gain term is not positive definite: .* eigenvalue is -0\.25 "):
-            use()
+        refuse(r"the gain term is not positive definite: .* eigenvalue is -0\.25 ", use)
 
 
 def test_indefinite_blocks_are_refused():
@@ -474,5 +467,4 @@ def test_the_term_is_t_p_t(prior, matrix):
     ],
 )
 def test_bad_input_is_refused(templates, prior, message):
-    with pytest.raises(lb.InputError, match=message):
-        lb.template_noise(jnp.asarray(templates), jnp.asarray(prior), SEEN)
+    refuse(message, lb.template_noise, jnp.asarray(templates), jnp.asarray(prior), SEEN)

@@ -9,6 +9,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 import scipy.linalg
+from assertions import refuse
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
@@ -248,10 +249,8 @@ def test_what_will_be_known_of_clock_and_turntable():
 
 
 def test_ports_that_do_not_exist_and_none_left():
-    with pytest.raises(lb.InputError, match="no port 4 to lose; ports are 0 to 3"):
-        forecast(varied(lost=(4,)))
-    with pytest.raises(lb.InputError, match="small, test: all .* samples are flagged"):
-        forecast(varied(lost=(0, 1, 2, 3)))
+    refuse("no port 4 to lose; ports are 0 to 3", forecast, varied(lost=(4,)))
+    refuse("small, test: all .* samples are flagged", forecast, varied(lost=(0, 1, 2, 3)))
 
 
 TINY = ["--set", "lmax=6", "--set", "observation.runs.0.cycles=0.05"]

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from assertions import refuse
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling import hmc
@@ -184,8 +185,7 @@ def test_an_unreadable_chunk_is_named_and_deleting_it_helps(folder, damage):
     path = chunks(folder)[-1]
     DAMAGE[damage](path)
     run = again(folder)
-    with pytest.raises(InputError, match=f"{path} cannot be read.*delete it"):
-        run.chunks()
+    refuse(f"{path} cannot be read.*delete it", run.chunks)
     path.unlink()
     assert run.chunks()[-1].iteration == N_DRAWS * N_CHUNKS
 
@@ -193,8 +193,7 @@ def test_an_unreadable_chunk_is_named_and_deleting_it_helps(folder, damage):
 def test_a_chunk_missing_in_the_middle_is_noticed(folder):
     """Draws behind the gap would silently take the place of those in it."""
     chunks(folder)[2].unlink()
-    with pytest.raises(InputError, match="lacks the draws of iterations 8 to 12"):
-        again(folder).chunks()
+    refuse("lacks the draws of iterations 8 to 12", again(folder).chunks)
 
 
 def test_chunks_without_a_marker_are_not_taken_for_ones_own(folder):
@@ -210,5 +209,4 @@ def test_chunks_without_a_marker_are_not_taken_for_ones_own(folder):
 @pytest.mark.parametrize("content", ["", "{", "[1]"])
 def test_an_unreadable_marker_is_bad_input(folder, content):
     (folder / hmc.IDENTITY).write_text(content)
-    with pytest.raises(InputError, match=re.escape(str(folder)) + ".*delete its folder"):
-        again(folder)
+    refuse(re.escape(str(folder)) + ".*delete its folder", again, folder)

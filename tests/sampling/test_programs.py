@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import refuse
 from numpyro import handlers
 from numpyro.infer.util import log_density
 from reference_linear import assert_draws_follow, posterior, random_covariance
@@ -171,8 +172,7 @@ def test_files_that_are_no_programs(write, text, message, more):
     with pytest.raises(lb.InputError, match=message) as error:
         lb.load_program(path)
     assert_one_sentence(error, str(path), more)
-    with pytest.raises(lb.InputError, match="give the path of a Python file"):
-        lb.load_program(write(text, "mine.txt"))
+    refuse("give the path of a Python file", lb.load_program, write(text, "mine.txt"))
 
 
 # --- what they ask for ----------------------------------------------------------------------------
@@ -449,16 +449,14 @@ def model(coupling, prior, noise, data=None):
     ],
 )
 def test_programs_without_a_sky_or_unknowns_are_refused(text, message, write, pieces):
-    with pytest.raises(lb.InputError, match=message):
-        check(write(text), pieces)
+    refuse(message, check, write(text), pieces)
 
 
 @pytest.mark.parametrize("argument", ["coupling, /, ", "*, coupling, *noise, ", "**others, "])
 def test_arguments_are_given_by_name(argument, tmp_path):
     path = tmp_path / "bad.py"
     path.write_text(f"def model({argument}data=None):\n    pass\n")
-    with pytest.raises(lb.InputError, match="does not run|by position, or as many as come"):
-        lb.load_program(path)
+    refuse("does not run|by position, or as many as come", lb.load_program, path)
 
 
 def test_a_density_that_is_nan_names_the_program(tmp_path, capsys):
